@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from core.errors import InputError
 from core.field.checks.extrapolated import mark_extrapolated
+from core.field.common import with_common_factor
 from core.field.points.images import MeasureImage, check_calibrated_size
 from core.field.points.result import Field
 from core.field.region.lay_points import make_grid
@@ -22,7 +23,7 @@ from core.measure import ReferencePair
 from core.settings import AnalysisSettings
 from core.strain import StrainOptions, surface_strain
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
-from server.formats.calibrations.volume import volume_of
+from server.formats.calibrations.volume import parameter_covariance, volume_of
 from server.formats.noise_json import LoadedNoise
 from stereorig.result import Result
 
@@ -145,6 +146,7 @@ class Measurement:
         if settings.smoothing_window and field.has_motion:
             field = smoothed_displacement(field, settings.smoothing_window, subset_px=settings.subset_px)
         field = mark_extrapolated(field, volume_of(self.calibration))
+        field = with_common_factor(field, parameter_covariance(self.calibration))
         options = StrainOptions.of(settings.strain)
         if options is not None and field.has_motion:
             strain = surface_strain(field, options, subset_px=settings.subset_px)

@@ -1,8 +1,8 @@
-"""The calibrated volume, and the calibration's covariance of points inside and outside it.
+"""The calibrated volume.
 
 The target's intersections reach up to some distance from each camera's optical axis and over some range of depths.
 Beyond these, distortion and pose are extrapolated by the model. The parameters' covariance gives the uncertainty there,
-as far as the model holds.
+too, as far as the model holds.
 """
 
 from __future__ import annotations
@@ -14,14 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from core.arrays import Bool, Float
-from core.calibration.measured_points import measured_derivatives
-from core.calibration.result import COVARIANCE_NAMES
-from core.calibration.uncertainty import point_derivatives
 from core.cameras.camera import Camera, RigidTransform
 from core.cameras.stereo import StereoPair
 
 _MIN_POINTS = 8
-_AT_ONCE = 20_000
 _BEYOND = 0.1  # of the depths of free poses: what the volume goes on before and behind them
 
 
@@ -37,17 +33,11 @@ class CalibratedVolume:
         (2,) largest distance from the optical axis over depth, of either camera.
     depth_mm
         (2, 2) smallest and largest depth, of either camera.
-    covariance
-        (n, n) of both cameras' parameters in ``names``, None where it is not known.
-    names
-        Names of these parameters.
     """
 
     pair: StereoPair
     slope: Float
     depth_mm: Float
-    covariance: Float | None = None
-    names: tuple[str, ...] = COVARIANCE_NAMES
 
     def contains(self, points_mm: ArrayLike) -> Bool:
         """Return (...) True for points (..., 3) of the system frame inside both cameras' volumes; False for NaN."""
@@ -61,37 +51,6 @@ class CalibratedVolume:
                 inside &= np.hypot(p[..., 0], p[..., 1]) <= self.slope[c] * depth
         return np.asarray(inside)
 
-    def covariance_mm2(self, points_mm: Float, displaced_mm: Float | None = None) -> Float:
-        """Return the covariance of points and displacements from the calibration alone.
-
-        Parameters
-        ----------
-        points_mm
-            (n, 3) points, system frame.
-        displaced_mm
-            (n, 3) their current positions.
-
-        Returns
-        -------
-        Float
-            (n, 3, 3) of X, Y, Z; with ``displaced_mm`` (n, 6, 6) of X, Y, Z, U, V, W. Zero where the calibration's own
-            covariance is not known.
-        """
-        n, size = len(points_mm), 3 if displaced_mm is None else 6
-        out = np.zeros((n, size, size))
-        if self.covariance is None:
-            return out
-        for first in range(0, n, _AT_ONCE):
-            part = slice(first, first + _AT_ONCE)
-            now = None if displaced_mm is None else displaced_mm[part]
-            J = measured_derivatives(self.pair, points_mm[part], self.names, now)
-            out[part] = J @ self.covariance @ np.swapaxes(J, 1, 2)
-        return out
-
-    def slopes(self, points_mm: Float) -> Float:
-        """Derivatives (n, 3, len(names)) of points (n, 3) over the parameters of ``covariance``."""
-        return point_derivatives(self.pair, points_mm, self.names)
-
 
 def calibrated_volume(
     pair: StereoPair,
@@ -100,8 +59,6 @@ def calibrated_volume(
     positions_mm: Sequence[Sequence[float]],
     *,
     pitch_mm: float,
-    covariance: Float | None = None,
-    names: tuple[str, ...] = COVARIANCE_NAMES,
 ) -> CalibratedVolume | None:
     """Build the volume from views at stage positions, each camera moved along its optical axis.
 
@@ -120,8 +77,6 @@ def calibrated_volume(
         Each camera's travels dZ of the views that were fitted.
     pitch_mm
         Distance of neighbouring intersections.
-    covariance, names
-        Covariance of the parameters, and their names.
 
     Returns
     -------
@@ -134,7 +89,7 @@ def calibrated_volume(
         margins.append(float(np.ptp(positions)) if len(positions) else 0.0)
         parts = [_seen(camera.moved(dz), points, size) for dz in sorted(set(positions))]
         seen.append(np.concatenate(parts) if parts else np.zeros((0, 3)))
-    return _volume(pair, seen, margins, pitch_mm, covariance, names)
+    return _volume(pair, seen, margins, pitch_mm)
 
 
 def volume_of_poses(
@@ -144,8 +99,6 @@ def volume_of_poses(
     cam_from_target: Sequence[Sequence[RigidTransform]],
     *,
     pitch_mm: float,
-    covariance: Float | None = None,
-    names: tuple[str, ...] = COVARIANCE_NAMES,
 ) -> CalibratedVolume | None:
     """Build the volume from the target's poses in each camera's frame, see :func:`calibrated_volume`.
 
@@ -158,16 +111,11 @@ def volume_of_poses(
         own = np.concatenate(parts) if parts else np.zeros((0, 3))
         seen.append(own)
         margins.append(_BEYOND * float(np.ptp(own[:, 2])) if len(own) else 0.0)
-    return _volume(pair, seen, margins, pitch_mm, covariance, names)
+    return _volume(pair, seen, margins, pitch_mm)
 
 
 def _volume(
-    pair: StereoPair,
-    seen: Sequence[Float],
-    margins_mm: Sequence[float],
-    pitch_mm: float,
-    covariance: Float | None,
-    names: tuple[str, ...],
+    pair: StereoPair, seen: Sequence[Float], margins_mm: Sequence[float], pitch_mm: float
 ) -> CalibratedVolume | None:
     slope, depth = np.empty(2), np.empty((2, 2))
     for c, (own, margin) in enumerate(zip(seen, margins_mm, strict=True)):
@@ -175,7 +123,7 @@ def _volume(
             return None
         slope[c] = ((np.hypot(own[:, 0], own[:, 1]) + pitch_mm) / own[:, 2]).max()
         depth[c] = own[:, 2].min() - margin, own[:, 2].max() + margin
-    return CalibratedVolume(pair, slope, depth, covariance, names)
+    return CalibratedVolume(pair, slope, depth)
 
 
 def _on_plane(nodes_mm: ArrayLike) -> Float:

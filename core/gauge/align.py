@@ -103,6 +103,9 @@ def align_plane(
     roots = roots_of(np.where(field.valid[..., None, None], field.covariance[..., :3, :3], 0.0))
     each = gain @ roots
     three = np.einsum("rcij,rckj->ik", each, shared.positions.summed(field, each))
+    if field.common is not None:
+        shift = np.einsum("rcij,rcjk->ik", gain, np.where(field.valid[..., None, None], field.common[..., :3, :], 0.0))
+        three = three + shift @ shift.T
     full = np.zeros((6, 6))
     position = np.ix_([0, 1, 5], [0, 1, 5])
     full[position] = 0.5 * (three + three.T)
@@ -153,6 +156,10 @@ def align_3_2_1(field: Field, positions_px: ArrayLike, *, shared: SharedPixels) 
     first, second = (i.ravel() for i in np.meshgrid(np.arange(6), np.arange(6), indexing="ij"))
     blocks = positions.covariance(shared, first, second)[:, :3, :3].reshape(6, 6, 3, 3)
     joint = np.swapaxes(blocks, 1, 2).reshape(18, 18)
+    common = positions.common()
+    if common is not None:
+        shift = common[:, :3].reshape(18, -1)
+        joint = joint + shift @ shift.T
     slope = np.empty((6, 18))
     step = 1e-5 * float(np.abs(x - x.mean(axis=0)).max())
     for k in range(18):
@@ -211,5 +218,6 @@ def aligned(field: Field, alignment: Alignment) -> Field:
         uvw_mm=None if field.uvw_mm is None else field.uvw_mm @ R.T,
         rotation_rad=None if field.rotation_rad is None else field.rotation_rad @ R.T,
         covariance=J @ field.covariance @ J.T,
+        common=None if field.common is None else J @ field.common,
         starts=None,
     )

@@ -27,7 +27,10 @@ class AreaStatistics:
     mean, sd, minimum, maximum, rms
         Of the values; ``sd`` about the mean, with count - 1. NaN without values.
     mean_sigma
-        Standard uncertainty of the mean from the points' noise and their common pixels; NaN where it is unknown.
+        Standard uncertainty of the mean, from the points' noise, their common pixels and their common factor; NaN where
+        it is unknown.
+    mean_sigma_calibration
+        The common factor's part of it; NaN where that is not known, and then not included.
     """
 
     count: int
@@ -38,6 +41,7 @@ class AreaStatistics:
     maximum: float
     rms: float
     mean_sigma: float
+    mean_sigma_calibration: float = float("nan")
 
 
 def points_within(field: Field, polygon_px: ArrayLike | None) -> Bool:
@@ -71,7 +75,7 @@ def points_within(field: Field, polygon_px: ArrayLike | None) -> Bool:
 
 
 def area_statistics(
-    field: Field, values: Float, sigma: Float | None, inside: Bool, *, shared: SharedPixels
+    field: Field, values: Float, sigma: Float | None, inside: Bool, *, shared: SharedPixels, common: Float | None = None
 ) -> AreaStatistics:
     """Return the statistics of values over an area.
 
@@ -82,19 +86,24 @@ def area_statistics(
     values
         (r, c) any variable of the field.
     sigma
-        (r, c) its standard deviations; None if they are not known.
+        (r, c) its own standard deviations; None if they are not known.
     inside
         (r, c) the area, see :func:`points_within`.
     shared
         The correlation of neighbouring points.
+    common
+        (r, c, k) the variable's common factor, which a mean does not reduce.
     """
     used = inside & field.valid & np.isfinite(values)
     v = values[used]
     n = int(v.size)
-    mean_sigma = float("nan")
+    mean_sigma = of_calibration = float("nan")
     if n and sigma is not None and np.isfinite(sigma[used]).all():
         s = np.where(used, sigma, 0.0)
         mean_sigma = float(np.sqrt(max(float(np.sum(s * shared.summed(field, s))), 0.0)) / n)
+        if common is not None:
+            of_calibration = float(np.linalg.norm(common[used].mean(axis=0)))
+            mean_sigma = float(np.hypot(mean_sigma, of_calibration))
     if not n:
         nan = float("nan")
         return AreaStatistics(0, int(inside.sum()), nan, nan, nan, nan, nan, nan)
@@ -107,4 +116,5 @@ def area_statistics(
         maximum=float(v.max()),
         rms=float(np.sqrt(np.mean(v**2))),
         mean_sigma=mean_sigma,
+        mean_sigma_calibration=of_calibration,
     )

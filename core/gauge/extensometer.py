@@ -74,6 +74,8 @@ def extensometer(field: Field, a_px: ArrayLike, b_px: ArrayLike, *, shared: Shar
     if why:
         return Extensometer(missing=", ".join(why))
     cov = _both_ends(samples, shared)
+    common = samples.common()
+    ends_common = None if common is None else common.reshape(cov.shape[0], -1)
     n = cov.shape[0] // 2
     start = samples.of(field.xyz_mm)
     now = start if field.uvw_mm is None else start + samples.of(field.uvw_mm)
@@ -85,7 +87,11 @@ def extensometer(field: Field, a_px: ArrayLike, b_px: ArrayLike, *, shared: Shar
     d = np.concatenate([moving, -moving]) / length
 
     def reading(value: float, slope: Float) -> Reading:
-        return Reading(value, float(np.sqrt(max(float(slope @ cov @ slope), 0.0))))
+        own = float(np.sqrt(max(float(slope @ cov @ slope), 0.0)))
+        if ends_common is None:
+            return Reading(value, own)
+        shared_part = float(np.linalg.norm(slope @ ends_common))
+        return Reading(value, float(np.hypot(own, shared_part)), shared_part)
 
     if field.uvw_mm is None:
         return Extensometer(length0_mm=reading(length0, d0), length_mm=reading(length0, d0))

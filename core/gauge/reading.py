@@ -14,10 +14,13 @@ class Reading(NamedTuple):
         NaN where it is missing.
     sigma
         Standard uncertainty in the value's unit; NaN where it is not known.
+    sigma_calibration
+        The calibration's part of it; NaN where that is not known, and then not included.
     """
 
     value: float
     sigma: float
+    sigma_calibration: float = float("nan")
 
 
 MISSING = Reading(float("nan"), float("nan"))

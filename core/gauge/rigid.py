@@ -4,7 +4,7 @@ A point X that moved by U is at X + U = c + d + R (X - c) + r. R and d minimise 
 covariance; c is the centre of the points used. Where the body deforms, the residual r is more than noise; then r's
 covariance is the noise's plus an isotropic variance that accounts for the residual. Else a body that only stretches
 would be turned until its contraction looks like a tilt, since depth is the noisiest direction. The parameters'
-covariance comes from the points' own and from the pixels that overlapping subsets share. It holds the noise only.
+covariance comes from the points' own, from the pixels that overlapping subsets share, and from their common factor.
 """
 
 from __future__ import annotations
@@ -65,6 +65,12 @@ class RigidMotion:
     noise_ratio: float
     gain: Float
     """(r, c, 6, 3) the fit's derivative over each point's r, zero for points without weight."""
+    own_covariance: Float
+    """(6, 6) ``small_covariance`` without the common part."""
+    common: Float | None
+    """(6, k) common factor of the small rotation and the translation; None where the field has none."""
+    sigma_common: Float
+    """(6,) the common part's standard deviations, as ``covariance``; NaN where the field has none."""
 
 
 def skew(v: Float) -> Float:
@@ -132,7 +138,9 @@ def rigid_motion(
     distance2 = np.einsum("na,nab,nb->n", r, np.linalg.inv(noise), r)
     gain = np.zeros((*field.shape, 6, 3))
     gain[used] = np.linalg.solve(H, np.swapaxes(weight[:, None, None] * (W @ A), 1, 2))
-    small = _fit_covariance(field, shared, gain, R)
+    own = _fit_covariance(field, shared, gain, R)
+    common = _fit_common(field, gain, R)
+    small = own if common is None else own + common @ common.T
     vector = Rotation.from_matrix(R).as_rotvec()
     to_vector = np.eye(6)
     to_vector[:3, :3] = _vector_slope(vector)
@@ -147,6 +155,9 @@ def rigid_motion(
         residual_rms_mm=float(np.sqrt(np.mean(np.sum(r[kept] ** 2, axis=1)))),
         noise_ratio=float(np.sqrt(np.mean(distance2[kept]) / 3.0)),
         gain=gain,
+        own_covariance=own,
+        common=common,
+        sigma_common=np.full(6, np.nan) if common is None else np.linalg.norm(to_vector @ common, axis=1),
     )
 
 
@@ -198,9 +209,10 @@ def without_rigid_motion(field: Field, motion: RigidMotion, *, shared: SharedPix
     common = shared.summed(field, motion.gain @ (M @ roots)) @ roots  # (r, c, 6, 6) of dp with dX, dU of the point
     mixed = P @ common @ J.T
     cov = J @ field.covariance @ J.T + mixed + np.swapaxes(mixed, -1, -2)
-    cov = cov + P @ motion.small_covariance @ np.swapaxes(P, -1, -2)
+    cov = cov + P @ motion.own_covariance @ np.swapaxes(P, -1, -2)
     cov[~valid] = np.nan
-    return replace(field, uvw_mm=uvw, rotation_rad=rotation, covariance=cov, starts=None)
+    left = None if field.common is None or motion.common is None else J @ field.common + P @ motion.common
+    return replace(field, uvw_mm=uvw, rotation_rad=rotation, covariance=cov, common=left, starts=None)
 
 
 def _fit_covariance(field: Field, shared: SharedPixels, gain: Float, R: Float) -> Float:
@@ -209,6 +221,15 @@ def _fit_covariance(field: Field, shared: SharedPixels, gain: Float, R: Float) -
     each = gain @ (M @ roots)  # (r, c, 6, 6): white noise to parameters
     total = np.einsum("rcij,rckj->ik", each, shared.summed(field, each))
     return np.asarray(0.5 * (total + total.T))
+
+
+def _fit_common(field: Field, gain: Float, R: Float) -> Float | None:
+    """(6, k): every point's share of the common factor, through the fit."""
+    if field.common is None:
+        return None
+    M = np.concatenate([np.eye(3) - R, np.eye(3)], axis=1)
+    held = np.where(field.valid[..., None, None], field.common, 0.0)
+    return np.asarray(np.einsum("rcij,rcjk->ik", gain, M @ held))
 
 
 def _unweighted(arm: Float, moved: Float) -> tuple[Float, Float]:

@@ -63,8 +63,12 @@ class Samples:
         # a corner of no weight may be a failed point
         return np.asarray(np.where(weight == 0.0, 0.0, weight * flat).sum(axis=1))
 
+    def common(self) -> Float | None:
+        """Return the positions' common factor (m, n, k); None where the field has none."""
+        return None if self.field.common is None else self.of(self.field.common)
+
     def covariance(self, shared: SharedPixels, first: ArrayLike, second: ArrayLike) -> Float:
-        """Return the covariance between pairs of positions, from the points' own and their subsets' common pixels.
+        """Return the own covariance between pairs of positions: from the points' and their subsets' common pixels.
 
         Parameters
         ----------

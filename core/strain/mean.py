@@ -19,8 +19,10 @@ from core.strain.tensors import strain_of, strain_slopes
 from core.strain.window import plane_weights
 
 
-def mean_strain_sigma(field: Field, options: StrainOptions, inside: Bool, *, subset_px: float) -> Float:
-    """Return the standard uncertainties (3,) of the means of exx, eyy, exy over an area; NaN without strain.
+def mean_strain_sigma(field: Field, options: StrainOptions, inside: Bool, *, subset_px: float) -> tuple[Float, Float]:
+    """Return the standard uncertainties (3,) of the means of exx, eyy, exy over an area, and the calibration's part.
+
+    NaN without strain; the part alone where the field has no common factor.
 
     Parameters
     ----------
@@ -38,7 +40,7 @@ def mean_strain_sigma(field: Field, options: StrainOptions, inside: Bool, *, sub
     Errors dX_k, dU_k of the points change the slopes of a window by ``d_a = sum_k c_ak (dX, dU)_k``, and its strain by
     ``sum_a D_a . d_a``. The mean's error is ``sum_k v_k . (dX, dU)_k`` with v the sum of D over the windows that hold
     point k, times their weights c; its variance is ``sum_kl v_k S_k rho_kl S_l v_l``, S the roots of the points'
-    covariances.
+    covariances. The common factor goes through the same weights: ``sum_k v_k . F_k``, squared.
     """
     from scipy.signal import oaconvolve  # slow to load, and not every start needs it
 
@@ -48,7 +50,7 @@ def mean_strain_sigma(field: Field, options: StrainOptions, inside: Bool, *, sub
     used = good & inside
     n = int(used.sum())
     if n == 0:
-        return np.full(3, np.nan)
+        return np.full(3, np.nan), np.full(3, np.nan)
     strain = strain_of(frame, gradient, options.tensor)
     D = np.zeros((*field.shape, 3, 2, 6))
     D[used] = strain_slopes(frame, gradient, options.tensor, per_mm, strain)[used[good]] / n
@@ -67,4 +69,9 @@ def mean_strain_sigma(field: Field, options: StrainOptions, inside: Bool, *, sub
     v = v[half : half + field.shape[0], half : half + field.shape[1]]
     roots = roots_of(np.where(field.valid[..., None, None], field.covariance, 0.0))
     each = np.where(field.valid[..., None, None], v, 0.0) @ roots
-    return np.asarray(np.sqrt(np.maximum(np.einsum("rcij,rcij->i", each, shared.summed(field, each)), 0.0)))
+    variance = np.maximum(np.einsum("rcij,rcij->i", each, shared.summed(field, each)), 0.0)
+    if field.common is None:
+        return np.asarray(np.sqrt(variance)), np.full(3, np.nan)
+    held = np.where(field.valid[..., None, None], field.common, 0.0)
+    part = np.linalg.norm(np.einsum("rcij,rcjk->ik", v, held), axis=1)
+    return np.asarray(np.hypot(np.sqrt(variance), part)), np.asarray(part)

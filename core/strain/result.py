@@ -54,7 +54,9 @@ class StrainField:
     strain
         (r, c, 3) exx, eyy, exy of the gauge.
     covariance
-        (r, c, 3, 3) of these, from the covariances of the points.
+        (r, c, 3, 3) of these, from the points' own covariances.
+    common
+        (r, c, 3, k) common factor of these, from that of the points; None where it is not known.
     patch
         (r, c, 3) exx, eyy, exy of each point's own stretch patch, the same tensor; NaN where the point is not valid,
         None for rigid patches.
@@ -69,6 +71,7 @@ class StrainField:
     strain: Float
     covariance: Float
     patch: Float | None = None
+    common: Float | None = None
 
     @property
     def valid(self) -> Bool:
@@ -76,9 +79,16 @@ class StrainField:
         return np.asarray(self.status == StrainStatus.OK)
 
     @property
+    def total_covariance(self) -> Float:
+        """(r, c, 3, 3) of exx, eyy, exy: own and common."""
+        if self.common is None:
+            return self.covariance
+        return np.asarray(self.covariance + self.common @ np.swapaxes(self.common, -1, -2))
+
+    @property
     def sigma(self) -> Float:
         """(r, c, 3) standard deviations of exx, eyy, exy."""
-        return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+        return np.sqrt(np.diagonal(self.total_covariance, axis1=-2, axis2=-1))
 
     @property
     def principal(self) -> Float:
@@ -109,7 +119,7 @@ class StrainField:
         c, s = np.cos(self.angle_rad), np.sin(self.angle_rad)
         along = np.stack([c**2, s**2, 2.0 * c * s], axis=-1)
         across = np.stack([s**2, c**2, -2.0 * c * s], axis=-1)
-        variance = [np.einsum("...i,...ij,...j", j, self.covariance, j) for j in (along, across)]
+        variance = [np.einsum("...i,...ij,...j", j, self.total_covariance, j) for j in (along, across)]
         return np.asarray(np.sqrt(np.maximum(np.stack(variance, axis=-1), 0.0)))
 
 

@@ -13,8 +13,8 @@ from core.matching.geometry import tangent_frames
 from core.strain.arcs import missed_slope
 from core.strain.options import StrainOptions
 from core.strain.result import StrainField, StrainStatus
-from core.strain.tensors import strain_covariance, strain_of, strain_of_stretch
-from core.strain.window import Slopes, window_slopes
+from core.strain.tensors import strain_covariance, strain_of, strain_of_stretch, strain_slopes
+from core.strain.window import Slopes, slopes_of, window_slopes
 
 
 def surface_strain(field: Field, options: StrainOptions | None = None, *, subset_px: int) -> StrainField:
@@ -67,6 +67,13 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
     strain = np.full((*field.shape, 3), np.nan)
     covariance = np.full((*field.shape, 3, 3), np.nan)
     strain[good] = found
+    common = None
+    if field.common is not None:
+        k = field.common.shape[-1]
+        moved = slopes_of(field.common.reshape(*field.shape, 6 * k), field.valid, slopes, options.window // 2)[good]
+        by_slope = strain_slopes(frame, gradient, options.tensor, per_mm, found)
+        common = np.full((*field.shape, 3, k), np.nan)
+        common[good] = np.einsum("niab,nbka->nik", by_slope, moved.reshape(-1, 6, k, 2), optimize=True)
     covariance[good] = strain_covariance(frame, gradient, options.tensor, around, spread, found)
     spacing_px = _step(field)
     # of smoothed displacements it begins with the width of the smoothing
@@ -81,6 +88,7 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
         strain=strain,
         covariance=covariance,
         patch=_patch_strain(field, options),
+        common=common,
     )
 
 

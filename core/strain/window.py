@@ -114,6 +114,21 @@ def window_slopes(
     return Slopes(status, slope, spread, second, moments, reduced)
 
 
+def slopes_of(values: Float, valid: Bool, slopes: Slopes, half: int) -> Float:
+    """Return slopes (r, c, m, 2) over column and row of other values (r, c, m), by the weights of the same windows."""
+    offsets, _ = window_offsets(half)
+    held = np.where(valid[..., None], values, 0.0)
+    out = _whole_slopes(held, half)
+    padded = np.pad(held, ((half, half), (half, half), (0, 0))).reshape(-1, values.shape[-1])
+    width = valid.shape[1] + 2 * half
+    reach = offsets @ np.array([width, 1])
+    for rows, cols, weights in slopes.reduced:
+        here = (rows + half) * width + cols + half
+        data = padded.take(here[:, None] + reach, axis=0) - held[rows, cols][:, None, :]
+        out[rows, cols] = np.einsum("man,mnb->mba", weights, data)
+    return out
+
+
 def plane_weights(half: int) -> Float:
     """(2, n) weights of a whole window's points in its slopes over column and row."""
     offsets, _ = window_offsets(half)

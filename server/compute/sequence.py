@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from core.errors import FileFormatError, SeedError
 from core.field.checks.extrapolated import mark_extrapolated
+from core.field.common import with_common_factor
 from core.field.points.images import MeasureImage, check_calibrated_size
 from core.field.points.result import Field
 from core.field.region.lay_points import make_grid
@@ -31,7 +32,7 @@ from server.compute.camera_watch import CameraWatch
 from server.compute.strain import smoothed_step, strain_of_step, summarise_strain
 from server.formats.calibrations.native import covariance_in
 from server.formats.calibrations.recognise import LoadedCalibration
-from server.formats.calibrations.volume import own_px_of, rbe_of, volume_of
+from server.formats.calibrations.volume import own_px_of, parameter_covariance, rbe_of, volume_of
 from server.formats.files import sha256_of, write_bytes
 from server.formats.images import read_image
 from server.formats.noise_json import LoadedNoise
@@ -103,6 +104,7 @@ class SequenceMeasurement:
         self.steps: dict[int, StepImages] = {}
         self._models = (None, None) if self.noise is None else self.noise.models
         self._volume = volume_of(self.calibration)
+        self._parameters = parameter_covariance(self.calibration)
         self._rbe_px = rbe_of(self.calibration)
         self._fields: dict[int, Field] = {}
         self._last_images: tuple[int, Pair] | None = None
@@ -223,7 +225,7 @@ class SequenceMeasurement:
         began = time.perf_counter()
         subset_px = self.settings.subset_px
         shown = smoothed_step(result, self.settings.smoothing_window, subset_px=subset_px)
-        shown = mark_extrapolated(shown, self._volume)
+        shown = with_common_factor(mark_extrapolated(shown, self._volume), self._parameters)
         strain = strain_of_step(shown, StrainOptions.of(self.settings.strain), subset_px=subset_px)
         path = self.file_of(step.n)
         summary = {

@@ -72,7 +72,7 @@ def along(strain: StrainField, direction: ArrayLike) -> tuple[Float, Float]:
     length = np.linalg.norm(n, axis=-1, keepdims=True)
     n = np.where(length > 0.0, n, [1.0, 0.0]) / np.where(length > 0.0, length, 1.0)
     share = np.stack([n[..., 0] ** 2, n[..., 1] ** 2, 2.0 * n[..., 0] * n[..., 1]], axis=-1)
-    variance = np.einsum("...i,...ij,...j", share, strain.covariance, share)
+    variance = np.einsum("...i,...ij,...j", share, strain.total_covariance, share)
     return np.asarray((share * strain.strain).sum(axis=-1)), np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 

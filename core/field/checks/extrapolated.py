@@ -1,10 +1,8 @@
-"""Points outside the volume in which the cameras were calibrated: flagged, with the calibration's part of the error."""
+"""Points outside the volume in which the cameras were calibrated: flagged."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-
-import numpy as np
 
 from core.calibration.volume import CalibratedVolume
 from core.field.points.result import Field
@@ -14,8 +12,8 @@ from core.status import PointStatus
 def mark_extrapolated(field: Field, volume: CalibratedVolume | None) -> Field:
     """Return the field with the points that lie, or lay at the reference, outside the calibrated volume marked.
 
-    Their status becomes EXTRAPOLATED, and the calibration's own covariance is added to theirs. Inside the volume that
-    part is common to neighbouring points and left out; outside it grows without bound.
+    Their status becomes EXTRAPOLATED. The calibration's part of their uncertainty, which grows without bound there, is
+    in the field's common factor as everywhere.
 
     Parameters
     ----------
@@ -33,7 +31,6 @@ def mark_extrapolated(field: Field, volume: CalibratedVolume | None) -> Field:
         outside |= (field.status == PointStatus.OK) & ~volume.contains(now)
     if not outside.any():
         return field
-    status, covariance = field.status.copy(), field.covariance.copy()
+    status = field.status.copy()
     status[outside] = PointStatus.EXTRAPOLATED
-    covariance[outside] += volume.covariance_mm2(field.xyz_mm[outside], None if now is None else now[outside])
-    return replace(field, status=status, covariance=np.asarray(covariance))
+    return replace(field, status=status)

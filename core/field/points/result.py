@@ -67,7 +67,8 @@ class Field:
         (r, c) standard deviation of noise, grey levels of the reference image, estimated from the point's own
         residuals.
     covariance
-        (r, c, 3, 3) of X, Y, Z, or (r, c, 6, 6) of X, Y, Z, U, V, W; mm^2, system frame.
+        (r, c, 3, 3) of X, Y, Z, or (r, c, 6, 6) of X, Y, Z, U, V, W; mm^2, system frame: the points' own, of their
+        matching.
     uvw_mm
         (r, c, 3) displacement since the reference, or None for a shape.
     rotation_rad
@@ -85,6 +86,10 @@ class Field:
         Smoothing of the displacement; None: it is as measured.
     cuts
         Cracks and borders of holes, which no subset or neighbour crosses; None where there are none.
+    common
+        (r, c, 3 or 6, k) common factor F, mm for unit causes: what the points share of the uncertainty, from the
+        calibration. The whole covariance of points i and j is that of their matching plus F_i F_j'. None where the
+        calibration's covariance is not known.
     starts
         The matcher's own unknowns, (r, c, ...), from which the next step of a sequence starts; not part of a result
         file, None in a field that was read from one.
@@ -111,6 +116,7 @@ class Field:
     references: References | None = None
     smoothing: Smoothing | None = None
     cuts: Cuts | None = None
+    common: Float | None = None
     starts: Starts | None = None
 
     @property
@@ -129,6 +135,14 @@ class Field:
         return np.isin(self.status, (PointStatus.OK, PointStatus.EXTRAPOLATED))
 
     @property
+    def total_covariance(self) -> Float:
+        """(r, c, n, n) the points' own covariance and the common part; the own alone where that is not known."""
+        if self.common is None:
+            return self.covariance
+        return np.asarray(self.covariance + self.common @ np.swapaxes(self.common, -1, -2))
+
+    @property
     def sigma_mm(self) -> Float:
-        """(r, c, 3 or 6) standard deviations, the root of the covariance's diagonal."""
-        return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+        """(r, c, 3 or 6) standard deviations, the root of the total covariance's diagonal."""
+        own = np.diagonal(self.covariance, axis1=-2, axis2=-1)
+        return np.sqrt(own if self.common is None else own + (self.common**2).sum(axis=-1))

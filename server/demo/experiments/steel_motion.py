@@ -10,13 +10,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from core.arrays import Float
-from core.calibration.volume import CalibratedVolume
 from core.field.points.result import Field
 from core.strain import StrainField
 from server.demo.session import Check, Outcome, Session, table
 from server.demo.strain import MICRO, chi_limit, fetched_strain
-from server.formats.calibrations.recognise import load_calibration
-from server.formats.calibrations.volume import volume_of
 from server.formats.gauges.readings import AreaStatistics, StepReadings
 
 # name, translation (mm) and rotation (degrees about X_sys, Y_sys, Z_sys) of the plate, about the system's origin
@@ -40,16 +37,16 @@ class Moved:
     name
         Of the motion.
     found, sigma, true
-        (6,) rotation vector in rad and translation of the points' middle in mm; sigma is the noise's.
+        (6,) rotation vector in rad and translation of the points' middle in mm.
     sigma_calibration
-        (6,) what the calibration's own covariance adds.
+        (6,) the calibration's part of sigma.
     noise_ratio
         What is left after the motion, in units of its noise.
     elongation_mm, elongation_sigma_mm
         (n,) of extensometers over the plate.
     false_mean, false_mean_sigma, false_mean_calibration
         (3,) microstrain of exx, eyy, exy: mean of strain that is not there, as the service's area reads it, its sigma,
-        and what the calibration's covariance adds.
+        and the calibration's part of that.
     false_sd, reported
         (3,) its standard deviation over the field, and the reported one.
     chi
@@ -112,41 +109,11 @@ def measure(
         remove_rigid={},
         steps=steps,
     )
-    volume = volume_of(load_calibration(session.out / "calibration.json"))
-    moved = []
-    for motion, step, field, strain in zip(MOTIONS, read, fields, strains, strict=True):
-        points = field.xyz_mm[field.valid][::FEW]
-        calibration = np.zeros((9, 9)) if volume is None else calibration_covariance(volume, points, motion)
-        moved.append(_moved(motion, step, strain, calibration))
+    moved = [_moved(motion, step, strain) for motion, step, strain in zip(MOTIONS, read, strains, strict=True)]
     return moved, fields, strains
 
 
-def calibration_covariance(volume: CalibratedVolume, points_mm: Float, motion: tuple[str, Any, Any]) -> Float:
-    """Covariance (9, 9) that the calibration gives the rigid motion of points (n, 3) about their middle, and strain.
-
-    An error of the cameras' parameters moves every place before and after; the fit follows. Rotation, translation, and
-    the mean exx, eyy, exy of points that lie about in the plane of X_sys and Y_sys.
-    """
-    if volume.covariance is None:
-        return np.zeros((9, 9))
-    _, shift, degrees = motion
-    turn = Rotation.from_rotvec(degrees, degrees=True)
-    now = turn.apply(points_mm) + np.array(shift)
-    before, after = volume.slopes(points_mm), volume.slopes(now)
-    left = after - turn.as_matrix() @ before  # what the true rotation leaves of the errors
-    left -= left.mean(axis=0)
-    x, y, z = (now - now.mean(axis=0)).T
-    zero = np.zeros_like(x)
-    small = np.moveaxis(np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]), -1, 0)  # a small rotation's moves
-    rotation = np.linalg.lstsq(small.reshape(-1, 3), left.reshape(-1, left.shape[-1]), rcond=None)[0]
-    back = np.swapaxes(turn.as_matrix().T @ left, 0, 1)[:2]  # (2, n, 20) of U and V, the body turned back
-    arm = points_mm[:, :2] - points_mm[:, :2].mean(axis=0)
-    (ux, uy), (vx, vy) = (np.linalg.lstsq(arm, part, rcond=None)[0] for part in back)
-    gain = np.concatenate([rotation, (after - before).mean(axis=0), [ux, vy, 0.5 * (uy + vx)]])
-    return np.asarray(gain @ volume.covariance @ gain.T)
-
-
-def _moved(motion: tuple[str, Any, Any], step: StepReadings, strain: StrainField, calibration: Float) -> Moved:
+def _moved(motion: tuple[str, Any, Any], step: StepReadings, strain: StrainField) -> Moved:
     name, shift, degrees = motion
     rigid = step.rigid_motion
     assert rigid is not None
@@ -162,19 +129,20 @@ def _moved(motion: tuple[str, Any, Any], step: StepReadings, strain: StrainField
     area = step.areas[0].values
     mean = MICRO * np.array([area[name].mean for name in STRAINS], dtype=np.float64)
     mean_sigma = MICRO * np.array([area[name].mean_sigma for name in STRAINS], dtype=np.float64)
+    mean_calibration = MICRO * np.array([area[name].mean_sigma_calibration for name in STRAINS], dtype=np.float64)
     e, sigma = strain.strain[strain.valid], strain.sigma[strain.valid]
     return Moved(
         name=name,
         found=np.array([v.value for v in values]),
         sigma=np.array([v.sigma for v in values]),
-        sigma_calibration=np.sqrt(np.diag(calibration))[:6],
+        sigma_calibration=np.array([v.sigma_calibration for v in values], dtype=np.float64),
         true=true,
         noise_ratio=rigid.noise_ratio,
         elongation_mm=np.array([v.value for v in elongation]),
         elongation_sigma_mm=np.array([v.sigma for v in elongation]),
         false_mean=mean,
         false_mean_sigma=mean_sigma,
-        false_mean_calibration=MICRO * np.sqrt(np.diag(calibration))[6:],
+        false_mean_calibration=mean_calibration,
         false_sd=MICRO * e.std(axis=0),
         reported=MICRO * np.sqrt(np.mean(sigma**2, axis=0)),
         chi=float(np.sqrt(np.mean((e / sigma) ** 2))),
@@ -243,7 +211,7 @@ def add_checks(outcome: Outcome, moved: list[Moved], strains: list[StrainField])
         ),
         "",
         f"strain in microstrain over a gauge of {strains[0].gauge_mm:.2f} mm, the mean of the worst component; first "
-        "the noise's sigma, then what the calibration's covariance adds",
+        "sigma, then the calibration's part of it",
     ]
     outcome.data["rigid_motion"] = [
         {
@@ -274,13 +242,13 @@ def _checks(one: Moved, strain: StrainField) -> list[Check]:
     for part, quantity, unit, scale in ((slice(0, 3), "rotation", "urad", 1e6), (slice(3, 6), "shift", "um", 1e3)):
         found, true = (scale * float(np.linalg.norm(v[part])) for v in (one.found, one.true))
         off = scale * float(np.max(np.abs(one.found - one.true)[part]))
-        limit = OF_MANY * scale * float(np.max(np.hypot(one.sigma, one.sigma_calibration)[part]))
+        limit = OF_MANY * scale * float(np.max(one.sigma[part]))
         checks.append(Check(f"the plate {one.name}: {quantity}, worst component", unit, found, true, off, limit))
     change = np.abs(one.elongation_mm) / one.elongation_sigma_mm
     k = int(np.argmax(change))
     elongation, worst = 1e3 * float(one.elongation_mm[k]), int(np.argmax(np.abs(one.false_mean)))
     mean = float(abs(one.false_mean[worst]))
-    sigma = float(np.hypot(one.false_mean_sigma, one.false_mean_calibration)[worst])
+    sigma = float(one.false_mean_sigma[worst])
     return [
         *checks,
         Check(

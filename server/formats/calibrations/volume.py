@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from core.arrays import Float
 from core.boards.board import BOARD_KINDS, BoardTarget
-from core.calibration import COVARIANCE_NAMES
 from core.calibration.volume import CalibratedVolume, calibrated_volume, volume_of_poses
 from core.cameras.camera import RigidTransform
+from core.common.factor import ParameterCovariance
 from core.errors import TargetError
 from core.names import CAMERAS
 from core.target import LINE_GRID, GridTarget
@@ -21,13 +21,7 @@ from server.formats.calibrations.record import ChecksRecord, PoseRecord, TargetR
 
 
 def volume_of(calibration: LoadedCalibration) -> CalibratedVolume | None:
-    """Return a pair's calibrated volume; None if its file does not state it (other programs', or parameters alone).
-
-    Raises
-    ------
-    FileFormatError
-        ``calibration_unreadable`` if the file's covariance is not usable.
-    """
+    """Return a pair's calibrated volume; None if its file does not state it (other programs', or parameters alone)."""
     record = calibration.record
     sizes = (calibration.image_size1_px, calibration.image_size2_px)
     if sizes[0] is None or sizes[1] is None or record.target is None or record.views is None:
@@ -38,34 +32,28 @@ def volume_of(calibration: LoadedCalibration) -> CalibratedVolume | None:
     points = _points_mm(target)
     if points is None:
         return None
-    found = covariance_in(calibration.details, name="calibration.json", pair=calibration.pair)
-    names, covariance = (COVARIANCE_NAMES, None) if found is None else found
     if record.stage.moves == "cameras" and all(view.dz_mm is not None for view in fitted):
         positions = [
             [view.dz_mm for view in fitted if view.camera == cam and view.dz_mm is not None] for cam in CAMERAS
         ]
-        return calibrated_volume(
-            calibration.pair,
-            points,
-            (sizes[0], sizes[1]),
-            positions,
-            pitch_mm=target.pitch_mm,
-            covariance=covariance,
-            names=names,
-        )
+        return calibrated_volume(calibration.pair, points, (sizes[0], sizes[1]), positions, pitch_mm=target.pitch_mm)
     poses = [
         [_transform(view.cam_from_target) for view in fitted if view.camera == cam and view.cam_from_target is not None]
         for cam in CAMERAS
     ]
-    return volume_of_poses(
-        calibration.pair,
-        points,
-        (sizes[0], sizes[1]),
-        poses,
-        pitch_mm=target.pitch_mm,
-        covariance=covariance,
-        names=names,
-    )
+    return volume_of_poses(calibration.pair, points, (sizes[0], sizes[1]), poses, pitch_mm=target.pitch_mm)
+
+
+def parameter_covariance(calibration: LoadedCalibration) -> ParameterCovariance | None:
+    """Return the covariance of the cameras' parameters; None where the file does not state it.
+
+    Raises
+    ------
+    FileFormatError
+        ``calibration_unreadable`` if the file's covariance is not usable.
+    """
+    found = covariance_in(calibration.details, name="calibration.json", pair=calibration.pair)
+    return None if found is None else ParameterCovariance(calibration.pair, *found)
 
 
 def target_of(target: TargetRecord | None) -> GridTarget | BoardTarget | None:

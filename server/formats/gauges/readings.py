@@ -16,6 +16,9 @@ class Number:
     value: Annotated[float | None, Field(description="The value; null where it is missing.")]
     sigma: Annotated[float | None, Field(description="Standard uncertainty; null where it is not known.")]
     units: Annotated[str, Field(description="Unit; `1` of a number without one.")]
+    sigma_calibration: Annotated[
+        float | None, Field(description="The calibration's part of sigma; null where it is not known and not included.")
+    ] = None
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,10 @@ class Numbers:
         Sequence[float | None], Field(description="Standard uncertainty at each position; null where it is not known.")
     ]
     units: Annotated[str, Field(description="Unit; `1` of numbers without one.")]
+    sigma_calibration: Annotated[
+        Sequence[float | None],
+        Field(description="The calibration's part of each sigma; null where it is not known and not included."),
+    ] = ()
 
 
 @dataclass(frozen=True)
@@ -80,11 +87,15 @@ class AreaStatistics:
     rms: Annotated[float | None, Field(description="Root of the mean square.")]
     min: Annotated[float | None, Field(description="Smallest value.")]
     max: Annotated[float | None, Field(description="Largest value.")]
+    mean_sigma_calibration: Annotated[
+        float | None,
+        Field(description="The calibration's part of mean_sigma; null where it is not known and not included."),
+    ] = None
 
     @property
     def mean_number(self) -> Number:
         """The mean with its standard deviation."""
-        return Number(self.mean, self.mean_sigma, self.units)
+        return Number(self.mean, self.mean_sigma, self.units, self.mean_sigma_calibration)
 
 
 @dataclass(frozen=True)

@@ -63,13 +63,19 @@ def read_field(path: str | Path) -> Field:
             else:
                 tail = 2 if v in CURVATURE else 3
                 arrays.setdefault(v.attribute, np.full((*shape, tail), np.nan))[..., v.component] = values
+        total = np.asarray(variables["covariance"][...], dtype=np.float64)
+        common = None
+        if "common_factor" in variables:
+            common = np.asarray(variables["common_factor"][...], dtype=np.float64)
+            total = total - common @ np.swapaxes(common, -1, -2)
         choice, smoothing = (getattr(dataset, name, None) for name in ("patch_choice", "smoothing"))
         return Field(
             **arrays,
             status=np.asarray(variables["status"][...], dtype=np.int8),
             iterations=np.asarray(variables["iterations"][...], dtype=np.int32),
             zncc=np.asarray(variables["zncc"][...], dtype=np.float64),
-            covariance=np.asarray(variables["covariance"][...], dtype=np.float64),
+            covariance=total,
+            common=common,
             smoothing=None if smoothing is None else Smoothing.from_document(current_entries(json.loads(smoothing))),
             patch=None if choice is None else PatchChoice.from_document(current_entries(json.loads(choice))),
             cuts=_cuts_of(variables),
@@ -100,7 +106,7 @@ def read_measured(path: str | Path) -> Field:
     # files of format 1 have it only beside a smoothed displacement: there, marked points keep the calibration's part
     covariance = read.get("measured_covariance", field.covariance)
     status = np.where(field.status == PointStatus.EXTRAPOLATED, PointStatus.OK, field.status).astype(np.int8)
-    return replace(field, covariance=covariance, status=status)
+    return replace(field, covariance=covariance, common=None, status=status)
 
 
 @dataclass(frozen=True)

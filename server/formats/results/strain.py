@@ -56,23 +56,25 @@ def put_strain(dataset: Any, strain: StrainField, *, sparse: bool = False) -> No
                 f"{tensor} of the patch itself, {component}",
                 sparse=sparse,
             ).setncatts({"gauge_px": float(strain.subset_px)})
-    _variable(
-        dataset,
-        "strain_covariance_exx_eyy",
-        strain.covariance[..., 0, 1],
-        "1",
-        "covariance of exx and eyy",
-        sparse=sparse,
-    )
+    total = strain.total_covariance
+    _variable(dataset, "strain_covariance_exx_eyy", total[..., 0, 1], "1", "covariance of exx and eyy", sparse=sparse)
     for k, name in enumerate(("exx", "eyy")):
         _variable(
             dataset,
             f"strain_covariance_{name}_exy",
-            strain.covariance[..., k, 2],
+            total[..., k, 2],
             "1",
             f"covariance of {name} and exy",
             sparse=sparse,
         )
+    if strain.common is not None:
+        dataset.createDimension("strain_component", len(_COMPONENTS))
+        common = dataset.createVariable(
+            "strain_common_factor", "f4", ("row", "col", "strain_component", "cause"), fill_value=np.nan
+        )
+        names = ", ".join(name for name, _ in _COMPONENTS)
+        common.setncatts({"units": "1", "long_name": f"F: what all points share of the uncertainty of {names}"})
+        common[...] = strain.common
     status = dataset.createVariable(
         "strain_status", "i1", ("row", "col"), fill_value=False, compression="zlib", complevel=1
     )
@@ -140,6 +142,10 @@ def _strain_of(dataset: Any) -> StrainField | None:
         ("strain_covariance_eyy_exy", 1, 2),
     ):
         covariance[..., i, j] = covariance[..., j, i] = variables[name][...]
+    common = None
+    if "strain_common_factor" in variables:
+        common = np.asarray(variables["strain_common_factor"][...], dtype=np.float64)
+        covariance = covariance - common @ np.swapaxes(common, -1, -2)
     known = StrainOptions.__dataclass_fields__
     return StrainField(
         options=StrainOptions(**{k: v for k, v in document.items() if k in known}),
@@ -151,4 +157,5 @@ def _strain_of(dataset: Any) -> StrainField | None:
         strain=strain,
         covariance=covariance,
         patch=stacked("_patch") if "exx_patch" in variables else None,
+        common=common,
     )

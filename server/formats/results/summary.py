@@ -66,6 +66,8 @@ class StepSummary:
         Of the reference positions.
     zncc_median, sigma_median_mm
         By comparison, and by coordinate (``x_mm`` ...).
+    sigma_calibration_median_mm
+        The calibration's part of it; None where it is not known, and then not included.
     smoothing
         Smoothing of the displacement, and its spatial resolution.
     patch
@@ -88,6 +90,7 @@ class StepSummary:
     plane_residual_rms_mm: float | None
     zncc_median: dict[str, float | None]
     sigma_median_mm: dict[str, float | None]
+    sigma_calibration_median_mm: dict[str, float | None] | None
     smoothing: Smoothing | None
     patch: PatchChoice | None
     camera_motion: CameraMotion | None = None
@@ -149,7 +152,12 @@ def summarise(
             for k, name in enumerate(COMPARISONS[: result.zncc.shape[-1]])
         },
         sigma_median_mm={
-            name: float(np.sqrt(np.median(result.covariance[valid][:, k, k]))) if n else None
+            name: float(np.median(result.sigma_mm[valid][:, k])) if n else None for k, name in enumerate(names)
+        },
+        sigma_calibration_median_mm=None
+        if result.common is None
+        else {
+            name: float(np.median(np.linalg.norm(result.common[valid][:, k], axis=-1))) if n else None
             for k, name in enumerate(names)
         },
         smoothing=result.smoothing,

@@ -37,6 +37,10 @@ from server.formats.results.strain import put_strain
 # the file. Repeating values are always deflated; everything is where at least this share of the points has no numbers
 _MANY_EMPTY = 0.2
 _REPETITIVE = ("x_px", "y_px", "status", "iterations", "zncc")
+_INCLUDES = {
+    False: "the matching of the point and, as F F', the calibration",
+    True: "the matching of the point; the calibration is not included: its covariance is not known",
+}
 _FRAMES = {
     "target": "sys: X_sys, Y_sys in the calibration target's plane at its first position, Z_sys away from the cameras",
     "camera1": "sys = camera 1: X along the rows, Y down the columns, Z along the optical axis, away from the camera",
@@ -171,14 +175,32 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
     _put(
         dataset,
         "covariance",
-        result.covariance,
+        result.total_covariance,
         ("row", "col", "i", "j"),
         units="mm2",
         long_name="covariance of " + ", ".join(names),
         dtype="f4",
         sparse=sparse,
     )
-    dataset.variables["covariance"].components = " ".join(names)
+    dataset.variables["covariance"].setncatts(
+        {"components": " ".join(names), "includes": _INCLUDES[result.common is None]}
+    )
+    if result.common is not None:
+        dataset.createDimension("component", n)
+        dataset.createDimension("cause", result.common.shape[-1])
+        _put(
+            dataset,
+            "common_factor",
+            result.common,
+            ("row", "col", "component", "cause"),
+            units="mm",
+            long_name="F: what all points share of the uncertainty of " + ", ".join(names) + ", for unit causes",
+            dtype="f4",
+            sparse=sparse,
+        )
+        dataset.variables[
+            "common_factor"
+        ].comment = "the covariance of points a and b is F_a F_b', of a point with itself covariance = own + F F'"
     sigma = result.sigma_mm
     for k, name in enumerate(names):
         _put(
@@ -250,7 +272,7 @@ def _put_measured(dataset: Any, result: Field, measured: Field) -> None:
                 dtype="f8",
                 long_name=f"displacement from the reference, {name.upper()}, as measured, before smoothing",
             )
-    if result.covariance is measured.covariance:
+    if result.covariance is measured.covariance and result.common is None:
         return
     _put(
         dataset,

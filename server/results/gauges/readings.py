@@ -49,6 +49,7 @@ from server.results.staleness import stale_results
 
 _Positions = dict[str | None, list[tuple[float, float]]]
 MAX_NUMBERS = 3_000_000
+_MOTION = (("rotation", "rad"), ("translation", "mm"))
 _EXTENSOMETER_UNITS = {"length0_mm": "mm", "length_mm": "mm", "elongation_mm": "mm", "strain": "1", "true_strain": "1"}
 
 
@@ -264,24 +265,30 @@ def _read_step(
 def _at_positions(variables: Variables, names: Sequence[str], positions: Samples) -> dict[str, Numbers]:
     own = np.arange(len(positions.xy_px))
     variance = np.diagonal(positions.covariance(variables.shared, own, own), axis1=-2, axis2=-1)
+    common = positions.common()
+    of_calibration = np.full(variance.shape, np.nan) if common is None else (common**2).sum(axis=-1)
     out = {}
     for name in names:
         variable, sigma = variables.get(name)
         k = component_of(name)
         if k is not None:
-            s = np.sqrt(variance[:, k])
+            s = np.sqrt(variance[:, k] + np.nan_to_num(of_calibration[:, k]))
         elif sigma is not None:
             s = positions.of(sigma)  # as if the errors of the points about it were one
         else:
             s = np.full(len(own), np.nan)
-        out[name] = Numbers(_list(positions.of(variable.values)), _list(s), variable.units)
+        part = np.full(len(own), np.nan) if k is None else np.sqrt(of_calibration[:, k])
+        out[name] = Numbers(_list(positions.of(variable.values)), _list(s), variable.units, _list(part))
     return out
 
 
 def _point(variables: Variables, names: Sequence[str], name: str | None, xy: tuple[float, float]) -> PointReading:
     positions = sample(variables.field, [xy])
     found = _at_positions(variables, names, positions)
-    values = {n: Number(reading.value[0], reading.sigma[0], reading.units) for n, reading in found.items()}
+    values = {
+        n: Number(reading.value[0], reading.sigma[0], reading.units, reading.sigma_calibration[0])
+        for n, reading in found.items()
+    }
     return PointReading(name, xy, positions.missing[0], values)
 
 
@@ -303,7 +310,7 @@ def _extensometer(
 ) -> ExtensometerReading:
     got = extensometer(variables.field, a, b, shared=variables.shared)
     readings: dict[str, Reading] = {n: getattr(got, n) for n in _EXTENSOMETER_UNITS}
-    values = {n: _number(r.value, r.sigma, _EXTENSOMETER_UNITS[n]) for n, r in readings.items()}
+    values = {n: _number(r.value, r.sigma, _EXTENSOMETER_UNITS[n], r.sigma_calibration) for n, r in readings.items()}
     return ExtensometerReading(name, a, b, got.missing, values)
 
 
@@ -314,14 +321,16 @@ def _area(
     inside = points_within(field, corners)
     values = {}
     for n in names:
-        variable, sigma = variables.get(n)
+        variable, _ = variables.get(n)
         # the correlation of other variables' errors is not known here: no uncertainty of their mean
-        known = sigma if component_of(n) is not None else None
+        known, common = variables.own_sigma(n) or (None, None)
         of_position = component_of(n) in range(3)
         shared = variables.shared.positions if of_position else variables.shared
-        got = area_statistics(field, variable.values, known, inside, shared=shared)
+        got = area_statistics(field, variable.values, known, inside, shared=shared, common=common)
         if n in STRAIN_NAMES and got.count:
-            got = replace(got, mean_sigma=variables.mean_strain_sigma(inside)[STRAIN_NAMES.index(n)])
+            total, part = variables.mean_strain_sigma(inside)
+            axis = STRAIN_NAMES.index(n)
+            got = replace(got, mean_sigma=total[axis], mean_sigma_calibration=part[axis])
         values[n] = AreaStatistics(
             units=variable.units,
             count=got.count,
@@ -331,6 +340,7 @@ def _area(
             rms=_finite(got.rms),
             min=_finite(got.minimum),
             max=_finite(got.maximum),
+            mean_sigma_calibration=_finite(got.mean_sigma_calibration),
         )
     valid = int((inside & field.valid).sum())
     missing = "" if valid else "no valid point in the area"
@@ -351,10 +361,12 @@ def _frame_reading(alignment: Alignment) -> FrameReading:
 
 def _motion_reading(motion: RigidMotion) -> RigidMotionReading:
     sigma = np.sqrt(np.diag(motion.covariance))
-    turns = {f"rotation_{axis}_rad": (motion.rotation_vector_rad[k], sigma[k], "rad") for k, axis in enumerate("xyz")}
-    shifts = {f"translation_{axis}_mm": (motion.translation_mm[k], sigma[3 + k], "mm") for k, axis in enumerate("xyz")}
+    found = np.concatenate([motion.rotation_vector_rad, motion.translation_mm])
+    names = [f"{quantity}_{axis}_{unit}" for quantity, unit in _MOTION for axis in "xyz"]
+    units = [unit for _, unit in _MOTION for _ in range(3)]
+    numbers = zip(names, found, sigma, units, motion.sigma_common, strict=True)
     return RigidMotionReading(
-        values={name: _number(*reading) for name, reading in (turns | shifts).items()},
+        values={name: _number(value, s, unit, part) for name, value, s, unit, part in numbers},
         centre_mm=motion.centre_mm.tolist(),
         covariance=motion.covariance.tolist(),
         points=motion.points,
@@ -371,5 +383,5 @@ def _list(values: Float) -> list[float | None]:
     return [_finite(v) for v in values]
 
 
-def _number(value: float, sigma: float, units: str) -> Number:
-    return Number(_finite(value), _finite(sigma), units)
+def _number(value: float, sigma: float, units: str, sigma_calibration: float) -> Number:
+    return Number(_finite(value), _finite(sigma), units, _finite(sigma_calibration))

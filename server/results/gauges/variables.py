@@ -35,13 +35,24 @@ class Variables:
             self._read[name] = self._find(name)
         return self._read[name]
 
-    def mean_strain_sigma(self, inside: NDArray[np.bool_]) -> Float:
-        """Return the standard uncertainties (3,) of the means of exx, eyy, exy over an area; NaN without strain."""
+    def mean_strain_sigma(self, inside: NDArray[np.bool_]) -> tuple[Float, Float]:
+        """Return standard uncertainties (3,) of the means of exx, eyy, exy over an area, and the calibration's part.
+
+        NaN without strain; the part alone where it is not known.
+        """
         strain = read_strain(self.path)
         if strain is None:
-            return np.full(3, np.nan)
+            return np.full(3, np.nan), np.full(3, np.nan)
         # the file's strain is that of the field as it was measured, along the file's axes
         return mean_strain_sigma(self.measured, strain.options, inside, subset_px=strain.subset_px)
+
+    def own_sigma(self, name: str) -> tuple[Float, Float | None] | None:
+        """Return a component's own standard deviation (r, c) and its common factor (r, c, k); None for others."""
+        k = component_of(name)
+        if k is None or k >= self.field.covariance.shape[-1]:
+            return None
+        own = np.sqrt(np.maximum(self.field.covariance[..., k, k], 0.0))
+        return own, None if self.field.common is None else self.field.common[..., k, :]
 
     def known(self, names: Sequence[str]) -> list[str]:
         """Return those that this step has: a shape has no displacement."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.measured_points import measured_derivatives
 from core.cameras.camera import TEN_PARAMETER_NAMES, Camera
 from core.cameras.stereo import StereoPair
+from core.common.derivatives import measured_derivatives
 from core.matching.fit import fit_motion, fit_shape
 from core.matching.geometry import motion_geometry, shape_geometry
 from core.matching.options import MatchOptions
