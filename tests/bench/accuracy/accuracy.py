@@ -20,6 +20,7 @@ from tests.bench.accuracy import adversarial as accuracy_adversarial
 from tests.bench.accuracy import bumps as accuracy_bumps
 from tests.bench.accuracy import calibration as accuracy_calibration
 from tests.bench.accuracy import calibration_beside as accuracy_beside
+from tests.bench.accuracy import coverage as accuracy_coverage
 from tests.bench.accuracy import cracks as accuracy_cracks
 from tests.bench.accuracy import (
     curved,
@@ -50,6 +51,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "line-grid": line_grid_covariance.line_grid,
     "beside": accuracy_beside.beside,
     "rigs": rig_campaign.rigs,
+    "coverage": accuracy_coverage.coverage,
     "real-boards": real_boards.real_boards,
     **accuracy_targets.SECTIONS,
     "plane": matching.plane,

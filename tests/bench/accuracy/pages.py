@@ -41,6 +41,7 @@ TOPICS = (
     Topic("smoothing", "Smoothing", ("smoothing",)),
     Topic("difficult_images", "Difficult images", ("adversarial",)),
     Topic("experiments", "The paper's experiments, simulated", ("plate", "steel", "panel")),
+    Topic("coverage", "Does the uncertainty cover", ("coverage",)),
     Topic("camera_bumps", "A camera that was bumped", ("bumps",)),
     Topic("specimen", "A real specimen", ("specimen", "strain-specimen")),
 )

@@ -95,6 +95,16 @@ step["w_mm"].where(step["status"] == 0).plot()
 w = ncread('result/step_0001.nc', 'w_mm');    % col by row in MATLAB
 ```
 
+`covariance` is the total: of the point's own matching, and of the calibration as F F' (`common_factor`, unit causes). Two points
+or steps share the second part, so that
+
+```python
+own_a, own_b = covariance[a] - F[a] @ F[a].T, covariance[b] - F[b] @ F[b].T
+variance_of_b_minus_a = own_a + own_b + (F[b] - F[a]) @ (F[b] - F[a]).T    # apart by a subset or more
+```
+
+Without `common_factor` the calibration's covariance is not known, and its part not included (attribute `includes`).
+
 For ParaView: `stereorig export result --format vtu --out out`, then open the `.pvd`. Other forms: [exports](exports.md).
 
 ## Axes
@@ -122,7 +132,8 @@ def _everything() -> tuple[Field, Field]:
         reduced=0,
         raw=0,
     )
-    field = replace(field, curvature_per_mm=np.zeros((*field.shape, 2)), references=references)
+    common = np.zeros((*field.shape, 6, 1))
+    field = replace(field, curvature_per_mm=np.zeros((*field.shape, 2)), references=references, common=common)
     return replace(field, smoothing=smoothing, covariance=2.0 * field.covariance), field
 
 
