@@ -125,8 +125,11 @@ def _pulls(frame: Float, gradient: Float, tensor: StrainTensor) -> Float:
     moved = frame + gradient
     if tensor == "infinitesimal":
         of_motion = frame
-        # E^T dP with P's own basis changed by dX: d(E^T P) = E^T (dF1 - P E^T dF0), both hold dX
-        of_position = frame - frame @ _transposed(_transposed(frame) @ moved)
+        # E^T dP with P's own basis changed by dX: d(E^T P) = E^T (dF1 - P E^T dF0), both hold dX; and the frame tilts
+        # with the positions, d(E)^T P = (n . dX) (n . P). The other tensors hold P^T P alone, without the frame
+        normal = np.cross(frame[..., 0], frame[..., 1])[..., None]
+        tilted = normal @ (_transposed(normal) @ moved)
+        of_position = frame - frame @ _transposed(_transposed(frame) @ moved) + tilted
     else:
         of_motion = moved
         of_position = moved - frame @ (_transposed(moved) @ moved)

@@ -48,6 +48,21 @@ def truth(name):
     return at, PLANES[name].position(at[:, :2]) - at
 
 
+@pytest.mark.parametrize("off_rad", [0.0, 1e-12, 1e-9, 1e-7, 1e-3, 0.1])
+@pytest.mark.parametrize("axis", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.6, -0.48, 0.64)])
+def test_half_a_turn_is_reported_as_half_a_turn(axis, off_rad):
+    pair = paper_pair()
+    w = true_w(pair.cam1, PLANES["rest"], XY)
+    true = Rotation.from_rotvec((np.pi - off_rad) * np.array(axis))
+    turned = Plane(np.array([1.0, -2.0, 5.0]), true.as_matrix()[:, :2])
+    found = motion_geometry(pair, XY, w, true_g(pair.cam1, PLANES["rest"], turned, XY)).rotation_rad
+    angle = np.linalg.norm(found, axis=1)
+    # G's own rounding, 1e-16 over the rays' differences across a patch of 1e-2, and twice that in a product
+    np.testing.assert_allclose(angle, np.pi - off_rad, atol=1e-12)
+    error = (Rotation.from_rotvec(found) * true.inv()).magnitude()
+    np.testing.assert_allclose(error, 0.0, atol=1e-12)
+
+
 @pytest.mark.parametrize(("interpolation", "limit_um"), [("cubic", 0.06), ("quintic", 0.03)])
 def test_noise_free_shape_is_the_plane(interpolation, limit_um):
     pair = paper_pair()

@@ -10,9 +10,12 @@ import pytest
 from scipy.linalg import logm, sqrtm
 
 from core.errors import InputError
+from core.field.points.shared_pixels import SharedPixels
 from core.field.region.cuts import Cuts
 from core.status import PointStatus
 from core.strain import StrainField, StrainOptions, StrainStatus, surface_strain
+from core.strain.surface import surface_slopes
+from core.strain.tensors import strain_of, strain_slopes
 from tests.support.strain_fields import cylinder, make_field, plane, sphere, turned
 
 F_SMALL = np.array([[1.001, 0.0004, 0], [-0.0002, 0.9995, 0], [0, 0, 1]])
@@ -167,6 +170,33 @@ def test_strain_gradient_planes_and_quadratics():
     assert planes.strain[15, 0, 0] == pytest.approx(k * x[15, 2], abs=1e-9)
     assert 3.0 < quadratics.sigma[15, 0, 0] / quadratics.sigma[15, 17, 0] < 12.0
     assert planes.status[0, 0] == StrainStatus.TOO_FEW
+
+
+@pytest.mark.parametrize("tensor", ["green_lagrange", "infinitesimal", "hencky"])
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_strains_derivatives_over_the_positions_are_its_differences(tensor, order):
+    """The surface rotates out of its plane by 0.1, where the frame's own tilt with the positions' noise counts."""
+    F = turned((0.3, 1.0, 0.0), np.degrees(0.1)) @ F_SMALL
+    field = make_field(lambda a, b: np.stack([a, b, 0.1 * a - 0.05 * b], axis=-1), lambda p: p @ F.T, shape=(7, 7))
+    options = StrainOptions(window=7, tensor=tensor, order=order)
+    slopes, frame, per_mm, gradient = surface_slopes(field, options, SharedPixels.of(field, 33))
+    at = int(np.flatnonzero((slopes.status == StrainStatus.OK).ravel()).tolist().index(3 * 7 + 3))
+    strain = strain_of(frame, gradient, tensor)
+    D = strain_slopes(frame, gradient, tensor, per_mm, strain)[at]
+    # the axes also turn within the plane, by a tenth of a tilt: that share of the strain, for slopes per mm
+    small = 0.15 * np.abs(strain[at]).max() * np.abs(per_mm[at]).max()
+    row, col = np.mgrid[-3:4, -3:4]
+    step = 1e-6  # mm a point: the second order is 1e-6 of the first, rounding 1e-9
+    for k in range(6):
+        for a, way in enumerate((col, row)):
+            found = []
+            for sign in (-1.0, 1.0):
+                shift = np.zeros((7, 7, 6))
+                shift[..., k] = sign * step * way
+                moved = replace(field, xyz_mm=field.xyz_mm + shift[..., :3], uvw_mm=field.uvw_mm + shift[..., 3:])
+                found.append(surface_strain(moved, options, subset_px=33).strain[3, 3])
+            difference = (found[1] - found[0]) / (2.0 * step)
+            np.testing.assert_allclose(D[:, a, k], difference, atol=small, err_msg=f"component {k}, way {a}")
 
 
 def test_derived_figures():

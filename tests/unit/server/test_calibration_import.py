@@ -242,6 +242,17 @@ def test_dice_cameras_placed_in_the_world(relative: str | None) -> None:
     check_against_opencv(load_text(moved))
 
 
+def test_two_poses_of_one_position_are_refused_though_rounding_leaves_a_length() -> None:
+    """Cameras in one place, turned against each other: composed, their poses leave 1e-14 mm."""
+    turns = [cv2.Rodrigues(np.array(v))[0] for v in ([0.3, 0.1, -0.2], [0.31, -0.25, 0.4])]
+    centre = np.array([12.3, -45.6, 789.1])
+    first, second = (-turn @ centre for turn in turns)
+    text = dice_text(relative="false", r1=turns[0], t1=first, rotation=matrix(turns[1]), translation=second)
+    with pytest.raises(FileFormatError, match="same position") as caught:
+        load_text(text)
+    assert caught.value.code == "calibration_invalid"
+
+
 def test_dice_euler_angles_mean_what_its_own_matrix_says(specimen_dir: Path) -> None:
     text = (specimen_dir / "calibration_dice.xml").read_text()
     found = re.findall(r"ALPHA (\S+) BETA (\S+) GAMMA (\S+) \(radians\)", text)[1]
