@@ -73,7 +73,7 @@ def test_reported_over_empirical(motion, tensor, order):
 
 @pytest.mark.parametrize("tensor", ["green_lagrange", "infinitesimal"])
 def test_noise_of_the_positions_alone_where_the_surface_leaves_its_plane(tensor):
-    """Depth is ten times as noisy as motion, as with a narrow stereo angle; the part rotates by 0.1 out of its plane."""
+    """Depth is ten times as noisy as motion, as with a narrow stereo angle; the part leaves its plane by 0.1."""
     sigma = np.array([1e-4, 1e-4, 1e-3, 1e-4, 1e-4, 1e-4])
     rng = np.random.default_rng(8)
     clean = make_field(plane, lambda p: p @ MOTIONS["out of its plane by 0.1"].T, shape=SHAPE, spacing_px=STEP)
