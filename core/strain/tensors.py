@@ -61,6 +61,14 @@ def hencky_of_green(green: Float) -> Float:
     return np.stack([slope * green[..., 0] + rest, slope * green[..., 1] + rest, slope * green[..., 2]], axis=-1)
 
 
+def as_tensor(small: Float, strain: Float, tensor: StrainTensor) -> Float:
+    """Return the change (n, 3) of a strain (n, 3) that a small change of the Green-Lagrange strain makes.
+
+    Infinitesimal strain changes by as much itself.
+    """
+    return np.einsum("nij,nj->ni", _hencky_slope(strain), small) if tensor == "hencky" else small
+
+
 def strain_covariance(
     frame: Float, gradient: Float, tensor: StrainTensor, points: Float, spread: Float, strain: Float
 ) -> Float:

@@ -15,7 +15,7 @@ from core.field.region.cuts import Cuts
 from core.status import PointStatus
 from core.strain import StrainField, StrainOptions, StrainStatus, surface_strain
 from core.strain.surface import surface_slopes
-from core.strain.tensors import strain_of, strain_slopes
+from core.strain.tensors import strain_slopes
 from tests.support.strain_fields import cylinder, make_field, plane, sphere, turned
 
 F_SMALL = np.array([[1.001, 0.0004, 0], [-0.0002, 0.9995, 0], [0, 0, 1]])
@@ -179,9 +179,9 @@ def test_the_strains_derivatives_over_the_positions_are_its_differences(tensor, 
     F = turned((0.3, 1.0, 0.0), np.degrees(0.1)) @ F_SMALL
     field = make_field(lambda a, b: np.stack([a, b, 0.1 * a - 0.05 * b], axis=-1), lambda p: p @ F.T, shape=(7, 7))
     options = StrainOptions(window=7, tensor=tensor, order=order)
-    slopes, frame, per_mm, gradient = surface_slopes(field, options, SharedPixels.of(field, 33))
+    slopes, surface, _, _ = surface_slopes(field, options, SharedPixels.of(field, 33))
+    frame, per_mm, gradient, strain = surface.frame, surface.per_mm, surface.gradient, surface.strain
     at = int(np.flatnonzero((slopes.status == StrainStatus.OK).ravel()).tolist().index(3 * 7 + 3))
-    strain = strain_of(frame, gradient, tensor)
     D = strain_slopes(frame, gradient, tensor, per_mm, strain)[at]
     # the axes also turn within the plane, by a tenth of a tilt: that share of the strain, for slopes per mm
     small = 0.15 * np.abs(strain[at]).max() * np.abs(per_mm[at]).max()
