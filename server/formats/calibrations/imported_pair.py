@@ -24,8 +24,8 @@ def unreadable(name: str, why: str) -> FileFormatError:
     return FileFormatError(
         f"{name} cannot be read as a calibration: {why}.",
         code="calibration_unreadable",
-        remedy="Give a calibration.json, a DICe XML camera system, an OpenCV YAML stereo calibration, a MatchID caldat "
-        "or a VIC-3D file.",
+        remedy="Give a calibration.json, a DICe XML camera system or text camera file, an OpenCV YAML stereo "
+        "calibration, a MatchID caldat, a VIC-3D file or a pyvale text.",
     )
 
 
