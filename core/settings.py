@@ -139,8 +139,8 @@ class StrainSettings(Settings):
     )
     order: StrainOrder = Field(
         "auto",
-        description="Fit planes (1) or quadratics (2); they differ only where an edge, a hole or a cut takes points away. "
-        "auto: there whichever has the smaller total error, point by point.",
+        description="Fit planes (1) or quadratics (2); they differ only where an edge, a hole or a cut takes points "
+        "away. auto: there whichever has the smaller total error, point by point.",
     )
     tensor: StrainTensor = Field("green_lagrange", description="Which strain is reported.")
 

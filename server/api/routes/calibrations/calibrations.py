@@ -88,7 +88,8 @@ def import_calibration(
     file: Annotated[
         UploadFile,
         File(
-            description="calibration.json, DICe XML or text, OpenCV YAML, MatchID caldat, VIC-3D XML or pyvale text of a stereo pair."
+            description="calibration.json, DICe XML or text, OpenCV YAML, MatchID caldat, VIC-3D XML or pyvale text of "
+            "a stereo pair."
         ),
     ],
     label: Annotated[Label, Form(description="Free text.")] = "",
