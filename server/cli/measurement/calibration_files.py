@@ -23,7 +23,7 @@ from server.results.epipolar_check import EpipolarComparison, check_against
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    known = "calibration.json, DICe XML, OpenCV YAML, MatchID caldat or VIC-3D XML"
+    known = "calibration.json, DICe XML or text, OpenCV YAML, MatchID caldat, VIC-3D XML or pyvale text"
     convert = actions.add_parser("convert", help="write a calibration in another form")
     convert.add_argument("file", metavar="IN", type=Path, help=known)
     convert.add_argument("out", metavar="OUT", type=Path, help="file to write; OUT.report.json goes beside it")

@@ -87,7 +87,10 @@ def import_calibration(
     service: ServiceDep,
     file: Annotated[
         UploadFile,
-        File(description="calibration.json, DICe XML, OpenCV YAML, MatchID caldat or VIC-3D XML of a stereo pair."),
+        File(
+            description="calibration.json, DICe XML or text, OpenCV YAML, MatchID caldat, VIC-3D XML or pyvale text of "
+            "a stereo pair."
+        ),
     ],
     label: Annotated[Label, Form(description="Free text.")] = "",
     key: KeyHeader = None,
