@@ -12,7 +12,7 @@ from server.cli.measurement import calibration_repair
 from server.cli.measurement.calibration_checks import ACTIONS, add_check_actions, run_check
 from server.formats.calibrations.export import FORMS, ConversionReport, convert_calibration
 from server.formats.calibrations.kept_checks import read_checks
-from server.formats.calibrations.plausibility import CalibrationCheck, Residual, check_calibration
+from server.formats.calibrations.programs.plausibility import CalibrationCheck, Residual, check_calibration
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.formats.files import make_folder, write_bytes
 from server.formats.images import read_file

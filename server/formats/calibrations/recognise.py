@@ -17,14 +17,14 @@ from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError
 from core.names import CAMERAS
-from server.formats.calibrations.dice_txt import is_dice_txt, parse_dice_txt
-from server.formats.calibrations.dice_xml import is_dice, parse_dice_xml
-from server.formats.calibrations.imported_pair import invalid, unreadable
-from server.formats.calibrations.matchid_caldat import is_caldat, parse_caldat
-from server.formats.calibrations.opencv_yaml import is_opencv, parse_opencv
-from server.formats.calibrations.pyvale_txt import is_pyvale, parse_pyvale
+from server.formats.calibrations.programs.dice_txt import is_dice_txt, parse_dice_txt
+from server.formats.calibrations.programs.dice_xml import is_dice, parse_dice_xml
+from server.formats.calibrations.programs.imported_pair import invalid, unreadable
+from server.formats.calibrations.programs.matchid_caldat import is_caldat, parse_caldat
+from server.formats.calibrations.programs.opencv_yaml import is_opencv, parse_opencv
+from server.formats.calibrations.programs.pyvale_txt import is_pyvale, parse_pyvale
+from server.formats.calibrations.programs.vic3d_xml import is_vic3d, parse_vic3d
 from server.formats.calibrations.record import CalibrationRecord
-from server.formats.calibrations.vic3d_xml import is_vic3d, parse_vic3d
 
 _MAX_BYTES = 64 << 20
 _MIN_BASELINE = 1e-6  # of the stand-off

@@ -28,7 +28,7 @@ from server.api.protocol.problems import errors
 from server.base.errors import NotFoundError
 from server.base.json_values import without_nan
 from server.base.models import Ids
-from server.formats.calibrations.plausibility import check_calibration
+from server.formats.calibrations.programs.plausibility import check_calibration
 from server.formats.calibrations.recognise import imported_content, parse_calibration
 from server.formats.images import read_image
 from server.results.reader import read_residuals

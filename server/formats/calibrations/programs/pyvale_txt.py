@@ -14,7 +14,7 @@ import numpy as np
 
 from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
-from server.formats.calibrations.imported_pair import euler_zyx, invalid, opencv_lens, pair_of, unreadable
+from server.formats.calibrations.programs.imported_pair import euler_zyx, invalid, opencv_lens, pair_of, unreadable
 
 _PIXELS = ("fx", "fy", "fs", "cx", "cy")
 _BENT = ("k1", "k2", "p1", "p2", "k3")

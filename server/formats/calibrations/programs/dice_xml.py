@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from core.cameras.camera import RigidTransform
 from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
-from server.formats.calibrations.imported_pair import (
+from server.formats.calibrations.programs.imported_pair import (
     euler_zyx,
     invalid,
     opencv_lens,
