@@ -41,6 +41,7 @@ class ReferencePair:
     image2: MeasureImage
 
     def __init__(self, pair: StereoPair, image1: Image, image2: Image) -> None:
+        pair.require_baseline()
         object.__setattr__(self, "pair", pair)
         object.__setattr__(self, "image1", MeasureImage(image1, "camera 1's reference image"))
         object.__setattr__(self, "image2", MeasureImage(image2, "camera 2's reference image"))
@@ -129,6 +130,8 @@ def measure_shape(
     ------
     RegionError, ImageError
         If region or images cannot be used; ``cameras_swapped`` if they fit with exchanged roles only.
+    InputError
+        ``baseline_zero`` if both cameras have the same position.
     SeedError
         If no start was found.
     Cancelled

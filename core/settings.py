@@ -22,6 +22,8 @@ ReferenceUpdate = Literal["never", "auto", "always"]
 REFERENCE_UPDATES: tuple[ReferenceUpdate, ...] = get_args(ReferenceUpdate)
 StrainTensor = Literal["green_lagrange", "infinitesimal", "hencky"]
 STRAIN_TENSORS: tuple[StrainTensor, ...] = get_args(StrainTensor)
+StrainOrder = Literal[1, 2, "auto"]
+STRAIN_ORDERS: tuple[StrainOrder, ...] = get_args(StrainOrder)
 StartFrom = Literal["previous", "reference"]
 Pattern = Literal["surface", "projected"]
 DEFAULT_PATCH: PatchSetting = "auto"
@@ -135,8 +137,10 @@ class StrainSettings(Settings):
     window: Annotated[Whole, Field(ge=STRAIN_WINDOW.low, le=STRAIN_WINDOW.high)] = Field(
         STRAIN_WINDOW.default, description="Points across the gauge, odd.", json_schema_extra=ODD
     )
-    order: Literal[1, 2] = Field(
-        1, description="Fit planes or quadratics; they differ only where an edge, a hole or a cut takes points away."
+    order: StrainOrder = Field(
+        "auto",
+        description="Fit planes (1) or quadratics (2); they differ only where an edge, a hole or a cut takes points "
+        "away. auto: there whichever has the smaller total error, point by point.",
     )
     tensor: StrainTensor = Field("green_lagrange", description="Which strain is reported.")
 

@@ -12,7 +12,7 @@ from server.formats.calibrations.recognise import LoadedCalibration, load_calibr
 
 
 def read_calibration(path: str | Path) -> LoadedCalibration:
-    """Read a calibration: ``calibration.json``, DICe's XML, OpenCV's YAML, MatchID's caldat or VIC-3D's XML.
+    """Read a calibration: ``calibration.json``, DICe's XML or text, OpenCV's YAML, and more.
 
     Parameters
     ----------

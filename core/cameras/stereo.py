@@ -10,7 +10,10 @@ from numpy.typing import ArrayLike
 
 from core.arrays import Float
 from core.cameras.camera import Camera, RigidTransform, SpacePoints, project_cam
+from core.errors import InputError
 from core.names import CAMERAS
+
+_ROUNDING = 1e-12  # of the cameras' distances from the origin: what composed poses leave of a zero
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,23 @@ class StereoPair:
     def baseline_mm(self) -> float:
         """Distance of the two pinholes."""
         return float(np.linalg.norm(self.cam2_from_cam1.translation_mm))
+
+    def require_baseline(self) -> None:
+        """Refuse cameras whose pinholes coincide: every depth then looks the same to both.
+
+        Raises
+        ------
+        InputError
+            ``baseline_zero``.
+        """
+        reach_mm = sum(float(np.linalg.norm(c.cam_from_sys.translation_mm)) for c in (self.cam1, self.cam2))
+        if not self.baseline_mm > _ROUNDING * reach_mm:
+            raise InputError(
+                f"the baseline is {self.baseline_mm:.3g} mm: both cameras have the same position, and no depth follows "
+                "from their images.",
+                code="baseline_zero",
+                remedy="Check the translation between the cameras in the calibration.",
+            )
 
     @property
     def stereo_angle_rad(self) -> float:

@@ -10,9 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from core.arrays import Float
 from core.cameras.stereo import StereoPair
+
+_NEAR_HALF_TURN = -0.99  # cosine, 8 degrees: nearer, the skew part has lost a digit and more
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +223,7 @@ def _root2(m: Float) -> Float:
 
 
 def _rotation_vectors(rotation: Float) -> Float:
-    """Axis times angle, through the quaternion, which keeps its digits at small and at large angles."""
+    """Axis times angle: from the skew part, and near half a turn, where that vanishes, through the quaternion."""
     r = rotation
     skew = np.stack([r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], axis=-1)
     trace = np.trace(r, axis1=-2, axis2=-1)
@@ -228,4 +231,8 @@ def _rotation_vectors(rotation: Float) -> Float:
     angle = np.arctan2(sine, 0.5 * (trace - 1.0))
     with np.errstate(invalid="ignore", divide="ignore"):
         factor = np.where(sine > 1e-8, 0.5 * angle / sine, 0.5)
-    return np.asarray(skew * factor[..., None])
+        half_turn = 0.5 * (trace - 1.0) < _NEAR_HALF_TURN
+    out = np.asarray(skew * factor[..., None])
+    if half_turn.any():
+        out[half_turn] = Rotation.from_matrix(r[half_turn]).as_rotvec()
+    return out

@@ -37,6 +37,12 @@ def reduced_moments(weights: Float, seen: Bool, half: int, order: int) -> Float:
     return np.asarray(weights @ _thirds(s, t))
 
 
+def second_moments(weights: Float, half: int) -> Float:
+    """Return (m, 2, 3) sums of slope weights (m, 2, n) times s^2/2, s t, t^2/2 about the windows' middles."""
+    t, s = window_offsets(half)[0].T.astype(np.float64)
+    return np.asarray(weights @ np.stack([0.5 * s * s, s * t, 0.5 * t * t], axis=-1))
+
+
 def _thirds(s: Float, t: Float) -> Float:
     """(..., n, 4) terms of a Taylor series."""
     return np.asarray(np.stack([s**3, s * s * t, s * t * t, t**3], axis=-1) * _FACTORS)

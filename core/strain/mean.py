@@ -15,7 +15,7 @@ from core.field.region.window import window_offsets
 from core.strain.options import StrainOptions
 from core.strain.result import StrainStatus
 from core.strain.surface import surface_slopes
-from core.strain.tensors import strain_of, strain_slopes
+from core.strain.tensors import strain_slopes
 from core.strain.window import plane_weights
 
 
@@ -40,18 +40,19 @@ def mean_strain_sigma(field: Field, options: StrainOptions, inside: Bool, *, sub
     Errors dX_k, dU_k of the points change the slopes of a window by ``d_a = sum_k c_ak (dX, dU)_k``, and its strain by
     ``sum_a D_a . d_a``. The mean's error is ``sum_k v_k . (dX, dU)_k`` with v the sum of D over the windows that hold
     point k, times their weights c; its variance is ``sum_kl v_k S_k rho_kl S_l v_l``, S the roots of the points'
-    covariances. The common factor goes through the same weights: ``sum_k v_k . F_k``, squared.
+    covariances. What planes leave out in one-sided windows (order ``auto``) may have one sign, and is added whole. The
+    common factor goes through the same weights: ``sum_k v_k . F_k``, squared.
     """
     from scipy.signal import oaconvolve  # slow to load, and not every start needs it
 
     shared = SharedPixels.of(field, subset_px)
-    slopes, frame, per_mm, gradient = surface_slopes(field, options, shared)
+    slopes, surface, left, _ = surface_slopes(field, options, shared)
+    frame, per_mm, gradient, strain = surface.frame, surface.per_mm, surface.gradient, surface.strain
     good = slopes.status == StrainStatus.OK
     used = good & inside
     n = int(used.sum())
     if n == 0:
         return np.full(3, np.nan), np.full(3, np.nan)
-    strain = strain_of(frame, gradient, options.tensor)
     D = np.zeros((*field.shape, 3, 2, 6))
     D[used] = strain_slopes(frame, gradient, options.tensor, per_mm, strain)[used[good]] / n
     half = options.window // 2
@@ -69,7 +70,8 @@ def mean_strain_sigma(field: Field, options: StrainOptions, inside: Bool, *, sub
     v = v[half : half + field.shape[0], half : half + field.shape[1]]
     roots = roots_of(np.where(field.valid[..., None, None], field.covariance, 0.0))
     each = np.where(field.valid[..., None, None], v, 0.0) @ roots
-    variance = np.maximum(np.einsum("rcij,rcij->i", each, shared.summed(field, each)), 0.0)
+    noise = np.maximum(np.einsum("rcij,rcij->i", each, shared.summed(field, each)), 0.0)
+    variance = noise + np.sqrt(left[used]).mean(axis=0) ** 2
     if field.common is None:
         return np.asarray(np.sqrt(variance)), np.full(3, np.nan)
     held = np.where(field.valid[..., None, None], field.common, 0.0)

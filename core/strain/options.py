@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from core.errors import InputError
-from core.settings import STRAIN_TENSORS, STRAIN_WINDOW, StrainSettings, StrainTensor
+from core.settings import STRAIN_ORDERS, STRAIN_TENSORS, STRAIN_WINDOW, StrainOrder, StrainSettings, StrainTensor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +22,7 @@ class StrainOptions:
         1: the window's positions are fitted by planes; 2: by quadratics. In a whole window both give the same strain,
         since its quadratic terms have no effect on the slope in its middle. In a window cut by an edge, planes give the
         strain in the middle of the points left, quadratics that at the point itself, with several times the noise.
+        ``auto``: point by point whichever has the smaller total error, see :mod:`core.strain.one_sided`.
     tensor
         ``green_lagrange`` 1/2 (C - I), ``infinitesimal`` (the symmetric gradient; not free of rotation), or ``hencky``
         1/2 log C.
@@ -40,7 +40,7 @@ class StrainOptions:
     """
 
     window: int = STRAIN_WINDOW.default
-    order: Literal[1, 2] = 1
+    order: StrainOrder = "auto"
     tensor: StrainTensor = "green_lagrange"
     min_share: float = 0.5
     max_amplification: float = 12.0
@@ -57,8 +57,8 @@ class StrainOptions:
                 code="strain_window_invalid",
                 remedy=f"Give {STRAIN_WINDOW.default}, for example, or switch strain off.",
             )
-        if self.order not in (1, 2):
-            _refuse("order", self.order, "1 or 2")
+        if self.order not in STRAIN_ORDERS:
+            _refuse("order", self.order, "1, 2 or auto")
         if self.tensor not in STRAIN_TENSORS:
             _refuse("tensor", self.tensor, ", ".join(STRAIN_TENSORS))
         if not 0.0 < self.min_share <= 1.0:

@@ -60,6 +60,9 @@ class StrainField:
     patch
         (r, c, 3) exx, eyy, exy of each point's own stretch patch, the same tensor; NaN where the point is not valid,
         None for rigid patches.
+    raised
+        (r, c) True where quadratics have replaced planes in a one-sided window; None where no such choice was made, or
+        it is not known.
     """
 
     options: StrainOptions
@@ -72,6 +75,7 @@ class StrainField:
     covariance: Float
     patch: Float | None = None
     common: Float | None = None
+    raised: Bool | None = None
 
     @property
     def valid(self) -> Bool:

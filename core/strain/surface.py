@@ -11,9 +11,10 @@ from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
 from core.matching.geometry import tangent_frames
 from core.strain.arcs import missed_slope
+from core.strain.one_sided import OnSurface, raise_order
 from core.strain.options import StrainOptions
 from core.strain.result import StrainField, StrainStatus
-from core.strain.tensors import strain_covariance, strain_of, strain_of_stretch, strain_slopes
+from core.strain.tensors import strain_of, strain_of_stretch, strain_slopes
 from core.strain.window import Slopes, slopes_of, window_slopes
 
 
@@ -58,23 +59,18 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
             remedy="Give the field of a later step.",
         )
     shared = SharedPixels.of(field, subset_px)
-    slopes, frame, per_mm, gradient = surface_slopes(field, options, shared)
+    slopes, surface, left, raised = surface_slopes(field, options, shared)
     status, good = slopes.status, slopes.status == StrainStatus.OK
-    area = 1.0 / np.abs(np.linalg.det(per_mm))
-    found = strain_of(frame, gradient, options.tensor)
-    spread = np.swapaxes(per_mm, -1, -2) @ slopes.spread[good] @ per_mm
-    around = _mean_around(field.covariance, field.valid, options.window)[good]
+    area = 1.0 / np.abs(np.linalg.det(surface.per_mm))
     strain = np.full((*field.shape, 3), np.nan)
     covariance = np.full((*field.shape, 3, 3), np.nan)
-    strain[good] = found
+    strain[good] = surface.strain
+    covariance[good] = surface.covariance(slopes.spread[good], options.tensor)
+    covariance[..., range(3), range(3)] += left
     common = None
     if field.common is not None:
-        k = field.common.shape[-1]
-        moved = slopes_of(field.common.reshape(*field.shape, 6 * k), field.valid, slopes, options.window // 2)[good]
-        by_slope = strain_slopes(frame, gradient, options.tensor, per_mm, found)
-        common = np.full((*field.shape, 3, k), np.nan)
-        common[good] = np.einsum("niab,nbka->nik", by_slope, moved.reshape(-1, 6, k, 2), optimize=True)
-    covariance[good] = strain_covariance(frame, gradient, options.tensor, around, spread, found)
+        common = np.full((*field.shape, 3, field.common.shape[-1]), np.nan)
+        common[good] = _common_part(field, slopes, surface, options)
     spacing_px = _step(field)
     # of smoothed displacements it begins with the width of the smoothing
     gauge_px = (options.window - 1) * spacing_px + shared.reach_px
@@ -89,11 +85,23 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
         covariance=covariance,
         patch=_patch_strain(field, options),
         common=common,
+        raised=raised,
     )
 
 
-def surface_slopes(field: Field, options: StrainOptions, shared: SharedPixels) -> tuple[Slopes, Float, Float, Float]:
-    """Return the windows' fits, and of the n points that have a strain frame, steps per mm in it, and gradient.
+def _common_part(field: Field, slopes: Slopes, surface: OnSurface, options: StrainOptions) -> Float:
+    """(n, 3, k) common factor of the strain: that of the points through the windows' weights."""
+    assert field.common is not None
+    k, good = field.common.shape[-1], slopes.status == StrainStatus.OK
+    moved = slopes_of(field.common.reshape(*field.shape, 6 * k), field.valid, slopes, options.window // 2)[good]
+    by_slope = strain_slopes(surface.frame, surface.gradient, options.tensor, surface.per_mm, surface.strain)
+    return np.asarray(np.einsum("niab,nbka->nik", by_slope, moved.reshape(-1, 6, k, 2), optimize=True))
+
+
+def surface_slopes(
+    field: Field, options: StrainOptions, shared: SharedPixels
+) -> tuple[Slopes, OnSurface, Float, Bool | None]:
+    """Return the windows' fits, and these on the surface.
 
     Parameters
     ----------
@@ -107,13 +115,22 @@ def surface_slopes(field: Field, options: StrainOptions, shared: SharedPixels) -
     Returns
     -------
     tuple
-        :class:`core.strain.window.Slopes`; (n, 3, 2) unit tangents; (n, 2, 2) steps of column and row (first index) per
-        mm along them; (n, 3, 2) the displacement's derivatives along them.
+        :class:`core.strain.window.Slopes`; :class:`core.strain.one_sided.OnSurface` of the n points that have a strain;
+        (r, c, 3) variance that the bias of one-sided planes adds; (r, c) True where quadratics replaced them, None
+        unless the order is ``auto``.
     """
     assert field.uvw_mm is not None
     values = np.concatenate([field.xyz_mm, field.uvw_mm], axis=-1)
     xy_px = np.stack([field.x_px, field.y_px], axis=-1)
     slopes = window_slopes(values, field.valid, xy_px, field.cuts, options, shared=shared)
+    surface = _on_surface(slopes, field, options)
+    if options.order != "auto":
+        return slopes, surface, np.zeros((*field.shape, 3)), None
+    slopes, left, raised = raise_order(slopes, surface, options.tensor)
+    return slopes, _on_surface(slopes, field, options) if raised.any() else surface, left, raised
+
+
+def _on_surface(slopes: Slopes, field: Field, options: StrainOptions) -> OnSurface:
     good = slopes.status == StrainStatus.OK
     slope, second, moments = slopes.slope[good], slopes.second[good], slopes.moments[good]
     before = missed_slope(slope[:, :3], second[:, :3], moments)
@@ -121,7 +138,9 @@ def surface_slopes(field: Field, options: StrainOptions, shared: SharedPixels) -
     slope = slope - np.concatenate([before, now - before], axis=1)
     frame = _frames(slope[:, :3], field.normal_sys[good])
     per_mm = np.linalg.inv(np.swapaxes(frame, -1, -2) @ slope[:, :3])
-    return slopes, frame, per_mm, slope[:, 3:] @ per_mm
+    gradient = slope[:, 3:] @ per_mm
+    around = _mean_around(field.covariance, field.valid, options.window)[good]
+    return OnSurface(frame, per_mm, gradient, around, strain_of(frame, gradient, options.tensor))
 
 
 def _frames(tangents: Float, towards: Float) -> Float:

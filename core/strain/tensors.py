@@ -61,6 +61,14 @@ def hencky_of_green(green: Float) -> Float:
     return np.stack([slope * green[..., 0] + rest, slope * green[..., 1] + rest, slope * green[..., 2]], axis=-1)
 
 
+def as_tensor(small: Float, strain: Float, tensor: StrainTensor) -> Float:
+    """Return the change (n, 3) of a strain (n, 3) that a small change of the Green-Lagrange strain makes.
+
+    Infinitesimal strain changes by as much itself.
+    """
+    return np.einsum("nij,nj->ni", _hencky_slope(strain), small) if tensor == "hencky" else small
+
+
 def strain_covariance(
     frame: Float, gradient: Float, tensor: StrainTensor, points: Float, spread: Float, strain: Float
 ) -> Float:
@@ -125,8 +133,11 @@ def _pulls(frame: Float, gradient: Float, tensor: StrainTensor) -> Float:
     moved = frame + gradient
     if tensor == "infinitesimal":
         of_motion = frame
-        # E^T dP with P's own basis changed by dX: d(E^T P) = E^T (dF1 - P E^T dF0), both hold dX
-        of_position = frame - frame @ _transposed(_transposed(frame) @ moved)
+        # E^T dP with P's own basis changed by dX: d(E^T P) = E^T (dF1 - P E^T dF0), both hold dX; and the frame tilts
+        # with the positions, d(E)^T P = (n . dX) (n . P). The other tensors hold P^T P alone, without the frame
+        normal = np.cross(frame[..., 0], frame[..., 1])[..., None]
+        tilted = normal @ (_transposed(normal) @ moved)
+        of_position = frame - frame @ _transposed(_transposed(frame) @ moved) + tilted
     else:
         of_motion = moved
         of_position = moved - frame @ (_transposed(moved) @ moved)

@@ -7,7 +7,7 @@ of the surface.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import ndimage
@@ -16,11 +16,36 @@ from core.arrays import Bool, Float
 from core.field.points.shared_pixels import SharedPixels
 from core.field.region.cuts import Cuts
 from core.field.region.window import connected_points, fit_terms, steps_of, ways_cut, window_offsets
-from core.strain.arcs import reduced_moments, second_weights, third_moments, whole_second_derivatives
+from core.strain.arcs import reduced_moments, second_moments, second_weights, third_moments, whole_second_derivatives
 from core.strain.options import StrainOptions
 from core.strain.result import StrainStatus
 
 _AT_ONCE = 1024
+
+
+@dataclass(frozen=True, eq=False)
+class Quadratics:
+    """Fits of quadratics over a batch of m windows that planes were fitted to, and what the planes leave out.
+
+    Attributes
+    ----------
+    status
+        (m,) int8, :class:`StrainStatus`.
+    slope, spread, moments, weights
+        As those of planes, in :class:`Slopes`.
+    bent
+        (m, 2, 3) the planes' weights' sums of s^2/2, s t, t^2/2 about the point: what second derivatives add to slopes.
+    seen
+        (m, n) True for the windows' connected points.
+    """
+
+    status: np.ndarray
+    slope: Float
+    spread: Float
+    moments: Float
+    weights: Float
+    bent: Float
+    seen: Bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +67,10 @@ class Slopes:
     reduced
         Of windows that edges, holes or cuts have reduced, in batches: rows (m,), columns (m,), and weights (m, 2, n) of
         the points of ``window_offsets`` in the slopes.
+    quadratics
+        Of order ``auto``: the same batches' quadratics; else empty.
+    second_spread
+        Of order ``auto``: (r, c, 3, 3) covariance of ``second`` in units of a point's, zero where undetermined.
     """
 
     status: np.ndarray
@@ -50,6 +79,8 @@ class Slopes:
     second: Float
     moments: Float
     reduced: list[tuple[np.ndarray, np.ndarray, Float]]
+    quadratics: list[Quadratics] = field(default_factory=list)
+    second_spread: Float | None = None
 
 
 def window_slopes(
@@ -89,6 +120,10 @@ def window_slopes(
     second = whole_second_derivatives(positions, half)
     moments = np.empty((*valid.shape, 2, 4))
     moments[...] = third_moments(c, half)
+    second_spread, quadratics = None, []
+    if options.order == "auto":
+        every = second_weights(np.ones((1, len(offsets)), bool), half)[0]
+        second_spread = np.where(whole[..., None, None], every @ rho @ every.T, 0.0)
     rows, cols = np.nonzero(valid & ~whole)
     reduced = []
     there = np.pad(valid, half)
@@ -99,19 +134,36 @@ def window_slopes(
         r, k = rows[first : first + _AT_ONCE], cols[first : first + _AT_ONCE]
         here = (r + half) * width + k + half
         seen = connected_points(there, here, None if crossed is None else crossed[r, k], half)
-        found, weights = _weights(seen, half, options)
         # from the centre's values on, so that no digits are lost
         data = padded.take(here[:, None] + reach, axis=0) - values[r, k][:, None, :]
-        status[r, k] = found
-        reduced.append((r, k, weights))
-        moments[r, k] = reduced_moments(weights, seen, half, options.order)
         there_now = np.concatenate([data[..., :3], data[..., :3] + data[..., 3:]], axis=-1)
-        second[r, k] = np.einsum("man,mnb->mba", second_weights(seen, half), there_now)
-        slope[r, k] = np.einsum("man,mnb->mba", weights, data)
-        # one large product instead of many small ones
-        together = (weights.reshape(-1, len(rho)) @ rho).reshape(weights.shape)
-        spread[r, k] = np.einsum("man,mbn->mab", together, weights)
-    return Slopes(status, slope, spread, second, moments, reduced)
+        bending = second_weights(seen, half)
+        second[r, k] = np.einsum("man,mnb->mba", bending, there_now)
+        status[r, k], slope[r, k], spread[r, k], moments[r, k], weights = _fitted(
+            seen, data, rho, half, 2 if options.order == 2 else 1, options
+        )
+        reduced.append((r, k, weights))
+        if second_spread is not None:
+            second_spread[r, k] = _spread(bending, rho)
+            raised = _fitted(seen, data, rho, half, 2, options)
+            quadratics.append(Quadratics(*raised, second_moments(weights, half), seen))
+    return Slopes(status, slope, spread, second, moments, reduced, quadratics, second_spread)
+
+
+def _fitted(
+    seen: Bool, data: Float, rho: Float, half: int, order: int, options: StrainOptions
+) -> tuple[np.ndarray, Float, Float, Float, Float]:
+    """Status, slope, spread, third moments and weights of windows' fits, as in :class:`Slopes`."""
+    found, weights = _weights(seen, half, order, options)
+    slope = np.einsum("man,mnb->mba", weights, data)
+    return found, slope, _spread(weights, rho), reduced_moments(weights, seen, half, order), weights
+
+
+def _spread(weights: Float, rho: Float) -> Float:
+    """Covariance (m, a, a) of sums with weights (m, a, n), in units of a point's."""
+    # one large product instead of many small ones
+    together = (weights.reshape(-1, len(rho)) @ rho).reshape(weights.shape)
+    return np.asarray(np.einsum("man,mbn->mab", together, weights))
 
 
 def slopes_of(values: Float, valid: Bool, slopes: Slopes, half: int) -> Float:
@@ -146,10 +198,10 @@ def _whole_slopes(values: Float, half: int) -> Float:
     return np.stack(out, axis=-1)
 
 
-def _weights(seen: Bool, half: int, options: StrainOptions) -> tuple[np.ndarray, Float]:
+def _weights(seen: Bool, half: int, order: int, options: StrainOptions) -> tuple[np.ndarray, Float]:
     """Status (m,) and weights (m, 2, n) of the points in the slopes; zero where there are none."""
     offsets, _ = window_offsets(half)
-    A = fit_terms(offsets, half, options.order)
+    A = fit_terms(offsets, half, order)
     n, terms = A.shape
     count = seen.sum(axis=1)
     normal = (seen.astype(np.float64) @ (A[:, :, None] * A[:, None, :]).reshape(n, -1)).reshape(-1, terms, terms)

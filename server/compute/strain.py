@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from core.field.points.result import Field
 from core.field.points.smoothing_record import Smoothing
 from core.field.smoothed import smoothed_displacement
+from core.settings import StrainOrder
 from core.strain import StrainField, StrainOptions, StrainStatus, surface_strain
 
 _NAMES = ("exx", "eyy", "exy")
@@ -86,7 +87,7 @@ class StrainSummary:
     """
 
     window: int
-    order: int
+    order: StrainOrder
     tensor: str
     gauge_px: float
     gauge_mm: float | None

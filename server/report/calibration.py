@@ -20,7 +20,14 @@ _CHECKS = (
     ("nsce", "NSCE (the same over the error that rounding to pixels would make)", ""),
 )
 _UNITS = {"px2": "1/px\u00b2", "px": "px", "rad": "rad", "mm": "mm"}
-_KINDS = {"dice_xml": "DICe XML", "opencv_yaml": "OpenCV YAML"}
+_KINDS = {
+    "dice_xml": "DICe XML",
+    "dice_txt": "DICe text",
+    "opencv_yaml": "OpenCV YAML",
+    "matchid_caldat": "MatchID caldat",
+    "vic3d_xml": "VIC-3D XML",
+    "pyvale_txt": "pyvale text",
+}
 
 
 @dataclass(frozen=True)

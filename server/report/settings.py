@@ -14,6 +14,7 @@ _SHAPES = {
     "affine": "plane patch, rigid motion and in-plane stretch (12 unknowns), projected by both calibrated cameras",
     "quadratic": "patch of second order in shape and motion, projected by both calibrated cameras",
 }
+_FITS = {1: "planes", 2: "quadratics", "auto": "planes or, where one-sided, quadratics"}
 _TENSORS = {
     "green_lagrange": "Green-Lagrange, E = (C - I) / 2",
     "infinitesimal": "infinitesimal, symmetric part of the displacement gradient",
@@ -135,7 +136,7 @@ def _strain_items(source: Source, measured: Measured) -> list[Item]:
         return [one("strain", "Strain", Value(text, None, SETTINGS))]
     window = strain.window
     mm = "" if strain.gauge_mm is None else f" = {strain.gauge_mm:.4g} mm"
-    fit = f"{window} x {window} points, polynomial of order {strain.order} through their displacements"
+    fit = f"{window} x {window} points, {_FITS[strain.order]} through their displacements"
     return [
         one(
             "strain",

@@ -27,7 +27,7 @@ from core.errors import CalibrationInputError, StereorigError
 from core.grid import GridView
 from core.target import GridTarget
 from server.formats.calibrations.native import covariance_in
-from server.formats.calibrations.plausibility import image_sizes, shared_points
+from server.formats.calibrations.programs.plausibility import image_sizes, shared_points
 from server.formats.calibrations.recognise import LoadedCalibration
 from server.formats.calibrations.volume import volume_of
 from server.formats.version import software_version

@@ -10,7 +10,7 @@ import numpy as np
 
 from core.errors import FileFormatError, InputError
 from core.orientation.matched import seen_by_camera2
-from server.formats.calibrations.plausibility import Residual
+from server.formats.calibrations.programs.plausibility import Residual
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.results.provenance import calibration_of
 from server.results.steps import read_step

@@ -139,3 +139,28 @@ def test_a_folder_measured_through_both_doors_is_the_same_to_the_last_bit(
     timed = {"compute_s", "write_s", "wall_s", "seconds", "cam1", "cam2", "sha256"}
     for x, y in zip(*(current_summary(s)["steps"] for s in summaries), strict=True):
         assert {k: v for k, v in x.items() if k not in timed} == {k: v for k, v in y.items() if k not in timed}
+
+
+def test_smoothing_changes_nothing_that_later_references_go_on_from(data: Path, tmp_path: Path) -> None:
+    """Each step is matched against the one before: through either door what it hands on is what was measured."""
+    settings = {"subset_px": 25, "spacing_px": 12, "patch": "affine", "reference_update": "always", "strain": None}
+    one = by_the_service(data, {**settings, "region": {"rectangle": ROI}, "smoothing_window": 5})
+    command = ["measure", str(data / "tests" / "t000001-abcdef"), "--roi", ",".join(map(str, ROI)), "--strain", "off"]
+    command += ["--subset", "25", "--step", "12", "--patch", "affine", "--reference-update", "always"]
+    assert main([*command, "--out", str(tmp_path / "smooth"), "--smooth", "5"]) == 0
+    assert main([*command, "--out", str(tmp_path / "plain")]) == 0
+    smoothed = 0.0
+    for n in range(1, STEPS):
+        name = f"step_{n:04d}.nc"
+        with xarray.open_dataset(tmp_path / "plain" / name) as plain:
+            for folder in (one, tmp_path / "smooth"):
+                with xarray.open_dataset(folder / name) as found:
+                    for key in ("status", "zncc", "x_mm", "y_mm", "z_mm", "rotation_x_rad", "iterations"):
+                        if key in plain:
+                            assert found[key].values.tobytes() == plain[key].values.tobytes(), (folder, n, key)
+                    for axis in "uvw":
+                        measured = found[f"measured_{axis}_mm"].values
+                        expected = plain[f"{axis}_mm"].values
+                        assert np.array_equal(measured.astype(expected.dtype), expected, equal_nan=True), (folder, n)
+                        smoothed = max(smoothed, float(np.nanmax(np.abs(found[f"{axis}_mm"].values - expected))))
+    assert smoothed > 1e-5  # mm: the smoothing itself does something here

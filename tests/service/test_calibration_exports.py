@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from server.formats.calibrations.plausibility import check_calibration, shared_points
 
 from core.arrays import Float
 from core.cameras.camera import Camera, RigidTransform
@@ -24,7 +25,6 @@ from core.errors import StereorigError
 from core.field.points.result import Field
 from server.cli.main import main
 from server.formats.calibrations.export import FORMS, convert_calibration
-from server.formats.calibrations.plausibility import check_calibration, shared_points
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration, parse_calibration
 from server.formats.results.writing import Provenance, write_field
 from server.results.epipolar_check import check_against
@@ -532,3 +532,48 @@ def test_over_http(client: httpx.Client) -> None:
         )
     assert client.get(url, params={"format": "pdf"}).json()["code"] == "invalid_request"
     assert client.get(url.replace("c0", "c9"), params={"format": "dice"}).status_code == 404
+
+
+PYVALE = "\n".join(
+    [f"cam{k}_{name},{value}" for k in (0, 1) for name, value in
+     (("fx_px", 6638.6), ("fy_px", 6639.8), ("fs_px", 0.4), ("cx_px", 981.5), ("cy_px", 610.0), ("k1", 0.09),
+      ("k2", -2.8), ("p1", 1e-3), ("p2", -2e-3), ("k3", 55.0))]
+    + ["tx_mm,121.4", "ty_mm,0.57", "tz_mm,23.2", "theta_deg,0.2", "phi_deg,-18.9", "psi_deg,0.4"]
+)  # fmt: skip
+DICE_TXT = "\n".join(
+    2 * ["981.5 # cx", "610 # cy", "6638.6 # fx", "6639.8 # fy", "0.4 # fs", "0.09 # k1", "-2.8 # k2", "55 # k3"]
+    + ["0.2 # alpha", "-18.9 # beta", "0.4 # gamma", "121.4 # tx", "0.57 # ty", "23.2 # tz", "1200", "1920"]
+)
+
+
+@pytest.mark.parametrize(("text", "kind"), [(PYVALE, "pyvale_txt"), (DICE_TXT, "dice_txt")])
+def test_text_calibrations_through_both_doors(
+    client: httpx.Client, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, kind: str
+) -> None:
+    file, out = tmp_path / "in.txt", tmp_path / "out.json"
+    file.write_text(text, encoding="utf-8")
+    assert main(["calibration", "convert", str(file), str(out), "--to", "json"]) == 0
+    loaded = load_calibration(out)
+    assert loaded.source == kind
+    assert loaded.pair.values() == load_calibration(file).pair.values()
+    assert main(["calibration", "check", str(file)]) == 0
+    printed = capsys.readouterr().out
+    assert ("r^2, r^4, r^6" in printed) == (kind == "dice_txt")
+    reply = client.post("/api/v1/calibrations:import", files={"file": ("in.txt", text.encode())})
+    assert reply.status_code == 201, reply.text
+    assert reply.json()["plan"]["check"]["volume"]["max_px"] < 1e-6
+    broken = client.post(
+        "/api/v1/calibrations:import", files={"file": ("in.txt", text.replace("610", "6x", 1).encode())}
+    )
+    assert broken.status_code == 422
+    assert broken.json()["code"] == "calibration_unreadable"
+    still = client.post("/api/v1/calibrations:import", files={"file": ("in.txt", _in_one_place(text).encode())})
+    assert still.status_code == 422
+    assert still.json()["code"] == "calibration_invalid"
+    assert "same position" in still.text
+
+
+def _in_one_place(text: str) -> str:
+    for number in ("121.4", "0.57", "23.2"):
+        text = text.replace(number, "0.0")
+    return text

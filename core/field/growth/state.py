@@ -124,7 +124,10 @@ def prepare(
     ------
     RegionError, ImageError
         If region or images cannot be used.
+    InputError
+        ``baseline_zero`` if both cameras have the same position.
     """
+    pair.require_baseline()
     options = options or MeasureOptions()
     subset_px, kind, blur = options.subset_px, options.interpolation, options.blur
     ref1, ref2 = (MeasureImage(reference[k], f"camera {k + 1}'s image") for k in (0, 1))

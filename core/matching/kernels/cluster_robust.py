@@ -149,7 +149,7 @@ def make_cluster_robust(degree: int, images: int, parts: PointKernels, freeze: A
         worth = 0.0
         for k in range(images):
             lens = lens1 if k == 1 else lens2
-            levels[k, GAIN], levels[k, SHIFT] = 1.0, 0.0
+            levels[k, GAIN], levels[k, SHIFT] = 1.0, seen.first_shift
             if not compare(shown[k], lens, M[k], order, ref, known, of_reference, warp_space, levels[k], rhs[k]):
                 return OUTSIDE_IMAGE, 0
             if levels[k, CONTRAST] == 0.0 or not levels[k, ZNCC] > 0.0:

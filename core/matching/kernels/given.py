@@ -87,7 +87,8 @@ class Subset(NamedTuple):
 
     ``inside``: True if it lies in the image and the lens model's domain; the point's ray ``xc, yc``, the weights' sum
     ``p``, the remaining mean of f, the sum of squares of f about it, the differences of neighbours against it (1 for
-    white noise), and the number of pixels that count.
+    white noise), the number of pixels that count, and the grey level that is taken off an image before it is first
+    compared: zero unless the mean is so large against the contrast that the sums would lose it.
     """
 
     inside: bool
@@ -98,6 +99,7 @@ class Subset(NamedTuple):
     f2: float
     white: float
     n_pixels: float
+    first_shift: float
 
 
 class WarpSpace(NamedTuple):

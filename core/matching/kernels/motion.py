@@ -141,7 +141,7 @@ def make_motion(degree: int) -> FitKernels:
         known = (blocks_of_pixels, p, offset, f2)
         e = 0.0
         for k in range(3):
-            levels[k, GAIN], levels[k, SHIFT] = 1.0, 0.0
+            levels[k, GAIN], levels[k, SHIFT] = 1.0, seen.first_shift
         moved, previous, last = np.inf, 0.0, np.inf
         status = NOT_CONVERGED
         iterations = 0

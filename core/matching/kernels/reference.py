@@ -26,6 +26,10 @@ from core.matching.kernels.naming import inner, kernel
 from core.matching.kernels.vectors import LANES, LONG, at, load, store
 from core.matching.kernels.warp import set_up_nodes, undistort
 
+LARGE_MEAN = 100.0
+"""Mean of a subset over its contrast from which on an image's sums start from the mean. A float32 sum of squares has
+six digits and must hold the contrast's square: up to here it has two of them, which a second comparison makes whole."""
+
 
 def subset_array(subset: int) -> np.ndarray:
     """Return an array for the reference subset, its rows that all points share filled; the surplus is zero."""
@@ -127,7 +131,7 @@ def make_reference(degree: int) -> Any:
         """
         pixels, grad_x, grad_y, weights = reference
         raw, node_work, powers, basis, middle, sum_g, sum_fg, gram = space
-        nothing = Subset(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        nothing = Subset(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         rows, cols = pixels.shape
         half = 0.5 * (subset - 1)
         left, top = int(np.floor(x_px - half + 0.5)), int(np.floor(y_px - half + 0.5))
@@ -150,8 +154,8 @@ def make_reference(degree: int) -> Any:
         mean = np.float32(0.0)  # of a diagonal: only there to keep the sums small
         for i in range(subset):
             mean += pixels[top + i, left + i]
-        for i in range(subset * subset, ref.shape[1]):
-            ref[F, i] = 0.0
+        for i in range(subset * subset, ref.shape[1]):  # the last pixel has no right neighbour: it differs by nothing
+            ref[F, i] = pixels[top + subset - 1, left + subset - 1]
         sum_all(ref, np.int64((subset * subset + LANES - 1) // LANES), np.float32(mean / subset), raw)
         p, offset = raw[0], raw[1] / raw[0]
         f2 = raw[2] - raw[1] * offset
@@ -177,7 +181,10 @@ def make_reference(degree: int) -> Any:
         if few == 6:
             for row, s, t in ((3, u, u), (4, u, v), (5, v, v)):
                 times(s, t, basis[row])
-        return Subset(True, xc, yc, p, offset, f2, 0.5 * raw[3] / f2, float(count))
+        first_shift = float(mean / subset)
+        if first_shift * first_shift * p <= LARGE_MEAN * LARGE_MEAN * f2:
+            first_shift = 0.0
+        return Subset(True, xc, yc, p, offset, f2, 0.5 * raw[3] / f2, float(count), first_shift)
 
     return set_up_reference, n_columns, first_gg + 3 * many
 

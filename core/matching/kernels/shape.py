@@ -93,7 +93,7 @@ def make_shape(degree: int) -> FitKernels:
         blocks_of_pixels = np.int64((subset * subset + LANES - 1) // LANES)
         known = (blocks_of_pixels, p, offset, f2)
         e = 0.0
-        levels[0, GAIN], levels[0, SHIFT] = 1.0, 0.0
+        levels[0, GAIN], levels[0, SHIFT] = 1.0, seen.first_shift
         moved, previous, last = np.inf, 0.0, np.inf
         status = NOT_CONVERGED
         iterations = 0

@@ -12,7 +12,7 @@ from server.cli.measurement import calibration_repair
 from server.cli.measurement.calibration_checks import ACTIONS, add_check_actions, run_check
 from server.formats.calibrations.export import FORMS, ConversionReport, convert_calibration
 from server.formats.calibrations.kept_checks import read_checks
-from server.formats.calibrations.plausibility import CalibrationCheck, Residual, check_calibration
+from server.formats.calibrations.programs.plausibility import CalibrationCheck, Residual, check_calibration
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.formats.files import make_folder, write_bytes
 from server.formats.images import read_file
@@ -23,7 +23,7 @@ from server.results.epipolar_check import EpipolarComparison, check_against
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    known = "calibration.json, DICe XML, OpenCV YAML, MatchID caldat or VIC-3D XML"
+    known = "calibration.json, DICe XML or text, OpenCV YAML, MatchID caldat, VIC-3D XML or pyvale text"
     convert = actions.add_parser("convert", help="write a calibration in another form")
     convert.add_argument("file", metavar="IN", type=Path, help=known)
     convert.add_argument("out", metavar="OUT", type=Path, help="file to write; OUT.report.json goes beside it")

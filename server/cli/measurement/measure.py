@@ -19,6 +19,7 @@ from core.settings import (
     REFERENCE_UPDATES,
     SMOOTHING_WINDOW,
     SPACING_PX,
+    STRAIN_ORDERS,
     STRAIN_TENSORS,
     STRAIN_WINDOW,
     SUBSET_PX,
@@ -45,7 +46,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("folder", nargs="?", metavar="FOLDER", help="a test's folder: steps/<nnnn>/cam1.tif ..., calibration.json")
     add("--cam1", nargs="+", metavar="GLOB", help="camera 1's images: a quoted pattern or several paths")
     add("--cam2", nargs="+", metavar="GLOB", help="camera 2's images; files are paired in sorted order")
-    add("--calibration", metavar="FILE", help="calibration.json, DICe XML or OpenCV YAML")
+    add(
+        "--calibration",
+        metavar="FILE",
+        help="calibration.json, or another program's: see stereorig calibration convert",
+    )
     add("--roi", metavar="X0,Y0,X1,Y1", help="points lie at X0 + i step, Y0 + j step up to X1, Y1")
     add("--mask", metavar="PNG", help="image of camera 1's size, white where points may lie")
     add(
@@ -104,7 +109,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"points across the virtual strain gauge, odd; it is (WINDOW - 1) step + subset wide "
         f"({STRAIN_WINDOW.default})",
     )
-    add("--strain-order", choices=("1", "2"), default="1", help="fit planes (1) or quadratics (2) over the gauge (1)")
+    add(
+        "--strain-order",
+        choices=[str(order) for order in STRAIN_ORDERS],
+        default="auto",
+        help="fit planes (1) or quadratics (2) over the gauge; auto: planes, but quadratics where an edge, a hole or a "
+        "cut leaves points on one side and the planes' bias there outweighs their noise (auto)",
+    )
     add("--strain-tensor", choices=STRAIN_TENSORS, default="green_lagrange", help="strain tensor (green_lagrange)")
     add(
         "--smooth",
@@ -146,7 +157,11 @@ def _strain(args: argparse.Namespace) -> dict[str, object] | None:
     if args.strain == "off" or (args.strain is None and args.projected):
         return None
     window = check_whole("--strain", str(STRAIN_WINDOW.default) if args.strain is None else args.strain, STRAIN_WINDOW)
-    return {"window": window, "order": int(args.strain_order), "tensor": args.strain_tensor}
+    return {
+        "window": window,
+        "order": next(order for order in STRAIN_ORDERS if str(order) == args.strain_order),
+        "tensor": args.strain_tensor,
+    }
 
 
 def _smoothing_window(args: argparse.Namespace) -> int | None:

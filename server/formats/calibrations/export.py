@@ -15,18 +15,18 @@ from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
 from core.errors import CalibrationError
 from core.names import CAMERAS
-from server.formats.calibrations.dice_xml import dice_text
-from server.formats.calibrations.matchid_caldat import caldat_text
-from server.formats.calibrations.opencv_yaml import opencv_text
-from server.formats.calibrations.plausibility import (
+from server.formats.calibrations.programs.dice_xml import dice_text
+from server.formats.calibrations.programs.matchid_caldat import caldat_text
+from server.formats.calibrations.programs.opencv_yaml import opencv_text
+from server.formats.calibrations.programs.plausibility import (
     Residual,
     image_sizes,
     independent_projection,
     middle_depth_mm,
     shared_points,
 )
+from server.formats.calibrations.programs.vic3d_xml import vic3d_text
 from server.formats.calibrations.recognise import LoadedCalibration, imported_content, parse_calibration
-from server.formats.calibrations.vic3d_xml import vic3d_text
 from server.formats.version import software_version
 
 CalibrationForm = Literal["json", "paper", "opencv", "dice", "matchid", "vic3d"]

@@ -17,12 +17,14 @@ from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError
 from core.names import CAMERAS
-from server.formats.calibrations.dice_xml import is_dice, parse_dice_xml
-from server.formats.calibrations.imported_pair import invalid, unreadable
-from server.formats.calibrations.matchid_caldat import is_caldat, parse_caldat
-from server.formats.calibrations.opencv_yaml import is_opencv, parse_opencv
+from server.formats.calibrations.programs.dice_txt import is_dice_txt, parse_dice_txt
+from server.formats.calibrations.programs.dice_xml import is_dice, parse_dice_xml
+from server.formats.calibrations.programs.imported_pair import invalid, unreadable
+from server.formats.calibrations.programs.matchid_caldat import is_caldat, parse_caldat
+from server.formats.calibrations.programs.opencv_yaml import is_opencv, parse_opencv
+from server.formats.calibrations.programs.pyvale_txt import is_pyvale, parse_pyvale
+from server.formats.calibrations.programs.vic3d_xml import is_vic3d, parse_vic3d
 from server.formats.calibrations.record import CalibrationRecord
-from server.formats.calibrations.vic3d_xml import is_vic3d, parse_vic3d
 
 _MAX_BYTES = 64 << 20
 _MIN_BASELINE = 1e-6  # of the stand-off
@@ -39,11 +41,14 @@ class LoadedCalibration:
     image_size1_px, image_size2_px
         (width, height) the calibration was made for, None where the file does not state it.
     source
-        ``calibration_json``, ``dice_xml``, ``opencv_yaml``, ``matchid_caldat`` or ``vic3d_xml``.
+        ``calibration_json``, ``dice_xml``, ``dice_txt``, ``opencv_yaml``, ``matchid_caldat``, ``vic3d_xml`` or
+        ``pyvale_txt``.
     sha256
         Of the file's bytes.
     details
         The whole content of a calibration.json, empty for other programs' files.
+    notes
+        What was assumed in reading another program's file.
     """
 
     pair: StereoPair
@@ -52,6 +57,7 @@ class LoadedCalibration:
     source: str
     sha256: str
     details: dict[str, Any]
+    notes: tuple[str, ...] = ()
 
     @property
     def imported(self) -> bool:
@@ -159,7 +165,7 @@ def _unwrapped(data: bytes, digest: str, name: str) -> LoadedCalibration:
 
 
 def _of_another(data: bytes) -> bool:
-    return any(recognises(data) for recognises in (is_dice, is_opencv, is_caldat, is_vic3d))
+    return any(recognises(data) for recognises in (is_dice, is_opencv, is_caldat, is_vic3d, is_pyvale, is_dice_txt))
 
 
 def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
@@ -168,8 +174,8 @@ def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
     if _wraps_another(data):
         return _unwrapped(data, digest, name)
     if is_dice(data):
-        pair, size1, size2 = parse_dice_xml(data, name=name)
-        return LoadedCalibration(pair, size1, size2, "dice_xml", digest, {})
+        pair, size1, size2, notes = parse_dice_xml(data, name=name)
+        return LoadedCalibration(pair, size1, size2, "dice_xml", digest, {}, notes)
     if is_opencv(data):
         pair, size = parse_opencv(data, name=name)
         return LoadedCalibration(pair, size, size, "opencv_yaml", digest, {})
@@ -178,6 +184,11 @@ def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
         return LoadedCalibration(pair, size, size, "vic3d_xml", digest, {})
     if is_caldat(data):
         return LoadedCalibration(parse_caldat(data, name=name), None, None, "matchid_caldat", digest, {})
+    if is_pyvale(data):
+        return LoadedCalibration(parse_pyvale(data, name=name), None, None, "pyvale_txt", digest, {})
+    if is_dice_txt(data):
+        pair, size, notes = parse_dice_txt(data, name=name)
+        return LoadedCalibration(pair, size, size, "dice_txt", digest, {}, notes)
     try:
         content = json.loads(data)
     except (ValueError, RecursionError) as error:
@@ -193,7 +204,7 @@ def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
 
 
 def load_calibration(path: str | Path) -> LoadedCalibration:
-    """Read a calibration.json, or another program's: DICe XML, OpenCV, MatchID caldat, VIC-3D XML.
+    """Read a calibration.json, or another program's: DICe XML or text, OpenCV, MatchID caldat, VIC-3D XML, pyvale text.
 
     Raises
     ------

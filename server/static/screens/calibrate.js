@@ -452,7 +452,7 @@ async function comparison(list) {
 function importer(done) {
   const file = h("input", { type: "file", accept: ".json,.xml,.yml,.yaml,.caldat,.z3d" });
   const label = h("input", { type: "text", maxlength: 300 });
-  return h("details", { style: { marginTop: "0.75rem" } }, h("summary", "Import a calibration"), field("File", file, "", "calibration.json, DICe XML, OpenCV YAML of a stereo pair"), field("Label", label),
+  return h("details", { style: { marginTop: "0.75rem" } }, h("summary", "Import a calibration"), field("File", file, "", "calibration.json, or DICe, OpenCV, MatchID, VIC-3D, pyvale file of a stereo pair"), field("Label", label),
     action("Import", async () => {
       const [chosen] = file.files ?? [];
       if (!chosen) throw api.problemOf({ cause: "No file is chosen.", remedy: "Choose the file of a stereo calibration." });

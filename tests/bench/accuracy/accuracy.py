@@ -39,6 +39,7 @@ from tests.bench.accuracy import prefilter as accuracy_prefilter
 from tests.bench.accuracy import smoothing as accuracy_smoothing
 from tests.bench.accuracy import specimen as accuracy_specimen
 from tests.bench.accuracy import strain as accuracy_strain
+from tests.bench.accuracy import strain_rim as accuracy_rim
 from tests.bench.accuracy import targets as accuracy_targets
 from tests.bench.accuracy.pages import FIGURES, write_headlines, write_section
 from tests.bench.accuracy.table import Section
@@ -61,6 +62,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "epipolar": matching.epipolar,
     **curved.SECTIONS,
     **accuracy_strain.SECTIONS,
+    **accuracy_rim.SECTIONS,
     **accuracy_specimen.SECTIONS,
     **gauges.SECTIONS,
     "cracks": accuracy_cracks.cracks,

@@ -33,18 +33,18 @@ BANDS = ((0.0, 2.0), (2.0, 5.0), (5.0, 10.5), (14.0, 40.0))
 MIDDLE_MM = 30.0  # from the crack's middle: nearer to the tips, 51 mm away, its field bends within a subset
 
 
-def _cut(camera: Camera) -> Camera:
+def cut_middle(camera: Camera) -> Camera:
     lens = camera.lens
     assert isinstance(lens, SeidelLens)
     return replace(camera, lens=replace(lens, cx_px=lens.cx_px - CORNER_PX[0], cy_px=lens.cy_px - CORNER_PX[1]))
 
 
-def _capture(clean: list[NDArray[np.float32]], seed: int) -> list[NDArray[np.uint8]]:
+def noisy(clean: list[NDArray[np.float32]], seed: int) -> list[NDArray[np.uint8]]:
     rng = np.random.default_rng(seed)
     return [np.clip(np.rint(255 * i + 2 * rng.standard_normal(i.shape)), 0, 255).astype(np.uint8) for i in clean]
 
 
-def _distance(xy: Float, line: Float) -> Float:
+def distance_px(xy: Float, line: Float) -> Float:
     a, along = line[:-1], np.diff(line, axis=0)
     t = np.clip(((xy[..., None, :] - a) * along).sum(-1) / (along**2).sum(-1), 0.0, 1.0)
     return np.linalg.norm(xy[..., None, :] - a - t[..., None] * along, axis=-1).min(axis=-1)
@@ -53,7 +53,7 @@ def _distance(xy: Float, line: Float) -> Float:
 def cracks(figures: Path) -> Section:
     """Measure the cracked panel's opening with and without its line."""
     rig = SimRig.from_toml(ROOT / "config" / "sim_panel.toml")
-    pair = StereoPair(_cut(rig.cam1.camera), _cut(rig.cam2.camera))
+    pair = StereoPair(cut_middle(rig.cam1.camera), cut_middle(rig.cam2.camera))
     before, after = make_scene(rig, "panel", load=0.0), make_scene(rig, "panel", load=LOAD_KN)
     half = CrackedPanel().half_crack_mm
     along = np.linspace(-half, half, 41)
@@ -61,14 +61,14 @@ def cracks(figures: Path) -> Section:
     line = np.asarray(pair.cam1.project(before.sys_from_body.apply(points)).xy)
     plain = PointGrid.rectangle(20, 20, SIZE_PX[0] - 21, SIZE_PX[1] - 21, spacing_px=SPACING_PX)
     grid, options = plain.with_cracks([line]), MeasureOptions(subset_px=SUBSET_PX, patch="affine")
-    clean = [_render(rig, pair, scene) for scene in (before, after)]
+    clean = [rendered(rig, pair, scene) for scene in (before, after)]
     truth = truth_at(before, pair.cam1, grid.xy_px, now=after)
-    away, middle = _distance(grid.xy_px, line), np.abs(truth.st_mm[..., 0]) < MIDDLE_MM
+    away, middle = distance_px(grid.xy_px, line), np.abs(truth.st_mm[..., 0]) < MIDDLE_MM
     fields = [
-        ReferencePair(pair, *_capture(clean[0], 2 * k)).motion(*_capture(clean[1], 2 * k + 1), grid, options)
+        ReferencePair(pair, *noisy(clean[0], 2 * k)).motion(*noisy(clean[1], 2 * k + 1), grid, options)
         for k in range(REPEATS)
     ]
-    without = ReferencePair(pair, *_capture(clean[0], 0)).motion(*_capture(clean[1], 1), plain, options)
+    without = ReferencePair(pair, *noisy(clean[0], 0)).motion(*noisy(clean[1], 1), plain, options)
     errors = np.stack([_moved(f) - truth.uvw_mm for f in fields])
     sigma = np.stack([f.sigma_mm[..., 3:] for f in fields])
     rows = _rows(fields, without, errors, sigma, away, middle)
@@ -106,7 +106,7 @@ def cracks(figures: Path) -> Section:
     )
 
 
-def _render(rig: SimRig, pair: StereoPair, scene: Scene) -> list[NDArray[np.float32]]:
+def rendered(rig: SimRig, pair: StereoPair, scene: Scene) -> list[NDArray[np.float32]]:
     options = RenderOptions(blur_px=rig.blur_px, threads=2)
     return [render(scene, camera, SIZE_PX, options=options) for camera in (pair.cam1, pair.cam2)]
 

@@ -35,7 +35,7 @@ TOPICS = (
     Topic("curved_patches", "Curved patches", ("curved-sphere", "curved-noise", "curved-bending", "curved-auto")),
     Topic("large_motion", "Large motion in one step", ("large",)),
     Topic("cracks", "Cracks", ("cracks",)),
-    Topic("strain", "Strain", ("strains", "strain-bending")),
+    Topic("strain", "Strain", ("strains", "strain-bending", "strain-rim")),
     Topic("gauges", "Gauges", ("gauges",)),
     Topic("long_sequences", "Long sequences", ("updates",)),
     Topic("smoothing", "Smoothing", ("smoothing",)),

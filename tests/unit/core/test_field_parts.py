@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
+from core.cameras.camera import Camera, RigidTransform
+from core.cameras.stereo import StereoPair
+from core.errors import InputError
 from core.field.checks.validity import ValidityOptions, apply_validity_checks, neighbour_disagreement
 from core.field.points.features import detect, match
 from core.field.points.fitter import PointFits
@@ -17,7 +21,7 @@ from core.field.seeding.local_fit import consistent, robust_local_fits
 from core.field.seeding.predict import predict
 from core.field.seeding.scattered_matches import combine
 from core.matching.fit import no_motion
-from core.measure import MeasureOptions, ReferencePair
+from core.measure import MeasureOptions, ReferencePair, measure_shape
 from core.status import PointStatus
 from core.threads import available_threads, set_threads
 from tests.support.field_bench import grid, pair, scene, take, truth
@@ -284,3 +288,21 @@ def test_a_smooth_motion_of_a_sample_is_carried_to_all_points_and_an_erratic_one
     erratic[:, :, 0] += 1e-3 * rng.standard_normal((len(sample), 3))
     assert predict(pair(), XY, still, sample, w[sample], erratic) is still
     assert predict(pair(), XY, still, sample[:5], w[sample[:5]], now[sample[:5]]) is still
+
+
+def test_cameras_in_one_place_are_refused_before_any_search() -> None:
+    """Also where composed poses leave a baseline of rounding alone, and whatever the entry."""
+    first, image = pair().cam1, np.random.default_rng(1).uniform(0.0, 255.0, (96, 96))
+    turn = RigidTransform(Rotation.from_rotvec([0.0, 0.2, 0.1]).as_matrix(), np.zeros(3))
+    moved = (turn @ first.cam_from_sys) @ first.cam_from_sys.inverse() @ first.cam_from_sys
+    for pose in (first.cam_from_sys, turn @ first.cam_from_sys, moved):
+        alike = StereoPair(first, Camera(first.lens, pose))
+        for call in (
+            lambda p: ReferencePair(p, image, image[::-1]),
+            lambda p: measure_shape(p, image, image[::-1], GRID),
+        ):
+            with pytest.raises(InputError, match="same position") as caught:
+                call(alike)
+            assert caught.value.code == "baseline_zero"
+            assert "calibration" in caught.value.remedy
+    pair().require_baseline()

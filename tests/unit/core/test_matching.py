@@ -48,6 +48,21 @@ def truth(name):
     return at, PLANES[name].position(at[:, :2]) - at
 
 
+@pytest.mark.parametrize("off_rad", [0.0, 1e-12, 1e-9, 1e-7, 1e-3, 0.1])
+@pytest.mark.parametrize("axis", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.6, -0.48, 0.64)])
+def test_half_a_turn_is_reported_as_half_a_turn(axis, off_rad):
+    pair = paper_pair()
+    w = true_w(pair.cam1, PLANES["rest"], XY)
+    true = Rotation.from_rotvec((np.pi - off_rad) * np.array(axis))
+    turned = Plane(np.array([1.0, -2.0, 5.0]), true.as_matrix()[:, :2])
+    found = motion_geometry(pair, XY, w, true_g(pair.cam1, PLANES["rest"], turned, XY)).rotation_rad
+    angle = np.linalg.norm(found, axis=1)
+    # G's own rounding, 1e-16 over the rays' differences across a patch of 1e-2, and twice that in a product
+    np.testing.assert_allclose(angle, np.pi - off_rad, atol=1e-12)
+    error = (Rotation.from_rotvec(found) * true.inv()).magnitude()
+    np.testing.assert_allclose(error, 0.0, atol=1e-12)
+
+
 @pytest.mark.parametrize(("interpolation", "limit_um"), [("cubic", 0.06), ("quintic", 0.03)])
 def test_noise_free_shape_is_the_plane(interpolation, limit_um):
     pair = paper_pair()
@@ -70,6 +85,31 @@ def test_noise_free_motion_of_a_stretch_patch(name, interpolation):
     motion = motion_geometry(pair, XY, fit.w, fit.G)
     error_um = 1e3 * (motion.uvw_mm - truth(name)[1])
     assert np.sqrt((error_um**2).mean(0)).max() < (0.1 if interpolation == "cubic" else 0.06)
+
+
+@pytest.mark.parametrize(("interpolation", "patch"), [("quintic", "affine"), ("quintic", "rigid"), ("cubic", "affine")])
+@pytest.mark.parametrize("mean", [3e3, 1e5, 3e5])
+def test_images_whose_mean_is_thousands_of_times_their_contrast_are_measured(mean, interpolation, patch):
+    """The same shape and motion but for the rounding of pixels that high to float32."""
+    pair, rng = paper_pair(), np.random.default_rng(3)
+    pictures = [image.astype(float) for image in (*noisy("rest", 2.0, rng), *noisy("moved", 2.0, rng))]
+    w, G = starts("moved")
+    options = MatchOptions(subset_px=21, interpolation=interpolation, patch=patch)
+    plain = fit_motion(pair, *pictures, XY, w, G, options)
+    raised = [image + mean for image in pictures]
+    found = fit_motion(pair, *raised, XY, w, G, options)
+    assert (found.status == 0).all()
+    shape, flat = fit_shape(pair, *raised[:2], XY, w, options), fit_shape(pair, *pictures[:2], XY, w, options)
+    assert (shape.status == 0).all()
+    # the last step is smaller than 1e-3 px, a tenth of sigma; a grey level of 3e5 is rounded by 0.02, noise 2
+    share = 0.1 + 3e-7 * mean
+    for a, b, sigma in (
+        (found.w[:, 0], plain.w[:, 0], np.sqrt(plain.covariance[:, 0, 0])),
+        (found.G[:, 2, 0], plain.G[:, 2, 0], np.sqrt(plain.covariance[:, 3, 3])),
+        (shape.w[:, 0], flat.w[:, 0], np.sqrt(flat.covariance[:, 0, 0])),
+    ):
+        assert np.abs((a - b) / sigma).max() < share
+    np.testing.assert_allclose(found.noise, plain.noise, rtol=0.05)
 
 
 def test_noise_stays_within_the_study_and_is_reported():

@@ -10,9 +10,12 @@ import pytest
 from scipy.linalg import logm, sqrtm
 
 from core.errors import InputError
+from core.field.points.shared_pixels import SharedPixels
 from core.field.region.cuts import Cuts
 from core.status import PointStatus
 from core.strain import StrainField, StrainOptions, StrainStatus, surface_strain
+from core.strain.surface import surface_slopes
+from core.strain.tensors import strain_slopes
 from tests.support.strain_fields import cylinder, make_field, plane, sphere, turned
 
 F_SMALL = np.array([[1.001, 0.0004, 0], [-0.0002, 0.9995, 0], [0, 0, 1]])
@@ -169,6 +172,33 @@ def test_strain_gradient_planes_and_quadratics():
     assert planes.status[0, 0] == StrainStatus.TOO_FEW
 
 
+@pytest.mark.parametrize("tensor", ["green_lagrange", "infinitesimal", "hencky"])
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_strains_derivatives_over_the_positions_are_its_differences(tensor, order):
+    """The surface rotates out of its plane by 0.1, where the frame's own tilt with the positions' noise counts."""
+    F = turned((0.3, 1.0, 0.0), np.degrees(0.1)) @ F_SMALL
+    field = make_field(lambda a, b: np.stack([a, b, 0.1 * a - 0.05 * b], axis=-1), lambda p: p @ F.T, shape=(7, 7))
+    options = StrainOptions(window=7, tensor=tensor, order=order)
+    slopes, surface, _, _ = surface_slopes(field, options, SharedPixels.of(field, 33))
+    frame, per_mm, gradient, strain = surface.frame, surface.per_mm, surface.gradient, surface.strain
+    at = int(np.flatnonzero((slopes.status == StrainStatus.OK).ravel()).tolist().index(3 * 7 + 3))
+    D = strain_slopes(frame, gradient, tensor, per_mm, strain)[at]
+    # the axes also turn within the plane, by a tenth of a tilt: that share of the strain, for slopes per mm
+    small = 0.15 * np.abs(strain[at]).max() * np.abs(per_mm[at]).max()
+    row, col = np.mgrid[-3:4, -3:4]
+    step = 1e-6  # mm a point: the second order is 1e-6 of the first, rounding 1e-9
+    for k in range(6):
+        for a, way in enumerate((col, row)):
+            found = []
+            for sign in (-1.0, 1.0):
+                shift = np.zeros((7, 7, 6))
+                shift[..., k] = sign * step * way
+                moved = replace(field, xyz_mm=field.xyz_mm + shift[..., :3], uvw_mm=field.uvw_mm + shift[..., 3:])
+                found.append(surface_strain(moved, options, subset_px=33).strain[3, 3])
+            difference = (found[1] - found[0]) / (2.0 * step)
+            np.testing.assert_allclose(D[:, a, k], difference, atol=small, err_msg=f"component {k}, way {a}")
+
+
 def test_derived_figures():
     U = np.array([[1.02, 0.004, 0], [0.004, 0.99, 0], [0, 0, 1.0]])
     found = _strain(make_field(plane, lambda p: p @ U.T), tensor="hencky")
@@ -208,6 +238,100 @@ def test_patch_strain_is_the_same_tensor(tensor):
     found = _strain(field, tensor=tensor)
     assert found.patch is not None
     np.testing.assert_allclose(found.patch[found.valid], found.strain[found.valid], atol=1e-10)
+
+
+# one-sided windows: planes or quadratics
+
+
+def _flat(a, b):
+    return np.stack([a, b, 0 * a], axis=-1)
+
+
+def _graded(k):
+    """exx = k x to first order; k in 1/mm."""
+    return make_field(_flat, lambda p: p + np.stack([0.5 * k * p[..., 0] ** 2, 0 * p[..., 0], 0 * p[..., 0]], axis=-1))
+
+
+@pytest.mark.parametrize("tensor", ["green_lagrange", "infinitesimal", "hencky"])
+def test_a_steep_strain_takes_quadratics_at_the_rim_and_reports_their_noise(tensor):
+    k = 3e-3
+    field = _graded(k)
+    one, two, auto = (_strain(field, order=order, tensor=tensor) for order in (1, 2, "auto"))
+    e = k * field.xyz_mm[..., 0]
+    exact = {"green_lagrange": e + 0.5 * e**2, "infinitesimal": e, "hencky": np.log1p(e)}[tensor]
+    rim = (slice(5, -5), [0, 1, -2, -1])
+    assert auto.raised[rim].all()
+    # the third derivative that the tensor's square makes is left: k^2 over a window of 1.3 mm
+    np.testing.assert_allclose(auto.strain[rim][..., 0], exact[rim], atol=2.0 * k**2)
+    np.testing.assert_array_equal(auto.strain[rim], two.strain[rim])
+    np.testing.assert_array_equal(auto.sigma[rim], two.sigma[rim])
+    assert (np.abs(one.strain[rim][..., 0] - exact[rim]) > 2.0 * one.sigma[rim][..., 0]).all()
+    whole = (slice(4, -4), slice(4, -4))
+    assert not auto.raised[whole].any()
+    np.testing.assert_array_equal(auto.strain[whole], one.strain[whole])
+    np.testing.assert_array_equal(auto.covariance[whole], one.covariance[whole])
+
+
+@pytest.mark.parametrize("k", [0.0, 3e-5, 1e-4, 2e-4, 1e-3])
+def test_what_planes_leave_at_the_rim_lies_below_the_reported_uncertainty(k):
+    """Also where they stay because their error is smaller than the noise of quadratics."""
+    field = _graded(k)
+    one, auto = _strain(field, tensor="infinitesimal", order=1), _strain(field, tensor="infinitesimal", order="auto")
+    exact = k * field.xyz_mm[..., 0]
+    error = np.abs(auto.strain[..., 0] - exact)[auto.valid]
+    assert (error <= auto.sigma[..., 0][auto.valid]).all()
+    kept = auto.valid & ~auto.raised
+    np.testing.assert_array_equal(auto.strain[kept], one.strain[kept])
+    assert (auto.sigma[kept] >= one.sigma[kept]).all()
+    if k == 0.0:
+        assert not auto.raised.any()
+        np.testing.assert_array_equal(auto.covariance[auto.valid], one.covariance[auto.valid])
+    np.testing.assert_array_equal(auto.valid, one.valid)
+
+
+def test_a_bend_without_strain_leaves_planes_where_they_are():
+    """A sheet rolled up to 20 mm: its second derivatives stand on the surface and are no gradient of strain."""
+    radius = 20.0
+
+    def rolled(p):
+        s = p[..., 0] / radius
+        return np.stack([radius * np.sin(s), p[..., 1], radius * (1.0 - np.cos(s))], axis=-1)
+
+    found = _strain(make_field(_flat, rolled), order="auto")
+    assert not found.raised.any()
+    # what the curvature's correction leaves of h^4 / R^4 in windows of a few points: some 0.1 microstrain
+    assert np.abs(found.strain[found.valid]).max() < 1e-6
+
+
+@pytest.mark.parametrize("k", [2e-4, 1e-3, 3e-3])
+def test_a_rotation_does_not_change_the_choice(k):
+    R = turned((0.2, -0.5, 1.0), 33.0)
+    plain = _graded(k)
+    moved = replace(plain, uvw_mm=(plain.xyz_mm + plain.uvw_mm) @ R.T - plain.xyz_mm)
+    for tensor in ("green_lagrange", "hencky"):
+        a, b = _strain(plain, tensor=tensor, order="auto"), _strain(moved, tensor=tensor, order="auto")
+        np.testing.assert_array_equal(a.raised, b.raised)
+        np.testing.assert_allclose(a.strain[a.valid], b.strain[b.valid], atol=1e-12)
+        assert a.raised.any() == (k > 2e-4)
+
+
+def test_both_flanks_of_a_crack_have_the_strain_at_the_point():
+    """The sides have gradients of their own; a window that the cut halves is as one-sided as one at the rim."""
+    k = np.array([2e-3, -3e-3])
+    x_cut = 100.0 + 10.0 * 17 + 5.0
+    cuts = Cuts([[(x_cut, 0.0), (x_cut, 1000.0)]])
+
+    def pull(p):
+        side = (p[..., 0] > 0.165).astype(int)
+        return p + np.stack([0.5 * k[side] * p[..., 0] ** 2 + 0.05 * side, 0 * p[..., 0], 0 * p[..., 0]], axis=-1)
+
+    field = make_field(_flat, pull, cuts=cuts)
+    found = _strain(field, tensor="infinitesimal", order="auto")
+    side = (field.xyz_mm[..., 0] > 0.165).astype(int)
+    exact = k[side] * field.xyz_mm[..., 0]
+    flanks = (slice(5, -5), [16, 17, 18, 19])
+    assert found.raised[flanks].all()
+    np.testing.assert_allclose(found.strain[flanks][..., 0], exact[flanks], atol=1e-9)
 
 
 # edges, holes, cracks

@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import yaml
+from server.formats.calibrations.plausibility import check_calibration
 
 from core.cameras.camera import Camera
 from core.cameras.lens import OpenCVLens
 from core.errors import FileFormatError
-from server.formats.calibrations.plausibility import check_calibration
-from server.formats.calibrations.recognise import LoadedCalibration, load_calibration, parse_calibration
+from server.formats.calibrations.recognise import (
+    LoadedCalibration,
+    imported_content,
+    load_calibration,
+    parse_calibration,
+)
 
 K1 = np.array([[6638.6, 0.0, 981.5], [0.0, 6639.8, 610.0], [0.0, 0.0, 1.0]])
 K2 = np.array([[6644.7, 0.0, 1005.4], [0.0, 6644.1, 567.3], [0.0, 0.0, 1.0]])
@@ -242,12 +248,23 @@ def test_dice_cameras_placed_in_the_world(relative: str | None) -> None:
     check_against_opencv(load_text(moved))
 
 
+def test_two_poses_of_one_position_are_refused_though_rounding_leaves_a_length() -> None:
+    """Cameras in one place, turned against each other: composed, their poses leave 1e-14 mm."""
+    turns = [cv2.Rodrigues(np.array(v))[0] for v in ([0.3, 0.1, -0.2], [0.31, -0.25, 0.4])]
+    centre = np.array([12.3, -45.6, 789.1])
+    first, second = (-turn @ centre for turn in turns)
+    text = dice_text(relative="false", r1=turns[0], t1=first, rotation=matrix(turns[1]), translation=second)
+    with pytest.raises(FileFormatError, match="same position") as caught:
+        load_text(text)
+    assert caught.value.code == "calibration_invalid"
+
+
 def test_dice_euler_angles_mean_what_its_own_matrix_says(specimen_dir: Path) -> None:
     text = (specimen_dir / "calibration_dice.xml").read_text()
     found = re.findall(r"ALPHA (\S+) BETA (\S+) GAMMA (\S+) \(radians\)", text)[1]
     angles = "".join(
         f'<Parameter name="{k}" type="double" value="{v}"/>'
-        for k, v in zip(("ALPHA", "BETA", "GAMMA"), found, strict=True)
+        for k, v in zip(("ALPHA", "BETA", "GAMMA"), np.degrees([float(v) for v in found]), strict=True)
     )
     expected = load_calibration(specimen_dir / "calibration_dice.xml").pair.cam2_from_cam1.rotation
     got = load_text(dice_text(rotation=angles)).pair.cam2_from_cam1.rotation
@@ -269,7 +286,6 @@ def test_the_specimens_calibration(specimen_dir: Path) -> None:
         ('value="OPENCV_LENS_DISTORTION"', 'value="VIC3D_LENS_DISTORTION"', "calibration_unsupported", "VIC3D_LENS"),
         ('value="OPENCV_LENS_DISTORTION"', 'value="K1R2_K2R4_K3R6"', "calibration_unsupported", "K1R2_K2R4_K3R6"),
         ('value="OPENCV_LENS_DISTORTION"', 'value="NONE"', "calibration_unsupported", "distortion coefficients"),
-        ('value="OPENCV"', 'value="VIC3D"', "calibration_unsupported", "VIC3D"),
         ('value="OPENCV"', 'value="SOMETHING"', "calibration_unsupported", "SOMETHING"),
         ('name="system_type_3D"', 'name="other"', "calibration_unsupported", "none given"),
         ("DICe_xml_camera_system_file", "else", "calibration_unreadable", "DICe_xml"),
@@ -322,6 +338,195 @@ def test_xml_bombs_are_refused() -> None:
     with pytest.raises(FileFormatError) as caught:
         load_text(bomb)
     assert caught.value.code == "calibration_unreadable"
+
+
+# the forms below are made here by the layouts that their programs write, and projected by formulas written out below
+
+BROWN1, BROWN2 = {"k1": 0.08, "k2": -0.9, "k3": 3.1}, {"k1": -0.05, "k2": 0.4, "k3": -2.2}
+ANGLES_DEG = (0.7, -18.2, 1.3)
+SHIFT_MM = (121.4, 0.574, 23.19)
+SKEWS_PX = (-2.5, 3.7)
+
+
+def turn_of(alpha_deg: float, beta_deg: float, gamma_deg: float) -> np.ndarray:
+    """First about x by alpha, then about the fixed y by beta, then about the fixed z by gamma: by Rodrigues."""
+    parts = np.radians([alpha_deg, beta_deg, gamma_deg])
+    about_x, about_y, about_z = (cv2.Rodrigues(angle * np.eye(3)[k])[0] for k, angle in enumerate(parts))
+    return np.asarray(about_z @ about_y @ about_x)
+
+
+def brown(points: np.ndarray, K: np.ndarray, skew: float, terms: dict[str, float]) -> np.ndarray:
+    """Pixels of points in a camera's frame: (1 + k1 r2 + k2 r4 + k3 r6) / (1 + k6 r6), p1 and p2, then skewed."""
+    x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
+    k1, k2, k3, k6, p1, p2 = (terms.get(key, 0.0) for key in ("k1", "k2", "k3", "k6", "p1", "p2"))
+    r2 = x * x + y * y
+    radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k6 * r2**3)
+    bent_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    bent_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return np.stack([K[0, 0] * bent_x + skew * bent_y + K[0, 2], K[1, 1] * bent_y + K[1, 2]], axis=1)
+
+
+def check_against_brown(
+    loaded: LoadedCalibration, terms1: dict[str, float], terms2: dict[str, float], skews: tuple[float, float] = SKEWS_PX
+) -> None:
+    in_cam2 = POINTS @ turn_of(*ANGLES_DEG).T + np.array(SHIFT_MM)
+    for camera, theirs in (
+        (loaded.pair.cam1, brown(POINTS, K1, skews[0], terms1)),
+        (loaded.pair.cam2, brown(in_cam2, K2, skews[1], terms2)),
+    ):
+        np.testing.assert_allclose(camera.project(POINTS).xy, theirs, atol=1e-8)
+
+
+def dice_lines(*, matrix: bool = False, size: bool = True, comments: bool = True, third: str = "k3") -> list[str]:
+    names, values = [], []
+    for K, skew, terms in ((K1, SKEWS_PX[0], BROWN1), (K2, SKEWS_PX[1], BROWN2)):
+        names += ["cx", "cy", "fx", "fy", "fs", "k1", "k2", third]
+        values += [K[0, 2], K[1, 2], K[0, 0], K[1, 1], skew, terms["k1"], terms["k2"], terms["k3"]]
+    if matrix:
+        names += [f"R{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
+        values += turn_of(*ANGLES_DEG).ravel().tolist()
+    else:
+        names += ["alpha", "beta", "gamma"]
+        values += ANGLES_DEG
+    names, values = [*names, "tx", "ty", "tz"], [*values, *SHIFT_MM]
+    lines = [f"{v:.15e}" + (f" # {n}" if comments else "") for n, v in zip(names, values, strict=True)]
+    return [*lines, "1200", "1920 # width"] if size else lines
+
+
+@pytest.mark.parametrize("matrix", [False, True])
+@pytest.mark.parametrize("size", [False, True])
+@pytest.mark.parametrize("comments", [False, True])
+def test_dices_text_in_each_of_its_layouts(matrix: bool, size: bool, comments: bool) -> None:
+    text = "\n".join(["# a head", "", *dice_lines(matrix=matrix, size=size, comments=comments)]) + "\n"
+    loaded = load_text(text)
+    assert loaded.source == "dice_txt"
+    assert loaded.image_size1_px == loaded.image_size2_px == ((1920, 1200) if size else None)
+    check_against_brown(loaded, BROWN1, BROWN2)
+    assert any("r^2" in warning for warning in check_calibration(loaded).warnings)
+    wrapped = json.dumps(imported_content(text.encode(), name="a.txt"))
+    check_against_brown(load_text(wrapped), BROWN1, BROWN2)
+
+
+def test_the_third_term_that_dices_own_calibration_wrote_is_opencvs_k6() -> None:
+    terms1, terms2 = ({"k1": t["k1"], "k2": t["k2"], "k6": t["k3"]} for t in (BROWN1, BROWN2))
+    check_against_brown(load_text("\n".join(dice_lines(matrix=True, third="k6"))), terms1, terms2)
+
+
+def test_dices_text_without_lens_terms_needs_no_warning() -> None:
+    lines = [re.sub(r"^\S+ # k\d", "0.0 # none", line) for line in dice_lines()]
+    loaded = load_text("\n".join(lines))
+    check_against_brown(loaded, {}, {})
+    assert check_calibration(loaded).warnings == []
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "word"),
+    [
+        (lambda lines: lines[:-3], "calibration_unreadable", "21 numbers"),
+        (lambda lines: lines[:12], "calibration_unreadable", "12 numbers"),
+        (
+            lambda lines: [*lines[:2], lines[3], lines[2], *lines[4:]],
+            "calibration_unreadable",
+            "commented fy, where fx",
+        ),
+        (lambda lines: [*lines[:9], "x # cy", *lines[10:]], "calibration_unreadable", "line 10 is 'x'"),
+        (lambda lines: [*lines[:9], "nan # cy", *lines[10:]], "calibration_invalid", "cy in line 10"),
+        (
+            lambda lines: ["0 # cx" if "cx" in n else n.replace("6.6386", "-6.6386") for n in lines],
+            "calibration_invalid",
+            "fx",
+        ),
+        (lambda lines: [re.sub(r"^\S+ # t", "0.0 # t", n) for n in lines], "calibration_invalid", "same position"),
+        (lambda lines: [*lines, "TRANSFORM", *"123456"], "calibration_unsupported", "TRANSFORM"),
+    ],
+)
+def test_dices_texts_that_are_refused(change: Callable[[list[str]], list[str]], code: str, word: str) -> None:
+    with pytest.raises(FileFormatError) as caught:
+        load_text("\n".join(change(dice_lines())))
+    assert caught.value.code == code
+    assert word in caught.value.cause
+
+
+def vic3d_in_dice(model: str = "VIC3D_LENS_DISTORTION", extra: str = "") -> str:
+    """A camera system of type VIC3D: both cameras placed in the world by angles in degrees."""
+    world, at = turn_of(179.6, 9.2, -0.4), np.array([-63.2, -0.34, 18.7])
+    second = turn_of(*ANGLES_DEG) @ world
+    poses = (world, at), (second, turn_of(*ANGLES_DEG) @ at + np.array(SHIFT_MM))
+    cameras = []
+    for i, (K, skew, terms, (R_world, t)) in enumerate(zip((K1, K2), SKEWS_PX, (BROWN1, BROWN2), poses, strict=True)):
+        beta = np.degrees(np.arcsin(-R_world[2, 0]))
+        alpha, gamma = np.degrees([np.arctan2(R_world[2, 1], R_world[2, 2]), np.arctan2(R_world[1, 0], R_world[0, 0])])
+        values = {"CX": K[0, 2], "CY": K[1, 2], "FX": K[0, 0], "FY": K[1, 1], "FS": skew}
+        values |= {key.upper(): value for key, value in terms.items()}
+        values |= {"ALPHA": alpha, "BETA": beta, "GAMMA": gamma, "TX": t[0], "TY": t[1], "TZ": t[2]}
+        lines = [f'<Parameter name="{k}" type="double" value="{float(v)!r}" />' for k, v in values.items()]
+        lines.append(f'<Parameter name="LENS_DISTORTION_MODEL" type="string" value="{model}" />{extra}')
+        lines.append('<Parameter name="IMAGE_HEIGHT_WIDTH" type="string" value="{ 1200, 1920 }" />')
+        cameras.append(f'<ParameterList name="CAMERA {i}">\n' + "\n".join(lines) + "\n</ParameterList>")
+    return (
+        '<ParameterList>\n<Parameter name="xml_file_format" type="string" value="DICe_xml_camera_system_file" />\n'
+        '<Parameter name="system_type_3D" type="string" value="VIC3D" />\n' + "\n".join(cameras) + "\n</ParameterList>"
+    )
+
+
+@pytest.mark.parametrize("model", ["VIC3D_LENS_DISTORTION", "K1R1_K2R2_K3R3", "K1R3_K2R5_K3R7"])
+def test_dices_xml_of_type_vic3d_is_read_as_vic3ds_own_numbers(model: str) -> None:
+    loaded = load_text(vic3d_in_dice(model))
+    assert loaded.source == "dice_xml"
+    assert loaded.image_size2_px == (1920, 1200)
+    check_against_brown(loaded, BROWN1, BROWN2)
+    assert any("VIC-3D's" in warning for warning in check_calibration(loaded).warnings)
+
+
+def test_dices_xml_of_type_vic3d_refuses_terms_that_vic3d_does_not_have() -> None:
+    for model, extra, word in (
+        ("K1R2_K2R4_K3R6", "", "K1R2_K2R4_K3R6"),
+        ("VIC3D_LENS_DISTORTION", '<Parameter name="P1" type="double" value="0.001" />', "P1"),
+        ("VIC3D_LENS_DISTORTION", '<Parameter name="K4" type="double" value="0.001" />', "K4"),
+    ):
+        with pytest.raises(FileFormatError, match=word) as caught:
+            load_text(vic3d_in_dice(model, extra))
+        assert caught.value.code == "calibration_unsupported"
+
+
+def pyvale_lines(separator: str = ",") -> list[str]:
+    rows: list[tuple[str, float]] = []
+    for k, (K, skew, terms) in enumerate(((K1, SKEWS_PX[0], BROWN1), (K2, SKEWS_PX[1], BROWN2))):
+        pixels = {"fx": K[0, 0], "fy": K[1, 1], "fs": skew, "cx": K[0, 2], "cy": K[1, 2]}
+        rows += [(f"cam{k}_{key}_px", value) for key, value in pixels.items()]
+        bent = {"k1": terms["k1"], "k2": terms["k2"], "p1": 1e-3 * (k + 1), "p2": -5e-4, "k3": terms["k3"]}
+        rows += [(f"cam{k}_{key}", value) for key, value in bent.items()]
+    rows += zip(("tx_mm", "ty_mm", "tz_mm"), SHIFT_MM, strict=True)
+    rows += zip(("theta_deg", "phi_deg", "psi_deg"), ANGLES_DEG, strict=True)
+    return [f"{name}{separator}{float(value)!r}" for name, value in rows]
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t", " "])
+def test_pyvales_text(separator: str) -> None:
+    loaded = load_text("\r\n".join(pyvale_lines(separator)) + "\r\n")
+    assert loaded.source == "pyvale_txt"
+    assert loaded.image_size1_px is None
+    check_against_brown(loaded, {**BROWN1, "p1": 1e-3, "p2": -5e-4}, {**BROWN2, "p1": 2e-3, "p2": -5e-4})
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "code", "word"),
+    [
+        ("cam1_k3", "cam1_k4", "calibration_unreadable", "lacks cam1_k3"),
+        ("psi_deg", "phi_deg", "calibration_unreadable", "phi_deg occurs twice"),
+        ("tx_mm,121.4", "tx_mm,here", "calibration_unreadable", "'here'"),
+        ("tx_mm,121.4", "tx_mm", "calibration_unreadable", "line 21"),
+        ("tx_mm,121.4", "tx_mm,inf", "calibration_invalid", "tx_mm is inf"),
+        ("cam0_fx_px,6", "cam0_fx_px,-6", "calibration_invalid", "fx"),
+    ],
+)
+def test_pyvales_texts_that_are_refused(old: str, new: str, code: str, word: str) -> None:
+    text = "\n".join(pyvale_lines())
+    assert old in text
+    with pytest.raises(FileFormatError) as caught:
+        load_text(text.replace(old, new))
+    assert caught.value.code == code
+    assert word in caught.value.cause
 
 
 OURS = {

@@ -28,7 +28,7 @@ from server.api.protocol.problems import errors
 from server.base.errors import NotFoundError
 from server.base.json_values import without_nan
 from server.base.models import Ids
-from server.formats.calibrations.plausibility import check_calibration
+from server.formats.calibrations.programs.plausibility import check_calibration
 from server.formats.calibrations.recognise import imported_content, parse_calibration
 from server.formats.images import read_image
 from server.results.reader import read_residuals
@@ -87,7 +87,10 @@ def import_calibration(
     service: ServiceDep,
     file: Annotated[
         UploadFile,
-        File(description="calibration.json, DICe XML, OpenCV YAML, MatchID caldat or VIC-3D XML of a stereo pair."),
+        File(
+            description="calibration.json, DICe XML or text, OpenCV YAML, MatchID caldat, VIC-3D XML or pyvale text of "
+            "a stereo pair."
+        ),
     ],
     label: Annotated[Label, Form(description="Free text.")] = "",
     key: KeyHeader = None,

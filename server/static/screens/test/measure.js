@@ -162,7 +162,7 @@ export async function measurePanel(id, test, ends, done) {
     const smoothing = number(null, { min: 3, step: 2, placeholder: "none" });
     const strain = h("input", { type: "checkbox", checked: true });
     const window_ = number(9, { min: 3, step: 2 });
-    const order = select([[1, "planes"], [2, "quadratics"]], 1);
+    const order = select([["auto", "planes or quadratics"], [1, "planes"], [2, "quadratics"]], "auto");
     const tensor = select([["green_lagrange", "Green-Lagrange"], ["infinitesimal", "infinitesimal"], ["hencky", "Hencky (logarithmic)"]], "green_lagrange");
     const noiseChoice = select([["", "from the residuals"], ...noise.filter((one) => one.state === "complete" || !one.state).map((one) => [one.id, String(one.plan.label || one.id)])], "");
     noiseChoice.addEventListener("change", changed);
@@ -186,7 +186,7 @@ export async function measurePanel(id, test, ends, done) {
       const body_ = {
         kind: /** @type {Request["kind"]} */ (kind.value), region, subset_px: Number(subset.value), spacing_px: Number(spacing.value), patch: /** @type {Request["patch"]} */ (patch.value), interpolation: /** @type {Request["interpolation"]} */ (interpolation.value), prefilter_px: Number(prefilter.value),
         reference: Number(reference.value), reference_update: /** @type {Request["reference_update"]} */ (update.value), noise_id: noiseChoice.value || null, label: label.value, ...editor.seeds(),
-        smoothing_window: smoothing.value === "" ? null : Number(smoothing.value), strain: strain.checked ? /** @type {Request["strain"]} */ ({ window: Number(window_.value), order: Number(order.value), tensor: tensor.value }) : null,
+        smoothing_window: smoothing.value === "" ? null : Number(smoothing.value), strain: strain.checked ? /** @type {Request["strain"]} */ ({ window: Number(window_.value), order: order.value === "auto" ? "auto" : Number(order.value), tensor: tensor.value }) : null,
       };
       const wanted = stepList(which.value);
       if (wanted) body_.steps = wanted;

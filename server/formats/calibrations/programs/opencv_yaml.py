@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
-from server.formats.calibrations.imported_pair import invalid, opencv_lens, pair_of, unreadable, unsupported
+from server.formats.calibrations.programs.imported_pair import invalid, opencv_lens, pair_of, unreadable, unsupported
 
 ImageSize = tuple[int, int] | None
 

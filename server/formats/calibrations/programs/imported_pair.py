@@ -15,6 +15,7 @@ from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError
 
+_MIN_BASELINE_MM = 1e-9  # two equal poses, composed, leave the digits' end
 _ROTATION_TOLERANCE = 1e-4  # files carry six digits and more; a wrong axis order is off by far more
 
 
@@ -23,8 +24,8 @@ def unreadable(name: str, why: str) -> FileFormatError:
     return FileFormatError(
         f"{name} cannot be read as a calibration: {why}.",
         code="calibration_unreadable",
-        remedy="Give a calibration.json, a DICe XML camera system, an OpenCV YAML stereo calibration, a MatchID caldat "
-        "or a VIC-3D file.",
+        remedy="Give a calibration.json, a DICe XML camera system or text camera file, an OpenCV YAML stereo "
+        "calibration, a MatchID caldat, a VIC-3D file or a pyvale text.",
     )
 
 
@@ -94,7 +95,7 @@ def pair_of(
         raise unreadable(name, f"T has {t.size} numbers, not 3")
     if not np.isfinite(t).all():
         raise invalid(name, "T holds a number that is not finite")
-    if not np.linalg.norm(t) > 0.0:
+    if not np.linalg.norm(t) > _MIN_BASELINE_MM:
         raise invalid(name, "both cameras have the same position (T is zero)")
     return StereoPair(Camera(lens1, RigidTransform.identity()), Camera(lens2, RigidTransform(R, t)))
 

@@ -2,8 +2,12 @@
 
 DICe counts cameras from 0: its camera 0 is camera 1 here. With ``extrinsics_relative_camera_to_camera`` the second
 camera's matrix and TX TY TZ are ``X_cam1 = R X_cam0 + T``, else each camera's are ``X_cam = R X_world + T``. Euler
-angles are radians with R = Rz(gamma) Ry(beta) Rx(alpha). Only OpenCV's lens (or none) is taken: what DICe's other
-lens models mean in pixels is not written in the file.
+angles are degrees with R = Rz(gamma) Ry(beta) Rx(alpha) (the comment that DICe writes beside a matrix has them in
+radians).
+
+Of the lens models OpenCV's is taken, none, and ``K1R3_K2R5_K3R7``, the same as OpenCV's k1 k2 k3. A system of type
+VIC3D holds VIC-3D's numbers: its lens is read as VIC-3D's own files are, with the skew in pixels; DICe itself only
+guesses that polynomial. What the other models and FS mean elsewhere in pixels is not written in the file.
 """
 
 from __future__ import annotations
@@ -18,7 +22,8 @@ from numpy.typing import NDArray
 from core.cameras.camera import RigidTransform
 from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
-from server.formats.calibrations.imported_pair import (
+from server.formats.calibrations.programs.imported_pair import (
+    euler_zyx,
     invalid,
     opencv_lens,
     pair_of,
@@ -29,12 +34,19 @@ from server.formats.calibrations.imported_pair import (
 
 ImageSize = tuple[int, int] | None
 
-_SYSTEMS = ("OPENCV", "GENERIC_SYSTEM")
+VIC3D_NOTE = (
+    "the lens was taken as VIC-3D's, 1 + k1 r^2 + k2 r^4 + k3 r^6, from which its numbers come; DICe itself reads them "
+    "in another way: check the calibration with points that it has measured"
+)
+_VIC3D = "VIC3D"
+_SYSTEMS = ("OPENCV", "GENERIC_SYSTEM", _VIC3D)
 _OPENCV_LENSES = ("OPENCV_LENS_DISTORTION", "OPENCV_DIS")
 _NO_LENSES = ("NO_LENS_DISTORTION", "NONE")
+_RADIAL_LENS = "K1R3_K2R5_K3R7"
+_VIC3D_LENSES = ("VIC3D_LENS_DISTORTION", "VIC3D_DIS", "K1R1_K2R2_K3R3")  # of a system of type VIC3D
 _DISTORTION = ("K1", "K2", "K3", "P1", "P2")
 _RATIONAL = ("K4", "K5", "K6")  # read, not written
-_NOT_CARRIED = ("FS", "S1", "S2", "S3", "S4", "T1", "T2")
+_NOT_CARRIED = ("S1", "S2", "S3", "S4", "T1", "T2")
 
 
 def is_dice(data: bytes) -> bool:
@@ -85,12 +97,7 @@ def _rotation(name: str, where: str, camera: Element, values: dict[str, str]) ->
     if len(matrices) > 1 or (matrices and angles):
         raise unreadable(name, f"the rotation of {where} is given more than once")
     if not matrices:
-        a, b, g = (_number(name, where, key, values) for key in ("ALPHA", "BETA", "GAMMA"))
-        ca, sa, cb, sb, cg, sg = np.cos(a), np.sin(a), np.cos(b), np.sin(b), np.cos(g), np.sin(g)
-        rz = np.array([[cg, -sg, 0.0], [sg, cg, 0.0], [0.0, 0.0, 1.0]])
-        ry = np.array([[cb, 0.0, sb], [0.0, 1.0, 0.0], [-sb, 0.0, cb]])
-        rx = np.array([[1.0, 0.0, 0.0], [0.0, ca, -sa], [0.0, sa, ca]])
-        return np.asarray(rz @ ry @ rx)
+        return euler_zyx(*(_number(name, where, key, values) for key in ("ALPHA", "BETA", "GAMMA")))
     rows = _parameters(name, f"the rotation of {where}", matrices[0])
     if set(rows) != {"ROW 0", "ROW 1", "ROW 2"}:
         raise unreadable(name, f"the rotation of {where} has the rows {sorted(rows)}")
@@ -98,19 +105,23 @@ def _rotation(name: str, where: str, camera: Element, values: dict[str, str]) ->
     return proper_rotation(name, f"the rotation of {where}", R)
 
 
-def _camera(name: str, camera: Element) -> tuple[OpenCVLens, RigidTransform, ImageSize]:
+def _camera(name: str, camera: Element, system: str) -> tuple[OpenCVLens, RigidTransform, ImageSize]:
     where = str(camera.get("name"))
     values = _parameters(name, where, camera)
     model = values.get("LENS_DISTORTION_MODEL", "NONE")
-    if model not in (*_OPENCV_LENSES, *_NO_LENSES):
-        raise unsupported(name, f"{where} has the lens model {model}; only OPENCV_LENS_DISTORTION and NONE are known")
-    for key in _NOT_CARRIED:
+    known = (*_OPENCV_LENSES, *_NO_LENSES, _RADIAL_LENS, *(_VIC3D_LENSES if system == _VIC3D else ()))
+    if model not in known:
+        raise unsupported(name, f"{where} has the lens model {model}; {', '.join(known)} are known")
+    radial = model == _RADIAL_LENS or model in _VIC3D_LENSES
+    others = (*_RATIONAL, "P1", "P2") if radial else ()
+    for key in (*(() if system == _VIC3D else ("FS",)), *_NOT_CARRIED, *others):
         if _number(name, where, key, values) != 0.0:
-            raise unsupported(name, f"{where} has {key} = {values[key]}, which the lens model here does not have")
+            raise unsupported(name, f"{where} has {key} = {values[key]}, which its lens model here does not have")
     numbers = {key.lower(): _number(name, where, key, values, None) for key in ("FX", "FY", "CX", "CY")}
     distortion = {key.lower(): _number(name, where, key, values) for key in (*_DISTORTION, *_RATIONAL)}
     if model in _NO_LENSES and any(distortion.values()):
         raise unsupported(name, f"{where} has distortion coefficients but the lens model {model}")
+    numbers["skew"] = _number(name, where, "FS", values)
     pose = RigidTransform(
         _rotation(name, where, camera, values),
         np.array([_number(name, where, key, values) for key in ("TX", "TY", "TZ")]),
@@ -123,13 +134,14 @@ def _camera(name: str, camera: Element) -> tuple[OpenCVLens, RigidTransform, Ima
     return opencv_lens(name, where, {**numbers, **distortion}), pose, size
 
 
-def parse_dice_xml(data: bytes, *, name: str) -> tuple[StereoPair, ImageSize, ImageSize]:
+def parse_dice_xml(data: bytes, *, name: str) -> tuple[StereoPair, ImageSize, ImageSize, tuple[str, ...]]:
     """Read a DICe camera system of two cameras.
 
     Returns
     -------
     tuple
-        The pair (system frame = its camera 0) and both image sizes (width, height), None where the file has none.
+        The pair (system frame = its camera 0), both image sizes (width, height), None where the file has none, and
+        notes on what was assumed.
 
     Raises
     ------
@@ -146,15 +158,17 @@ def parse_dice_xml(data: bytes, *, name: str) -> tuple[StereoPair, ImageSize, Im
         raise unreadable(name, "it is XML, but no DICe_xml_camera_system_file")
     system = top.get("system_type_3D", "none given")
     if system not in _SYSTEMS:
-        raise unsupported(name, f"its system type is {system}; OPENCV and GENERIC_SYSTEM are known")
+        raise unsupported(name, f"its system type is {system}; {', '.join(_SYSTEMS)} are known")
     cameras = {str(c.get("name")): c for c in root.findall("ParameterList") if str(c.get("name")).startswith("CAMERA")}
     if set(cameras) != {"CAMERA 0", "CAMERA 1"}:
         raise unsupported(name, f"it has the cameras {sorted(cameras)}; a pair has CAMERA 0 and CAMERA 1")
-    lens1, pose1, size1 = _camera(name, cameras["CAMERA 0"])
-    lens2, pose2, size2 = _camera(name, cameras["CAMERA 1"])
+    lens1, pose1, size1 = _camera(name, cameras["CAMERA 0"], system)
+    lens2, pose2, size2 = _camera(name, cameras["CAMERA 1"], system)
     relative = top.get("extrinsics_relative_camera_to_camera", "false").strip().lower() in ("true", "1")
     cam2_from_cam1 = pose2 if relative else pose2 @ pose1.inverse()
-    return pair_of(name, lens1, lens2, cam2_from_cam1.rotation, cam2_from_cam1.translation_mm), size1, size2
+    bent = any(any((lens.k1, lens.k2, lens.k3)) for lens in (lens1, lens2))
+    pair = pair_of(name, lens1, lens2, cam2_from_cam1.rotation, cam2_from_cam1.translation_mm)
+    return pair, size1, size2, (VIC3D_NOTE,) if system == _VIC3D and bent else ()
 
 
 def dice_text(

@@ -161,7 +161,7 @@ def check_calibration(loaded: LoadedCalibration) -> CalibrationCheck:
 def _checked(loaded: LoadedCalibration) -> CalibrationCheck:
     size1, size2, known = image_sizes(loaded)
     points = shared_points(loaded.pair, size1, size2)
-    warnings = []
+    warnings = list(loaded.notes)
     residual = Residual(0, None, None)
     if len(points):
         xy1 = independent_projection(loaded.pair.cam1, points)

@@ -20,7 +20,7 @@ from core.arrays import Float
 from core.cameras.camera import RigidTransform
 from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
-from server.formats.calibrations.imported_pair import (
+from server.formats.calibrations.programs.imported_pair import (
     euler_zyx,
     euler_zyx_deg,
     invalid,

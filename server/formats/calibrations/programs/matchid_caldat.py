@@ -15,7 +15,7 @@ import numpy as np
 
 from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
-from server.formats.calibrations.imported_pair import (
+from server.formats.calibrations.programs.imported_pair import (
     euler_zyx,
     euler_zyx_deg,
     invalid,

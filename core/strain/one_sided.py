@@ -1,0 +1,152 @@
+"""Planes or quadratics in windows whose points an edge, a hole or a crack has left on one side.
+
+There planes give the strain in the middle of the points left, off by its gradient times that middle's distance;
+quadratics give it at the point, with several times the noise. The gradient is known better than either strain: it is
+the derivative of the metric, from the second derivatives over the windows about the point, of which those farther from
+the edge are nearly free of noise. So the planes' error is estimated, and the smaller total error taken. Where planes
+stay, what they leave counts in the reported uncertainty.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from core.arrays import Bool, Float
+from core.field.region.window import window_offsets
+from core.settings import StrainTensor
+from core.strain.result import StrainStatus
+from core.strain.tensors import as_tensor, strain_covariance
+from core.strain.window import Slopes
+
+_VALUES_AT_ONCE = 4_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class OnSurface:
+    """Windows' slopes on the surface, at the n points that have a strain.
+
+    Attributes
+    ----------
+    frame
+        (n, 3, 2) unit tangents.
+    per_mm
+        (n, 2, 2) steps of column and row (first index) per mm along them.
+    gradient
+        (n, 3, 2) the displacement's derivatives along them.
+    around
+        (n, 6, 6) the points' covariance, mean over each window.
+    strain
+        (n, 3) exx, eyy, exy.
+    """
+
+    frame: Float
+    per_mm: Float
+    gradient: Float
+    around: Float
+    strain: Float
+
+    def covariance(self, spread: Float, tensor: StrainTensor, at: np.ndarray | slice = slice(None)) -> Float:
+        """Covariance (m, 3, 3) of the strain of some points, from the spread (m, 2, 2) of the slopes in grid steps."""
+        per_mm = self.per_mm[at]
+        spread = np.swapaxes(per_mm, -1, -2) @ spread @ per_mm
+        return strain_covariance(self.frame[at], self.gradient[at], tensor, self.around[at], spread, self.strain[at])
+
+
+def raise_order(slopes: Slopes, surface: OnSurface, tensor: StrainTensor) -> tuple[Slopes, Float, Bool]:
+    """Replace planes by quadratics where these have the smaller total error.
+
+    Parameters
+    ----------
+    slopes
+        Of planes, with the quadratics beside them (order ``auto``).
+    surface
+        The same on the surface.
+    tensor
+        Which strain.
+
+    Returns
+    -------
+    tuple
+        The slopes; (r, c, 3) variance of exx, eyy, exy that the planes' bias adds, zero for quadratics and whole
+        windows; (r, c) True for quadratics.
+    """
+    assert slopes.second_spread is not None
+    good = slopes.status == StrainStatus.OK
+    number = np.cumsum(good).reshape(good.shape) - 1
+    left, raised = np.zeros((*good.shape, 3)), np.zeros(good.shape, bool)
+    slope, spread, moments, reduced = slopes.slope.copy(), slopes.spread.copy(), slopes.moments.copy(), []
+    bending = _metric_gradients(slopes, tensor)
+    for (rows, cols, weights), curved in zip(slopes.reduced, slopes.quadratics, strict=True):
+        ok = slopes.status[rows, cols] == StrainStatus.OK
+        reduced.append((rows, cols, weights))
+        if not ok.any():
+            continue
+        r, c = rows[ok], cols[ok]
+        at = number[r, c]
+        steep, noise = _around(bending, slopes.second_spread, good, r, c, curved.seen[ok])
+        bent, per_mm = curved.bent[ok], surface.per_mm[at]
+        off = np.einsum("mak,mbk->mab", steep, bent)
+        off = np.swapaxes(per_mm, -1, -2) @ (0.5 * (off + np.swapaxes(off, -1, -2))) @ per_mm
+        bias = as_tensor(np.stack([off[:, 0, 0], off[:, 1, 1], off[:, 0, 1]], axis=-1), surface.strain[at], tensor)
+        own = _diagonal(surface.covariance(bent @ noise @ np.swapaxes(bent, -1, -2), tensor, at))
+        square = np.maximum(bias**2 - own, 0.0)
+        planes = _diagonal(surface.covariance(slopes.spread[r, c], tensor, at)) + square
+        quadratics = _diagonal(surface.covariance(curved.spread[ok], tensor, at))
+        better = (curved.status[ok] == StrainStatus.OK) & (quadratics.sum(axis=1) < planes.sum(axis=1))
+        left[r, c] = np.where(better[:, None], 0.0, square)
+        raised[r[better], c[better]] = True
+        which = np.flatnonzero(ok)[better]
+        r, c = rows[which], cols[which]
+        slope[r, c], spread[r, c], moments[r, c] = curved.slope[which], curved.spread[which], curved.moments[which]
+        weights = weights.copy()
+        weights[which] = curved.weights[which]
+        reduced[-1] = rows, cols, weights
+    return replace(slopes, slope=slope, spread=spread, moments=moments, reduced=reduced), left, raised
+
+
+def _metric_gradients(slopes: Slopes, tensor: StrainTensor) -> Float:
+    """(r, c, 2, 3) tangent a times second derivative k, of the deformed surface less the reference's; zero if unknown.
+
+    Half the sum over a and b exchanged is the gradient of the Green-Lagrange strain in grid steps. A bend without
+    strain has none, since second derivatives then stand on the tangents.
+    """
+    before, second = slopes.slope[..., :3, :], slopes.second[..., :3, :]
+    now, second_now = before + slopes.slope[..., 3:, :], slopes.second[..., 3:, :]
+    if tensor == "infinitesimal":
+        out = np.swapaxes(before, -1, -2) @ (second_now - second)
+    else:
+        out = np.swapaxes(now, -1, -2) @ second_now - np.swapaxes(before, -1, -2) @ second
+    return np.where(np.isfinite(out), out, 0.0)
+
+
+def _around(
+    bending: Float, noise: Float, good: Bool, rows: np.ndarray, cols: np.ndarray, seen: Bool
+) -> tuple[Float, Float]:
+    """Mean over the windows about the points seen, weighted by their certainty: gradients (m, 2, 3), spread (m, 3, 3).
+
+    Neighbouring windows share most of their points, so that averaging is taken not to lessen the noise.
+    """
+    half = int(np.sqrt(seen.shape[1])) // 2
+    trace = np.trace(noise, axis1=-2, axis2=-1)
+    known = good & (trace > 0.0)
+    weight = np.where(known, 1.0 / np.where(known, trace, 1.0), 0.0)
+    flat = (*good.shape, -1)
+    both = np.concatenate([np.ones((*flat[:2], 1)), bending.reshape(flat), noise.reshape(flat)], axis=-1)
+    both = np.pad(both * weight[..., None], ((half, half), (half, half), (0, 0)))
+    width, depth = both.shape[1:]
+    both = both.reshape(-1, depth)
+    reach = window_offsets(half)[0] @ np.array([width, 1])
+    here = (rows + half) * width + cols + half
+    out = np.empty((len(rows), depth))
+    step = max(_VALUES_AT_ONCE // (seen.shape[1] * depth), 1)
+    for first in range(0, len(rows), step):
+        part = slice(first, first + step)
+        out[part] = np.einsum("mn,mnq->mq", seen[part].astype(np.float64), both[here[part, None] + reach])
+    out /= np.where(out[:, :1] > 0.0, out[:, :1], 1.0)
+    return out[:, 1:7].reshape(-1, 2, 3), out[:, 7:].reshape(-1, 3, 3)
+
+
+def _diagonal(covariance: Float) -> Float:
+    return np.asarray(np.diagonal(covariance, axis1=-2, axis2=-1))

@@ -1,0 +1,1 @@
+"""Calibrations of other programs: a reader a format, and what all of them must hold."""
