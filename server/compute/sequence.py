@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import FileFormatError, SeedError
+from core.errors import FileFormatError, MeasurementError, SeedError
 from core.field.checks.extrapolated import mark_extrapolated
 from core.field.points.images import MeasureImage, check_calibrated_size
 from core.field.points.result import Field
@@ -158,6 +158,8 @@ class SequenceMeasurement:
             No start was found.
         FileFormatError
             An earlier step's file is missing, or its images were replaced.
+        MeasurementError
+            ``nothing_measured``: no point passed the checks.
         Cancelled
             If the token was set.
         """
@@ -197,6 +199,12 @@ class SequenceMeasurement:
             raise
         if not result.valid.any():
             self._watch.refuse_moved(n, images)
+            one, two = self.steps[n].files
+            raise MeasurementError(
+                f"No point of step {n} ({one.name}, {two.name}) could be measured.",
+                code="nothing_measured",
+                remedy="Check that both cameras see the same textured surface, in this order, and the region.",
+            )
         return result
 
     def finish(

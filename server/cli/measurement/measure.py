@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 from pathlib import Path
 
-from core.errors import FileFormatError, ImageError, InputError
-from core.field.points.images import check_calibrated_size
+from core.errors import FileFormatError, InputError
 from core.field.prefilter import check_prefilter
 from core.settings import (
     DEFAULT_INTERPOLATION,
@@ -26,17 +24,14 @@ from core.settings import (
     patch_name,
 )
 from server.cli.measurement.image_lists import ImagePair, expand, pair_up, pairs_of_test_folder
+from server.cli.measurement.image_pairs import check_cameras, checked_pairs, checked_shapes, first_readable
 from server.cli.measurement.region import check_region, check_whole, parse_rectangle
 from server.cli.measurement.sequence import MeasureJob, measure_sequence
 from server.cli.terminal import ProgressLine
 from server.compute.seeds import check_positions
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
-from server.formats.images import decode_image, read_file
 from server.formats.noise_json import load_noise
 from server.results.projected_pattern import check_settings
-from server.store.durable import read_json
-from server.worker.tasks import StepImages
-from server.workflows.camera_identity import check_same_cameras
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -128,14 +123,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", metavar="DIR", help="for step_0000.nc (shape), step_0001.nc ... (displacement) and summary.json")
 
 
+SOME_FAILED = 3
+"""Exit status where some steps failed and others were measured: neither 0, all done, nor 1, nothing was."""
+
+
 def run(args: argparse.Namespace) -> int:
     """Run the command; return the exit status."""
     progress = ProgressLine()
     try:
-        measure_sequence(_prepare(args, progress), progress)
+        summary = measure_sequence(_prepare(args, progress), progress)
     finally:
         progress.close()
-    return 0
+    return SOME_FAILED if summary["steps_failed"] else 0
 
 
 def _missing(option: str) -> InputError:
@@ -202,7 +201,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
     for pair in files:
         check_cameras(pair, calibration_file)
     out = Path(args.out) if args.out or folder is None else folder / "exports" / "measure"
-    shapes = checked_shapes(files[0], calibration)
+    shapes = checked_shapes(first_readable(files) if args.projected else files[0], calibration)
     if rectangle is None:  # of a test folder: as much of camera 1's image as takes whole subsets
         rows, cols = shapes[0]
         margin = float(subset // 2 + 2)
@@ -220,7 +219,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         holes=args.hole,
     )
     check_positions(calibration.pair, seeds or (), (shapes[1][1], shapes[1][0]))
-    steps = [check_pair(pair, k, shapes) for k, pair in enumerate(files)]
+    steps, failed = checked_pairs(files, shapes, alone=not args.projected)
     settings = StoredSettings.model_validate(
         {
             "region": region,
@@ -248,6 +247,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         mask_file=mask_file,
         out=out,
         noise=noise,
+        failed=failed,
     )
 
 
@@ -264,61 +264,3 @@ def _check_calibration(folder: Path, calibration: LoadedCalibration) -> None:
             code="calibration_changed",
             remedy="Restore the file, or name the calibration that is meant with --calibration.",
         )
-
-
-def check_cameras(pair: ImagePair, calibration_file: Path) -> None:
-    """Refuse a pair that was taken with other cameras than were calibrated, by its record."""
-    record = pair.cam1.parent / "step.json"
-    if record.is_file() and calibration_file.suffix == ".json":
-        check_same_cameras(calibration_file, read_json(record).get("cameras"), f"{pair.cam1.parent}")
-
-
-def checked_shapes(first: ImagePair, calibration: LoadedCalibration) -> tuple[tuple[int, int], tuple[int, int]]:
-    """(rows, cols) of both cameras' images, which the calibration must agree with where it states a size."""
-    shapes = []
-    for path, size in ((first.cam1, calibration.image_size1_px), (first.cam2, calibration.image_size2_px)):
-        rows, cols = decode_image(read_file(path), name=str(path)).shape
-        check_calibrated_size(str(path), (rows, cols), size)
-        shapes.append((rows, cols))
-    return shapes[0], shapes[1]
-
-
-def check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[int, int]]) -> StepImages:
-    """Read both images of a step once, so that a bad one is found before hours of work on the others."""
-    hashes, images = [], []
-    for path, recorded, shape in ((pair.cam1, pair.sha256_1, shapes[0]), (pair.cam2, pair.sha256_2, shapes[1])):
-        data = read_file(path)
-        hashes.append(hashlib.sha256(data).hexdigest())
-        if recorded is not None and hashes[-1] != recorded:
-            raise FileFormatError(
-                f"{path} does not match the checksum in its step.json.",
-                code="checksum_mismatch",
-                remedy="Restore the file, or leave this step out.",
-            )
-        image = decode_image(data, name=str(path))
-        if image.shape != shape:
-            is_px, first_px = f"{image.shape[1]} x {image.shape[0]} px", f"{shape[1]} x {shape[0]} px"
-            raise ImageError(
-                f"{path} (step {step}) is {is_px}, the first image {first_px}.",
-                code="image_size_mismatch",
-                remedy="All images of one camera must have one size.",
-            )
-        if int(image.max()) == int(image.min()):
-            raise ImageError(
-                f"{path} (step {step}) is blank: every pixel is {int(image.max())}.",
-                code="image_blank",
-                remedy="Check exposure, lens cap and trigger, then take the step again.",
-            )
-        images.append(image)
-    if hashes[0] == hashes[1]:
-        raise InputError(
-            f"{pair.cam1} and {pair.cam2} (step {step}) hold the same image.",
-            code="same_image",
-            remedy="Give each camera its own images.",
-        )
-    return StepImages(
-        n=step if pair.number is None else pair.number,
-        files=(pair.cam1, pair.cam2),
-        sha256=(hashes[0], hashes[1]),
-        averages=pair.averages,
-    )

@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import xarray as xr
@@ -309,20 +310,114 @@ def test_bad_options(folder: Path, tmp_path: Path, capfd: Any, changes: dict[str
     assert sorted(folder.iterdir()) == before
 
 
-def test_bad_images(folder: Path, tmp_path: Path, capfd: Any) -> None:
+def spoiled(folder: Path) -> list[tuple[np.ndarray | bytes, str, str]]:
+    """What a second camera may deliver, and what is said of it."""
     good = read_image(folder / "cam2_1.tif")
-    for data, code, word in (
+    return [
         (good[:, :-1], "image_size_mismatch", "229 x 200"),
         (np.full_like(good, 90), "image_blank", "90"),
         (good[:50], "image_size_mismatch", "step 1"),
+        ((folder / "cam2_0.tif").read_bytes()[:2000], "image_unreadable", "cam2_1.tif"),
+        ((folder / "cam1_1.tif").read_bytes(), "same_image", "cam1_1.tif"),
+    ]
+
+
+def put(path: Path, what: np.ndarray | bytes) -> None:
+    if isinstance(what, bytes):
+        path.write_bytes(what)
+    else:
+        write_image(path, what)
+
+
+def test_a_bad_reference_pair_is_refused_as_a_whole(folder: Path, tmp_path: Path, capfd: Any) -> None:
+    good = read_image(folder / "cam2_0.tif")
+    for data, code, word in (
+        (np.full_like(good, 90), "image_blank", "90"),
+        ((folder / "cam2_0.tif").read_bytes()[:2000], "image_unreadable", "cam2_0.tif"),
     ):
-        write_image(folder / "cam2_1.tif", data)
+        put(folder / "cam2_0.tif", data)
         fails(command(folder, tmp_path / "out"), code, word, capfd)
-    (folder / "cam2_1.tif").write_bytes((folder / "cam2_0.tif").read_bytes()[:2000])
-    fails(command(folder, tmp_path / "out"), "image_unreadable", "cam2_1.tif", capfd)
-    Image.fromarray(np.stack([good, good // 2, good], axis=-1)).save(folder / "cam2_1.tif")
-    fails(command(folder, tmp_path / "out"), "image_unsupported", "colour", capfd)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_bad_pair_is_a_failed_step_and_the_rest_is_measured(folder: Path, tmp_path: Path, capfd: Any) -> None:
+    options = {"roi": "60,60,120,120", "strain": "off"}
+    assert (
+        main(
+            command(
+                folder,
+                tmp_path / "alone",
+                cam1=[str(folder / f"cam1_{n}.tif") for n in (0, 2)],
+                cam2=[str(folder / f"cam2_{n}.tif") for n in (0, 2)],
+                **options,
+            )
+        )
+        == 0
+    )
+    for data, code, word in spoiled(folder):
+        put(folder / "cam2_1.tif", data)
+        capfd.readouterr()
+        assert main(command(folder, tmp_path / "out", **options)) == measure.SOME_FAILED
+        err = capfd.readouterr().err
+        assert f"step 1 of 2: failed: {code}: " in err
+        summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+        assert summary["state"] == "succeeded"
+        assert [step["n"] for step in summary["steps"]] == [0, 2]
+        problem = summary["steps_failed"]["1"]
+        assert problem["code"] == code
+        assert word in problem["cause"]
+        assert problem["remedy"]
+        assert problem["context"]["cam2"] == str(folder / "cam2_1.tif")
+        assert not (tmp_path / "out" / "step_0001.nc").exists()
+    # the step after the bad one is what it would have been without it
+    with (
+        xr.open_dataset(tmp_path / "alone" / "step_0001.nc") as alone,
+        xr.open_dataset(tmp_path / "out" / "step_0002.nc") as among,
+    ):
+        np.testing.assert_array_equal(alone.w_mm, among.w_mm)
+
+
+@pytest.mark.parametrize("update", ["always", "auto"])
+def test_a_pair_of_another_specimen_is_a_failed_step_with_later_references_too(
+    folder: Path, tmp_path: Path, capfd: Any, update: str
+) -> None:
+    rng = np.random.default_rng(5)
+    for cam in CAMERAS:  # a texture in each, but none that is in another image
+        noise = cv2.GaussianBlur(rng.normal(size=(SIZE[1], SIZE[0])), (0, 0), 1.5)
+        write_image(folder / f"{cam}_3.tif", np.clip(120 + 40 * noise / noise.std(), 0, 255).astype(np.uint8))
+        write_image(folder / f"{cam}_4.tif", read_image(folder / f"{cam}_1.tif"))
+    more = {"roi": "60,60,120,120", "strain": "off", "reference-update": update}
+    assert main(command(folder, tmp_path / "out", **more)) == measure.SOME_FAILED
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert list(summary["steps_failed"]) == ["3"]
+    assert summary["steps_failed"]["3"]["code"] == "not_seeded"
+    assert [step["n"] for step in summary["steps"]] == [0, 1, 2, 4]
+    if update == "always":
+        assert summary["steps"][-1]["reference_step"] == 2  # the last good one
+    assert summary["steps"][-1]["valid"] > 0.9 * summary["steps"][-1]["points"]
+
+
+def test_a_series_of_which_nothing_but_the_reference_could_be_measured_has_failed(
+    folder: Path, tmp_path: Path, capfd: Any
+) -> None:
+    good = read_image(folder / "cam2_1.tif")
+    for n in (1, 2):
+        write_image(folder / f"cam2_{n}.tif", np.full_like(good, 90))
+    fails(command(folder, tmp_path / "out", roi="60,60,120,120", strain="off"), "image_blank", "step 1", capfd)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["state"] == "failed"
+    assert summary["problem"]["code"] == "image_blank"
+    assert [step["n"] for step in summary["steps"]] == [0]
+    assert list(summary["steps_failed"]) == ["1", "2"]
+
+
+def test_under_a_projected_pattern_the_first_pair_fails_alone_too(folder: Path, tmp_path: Path) -> None:
+    (folder / "cam1_0.tif").write_bytes(b"nothing")
+    options = command(folder, tmp_path / "out", roi="60,60,120,120")
+    assert main([*options, "--projected"]) == measure.SOME_FAILED
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert list(summary["steps_failed"]) == ["0"]
+    assert [step["n"] for step in summary["steps"]] == [1, 2]
 
 
 def test_bad_calibrations(folder: Path, tmp_path: Path, capfd: Any) -> None:
