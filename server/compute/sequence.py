@@ -24,6 +24,7 @@ from core.field.region.lay_points import make_grid
 from core.field.seeding.seeds import seeds_of
 from core.field.settings import MeasureOptions
 from core.measure import PreviousStep, ReferencePair, Updating
+from core.names import CAMERAS
 from core.progress import CancelToken, Progress
 from core.settings import StoredSettings
 from core.strain import StrainOptions
@@ -247,6 +248,10 @@ class SequenceMeasurement:
             ).document(),
             "strain": None if strain is None else summarise_strain(strain).document(),
         }
+        greys = {cam: made for cam, made in zip(CAMERAS, step.grey_from, strict=True) if made is not None}
+        if greys:
+            summary["grey_from"] = greys
+            about = {**about, **{f"{cam}_grey_from": made for cam, made in greys.items()}}
         if in_service:  # first: where the result is, they are
             write_bytes(path.with_suffix(".json"), to_json(summary))
             if result.starts is not None and keep_starts:

@@ -43,12 +43,15 @@ def source_of(folder: Path, files: list[Path]) -> Source:
     heads = [read_head(path) for path in files]
     stale, mask = stale_results(files, heads), _mask(folder, heads[0].settings)
     about: dict[str, object] = {}
+    failed = failed_steps(folder)
+    if failed:
+        about["steps_failed"] = failed
     test = folder.parent.parent  # <test>/analyses/<id>, or <test>/exports/measure
     document = known_json(test / "test.json")
     reference = heads[0].step if heads[-1].reference_step is None else heads[-1].reference_step
     image = test / "steps" / f"{reference:04d}" / "cam1.tif"
     if document or image.is_file():
-        about = {
+        about |= {
             "test_id": document.get("id", test.name),
             "test": document.get("name", ""),
             "calibration_id": document.get("calibration_id"),
@@ -66,6 +69,12 @@ def source_of(folder: Path, files: list[Path]) -> Source:
     return Source(
         files, folder.name or "results", folder.name, Path(image_file) if image_file else None, about, mask, stale
     )
+
+
+def failed_steps(folder: Path) -> dict[str, object]:
+    """Return the problem of each step that could not be measured, by its number, as ``summary.json`` has it."""
+    failed = known_json(folder / "summary.json").get("steps_failed")
+    return dict(failed) if isinstance(failed, dict) else {}
 
 
 def _mask(folder: Path, settings: object) -> Path | None:

@@ -116,8 +116,11 @@ def chosen(source: Source, steps: Sequence[int] | None) -> list[Path]:
         )
     missing = [] if steps is None else [n for n in steps if n not in files]
     if missing:
+        failed = source.about.get("steps_failed")
+        problem = failed.get(str(missing[0])) if isinstance(failed, dict) else None
+        because = f": it failed ({problem['code']})" if isinstance(problem, dict) and "code" in problem else ""
         raise NotFoundError(
-            f"There is no result for step {missing[0]}.",
+            f"There is no result for step {missing[0]}{because}.",
             code="step_missing",
             remedy="Ask for steps that are finished.",
             available=sorted(files),

@@ -11,7 +11,7 @@ from core.errors import FileFormatError, ImageError, InputError, StereorigError
 from core.field.points.images import check_calibrated_size
 from server.cli.measurement.image_lists import ImagePair
 from server.formats.calibrations.recognise import LoadedCalibration
-from server.formats.images import decode_image, read_file
+from server.formats.images import decode, decode_image, read_file
 from server.store.durable import read_json
 from server.worker.tasks import StepImages
 from server.workflows.camera_identity import check_same_cameras
@@ -72,7 +72,7 @@ def checked_shapes(first: ImagePair, calibration: LoadedCalibration) -> tuple[tu
 
 def check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[int, int]]) -> StepImages:
     """Read both images of a step once, so that a bad one is found before hours of work on the others."""
-    hashes, images = [], []
+    hashes, greys = [], []
     for path, recorded, shape in ((pair.cam1, pair.sha256_1, shapes[0]), (pair.cam2, pair.sha256_2, shapes[1])):
         data = read_file(path)
         hashes.append(hashlib.sha256(data).hexdigest())
@@ -82,7 +82,8 @@ def check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[
                 code="checksum_mismatch",
                 remedy="Restore the file, or leave this step out.",
             )
-        image = decode_image(data, name=str(path))
+        decoded = decode(data, name=str(path))
+        image = decoded.pixels
         if image.shape != shape:
             is_px, first_px = f"{image.shape[1]} x {image.shape[0]} px", f"{shape[1]} x {shape[0]} px"
             raise ImageError(
@@ -96,7 +97,7 @@ def check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[
                 code="image_blank",
                 remedy="Check exposure, lens cap and trigger, then take the step again.",
             )
-        images.append(image)
+        greys.append(decoded.grey_from)
     if hashes[0] == hashes[1]:
         raise InputError(
             f"{pair.cam1} and {pair.cam2} (step {step}) hold the same image.",
@@ -108,4 +109,5 @@ def check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[
         files=(pair.cam1, pair.cam2),
         sha256=(hashes[0], hashes[1]),
         averages=pair.averages,
+        grey_from=(greys[0] or pair.grey_from[0], greys[1] or pair.grey_from[1]),
     )
