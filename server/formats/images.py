@@ -157,7 +157,7 @@ def _decode_pil(name: str, data: bytes, formats: tuple[str, ...]) -> NDArray[Any
                     image.load()
                     return np.asarray(image.convert("RGBA" if "transparency" in image.info else "RGB"))
                 # Pillow would cut 16 bit colour to 8 bit without a word
-                if image.mode in ("RGB", "RGBA", "LA") and any("16" in str(tile[3]) for tile in image.tile):
+                if image.mode in ("RGB", "RGBA", "LA") and any("16" in _raw_mode(tile[3]) for tile in image.tile):
                     return _decode_deep_colour(name, data)
                 if image.mode not in ("L", "LA", "I;16", "I;16B", "I;16L", "I;16N", "RGB", "RGBA"):
                     raise _unsupported(name, f"its pixel type is {image.mode!r}")
@@ -170,6 +170,11 @@ def _decode_pil(name: str, data: bytes, formats: tuple[str, ...]) -> NDArray[Any
         raise _too_large(f"{name} is too large: {error}") from error
     except Exception as error:  # a damaged file can fail anywhere inside the reader
         raise _unreadable(name, f"{type(error).__name__}, {error}") from error
+
+
+def _raw_mode(arguments: object) -> str:
+    """Return the pixel form, as RGB;16B, of a Pillow decoder's arguments: the others may be offsets with any digits."""
+    return str(arguments[0] if isinstance(arguments, tuple) and arguments else arguments)
 
 
 def _decode_deep_colour(name: str, data: bytes) -> NDArray[Any]:
