@@ -283,6 +283,13 @@ def decode_mask(data: bytes, *, name: str = "the mask") -> NDArray[np.bool_]:
     return np.asarray(gray > np.iinfo(gray.dtype).max // 2)
 
 
+def encode_png(mask: NDArray[np.bool_]) -> bytes:
+    """Encode a mask (rows, cols) as a PNG, white where it is True."""
+    buffer = io.BytesIO()
+    Image.fromarray(mask.astype(np.uint8) * np.uint8(255)).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
 def encode_tiff(image: GrayImage) -> bytes:
     """Encode (rows, cols) uint8 or uint16 as an uncompressed TIFF."""
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):

@@ -27,9 +27,11 @@ from server.cli.measurement.image_lists import ImagePair, expand, pair_up, pairs
 from server.cli.measurement.image_pairs import check_cameras, checked_pairs, checked_shapes, first_readable
 from server.cli.measurement.region import check_region, check_whole, parse_rectangle
 from server.cli.measurement.sequence import MeasureJob, measure_sequence
+from server.cli.measurement.specimen import SPECIMEN_FILE, found_specimen
 from server.cli.terminal import ProgressLine
 from server.compute.seeds import check_positions
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
+from server.formats.images import read_mask
 from server.formats.noise_json import load_noise
 from server.results.projected_pattern import check_settings
 
@@ -41,7 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--cam1", nargs="+", metavar="GLOB", help="camera 1's images: a quoted pattern or several paths")
     add("--cam2", nargs="+", metavar="GLOB", help="camera 2's images; files are paired in sorted order")
     add("--calibration", metavar="FILE", help="calibration.json, DICe XML or OpenCV YAML")
-    add("--roi", metavar="X0,Y0,X1,Y1", help="points lie at X0 + i step, Y0 + j step up to X1, Y1")
+    add(
+        "--roi",
+        metavar="X0,Y0,X1,Y1|auto",
+        help="points lie at X0 + i step, Y0 + j step up to X1, Y1; auto: on the specimen, found by its texture and "
+        "shown in specimen.png (auto, without a mask)",
+    )
     add("--mask", metavar="PNG", help="image of camera 1's size, white where points may lie")
     add(
         "--crack",
@@ -174,7 +181,7 @@ def _pairs(args: argparse.Namespace, progress: ProgressLine) -> list[ImagePair]:
                 remedy="Give one or the other.",
             )
         return pairs_of_test_folder(Path(args.folder))
-    for option in ("cam1", "cam2", "calibration", "roi", "out"):
+    for option in ("cam1", "cam2", "calibration", "out"):
         if getattr(args, option) is None:
             raise _missing(f"--{option}")
     lists = []
@@ -190,7 +197,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
     """Check everything that can be checked before anything is computed or written."""
     subset = check_whole("--subset", args.subset, SUBSET_PX)
     step = check_whole("--step", args.step, SPACING_PX)
-    rectangle = None if args.roi is None else parse_rectangle(args.roi)
+    rectangle = None if args.roi in (None, "auto") else parse_rectangle(args.roi)
     strain, prefilter_px = _strain(args), _prefilter_px(args, subset)
     files = _pairs(args, progress)
     folder = None if args.folder is None else Path(args.folder)
@@ -201,12 +208,14 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
     for pair in files:
         check_cameras(pair, calibration_file)
     out = Path(args.out) if args.out or folder is None else folder / "exports" / "measure"
-    shapes = checked_shapes(first_readable(files) if args.projected else files[0], calibration)
-    if rectangle is None:  # of a test folder: as much of camera 1's image as takes whole subsets
-        rows, cols = shapes[0]
-        margin = float(subset // 2 + 2)
-        rectangle = (margin, margin, cols - 1 - margin, rows - 1 - margin)
+    first = first_readable(files) if args.projected else files[0]
+    shapes = checked_shapes(first, calibration)
     mask_file = None if args.mask is None else Path(args.mask)
+    specimen = None
+    if args.roi == "auto" or (rectangle is None and mask_file is None):
+        specimen = found_specimen(first, calibration, subset, None if mask_file is None else read_mask(mask_file))
+        progress.note(f"region: {specimen.text}")
+        rectangle, mask_file = specimen.rectangle_px(subset), out / SPECIMEN_FILE
     noise = None if args.noise is None else load_noise(args.noise)
     region, seeds = check_region(
         rectangle,
@@ -217,6 +226,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         seeds=args.seed,
         cracks=args.crack,
         holes=args.hole,
+        mask=None if specimen is None else specimen.mask,
     )
     check_positions(calibration.pair, seeds or (), (shapes[1][1], shapes[1][0]))
     steps, failed = checked_pairs(files, shapes, alone=not args.projected)
@@ -248,6 +258,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         out=out,
         noise=noise,
         failed=failed,
+        specimen=specimen,
     )
 
 

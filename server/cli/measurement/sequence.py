@@ -6,6 +6,7 @@ While a step is measured, the next pair is read and the last result is written; 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import re
 import time
 from collections.abc import Iterator, Mapping
@@ -27,13 +28,14 @@ from server.compute.overlap import ReadAhead, WriteBehind
 from server.compute.strain import smoothing_note
 from server.formats.calibrations.recognise import LoadedCalibration
 from server.formats.files import make_folder, sha256_of, write_bytes
-from server.formats.images import read_mask
+from server.formats.images import encode_png, read_mask
 from server.formats.noise_json import LoadedNoise
-from server.formats.results.summary import SequenceSummary, to_json
+from server.formats.results.summary import SequenceSummary, region_found, to_json
 from server.formats.version import software_version
 from server.worker.tasks import StepImages
 
 if TYPE_CHECKING:
+    from core.field.seeding.specimen import Specimen
     from server.compute.sequence import Pair, SequenceMeasurement
 
 _MIN_OF_STATED, _MAX_OF_STATED = 0.75, 1.5  # residuals hold interpolation error besides noise, never less
@@ -66,6 +68,7 @@ class MeasureJob:
     """Everything that ``stereorig measure`` was asked to do, checked.
 
     ``steps`` are those that can be measured, the reference first; ``failed`` has the error of each other one.
+    ``specimen`` is what was found where no region was given; its mask is then to be written to ``mask_file``.
     """
 
     calibration: LoadedCalibration
@@ -76,6 +79,7 @@ class MeasureJob:
     out: Path
     noise: LoadedNoise | None = None
     failed: Mapping[int, StereorigError] = field(default_factory=dict)
+    specimen: Specimen | None = None
 
     @property
     def last(self) -> int:
@@ -162,6 +166,7 @@ def _write_summary(runner: _Runner, seconds: float, error: BaseException | None)
         seconds=round(seconds, 3),
         steps=runner.summaries,
         steps_failed={str(n): problem_of(runner.failed[n]).plain() for n in sorted(runner.failed)},
+        region_found=None if job.specimen is None else region_found(job.specimen),
     ).document()
     summary["problem"] = problem_of(error).plain() if isinstance(error, StereorigError) else None
     write_bytes(job.out / "summary.json", to_json(summary))
@@ -224,14 +229,19 @@ class _Runner:
         from server.compute.sequence import SequenceMeasurement
 
         job = self.job
+        mask, inputs = None, {}
+        if job.specimen is not None:
+            mask, inputs = job.specimen.mask, {"mask": hashlib.sha256(encode_png(job.specimen.mask)).hexdigest()}
+        elif job.mask_file is not None:
+            mask, inputs = read_mask(job.mask_file), {"mask": sha256_of(job.mask_file)}
         return SequenceMeasurement(
             calibration=job.calibration,
             settings=job.settings,
-            mask=None if job.mask_file is None else read_mask(job.mask_file),
+            mask=mask,
             reference=reference,
             folder=job.out,
             noise=job.noise,
-            inputs={} if job.mask_file is None else {"mask": sha256_of(job.mask_file)},
+            inputs=inputs,
         )
 
     def measure(self, step: StepImages, images: Iterator[Pair] | None) -> None:
@@ -258,6 +268,8 @@ class _Runner:
         compute_s = round(time.monotonic() - started, 3)
         if not self.begun:
             self._remove_older()
+            if self.job.specimen is not None and self.job.mask_file is not None:
+                write_bytes(self.job.mask_file, encode_png(self.job.specimen.mask))
             self._doubt_noise(result)
             self.begun = True
         elif not alone:

@@ -287,7 +287,8 @@ BAD_OPTIONS: list[tuple[dict[str, Any], str, str]] = [
     ({"seed": "1000,90"}, "seed_outside", "1000,90"),
     ({"seed": "80,85,500,85"}, "seed_outside", "camera 2"),
     ({"seed": "80,85,80,150"}, "seed_off_epipolar", "epipolar line"),
-    ({"roi": None}, "option_missing", "--roi"),
+    ({"roi": None, "subset": "101"}, "region_not_found", "101 px"),
+    ({"calibration": None}, "option_missing", "--calibration"),
     ({"out": "IN/cam1_0.tif"}, "output_unusable", "cam1_0.tif"),
 ]
 
@@ -448,6 +449,66 @@ def test_noise_without_texture_is_refused(folder: Path, tmp_path: Path, capfd: A
         write_image(folder / f"{cam}_0.tif", rng.normal(120, 2, (SIZE[1], SIZE[0])).round().astype(np.uint8))
     fails(command(folder, tmp_path / "out"), "image_blank", "noise only", capfd)
     assert not (tmp_path / "out").exists()
+
+
+def test_without_a_region_the_specimen_is_found_and_can_be_corrected(
+    folder: Path, tmp_path: Path, capfd: Any, rig: SimRig
+) -> None:
+    for n in (1, 2):
+        for cam in CAMERAS:
+            (folder / f"{cam}_{n}.tif").unlink()
+    for cam, x in (("cam1", 120), ("cam2", 110)):  # half of the view is plain: no specimen there
+        image = read_image(folder / f"{cam}_0.tif").copy()
+        image[:, x:] = np.random.default_rng(1).normal(70.0, 2.0, image[:, x:].shape).round()
+        write_image(folder / f"{cam}_0.tif", image)
+    out = tmp_path / "out"
+    assert main(command(folder, out, roi=None)) == 0
+    assert "region: texture that camera 2 sees: 1 part" in capfd.readouterr().err
+    summary = json.loads((out / "summary.json").read_text())
+    found = summary["region_found"]
+    assert summary["settings"]["region"]["mask"] == str(out / "specimen.png")
+    (outline,) = np.array(found["outlines_px"])
+    assert 110 < outline[:, 0].max() < 125
+    white = np.array(Image.open(out / "specimen.png")) > 127
+    assert white[20:-20, 5:100].mean() > 0.95
+    assert not white[:, 130:].any()
+    with xr.open_dataset(out / "step_0000.nc") as data:
+        measured = data.status.values == 0
+        allowed = data.status.values != 2
+        assert measured[allowed].mean() > 0.8
+        assert float(data.x_px.values[measured].max()) < 125
+    # corrected by hand, it is a mask like any other
+    white[100:] = False
+    Image.fromarray(white).save(tmp_path / "mine.png")
+    assert main(command(folder, tmp_path / "corrected", roi=None, mask=str(tmp_path / "mine.png"))) == 0
+    with xr.open_dataset(tmp_path / "corrected" / "step_0000.nc") as data:
+        assert float(data.y_px.values[data.status.values == 0].max()) < 100
+    assert main(command(folder, tmp_path / "auto", roi="auto", mask=str(tmp_path / "mine.png"))) == 0
+    assert json.loads((tmp_path / "auto" / "summary.json").read_text())["region_found"] is not None
+
+
+def test_colour_images_are_measured_by_their_luminance_and_said_so(folder: Path, tmp_path: Path) -> None:
+    options = {"roi": "60,60,120,120", "strain": "off"}
+    gray, colour = {}, {}
+    for cam in CAMERAS:
+        gray[cam], colour[cam] = [], []
+        for n in (0, 1):
+            image = read_image(folder / f"{cam}_{n}.tif").astype(float)
+            rgb = np.clip(np.stack([image * 0.8, image * 0.9, image], axis=-1), 0, 255).round().astype(np.uint8)
+            colour[cam].append(str(folder / f"colour_{cam}_{n}.png"))
+            Image.fromarray(rgb).save(colour[cam][-1])
+            gray[cam].append(str(folder / f"gray_{cam}_{n}.tif"))
+            write_image(Path(gray[cam][-1]), np.rint(rgb @ np.array([0.299, 0.587, 0.114])).astype(np.uint8))
+    assert main(command(folder, tmp_path / "colour", **colour, **options)) == 0
+    assert main(command(folder, tmp_path / "gray", **gray, **options)) == 0
+    taken, plain = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("colour", "gray"))
+    said = "luminance, 0.299 R + 0.587 G + 0.114 B"
+    assert taken["steps"][1]["grey_from"] == {"cam1": said, "cam2": said}
+    assert "grey_from" not in plain["steps"][1]
+    one, two = (xr.open_dataset(tmp_path / name / "step_0001.nc") for name in ("colour", "gray"))
+    with one, two:
+        np.testing.assert_array_equal(one.w_mm, two.w_mm)
+        assert one.attrs["cam1_grey_from"] == said
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a file system that takes no new folders")
