@@ -410,6 +410,25 @@ def test_an_analysis_of_which_nothing_but_the_reference_could_be_measured_has_fa
     assert done["result"]["steps_finished"] == [0]
 
 
+def test_the_specimen_is_found_as_a_region_to_begin_with(client: httpx.Client, plate_test: str) -> None:
+    answer = client.post(f"{API}/tests/{plate_test}/region:find", json={"reference": 0, "subset_px": 25})
+    assert answer.status_code == 200, answer.text
+    found = answer.json()
+    corners = np.array(found["region"]["polygon"])
+    assert len(corners) >= 3
+    mask = np.asarray(Image.open(io.BytesIO(base64.b64decode(found["mask_png_base64"])))) > 127
+    assert mask.mean() == pytest.approx(found["share"], abs=1e-3)
+    assert mask[60:170, 60:180].mean() > 0.99  # the plate, textured all over
+    assert found["text"].startswith("texture that camera 2 sees: 1 part")
+    body = {"region": found["region"], "subset_px": 25, "spacing_px": 20, "steps": [0], "strain": None}
+    done = wait_for_job(client, client.post(f"{API}/tests/{plate_test}/analyses", json=body).json()["job"])
+    assert done["state"] == "succeeded", done["problem"]
+    assert done["result"]["steps"][0]["valid"] > 20
+    refused = client.post(f"{API}/tests/{plate_test}/region:find", json={"subset_px": 24})
+    assert refused.status_code == 422
+    assert client.post(f"{API}/tests/{plate_test}/region:find", json={"reference": 99}).status_code == 404
+
+
 @pytest.mark.fault(43)
 def test_cancelled_analysis_keeps_its_finished_steps(client: httpx.Client, plate_test: str) -> None:
     body = {"region": {"rectangle": [20, 20, 230, 215]}, "subset_px": 25, "spacing_px": 2}
