@@ -36,6 +36,7 @@ Finding = Literal[
 _MIN_FEATURES = 50
 _MIN_MATCHES = 20  # agreeing with their neighbours; two unrelated textures give none to a few
 _ON_LINE_PX = 1.0  # median of matches whose geometry is the cameras': features are found to some tenths of a pixel
+_UNDONE_PX = 2.0  # the same of an image that is turned back: SIFT's positions are off by a quarter of a pixel
 _CLEARLY = 0.3  # of the distance as given, at most, to say that an image was turned
 _FAR_FEWER = 5
 _MOSTLY = 0.5
@@ -147,13 +148,14 @@ def diagnose(
             f"{' and '.join(few)} feature{'s' if min(features) != 1 else ''}: too little texture, or defocused",
             "Check focus, exposure and light, and that the specimen carries a pattern that the cameras resolve.",
         )
-    limit = _ON_LINE_PX * max(1.0, scale / 2.0)
+    looser = max(1.0, scale / 2.0)
+    limit, undone = _ON_LINE_PX * looser, _UNDONE_PX * looser
     shapes = one.shape, two.shape
     if len(direct.xy_px) < _MIN_MATCHES:
         mirrored = _mirrored_matches(found1, two, scale)
         if len(mirrored.xy_px) >= _MIN_MATCHES and len(mirrored.xy_px) > 2 * len(direct.xy_px):
             flips = [(flip, _AS_IT_IS) for flip in _FLIPS] + [(_AS_IT_IS, flip) for flip in _FLIPS]
-            changed = _that_fits(pair, mirrored, flips, shapes, limit)
+            changed = _that_fits(pair, mirrored, flips, shapes, undone)
             which = "one of the two images is mirrored" if changed is None else _text(changed, names)
             return result(
                 "mirrored",
@@ -172,13 +174,16 @@ def diagnose(
         )
     if off is None or off > limit:
         far = "far" if off is None else f"{off:.3g} px (median)"
-        changes = [*_each_and_both(_TURNS), (_FLIPS[0], _FLIPS[0])]
-        changed = _that_fits(pair, direct, changes, shapes, min(limit, _CLEARLY * (np.inf if off is None else off)))
+        changes = [*_each_and_both(_TURNS), *((flip, flip) for flip in _FLIPS)]
+        changed = _that_fits(pair, direct, changes, shapes, min(undone, _CLEARLY * (np.inf if off is None else off)))
         if changed is None:
+            lost = in_time is not None and in_time < _MIN_MATCHES
+            also = f"; {in_time} match the region's texture at the reference: another specimen, too" if lost else ""
             return result(
                 "off_epipolar_lines",
                 f"{len(direct.xy_px)} feature matches between the cameras agree with their neighbours, but lie {far} "
-                "from their epipolar lines: the calibration is of another rig, or a camera was moved or refocused",
+                "from their epipolar lines: the calibration is of another rig, or a camera was moved or refocused"
+                f"{also}",
                 "Give these cameras' own calibration, or calibrate again.",
             )
         return result(
