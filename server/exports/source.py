@@ -8,7 +8,7 @@ from core.errors import InputError
 from server.formats.results.folder import first_results, results_in
 from server.formats.results.reading import read_head
 from server.results.staleness import stale_results
-from server.results.steps import Source
+from server.results.steps import Source, failed_steps
 from server.store.durable import known_json
 
 
@@ -69,12 +69,6 @@ def source_of(folder: Path, files: list[Path]) -> Source:
     return Source(
         files, folder.name or "results", folder.name, Path(image_file) if image_file else None, about, mask, stale
     )
-
-
-def failed_steps(folder: Path) -> dict[str, object]:
-    """Return the problem of each step that could not be measured, by its number, as ``summary.json`` has it."""
-    failed = known_json(folder / "summary.json").get("steps_failed")
-    return dict(failed) if isinstance(failed, dict) else {}
 
 
 def _mask(folder: Path, settings: object) -> Path | None:

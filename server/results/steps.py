@@ -19,6 +19,7 @@ from server.formats.results.folder import number_of
 from server.formats.results.netcdf import opened
 from server.formats.results.settings import current_inputs, current_settings
 from server.results.reader import Variable
+from server.store.durable import known_json
 
 ALWAYS = ("x_px", "y_px", "x_mm", "y_mm", "z_mm", "status")
 _GRID = ("row", "col")
@@ -97,6 +98,12 @@ class Source:
     about: dict[str, object] = field(default_factory=dict)
     mask: Path | None = None
     stale_reasons: Sequence[str] = ()
+
+
+def failed_steps(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return the problem of each step that could not be measured, by its number, as ``summary.json`` has it."""
+    failed = known_json(folder / "summary.json").get("steps_failed")
+    return {n: one for n, one in failed.items() if isinstance(one, dict)} if isinstance(failed, dict) else {}
 
 
 def chosen(source: Source, steps: Sequence[int] | None) -> list[Path]:

@@ -370,6 +370,13 @@ def test_a_bad_pair_is_a_failed_step_and_the_rest_is_measured(folder: Path, tmp_
         assert problem["remedy"]
         assert problem["context"]["cam2"] == str(folder / "cam2_1.tif")
         assert not (tmp_path / "out" / "step_0001.nc").exists()
+    # exports and reports say which step there is not, and why
+    assert (
+        main(["export", str(tmp_path / "out"), "--format", "csv", "--step", "2", "--out", str(tmp_path / "csv")]) == 0
+    )
+    assert '"same_image"' in next((tmp_path / "csv").glob("*.csv")).read_text()
+    assert main(["report", str(tmp_path / "out"), "--out", str(tmp_path / "report.html")]) == 0
+    assert "Step 1 could not be measured: same_image: " in (tmp_path / "report.html").read_text()
     # the step after the bad one is what it would have been without it
     with (
         xr.open_dataset(tmp_path / "alone" / "step_0001.nc") as alone,
