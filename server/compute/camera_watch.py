@@ -60,6 +60,9 @@ class CameraWatch:
         SeedError
             ``camera_moved``.
         """
+        found = cause.context.get("finding") if isinstance(cause, SeedError) else None
+        if found not in (None, "off_epipolar_lines"):
+            return  # turned, mirrored, of something else: no motion of a camera
         off_px = None if self.imported else features_off_px(self.pair, *images)
         if off_px is not None and off_px > _FAR_PX:
             raise SeedError(

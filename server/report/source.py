@@ -21,6 +21,7 @@ from server.formats.results.reading import ResultHead, read_head
 from server.report.records import AnalysisRecord, RigRecord, SettingsRecord, StepRecord, TestRecord
 from server.results.metadata import TestMetadata, parse_metadata
 from server.results.staleness import stale_results
+from server.results.steps import failed_steps
 from server.store.durable import known_json
 
 
@@ -47,7 +48,7 @@ class Source:
     stale
         Inputs that are gone or were replaced since the results were written.
     doubts
-        Warnings about inputs that were not found.
+        Warnings about inputs that were not found, and steps that failed.
     """
 
     files: dict[int, Path]
@@ -154,7 +155,10 @@ def find_source(
         test_record = TestRecord.model_validate(known_json(home / "test.json"))
         steps = {n: StepRecord.model_validate(known_json(home / "steps" / f"{n:04d}" / "step.json")) for n in heads}
     made = AnalysisRecord.model_validate(known_json(folder / "analysis.json") or known_json(folder / "summary.json"))
-    doubts: list[str] = []
+    doubts = [
+        f"Step {n} could not be measured: {one.get('code', '')}: {one.get('cause', '')}"
+        for n, one in failed_steps(folder).items()
+    ]
     loaded, file = _calibration(calibration, home, made, heads, doubts)
     if loaded is not None and file is not None:
         loaded = _with_kept_checks(loaded, file, home, test_record)

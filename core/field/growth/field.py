@@ -12,9 +12,11 @@ from core.field.growth.seed import Seeds, match_seeds, seed_motion, seed_shape
 from core.field.growth.state import FieldInputs, GrowthState, begin, fresh_attempts
 from core.field.points.assemble import assemble
 from core.field.points.result import Field
+from core.field.seeding.diagnosis import diagnose, seed_error
 from core.status import PointStatus
 
 _LEFT_OVER = 0.02
+_MOSTLY = 0.5
 
 
 def shape_field(inputs: FieldInputs, seeds: Seeds | None) -> Field:
@@ -55,7 +57,7 @@ def fill_field(inputs: FieldInputs, state: GrowthState, *, automatic: bool, shap
         If no point is valid.
     """
     if not state.points.ok.any() and (shape is None or shape.valid.any()):
-        raise _no_seed(state.fitter.ref1.noise_variance)
+        raise _no_seed(inputs)
     if state.patch.patch == "quadratic" and state.fitter.terms == 3:
         state = refit_curved(inputs, state)
     state = choose_patch(inputs, fill(inputs, state))
@@ -77,14 +79,14 @@ def _unreached(inputs: FieldInputs, state: GrowthState) -> float:
     return float(untouched.sum()) / max(int(inputs.usable.sum()), 1)
 
 
-def _no_seed(noise_variance: float | None) -> SeedError:
-    remedy = (
-        "Check that both cameras see the same textured surface and that the calibration belongs to these "
-        "images, or give a seed point. A texture that repeats itself gives no start."
+def _no_seed(inputs: FieldInputs) -> SeedError:
+    """Return the error for a field without a start, with what its images show about the cause."""
+    usable = inputs.usable
+    found = diagnose(
+        inputs.pair,
+        (inputs.ref1, inputs.ref2),
+        inputs.current,
+        region_px=inputs.grid.extent_px,
+        repeating=bool(usable.any() and inputs.repeating[usable].mean() > _MOSTLY),
     )
-    if noise_variance is not None:
-        remedy += (
-            f" The noise model says {noise_variance**0.5:.1f} grey levels: with too much, texture passes for noise; "
-            "try without it."
-        )
-    return SeedError("no point of the region could be matched between the images from any start.", remedy=remedy)
+    return seed_error(found, inputs.matcher.ref1.noise_variance)

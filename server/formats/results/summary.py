@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,9 @@ from core.field.points.smoothing_record import Smoothing
 from core.status import PointStatus
 from server.formats.results.camera_motion import CameraMotion
 from server.formats.results.layout import COMPARISONS, FORMAT_VERSION
+
+if TYPE_CHECKING:
+    from core.field.seeding.specimen import Specimen
 
 
 def plane_residuals_mm(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -190,6 +193,9 @@ class SequenceSummary:
         An entry a finished step, in their order.
     steps_failed
         The problem of each step that could not be measured, by its number.
+    region_found
+        How the specimen was found where no region was given: `text`, `outlines_px` of its parts and `holes_px` in
+        them, `share` of the image, `matches` on it; the mask is the region's.
     """
 
     state: str
@@ -200,11 +206,23 @@ class SequenceSummary:
     seconds: float
     steps: Sequence[Mapping[str, object]]
     steps_failed: Mapping[str, object] = field(default_factory=dict)
+    region_found: Mapping[str, object] | None = None
     format_version: int = FORMAT_VERSION
 
     def document(self) -> dict[str, object]:
         """Return it as plain values."""
         return asdict(self)
+
+
+def region_found(specimen: Specimen) -> dict[str, object]:
+    """Return a specimen that was found, as the summary states it."""
+    return {
+        "text": specimen.text,
+        "share": round(specimen.share, 4),
+        "matches": specimen.matches,
+        "outlines_px": [part.tolist() for part in specimen.outlines_px],
+        "holes_px": [hole.tolist() for hole in specimen.holes_px],
+    }
 
 
 def to_json(document: Any) -> bytes:

@@ -50,6 +50,7 @@ async function list(root, testId) {
         table([
           ["Analysis", (one) => h("a", { href: `#/results/${test.id}/${one.id}` }, one.label || one.id)],
           ["Kind", (one) => one.kind],
+          ["Failed steps", (one) => one.steps_failed?.join(", ") ?? ""],
           ["Begun", (one) => when(one.created_utc)],
         ], (whole.analyses ?? []).toReversed(), { caption: "Analyses of this test, newest first", empty: "This test has not been measured yet.",
           onrow: (one) => { location.hash = `#/results/${test.id}/${one.id}`; } }));
@@ -258,7 +259,9 @@ async function show(root, testId, analysisId, query) {
 
   function drawStatus() {
     const { analysis } = result;
-    replace(status, h("span.row", badge(analysis.state, STATE_KIND[analysis.state]), analysis.stale ? badge("out of date", "warn") : null),
+    const failed = Object.keys(analysis.steps_failed ?? {});
+    replace(status, h("span.row", badge(analysis.state, STATE_KIND[analysis.state]),
+      failed.length ? h("span", { title: `Steps ${failed.join(", ")}: see Settings, checks and warnings` }, badge(`${failed.length} ${failed.length === 1 ? "step" : "steps"} failed`, "warn")) : null, analysis.stale ? badge("out of date", "warn") : null),
       analysis.stale ? h("p", h("strong", "Out of date: "), (analysis.stale_reasons ?? []).join("; ")) : null, analysis.problem ? problemText(api.problemOf(analysis.problem)) : null);
   }
 
@@ -285,6 +288,11 @@ async function show(root, testId, analysisId, query) {
     slider.max = String(Math.max(result.steps.length - 1, 0));
     aboutPanel.draw();
     if (first) await setStep(result.steps.at(-1) ?? null);
+  }), events.on("step_failed", async (event) => {
+    if (event.analysis_id !== analysisId) return;
+    await result.refresh();
+    drawStatus();
+    aboutPanel.draw();
   }), events.on("job", async (job) => {
     if (job.id !== result.analysis.job_id || job.state === result.analysis.state) return;
     await result.refresh();

@@ -57,6 +57,7 @@ export interface Events {
   job: Schemas["JobReply"];
   step: { test_id: string; n: number };
   result: { test_id: string; analysis_id: string };
+  step_failed: { test_id: string; analysis_id: string; n: number; problem: Trouble };
   camera: { camera: string; state: string; problem?: Trouble | null };
   stage: object;
   scene: object;

@@ -29,13 +29,13 @@ export function about(screen) {
   function draw() {
     const { analysis } = result;
     const steps = analysis.summary?.steps ?? [];
-    const failed = Object.entries(analysis.summary?.steps_failed ?? {});
+    const failed = Object.entries(analysis.steps_failed ?? {});
     const verdict = (/** @type {StepSummary["epipolar_check"]} */ check) => (check ? h("span", { title: check.reason }, badge(check.level, STATE_KIND[check.level] ?? "warn")) : "–");
     const warned = steps.flatMap((one) => (one.epipolar_check && one.epipolar_check.level !== "ok" ? [`Step ${one.n}: ${one.epipolar_check.reason}`] : []));
     replace(body,
       analysis.stale ? h("p", badge("out of date", "warn"), " ", (analysis.stale_reasons ?? []).join("; ")) : null,
       warned.length ? h("div", h("h3", "Warnings"), h("ul", warned.map((one) => h("li", one)))) : null,
-      failed.length ? h("div", h("h3", "Steps that failed"), h("ul", failed.map(([n, one]) => h("li", `Step ${n}: ${one.cause ?? one.detail ?? one.code} ${one.remedy ?? ""}`)))) : null,
+      failed.length ? h("div", h("h3", "Steps that failed"), h("ul", failed.map(([n, one]) => h("li", `Step ${n}: ${one.code}: ${one.cause} ${one.remedy}`)))) : null,
       h("h3", "Settings"),
       definitions([["kind", analysis.kind], ...Object.entries(analysis.settings ?? {}).map(([name, value]) => /** @type {const} */ ([name.replace(/_/g, " "), text(value)])),
         ["software", analysis.software ?? "–"], ["begun", when(analysis.created_utc)], ["calibration", analysis.inputs?.calibration_sha256 ? h("code", analysis.inputs.calibration_sha256.slice(0, 16)) : "–"]]),
