@@ -43,22 +43,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("folder", nargs="?", metavar="FOLDER", help="a test's folder: steps/<nnnn>/cam1.tif ..., calibration.json")
     add("--cam1", nargs="+", metavar="GLOB", help="camera 1's images: a quoted pattern or several paths")
     add("--cam2", nargs="+", metavar="GLOB", help="camera 2's images; files are paired in sorted order")
-<<<<<<< HEAD
     add(
         "--calibration",
         metavar="FILE",
         help="calibration.json, or another program's: see stereorig calibration convert",
     )
-    add("--roi", metavar="X0,Y0,X1,Y1", help="points lie at X0 + i step, Y0 + j step up to X1, Y1")
-=======
-    add("--calibration", metavar="FILE", help="calibration.json, DICe XML or OpenCV YAML")
     add(
         "--roi",
         metavar="X0,Y0,X1,Y1|auto",
         help="points lie at X0 + i step, Y0 + j step up to X1, Y1; auto: on the specimen, found by its texture and "
         "shown in specimen.png (auto, without a mask)",
     )
->>>>>>> series
     add("--mask", metavar="PNG", help="image of camera 1's size, white where points may lie")
     add(
         "--crack",

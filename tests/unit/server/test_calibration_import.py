@@ -15,7 +15,7 @@ import yaml
 from core.cameras.camera import Camera
 from core.cameras.lens import OpenCVLens
 from core.errors import FileFormatError
-from server.formats.calibrations.plausibility import check_calibration
+from server.formats.calibrations.programs.plausibility import check_calibration
 from server.formats.calibrations.recognise import (
     LoadedCalibration,
     imported_content,
