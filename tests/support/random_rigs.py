@@ -48,9 +48,9 @@ CAUSES: dict[str, frozenset[str]] = {
 }
 #: words of the causes that the reasons of a verdict may give for a fault, where its numbers are wrong
 REASONS: dict[str, tuple[str, ...]] = {
-    "permuted files": ("left out", "moved there", "Worst views"),
-    "bumped half-way": ("left out", "moved there"),
-    "moved in some": ("left out", "moved there"),
+    "permuted files": ("left out", "moved there", "cameras disagree"),
+    "bumped half-way": ("left out", "moved there", "cameras disagree"),
+    "moved in some": ("left out", "moved there", "cameras disagree"),
     "bent board": ("departs from a plane", "um out of plane", "Node corrections"),
     "parallel poses": ("Predicted shape uncertainty",),
     "too few poses": ("Predicted shape uncertainty", "nothing independent confirms"),
