@@ -73,6 +73,8 @@ _WIDTH_PRIOR = 0.15  # relative standard deviation of the described width
 _MAX_BLUR = 8.0
 _MIN_PIXELS = 20
 _SEARCHED_PIXELS = 500
+_MANY_PIXELS = 2000  # of a piece; a part of them leads all to within a step of their minimum
+_NO_GAIN = 1e-7  # of the sum of squares: hundredths of a standard deviation
 _MIN_BOX = 0.01  # px; narrower boxes, of lines along the rows or columns, change the profile by 1e-5 of itself
 
 
@@ -205,6 +207,108 @@ def solve_cholesky(M: Float, b: Float, x: Float) -> bool:
 
 
 @njit(cache=True, nogil=True)
+def _minimise(
+    ts: Float,
+    ds: Float,
+    gs: Float,
+    n: int,
+    every: int,
+    a: float,
+    b: float,
+    scale: float,
+    width: float,
+    fit_width: bool,
+    par: Float,
+    accepted: Float,
+    led: bool,
+) -> float:
+    """Fit ``par`` to every ``every``-th pixel; return the sum of squares, inf where there is no minimum.
+
+    ``accepted`` becomes the normal matrix at ``par``. ``led``: ``par`` lies near the minimum already.
+    """
+    count = (n + every - 1) // every
+    N = np.zeros((_N, _N))
+    g = np.zeros(_N)
+    J = np.zeros(_N)
+    trial = par.copy()
+    delta = np.zeros(_N)
+    lam = 0.0
+    best = np.inf
+    kept = False
+    for step in range(_STEPS):
+        N[:] = 0.0
+        g[:] = 0.0
+        rss = 0.0
+        for k in range(0, n, every):
+            p, pd, ps, pw = profile_terms(ds[k] - trial[0] - trial[1] * ts[k] * scale, trial[7], trial[6], a, b)
+            J[0] = -trial[5] * pd
+            J[1] = J[0] * ts[k] * scale
+            J[2] = 1.0
+            J[3] = ts[k] * scale
+            J[4] = ds[k]
+            J[5] = p
+            J[6] = trial[5] * ps
+            J[7] = trial[5] * pw if fit_width else 0.0
+            r = gs[k] - (trial[2] + trial[3] * J[3] + trial[4] * ds[k] + trial[5] * p)
+            rss += r * r
+            for i in range(_N):
+                g[i] += J[i] * r
+                for j in range(i, _N):
+                    N[i, j] += J[i] * J[j]
+        if not rss <= best * (1.0 + 1e-9):  # also NaN
+            if step == 0:
+                return np.inf
+            lam = max(4.0 * lam, 1e-3)
+            # half way back
+            for i in range(_N):
+                trial[i] = 0.5 * (trial[i] + par[i])
+            continue
+        settled = kept and best - rss < 1e-7 * best
+        best = rss
+        kept = True
+        par[:] = trial
+        if fit_width:
+            # without the description's width, a line of two pixels trades its width for depth and blur
+            prior = rss / (count - _N) / (_WIDTH_PRIOR * width) ** 2
+            N[7, 7] += prior
+            g[7] += prior * (width - par[7])
+        else:
+            N[7, 7] = 1.0
+            g[7] = 0.0
+        # slight damping on the shape keeps the matrix regular when blur or contrast are undetermined
+        N[6, 6] *= 1.0 + 1e-6
+        N[6, 6] += 1e-9
+        for i in range(_N):
+            for j in range(i):
+                N[i, j] = N[j, i]
+        accepted[:] = N
+        if settled or step == _STEPS - 1:
+            break
+        M = N.copy()
+        for i in range(_N):
+            M[i, i] *= 1.0 + lam
+            if not M[i, i] > 0.0:
+                return np.inf
+        if not solve_cholesky(M, g, delta):
+            return np.inf
+        lam *= 0.2
+        for i in range(_N):
+            trial[i] = par[i] + delta[i]
+        trial[0] = min(max(trial[0], par[0] - 1.0), par[0] + 1.0)
+        trial[6] = min(max(trial[6], max(0.08, 0.5 * par[6])), min(_MAX_BLUR, 2.0 * par[6] + 0.1))
+        trial[7] = min(max(trial[7], 0.6 * par[7]), 1.6 * par[7])
+        if led and step > 0 and lam == 0.0:
+            # a step that is foreseen to gain next to nothing is made, and not looked back at
+            gain = 0.0
+            for i in range(_N):
+                gain += delta[i] * g[i]
+            if gain < _NO_GAIN * best:
+                par[:] = trial
+                break
+    return best
+
+
+@njit(cache=True, nogil=True)
 def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, out: Float) -> None:
     out[:] = np.nan
     out[15] = 0.0
@@ -266,78 +370,18 @@ def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, ou
     par[2] = ground / n_ground
     peak, _, _, _ = profile_terms(0.0, width, blur, a, b)
     par[5] = (line / n_line - par[2]) / max(peak, 0.1)
-    N = np.zeros((_N, _N))
-    accepted = np.zeros((_N, _N))  # the normal matrix at ``par``; N may be that of a rejected trial
-    g = np.zeros(_N)
-    J = np.zeros(_N)
-    trial = par.copy()
-    delta = np.zeros(_N)
-    C = np.zeros((_N, _N))
-    lam = 0.0
-    best = np.inf
-    kept = False
-    for step in range(_STEPS):
-        N[:] = 0.0
-        g[:] = 0.0
-        rss = 0.0
-        for k in range(n):
-            p, pd, ps, pw = profile_terms(ds[k] - trial[0] - trial[1] * ts[k] * scale, trial[7], trial[6], a, b)
-            J[0] = -trial[5] * pd
-            J[1] = J[0] * ts[k] * scale
-            J[2] = 1.0
-            J[3] = ts[k] * scale
-            J[4] = ds[k]
-            J[5] = p
-            J[6] = trial[5] * ps
-            J[7] = trial[5] * pw if fit_width else 0.0
-            r = gs[k] - (trial[2] + trial[3] * J[3] + trial[4] * ds[k] + trial[5] * p)
-            rss += r * r
-            for i in range(_N):
-                g[i] += J[i] * r
-                for j in range(i, _N):
-                    N[i, j] += J[i] * J[j]
-        if not rss <= best * (1.0 + 1e-9):  # also NaN
-            if step == 0:
-                return
-            lam = max(4.0 * lam, 1e-3)
-            # half way back
-            for i in range(_N):
-                trial[i] = 0.5 * (trial[i] + par[i])
-            continue
-        settled = kept and best - rss < 1e-7 * best
-        best = rss
-        kept = True
-        par[:] = trial
-        if fit_width:
-            # without the description's width, a line of two pixels trades its width for depth and blur
-            prior = rss / (n - _N) / (_WIDTH_PRIOR * width) ** 2
-            N[7, 7] += prior
-            g[7] += prior * (width - par[7])
-        else:
-            N[7, 7] = 1.0
-            g[7] = 0.0
-        # slight damping on the shape keeps the matrix regular when blur or contrast are undetermined
-        N[6, 6] *= 1.0 + 1e-6
-        N[6, 6] += 1e-9
-        for i in range(_N):
-            for j in range(i):
-                N[i, j] = N[j, i]
-        accepted[:] = N
-        if settled or step == _STEPS - 1:
-            break
-        M = N.copy()
-        for i in range(_N):
-            M[i, i] *= 1.0 + lam
-            if not M[i, i] > 0.0:
-                return
-        if not solve_cholesky(M, g, delta):
-            return
-        lam *= 0.2
-        for i in range(_N):
-            trial[i] = par[i] + delta[i]
-        trial[0] = min(max(trial[0], par[0] - 1.0), par[0] + 1.0)
-        trial[6] = min(max(trial[6], max(0.08, 0.5 * par[6])), min(_MAX_BLUR, 2.0 * par[6] + 0.1))
-        trial[7] = min(max(trial[7], 0.6 * par[7]), 1.6 * par[7])
+    accepted = np.zeros((_N, _N))
+    led = False
+    if n > _MANY_PIXELS:
+        start, every = par.copy(), n // _SEARCHED_PIXELS
+        best = _minimise(ts, ds, gs, n, every, a, b, scale, width, fit_width, par, accepted, False)
+        led = np.isfinite(best)
+        if not led:
+            par[:] = start
+    best = _minimise(ts, ds, gs, n, 1, a, b, scale, width, fit_width, par, accepted, led)
+    if not np.isfinite(best):
+        return
+    J, delta, C = np.zeros(_N), np.zeros(_N), np.zeros((_N, _N))
     dof = n - (_N if fit_width else _N - 1)
     variance = best / dof
     for j in range(_N):  # inverse, column by column

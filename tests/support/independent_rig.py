@@ -6,6 +6,7 @@ It shares nothing with `core` or `sim`, so that what the command line finds in t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,6 +117,18 @@ class LineGrid:
 FLAT = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
 
 
+class Drawn(TypedDict, total=False):
+    """How a pattern is drawn, see :func:`picture`."""
+
+    frame: Array
+    origin: Array | None
+    dz: float
+    n: int
+    low: float
+    high: float
+    blur_px: float
+
+
 def picture(
     camera: PlainCamera,
     pattern: Waves | LineGrid,
@@ -149,19 +162,7 @@ def exposed(grey: Array, noise: float, rng: np.random.Generator) -> NDArray[np.u
 
 
 def render(
-    camera: PlainCamera,
-    pattern: Waves | LineGrid,
-    *,
-    frame: Array = FLAT,
-    origin: Array | None = None,
-    dz: float = 0.0,
-    n: int = 4,
-    low: float = 40.0,
-    high: float = 210.0,
-    noise: float = 2.0,
-    blur_px: float = 0.6,
-    seed: int = 0,
+    camera: PlainCamera, pattern: Waves | LineGrid, *, noise: float = 2.0, seed: int = 0, **drawn: Unpack[Drawn]
 ) -> NDArray[np.uint8]:
-    """A picture of the pattern with noise, in eight bits."""
-    grey = picture(camera, pattern, frame=frame, origin=origin, dz=dz, n=n, low=low, high=high, blur_px=blur_px)
-    return exposed(grey, noise, np.random.default_rng(seed))
+    """A picture of the pattern with noise, in eight bits; ``drawn`` as of :func:`picture`."""
+    return exposed(picture(camera, pattern, **drawn), noise, np.random.default_rng(seed))
