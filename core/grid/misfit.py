@@ -156,7 +156,7 @@ def without_misfit(
 
     Parameters
     ----------
-    image, pieces, guard_blurs
+    image, pieces
         As :func:`core.grid.profile.fit_pieces` had them, with no search.
     fits
         (n, :data:`core.grid.profile.OUTPUTS`) its result.
@@ -164,6 +164,8 @@ def without_misfit(
         (n,) 0 or 1 of each piece.
     good
         (n,) pieces that show the misfit; the others keep their fit as it is.
+    guard_blurs
+        As :func:`core.grid.profile.fit_pieces` had it.
 
     Returns
     -------

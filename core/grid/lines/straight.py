@@ -46,6 +46,7 @@ def fit_straight(
     LineFit
         With the intersections' covariance from the points' own noise.
     Distortion
+        Common to all lines.
     normal
         (n_line, 2) across each line in coordinates without distortion.
     """
