@@ -56,8 +56,9 @@ def seed_shape(inputs: FieldInputs, state: GrowthState, seeds: Seeds | None) -> 
     """Seed a shape."""
     inputs.progress("seeds", 0, 1)
     if seeds is not None:
-        _given_shape(inputs, state, as_seeds(seeds))
-    elif match_seeds(inputs, state) == 0:
+        state = _given_shape(inputs, state, as_seeds(seeds))
+    # a user's seed comes first: of a texture that repeats itself it says which period is right
+    if not state.points.ok.any() and match_seeds(inputs, state) == 0:
         _swept_shape(inputs, state)
     inputs.progress("seeds", 1, 1)
     return state
@@ -79,8 +80,8 @@ def seed_motion(
             return _go_on(inputs, state, w, G)
     inputs.progress("seeds", 0, 1)
     if seeds is not None:
-        _given_motion(inputs, state, as_seeds(seeds))
-    elif not _stayed(inputs, state):
+        state = _given_motion(inputs, state, as_seeds(seeds))
+    if not state.points.ok.any() and not _stayed(inputs, state):
         state.points.status[inputs.usable] = PointStatus.NOT_SEEDED
         if match_seeds(inputs, state) == 0:
             _searched_motion(inputs, state)
@@ -205,7 +206,8 @@ def _nearest(inputs: FieldInputs, seeds: tuple[Seed, ...], usable: Bool) -> NDAr
     return nearest_points(seeds, inputs.xy_px, usable, reach_px=reach, visibility=inputs.visibility)
 
 
-def _given_shape(inputs: FieldInputs, state: GrowthState, seeds: tuple[Seed, ...]) -> None:
+def _given_shape(inputs: FieldInputs, state: GrowthState, seeds: tuple[Seed, ...]) -> GrowthState:
+    failed = []
     for seed, i in zip(seeds, _nearest(inputs, seeds, inputs.usable), strict=True):
         raise_if_cancelled(inputs.cancel)
         found = PointFits.empty(1, 1)
@@ -217,15 +219,26 @@ def _given_shape(inputs: FieldInputs, state: GrowthState, seeds: tuple[Seed, ...
         if not found.ok[0]:
             found = sweep_shape(state.fitter, inputs.ref1.pixels, inputs.ref2.pixels, inputs.xy_px[i])
         _put_one(state, i, found)
+        if not found.ok[0]:
+            failed.append(seed.xy_px)
+    return replace(state, failed_seeds_px=tuple(failed))
 
 
-def _given_motion(inputs: FieldInputs, state: GrowthState, seeds: tuple[Seed, ...]) -> None:
+def _given_motion(inputs: FieldInputs, state: GrowthState, seeds: tuple[Seed, ...]) -> GrowthState:
     if inputs.known_w is None:
         raise SeedError("a seed for a motion needs the shape that was measured before it.")
-    index = _nearest(inputs, seeds, inputs.usable & np.isfinite(inputs.known_w).all(axis=1))
-    for i in index[~inputs.repeating[index]]:
+    failed = []
+    for seed, i in zip(
+        seeds, _nearest(inputs, seeds, inputs.usable & np.isfinite(inputs.known_w).all(axis=1)), strict=True
+    ):
+        if inputs.repeating[i]:
+            continue
         raise_if_cancelled(inputs.cancel)
-        _put_one(state, i, search_motion(state.fitter, inputs.xy_px[i], inputs.known_w[i]))
+        found = search_motion(state.fitter, inputs.xy_px[i], inputs.known_w[i])
+        _put_one(state, i, found)
+        if not found.ok[0]:
+            failed.append(seed.xy_px)
     if not state.points.ok.any():
         # turned or stretched too far for a template: the matches about the seed give the deformation
         match_seeds(inputs, state)
+    return replace(state, failed_seeds_px=tuple(failed))
