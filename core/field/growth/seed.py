@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from core.arrays import Bool, Float
 from core.errors import SeedError
@@ -47,7 +48,8 @@ from core.status import PointStatus
 Seeds = Sequence[Seed | Sequence[float]] | NDArray[Any]
 
 _MIN_MATCHES = 12
-_SAMPLE_SHARE = 0.7
+_SAMPLE_SHARE = 0.3  # of a sample: the rest may be hidden, or have moved by itself, and is seeded after growth
+_NEAREST = 3
 _REACH_STEPS = 2.0
 _SEARCHED = 6  # positions
 
@@ -76,8 +78,9 @@ def seed_motion(
     if previous is not None and previous.starts is not None and previous.starts.G is not None:
         n = len(inputs.xy_px)
         w, G = previous.starts.w.reshape(n, -1), previous.starts.G.reshape(n, 3, -1)
-        if _sample_holds(inputs, state, w, G):
-            return _go_on(inputs, state, w, G)
+        tried = _sample_holds(inputs, state, w, G)
+        if len(tried):
+            return _go_on(inputs, state, w, G, tried)
     inputs.progress("seeds", 0, 1)
     if seeds is not None:
         state = _given_motion(inputs, state, as_seeds(seeds))
@@ -135,8 +138,11 @@ def _match_seeds_at(inputs: FieldInputs, state: GrowthState, scale: int, box1: B
     return found
 
 
-def _go_on(inputs: FieldInputs, state: GrowthState, w: Float, G: Float) -> GrowthState:
-    """Start all points from the previous step's values; a fitted sample of them is valid already."""
+def _go_on(inputs: FieldInputs, state: GrowthState, w: Float, G: Float, tried: NDArray[np.intp]) -> GrowthState:
+    """Start all points from the previous step's values; a fitted sample of them is valid already.
+
+    Points in the midst of those of the sample ``tried`` that failed are hidden, probably: growth gets there if not.
+    """
     if state.patch.patch == "quadratic":
         state = refit_curved(inputs, state)
     points = state.points
@@ -144,6 +150,7 @@ def _go_on(inputs: FieldInputs, state: GrowthState, w: Float, G: Float) -> Growt
     if points.G.shape == G.shape:
         G = predict(inputs.pair, inputs.xy_px, G, sample, points.w[sample], points.G[sample])
     known = np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2))
+    known &= ~_amid_failed(inputs.xy_px, tried, points.ok[tried])
     index = np.flatnonzero(inputs.usable & known & ~points.ok)
     inputs.progress("previous", 0, len(index))
     fit_in_batches(
@@ -156,23 +163,36 @@ def _go_on(inputs: FieldInputs, state: GrowthState, w: Float, G: Float) -> Growt
 def _stayed(inputs: FieldInputs, state: GrowthState) -> bool:
     """Return True if the surface is about where it was; not tried on a texture that repeats itself."""
     w = inputs.known_w
-    return w is not None and _sample_holds(inputs, state, w, no_motion(inputs.pair, inputs.xy_px), once_only=True)
+    if w is None:
+        return False
+    return len(_sample_holds(inputs, state, w, no_motion(inputs.pair, inputs.xy_px), once_only=True)) > 0
 
 
-def _sample_holds(inputs: FieldInputs, state: GrowthState, w: Float, G: Float, *, once_only: bool = False) -> bool:
-    """Fit a spread sample from given starts; return True, and keep the sample as seeds, if nearly all of it matches."""
+def _amid_failed(xy_px: Float, tried: NDArray[np.intp], held: Bool) -> Bool:
+    """Return (n,) True where all of the nearest points of a sample failed."""
+    if held.all() or len(tried) < _NEAREST:
+        return np.zeros(len(xy_px), bool)
+    nearest = np.asarray(cKDTree(xy_px[tried]).query(xy_px, k=_NEAREST)[1])
+    return np.asarray(~held[nearest].any(axis=1))
+
+
+def _sample_holds(
+    inputs: FieldInputs, state: GrowthState, w: Float, G: Float, *, once_only: bool = False
+) -> NDArray[np.intp]:
+    """Fit a spread sample from given starts; return it, and keep its matches as seeds, if enough of it matches."""
     usable = inputs.usable & np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2))
     if once_only:
         usable &= ~inputs.repeating
+    nothing = np.zeros(0, np.intp)
     if usable.sum() < 1:
-        return False
+        return nothing
     index = spread(inputs.xy_px, usable, np.zeros(len(usable)))[0]
     fits = refine(state.fitter, inputs.xy_px[index], Starts(w[index], G[index]), far_px=SAMPLE_FAR_PX)
     if fits.ok.mean() < _SAMPLE_SHARE:
-        return False
+        return nothing
     good = np.flatnonzero(fits.ok)
     state.points.put(index[good], fits.take(good))
-    return True
+    return index
 
 
 def _swept_shape(inputs: FieldInputs, state: GrowthState) -> None:

@@ -132,9 +132,9 @@ def _matches(
     whole = np.isfinite(grey).all(axis=1)
     w, grey = w[whole], grey[whole]
     if len(w) == 0:
-        return w
+        return np.zeros((0, 3))
     zncc = normalise(grey) @ normalise(sample(image1, pixels[None]))[0]
-    return np.asarray(distinct(w, zncc, depths, _CANDIDATES)[0])
+    return distinct(w, np.asarray(zncc, np.float64), depths, _CANDIDATES)[0]
 
 
 def _has_rival(pair: StereoPair, fits: PointFits, mine: np.ndarray, best: int, quality: Float, xy_px: Float) -> bool:
