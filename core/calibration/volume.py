@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from core.arrays import Bool, Float
+from core.calibration.measured_points import measured_derivatives
 from core.calibration.result import COVARIANCE_NAMES
 from core.calibration.uncertainty import point_derivatives
 from core.cameras.camera import Camera, RigidTransform
@@ -82,9 +83,8 @@ class CalibratedVolume:
             return out
         for first in range(0, n, _AT_ONCE):
             part = slice(first, first + _AT_ONCE)
-            J = self.slopes(points_mm[part])
-            if displaced_mm is not None:
-                J = np.concatenate([J, self.slopes(displaced_mm[part]) - J], axis=1)
+            now = None if displaced_mm is None else displaced_mm[part]
+            J = measured_derivatives(self.pair, points_mm[part], self.names, now)
             out[part] = J @ self.covariance @ np.swapaxes(J, 1, 2)
         return out
 
