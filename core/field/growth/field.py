@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from core.errors import SeedError
 from core.field.checks.unreached import mark_outside
-from core.field.growth.check import check, check_residuals, fill, grow_field
+from core.field.growth.check import check, check_edges, check_residuals, fill, grow_field
 from core.field.growth.patch import choose_patch, refit_curved
 from core.field.growth.reach import hidden, reach_further
 from core.field.growth.seed import Seeds, match_seeds, seed_motion, seed_shape
@@ -71,6 +71,7 @@ def fill_field(inputs: FieldInputs, state: GrowthState, *, shape: Field | None =
         reach_further(inputs, state)
     elif shape is None:
         reach_further(inputs, state)
+    check_edges(inputs, state)
     check_residuals(inputs, state)
     inputs.progress("done", int(state.points.ok.sum()), int(inputs.usable.sum()))
     return state
