@@ -58,7 +58,7 @@ def reach_further(inputs: FieldInputs, state: GrowthState) -> int:
             continue
         before = int(points.ok.sum())
         points.put(index[good], found.take(np.flatnonzero(good)))
-        state.attempts.renew(_near(inputs, label, matched))
+        state.attempts.renew(_near(inputs, label, matched) & inputs.hoped_for)
         grow_field(inputs, state)
         check(inputs, points)
         gained = int(points.ok.sum()) - before
