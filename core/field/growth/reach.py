@@ -24,7 +24,8 @@ _ROUNDS = 12
 _CLEAR_SUBSETS = 0.6  # from the nearest valid point: nearer ones have had their starts, or lie across an edge
 _PITCH_SUBSETS = 0.5  # of the positions that are searched: a subset on a small face meets one of them
 _A_GROUP = 24
-_A_ROUND = 120
+_A_ROUND = 16  # positions, and one more for so many points of the field
+_POINTS_PER_POSITION = 200
 _FIELD_SHARE = 5.0  # times the field's median of 1 - zncc: what a match without neighbours may have
 _CHANCE_ZNCC = 0.8  # what a subset of some twenty speckles reaches by chance, over all depths and tilts
 _OPEN = (
@@ -44,10 +45,10 @@ def reach_further(inputs: FieldInputs, state: GrowthState) -> int:
     hopeless = np.zeros(len(points.status), bool)
     for _ in range(_ROUNDS):
         raise_if_cancelled(inputs.cancel)
-        label = _groups(inputs, state, hopeless)
+        label, distance = _groups(inputs, state, hopeless)
         if not label.any():
             break
-        index = _positions(inputs, label)
+        index = _positions(inputs, label, distance)
         found = _search(inputs, state, index)
         good = found.ok
         matched = np.zeros(int(label.max()) + 1, bool)
@@ -72,20 +73,25 @@ def _open(inputs: FieldInputs, state: GrowthState) -> Bool:
     return np.asarray(inputs.usable & inputs.hoped_for & np.isin(state.points.status, _OPEN))
 
 
-def _groups(inputs: FieldInputs, state: GrowthState, hopeless: Bool) -> NDArray[np.int32]:
-    """Return (n,) the group of each open point that lies clear of the valid ones; 0: in none."""
+def _groups(inputs: FieldInputs, state: GrowthState, hopeless: Bool) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Return (n,) the group of each open point that lies clear of the valid ones, 0: in none, and its distance, points."""
     shape = inputs.grid.shape
     clear = max(_CLEAR_SUBSETS * inputs.options.subset_px / inputs.grid.spacing_px, 1.0)
-    distance = cv2.distanceTransform((~state.points.ok).astype(np.uint8).reshape(shape), cv2.DIST_C, 3)
-    core = _open(inputs, state) & ~hopeless & (np.asarray(distance).ravel() > clear)
+    distance = np.asarray(
+        cv2.distanceTransform((~state.points.ok).astype(np.uint8).reshape(shape), cv2.DIST_C, 3), np.float32
+    ).ravel()
+    core = _open(inputs, state) & ~hopeless & (distance > clear)
     if core.any():
         core &= ~inputs.repeating
     label = cv2.connectedComponents(core.astype(np.uint8).reshape(shape), connectivity=8)[1]
-    return np.asarray(label, dtype=np.int32).ravel()
+    return np.asarray(label, dtype=np.int32).ravel(), distance
 
 
-def _positions(inputs: FieldInputs, label: NDArray[np.int32]) -> NDArray[np.intp]:
-    """Return the points to be searched: those of most texture in the cells of each group, few in a large one."""
+def _positions(inputs: FieldInputs, label: NDArray[np.int32], distance: NDArray[np.float32]) -> NDArray[np.intp]:
+    """Return the points to be searched: those farthest from valid ones in the cells of each group, few in a large one.
+
+    That is where the middle of a face lies that growth did not reach.
+    """
     core = np.flatnonzero(label > 0)
     xy, own = inputs.xy_px[core], label[core]
     size = np.bincount(own)
@@ -93,13 +99,13 @@ def _positions(inputs: FieldInputs, label: NDArray[np.int32]) -> NDArray[np.intp
     # a large group is sampled more coarsely
     cell = pitch * np.maximum(np.sqrt(size * (inputs.grid.spacing_px / pitch) ** 2 / _A_GROUP), 1.0)
     place = np.floor((xy - xy.min(axis=0)) / cell[own][:, None]).astype(np.int64)
-    order = np.lexsort((-inputs.texture[core], place[:, 1], place[:, 0], own))
+    order = np.lexsort((-distance[core], place[:, 1], place[:, 0], own))
     key = np.stack([own, place[:, 0], place[:, 1]], axis=1)[order]
     first = np.ones(len(order), bool)
     first[1:] = (key[1:] != key[:-1]).any(axis=1)
     chosen = core[order[first]]
-    # the largest groups first, where there are too many
-    return np.asarray(chosen[np.argsort(-size[label[chosen]], kind="stable")][:_A_ROUND])
+    most = _A_ROUND + int(inputs.usable.sum()) // _POINTS_PER_POSITION
+    return np.asarray(chosen[np.argsort(-distance[chosen], kind="stable")][:most])
 
 
 def _search(inputs: FieldInputs, state: GrowthState, index: NDArray[np.intp]) -> PointFits:

@@ -15,14 +15,15 @@ from core.arrays import Bool, Float, Float32
 from core.cameras.stereo import StereoPair
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.starts import depth_per_px, image_shift_px
-from core.field.seeding.epipolar_search import distinct, normalise, sample, tilted, visible_depths
+from core.field.seeding.epipolar_search import distinct, normalise, sample, tilted
 
 _BEYOND = 0.5  # of the range of depths, on either side
 _BEYOND_PX = 24.0
 _MAX_DEPTHS = 600
 _TILTS_RAD = ((0.0, 1), (0.6, 6), (1.0, 8))  # and the number of directions of each; patches tolerate some 15 degrees
 _CANDIDATES = 4
-_SAMPLES = 13  # per side
+_SAMPLES = 11  # per side
+_STEP_PX = 1.5  # of depth: the refinement finds its way over two
 _FAR_PX = 4.0
 _DISTINCT_PX = 2.0
 _AMBIGUOUS = 2.0
@@ -108,23 +109,26 @@ def _matches(
     ox, oy = (a.ravel() for a in np.meshgrid(offsets, offsets))
     pixels = xy_px + np.stack([ox, oy], axis=-1)
     rows, cols = image1.shape
-    depths = visible_depths(pair, xy_px, (image2.shape[0], image2.shape[1]))
-    depths = depths[(depths > within.low) & (depths < within.high)]
     inside = pixels.min() >= 0 and pixels[:, 0].max() <= cols - 1 and pixels[:, 1].max() <= rows - 1
-    if not (2 <= len(depths) <= _MAX_DEPTHS and inside):
+    if not inside:
         return np.zeros((0, 3))
     rays = pair.cam1.rays_cam(pixels).xyz_mm
     ray = pair.cam1.rays_cam(xy_px[None]).xyz_mm[0]
+    px = float(depth_per_px(pair, ray[None], np.array([0.5 * (within.low + within.high)]))[0])
+    depths = np.arange(within.low, within.high, _STEP_PX * px)
+    if not 2 <= len(depths) <= _MAX_DEPTHS:
+        return np.zeros((0, 3))
     d = rays[:, :2] - ray[:2]
     w = np.concatenate(tilted(pair, ray, depths, normals))
     inverse = w[:, :1] + w[:, 1:] @ d.T  # (m, s)
-    step = 0.5 * (depths.max() - depths.min()) / (len(depths) - 1)
-    low, high = max(float(inverse.min()), 0.5 * within.low), min(float(inverse.max()), 2.0 * within.high)
+    # a face of 65 degrees changes the depth by a px in a px of the subset
+    low, high = max(within.low - half * px, 0.5 * within.low), within.high + half * px
+    step = 0.5 * px
     ladder = np.arange(low, high + step, step)
     xy2 = pair.image2_at_depth(pixels[:, None], 1.0 / ladder[None])  # (s, l, 2)
     with np.errstate(invalid="ignore"):
         seen = (xy2 >= 0.0).all(axis=-1) & (xy2[..., 0] <= image2.shape[1] - 1) & (xy2[..., 1] <= image2.shape[0] - 1)
-    levels = np.where(seen, sample(image2, np.where(seen[..., None], xy2, 0.0)), np.nan)
+    levels = np.where(seen, sample(image2, np.where(seen[..., None], xy2, 0.0)), np.nan).astype(np.float32)
     place = np.rint((inverse - low) / step).astype(np.int64)
     whole = ((place >= 0) & (place < len(ladder))).all(axis=1)
     w, place = w[whole], place[whole]
@@ -133,7 +137,7 @@ def _matches(
     w, grey = w[whole], grey[whole]
     if len(w) == 0:
         return np.zeros((0, 3))
-    zncc = normalise(grey) @ normalise(sample(image1, pixels[None]))[0]
+    zncc = normalise(grey) @ normalise(sample(image1, pixels[None]))[0].astype(np.float32)
     return distinct(w, np.asarray(zncc, np.float64), depths, _CANDIDATES)[0]
 
 
