@@ -22,7 +22,7 @@ HEIGHTS_MM = (9.0, 4.0, 12.0, 2.5, 7.0, 12.0, 3.0, 10.0, 5.5)
 
 @pytest.fixture(scope="module")
 def steps() -> Part:
-    """A plate with nine pillars of 34 px, a subset and a half, with disparities of 10 to 48 px, and a plateau of 0.4 mm."""
+    """A plate with nine pillars of 34 px, a subset and a half, up to 48 px of disparity high, and a low plateau."""
     pillars = [
         Feature(PLATEAU, (-8.5 + 7.5 * (k % 3), -7.0 + 7.0 * (k // 3)), (1.7, 1.7), height)
         for k, height in enumerate(HEIGHTS_MM)

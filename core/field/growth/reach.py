@@ -74,7 +74,7 @@ def _open(inputs: FieldInputs, state: GrowthState) -> Bool:
 
 
 def _groups(inputs: FieldInputs, state: GrowthState, hopeless: Bool) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Return (n,) the group of each open point that lies clear of the valid ones, 0: in none, and its distance, points."""
+    """Return (n,) the group of each open point that lies clear of valid ones, 0: in none, and that distance, points."""
     shape = inputs.grid.shape
     clear = max(_CLEAR_SUBSETS * inputs.options.subset_px / inputs.grid.spacing_px, 1.0)
     distance = np.asarray(

@@ -20,7 +20,9 @@ from core.field.seeding.epipolar_search import distinct, normalise, sample, tilt
 _BEYOND = 0.5  # of the range of depths, on either side
 _BEYOND_PX = 24.0
 _MAX_DEPTHS = 600
-_TILTS_RAD = ((0.0, 1), (0.6, 6), (1.0, 8))  # and the number of directions of each; patches tolerate some 15 degrees
+_TILT_RAD = 1.05
+_TILT_STEP_RAD = (0.22, 0.52)
+_TILT_PX = 2.2  # of disparity at the subset's edge: half a step is refined
 _CANDIDATES = 4
 _SAMPLES = 11  # per side
 _STEP_PX = 1.5  # of depth: the refinement finds its way over two
@@ -44,15 +46,29 @@ def depth_range(pair: StereoPair, rays: Float, w0: Float) -> DepthRange:
     return DepthRange(max(low - more, 0.2 * low), high + more)
 
 
-def tilts() -> Float:
-    """Return (m, 3) unit normals, as :func:`core.field.seeding.epipolar_search.tilted` takes them."""
-    turn = 2.0 * np.pi
-    out = [
-        (np.sin(tilt) * np.sin(turn * k / count), np.sin(tilt) * np.cos(turn * k / count), np.cos(tilt))
-        for tilt, count in _TILTS_RAD
-        for k in range(count)
-    ]
+def tilts(between_rad: float, subset_px: int) -> Float:
+    """Return (m, 3) unit normals, as :func:`core.field.seeding.epipolar_search.tilted` takes them.
+
+    The wider the angle between the views, the more a tilt distorts one of them, and the finer the steps.
+    """
+    per_rad = max(subset_px // 2 * 2.0 * np.tan(0.5 * between_rad), 1e-3)
+    step = float(np.clip(_TILT_PX / per_rad, *_TILT_STEP_RAD))
+    out = [(0.0, 0.0, 1.0)]
+    for tilt in np.arange(step, _TILT_RAD + 1e-9, step):
+        count = max(int(np.ceil(2.0 * np.pi * np.sin(tilt) / step)), 5)
+        turn = 2.0 * np.pi * np.arange(count) / count
+        out += list(
+            zip(np.sin(tilt) * np.sin(turn), np.sin(tilt) * np.cos(turn), np.full(count, np.cos(tilt)), strict=True)
+        )
     return np.array(out)
+
+
+def pair_angle(pair: StereoPair, xy_px: Float, w0: float) -> float:
+    """Return the median angle between both cameras' views of points (n, 2) at an inverse depth, rad."""
+    point = pair.cam1.rays_cam(xy_px).xyz_mm / w0
+    other = point - pair.cam2_from_cam1.inverse().translation_mm
+    cosine = np.sum(point * other, axis=1) / np.linalg.norm(point, axis=1) / np.linalg.norm(other, axis=1)
+    return float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
 def search_shapes(fitter: Fitter, xy_px: Float, within: DepthRange, *, min_zncc: float) -> PointFits:
@@ -76,7 +92,8 @@ def search_shapes(fitter: Fitter, xy_px: Float, within: DepthRange, *, min_zncc:
     smooth1, smooth2 = (
         np.asarray(cv2.GaussianBlur(image.pixels, (0, 0), 1.0), np.float32) for image in (fitter.ref1, fitter.ref2)
     )
-    normals = tilts()
+    middle = pair_angle(fitter.pair, xy_px, 0.5 * (within.low + within.high))
+    normals = tilts(middle, fitter.options.subset_px)
     starts, owners = [], []
     for i in range(n):
         w = _matches(fitter.pair, smooth1, smooth2, xy_px[i], within, normals, fitter.options.subset_px)

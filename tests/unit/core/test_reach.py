@@ -54,7 +54,10 @@ def test_a_search_finds_faces_of_any_tilt_from_the_depths_alone(degrees: float, 
     w = true_w(PAIR.cam1, plane, XY)
     within = depth_range(PAIR, rays(), w[:, 0])
     found = search_shapes(matcher, XY, within, min_zncc=0.8)
-    assert found.ok.mean() > 0.8
+    from_truth = matcher.fit(XY, w, None)
+    could = from_truth.ok & (from_truth.quality > 0.8)
+    assert could.mean() > 0.2
+    assert found.ok[could].mean() > 0.8
     off = np.abs(found.w[found.ok, 0] - w[found.ok, 0]) / depth_per_px(PAIR, rays(), w[:, 0])[found.ok]
     assert off.max() < 0.2  # a match elsewhere is pixels off
 
@@ -71,9 +74,12 @@ def test_a_search_in_an_image_of_something_else_finds_nothing() -> None:
     assert not search_shapes(hidden, XY, within, min_zncc=0.8).ok.any()
 
 
-def test_the_tilts_are_unit_normals_up_to_57_degrees() -> None:
-    np.testing.assert_allclose(np.linalg.norm(tilts(), axis=1), 1.0)
-    assert np.rad2deg(np.arccos(tilts()[:, 2])).max() == pytest.approx(57.3, abs=0.1)
+@pytest.mark.parametrize(("between_rad", "most"), [(0.2, 25), (0.4, 25), (1.05, 90)])
+def test_the_tilts_are_unit_normals_and_finer_between_wide_views(between_rad: float, most: int) -> None:
+    normals = tilts(between_rad, SUBSET_PX)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
+    assert np.rad2deg(np.arccos(normals[:, 2])).max() > 50.0
+    assert 10 < len(normals) < most  # a search takes its time for each
 
 
 def some_valid(matcher: Fitter, plane: Plane, known: np.ndarray) -> tuple[PointFits, np.ndarray]:
