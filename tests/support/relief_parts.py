@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from core.cameras.stereo import StereoPair
 from core.field.points.result import Field
 from core.field.region.region import PointGrid
 from core.status import PointStatus
-from tests.support.relief_rig import Body, Optics, ReliefCamera, exposed, picture, truth
+from tests.support.relief_rig import Body, Optics, ReliefCamera, Seen, exposed, picture, truth
 
 WRONG_SIGMAS = 5.0
 
@@ -77,7 +77,7 @@ class Found:
         return float(np.nanmax(self.error_sigmas))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Part:
     """A part at rest before two cameras."""
 
@@ -99,9 +99,20 @@ class Part:
         return a, b
 
     def beside_truth(self, field: Field, grid: PointGrid, subset_px: int) -> Found:
-        seen = truth(self.cameras, self.bodies, grid.xy_px, subset_px=subset_px)
+        seen = _truth_everywhere(self, subset_px)
+        x, y = (np.rint(v).astype(int) for v in (grid.x_px, grid.y_px))
+        assert (x == grid.x_px).all()
+        assert (y == grid.y_px).all()
         with np.errstate(invalid="ignore"):
-            off = np.abs(field.xyz_mm - seen.xyz_mm) / field.sigma_mm[..., :3]
+            off = np.abs(field.xyz_mm - seen.xyz_mm[y, x]) / field.sigma_mm[..., :3]
         # a point whose centre sees nothing has no truth: valid, it is wrong
         off = np.where(field.valid[..., None], np.nan_to_num(off, nan=np.inf), np.nan)
-        return Found(seen.one_face, seen.face, field.status, field.valid, off.max(axis=-1))
+        return Found(seen.one_face[y, x], seen.face[y, x], field.status, field.valid, off.max(axis=-1))
+
+
+@lru_cache(maxsize=4)
+def _truth_everywhere(part: Part, subset_px: int) -> Seen:
+    """The truth at every pixel of camera 1."""
+    w, h = part.cameras[0].size
+    x, y = np.meshgrid(np.arange(w, dtype=float), np.arange(h, dtype=float))
+    return truth(part.cameras, part.bodies, np.stack([x, y], axis=-1), subset_px=subset_px)
