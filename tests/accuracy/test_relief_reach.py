@@ -9,6 +9,7 @@ from core.field.points import features, fitter
 from core.field.points.result import Field
 from core.field.region.region import PointGrid
 from core.measure import MeasureOptions, ReferencePair, measure_shape
+from server.formats.results.summary import summarise
 from tests.support.relief_parts import Part
 from tests.support.relief_rig import PLATEAU, Body, Feature, Texture, two_cameras
 
@@ -73,6 +74,7 @@ def test_a_given_seed_that_fails_is_named_and_the_field_measured_all_the_same(
     grid = placed()
     field = shape_of(steps, (first, second), grid, seeds=[(275.0, 45.0)])
     assert field.failed_seeds_px == ((275.0, 45.0),)
+    assert summarise(field).document()["failed_seeds_px"] == ((275.0, 45.0),)
     far = (grid.x_px < 200) | (grid.y_px > 110)
     found = steps.beside_truth(field, grid, SUBSET_PX)
     # a twentieth is left to the validity checks
