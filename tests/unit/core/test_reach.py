@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from core.field.checks.straddling import half_subsets
 from core.field.points.fitter import Fitter, PointFits
+from core.field.points.images import MeasureImage
+from core.field.points.result import Field
 from core.field.points.starts import depth_per_px
 from core.field.seeding.local_search import depth_range, search_shapes, tilts
 from core.field.seeding.predicted import local_motion, predicted_motion, seen_elsewhere
+from core.field.sequence.still_visible import still_visible
 from core.matching import MatchOptions, prepare
 from core.status import PointStatus
 from tests.support.matching_scene import Plane, Texture, digitise, grid, paper_pair, render, true_g, true_w
@@ -117,3 +122,34 @@ def test_each_half_of_a_subset_holds_its_middle() -> None:
     assert halves[:, SUBSET_PX // 2, SUBSET_PX // 2].all()
     assert (np.abs(halves.mean(axis=(1, 2)) - 0.5) < 0.03).all()
     np.testing.assert_array_equal(np.maximum(halves[::2], halves[1::2]), 1)
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_later_reference_is_worth_its_time_where_both_cameras_show_the_lost_points_again(hidden: bool) -> None:
+    texture, rng = Texture(blob_mm=0.07), np.random.default_rng(4)
+    cameras, plane = (PAIR.cam1, PAIR.cam2), Plane()
+
+    def taken(at: Plane, texture2: Texture = texture) -> tuple[MeasureImage, MeasureImage]:
+        pictures = (render(cameras[0], at, texture), render(cameras[1], at, texture2))
+        one, two = (MeasureImage(digitise(p, noise=2.0, rng=rng), "image") for p in pictures)
+        return one, two
+
+    rows = (5, 5)
+    material = plane.material(PAIR.cam1, XY)
+    xyz, moved = plane.position(material), AFTER.position(material)
+    lost = np.arange(len(XY)).reshape(rows) >= 10
+    everywhere = np.ones(rows, bool)
+
+    def field(uvw: np.ndarray, valid: np.ndarray) -> Field:
+        return cast(Field, SimpleNamespace(xyz_mm=xyz.reshape(*rows, 3), uvw_mm=uvw.reshape(*rows, 3), valid=valid))
+
+    found = still_visible(
+        PAIR,
+        taken(plane),
+        taken(AFTER, Texture(blob_mm=0.07, seed=8) if hidden else texture),
+        field(np.zeros((len(XY), 3)), everywhere),
+        field(moved - xyz, ~lost),
+        lost,
+        subset_px=SUBSET_PX,
+    )
+    assert found is not hidden
