@@ -10,8 +10,8 @@ from core.field.points.result import Field
 from core.field.region.region import PointGrid
 from core.measure import MeasureOptions, ReferencePair, measure_shape
 from server.formats.results.summary import summarise
-from tests.support.relief_parts import Part
 from tests.support.relief_rig import PLATEAU, Body, Feature, Texture, two_cameras
+from tests.support.relief_truth import Part
 
 SUBSET_PX = 21
 OPTIONS = MeasureOptions(subset_px=SUBSET_PX, patch="affine")

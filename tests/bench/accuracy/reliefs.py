@@ -17,8 +17,9 @@ from core.field.points.result import Field
 from core.field.region.region import PointGrid
 from core.measure import MeasureOptions, measure_shape
 from tests.bench.accuracy.table import Row, Section
-from tests.support.relief_parts import Found, Part
+from tests.support.relief_parts import relief_plate
 from tests.support.relief_rig import CYLINDER, PLATEAU, RIDGE, VALLEY, Body, Feature, two_cameras
+from tests.support.relief_truth import Found, Part
 
 SIZE = (640, 512)
 SUBSETS_PX = (21, 27, 33)
@@ -84,20 +85,38 @@ def _rows(name: str, found: list[Found], asked_percent: float) -> list[Row]:
 
 def plate(figures: Path) -> Section:
     """A plate with wedges, without seeds, in random placements of the region."""
-    part = Part(two_cameras(SIZE), (wedges(),))
+    return _plate(
+        wedges(),
+        figures / "accuracy_faces_plate.png",
+        "Plate with wedges",
+        "Faces of 45 and 55 degrees, plateaus of 4 and 8 mm, a valley",
+    )
+
+
+def ball(figures: Path) -> Section:
+    """A plate with a ball and a cylinder too."""
+    return _plate(
+        relief_plate(),
+        figures / "accuracy_faces_ball.png",
+        "Plate with ball and cylinder",
+        "A ridge and a valley of 45 degrees, a step of 4 mm, a ball and a cylinder to 60 degrees",
+    )
+
+
+def _plate(body: Body, figure: Path, title: str, what: str) -> Section:
+    part = Part(two_cameras(SIZE), (body,))
     images = part.images()
     rows: list[Row] = []
     for subset in SUBSETS_PX:
         all_found = [_measured(part, images, grid, subset) for grid in placements(subset)]
         rows += _rows(f"{subset} px, {PLACEMENTS} placements", [found for _, found in all_found], 99.0)
         if subset == SUBSETS_PX[0]:
-            maps(figures / "accuracy_faces_plate.png", *all_found[0])
+            maps(figure, *all_found[0])
     return Section(
-        "Plate with wedges",
-        "Faces of 45 and 55 degrees, plateaus of 4 and 8 mm, a valley, 640 x 512 px, noise 2, views 23 degrees apart; default options, no "
-        "seed, the region's corner drawn at random.",
+        title,
+        f"{what}; 640 x 512 px, noise 2, views 23 degrees apart; default options, no seed, the region's corner drawn at random.",
         rows,
-        [("accuracy_faces_plate.png", "Status, error over reported sigma, and shape of one field, 21 px")],
+        [(figure.name, "Status, error over reported sigma, and shape of one field, 21 px")],
         [],
     )
 
@@ -153,4 +172,4 @@ def maps(path: Path, field: Field, found: Found) -> None:
     plt.close(fig)
 
 
-SECTIONS = {"faces-plate": plate, "faces-misfit": misfit, "faces-cylinder": rough}
+SECTIONS = {"faces-plate": plate, "faces-ball": ball, "faces-misfit": misfit, "faces-cylinder": rough}
