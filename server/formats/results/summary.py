@@ -73,6 +73,9 @@ class StepSummary:
         Smoothing of the displacement, and its spatial resolution.
     patch
         The patch of the measurement, with the reason and the numbers of the choice.
+    failed_seeds_px
+        (x, y) of given seeds that did not match, though the step was measured from others; left out where there are
+        none.
     reference_step, points_by_reference, displacement_mm
         Of displacements alone: what the step was matched against, valid points by what they were matched against, and
         the components' spans.
@@ -97,13 +100,17 @@ class StepSummary:
     reference_step: int | None = None
     points_by_reference: dict[str, int] | None = None
     displacement_mm: dict[str, Span | None] | None = None
+    failed_seeds_px: tuple[tuple[float, float], ...] = ()
 
     def document(self) -> dict[str, object]:
         """Return it as plain values; a shape has no entries of displacements."""
         of_motion = ("reference_step", "points_by_reference", "displacement_mm")
         motion = None if self.camera_motion is None else self.camera_motion.document()
         plain = {**asdict(replace(self, camera_motion=None)), "camera_motion": motion}
-        return {k: v for k, v in plain.items() if self.kind == "displacement" or k not in of_motion}
+        left_out = set() if self.kind == "displacement" else set(of_motion)
+        if not self.failed_seeds_px:
+            left_out.add("failed_seeds_px")
+        return {k: v for k, v in plain.items() if k not in left_out}
 
 
 def summarise(
@@ -158,6 +165,7 @@ def summarise(
         smoothing=result.smoothing,
         patch=result.patch,
         camera_motion=camera_motion,
+        failed_seeds_px=result.failed_seeds_px,
     )
     if result.uvw_mm is None:
         return summary
