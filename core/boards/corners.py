@@ -21,7 +21,7 @@ def find_checkerboard(pictures: Pictures, size: tuple[int, int], *, coarsely: bo
 
     ``coarsely``: on the smallest picture only.
     """
-    for picture, factor in pictures.scales()[: 1 if coarsely else None]:
+    for picture, factor in pictures.scales(1 if coarsely else 3):
         found, corners = cv2.findChessboardCornersSB(picture, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
         if found:
             grid = _arranged(_settled(picture, np.asarray(corners), size), size, factor)
@@ -32,7 +32,7 @@ def find_checkerboard(pictures: Pictures, size: tuple[int, int], *, coarsely: bo
 
 def search_checkerboard(pictures: Pictures, size: tuple[int, int]) -> Float | None:
     """Search longer, where :func:`find_checkerboard` found nothing."""
-    for picture, factor in pictures.scales()[:2]:
+    for picture, factor in pictures.scales(2):
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
         found, corners = cv2.findChessboardCornersSB(picture, size, flags=flags)
         if not found:

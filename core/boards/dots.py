@@ -84,7 +84,7 @@ class DotSearch:
 def find_dots(pictures: Pictures, target: BoardTarget, *, coarsely: bool = False) -> DotSearch:
     """Find a grid of dots; ``coarsely``: on the smallest picture only."""
     best = DotSearch(None, (0, 0), np.zeros((0, 2)), False)
-    for picture, scale in pictures.scales()[: 1 if coarsely else None]:
+    for picture, scale in pictures.scales(1 if coarsely else 3):
         for dark in (True, False):
             for block in _BLOCKS:
                 blobs = find_blobs(picture, dark=dark, block=block, scale=scale)

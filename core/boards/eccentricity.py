@@ -25,9 +25,10 @@ def dot_centre_offset_px(project: Callable[[Float], Float], points_mm: Float, ra
     Parameters
     ----------
     project
-        From points (..., 3) of the board, mm, Z = 0, to their image (..., 2), px.
+        From points (..., 3) of the board, mm, to their image (..., 2), px.
     points_mm
-        (..., 2) centres of the dots on the board.
+        (..., 2) centres of the dots on the board, or (..., 3) of a board that is not flat; each dot lies parallel to
+        the plane Z = 0.
     radius_mm
         Radius of the dots.
 
@@ -37,16 +38,18 @@ def dot_centre_offset_px(project: Callable[[Float], Float], points_mm: Float, ra
         (..., 2) px, to be taken off the places found, or added to those predicted. NaN where ``project`` gives NaN.
     """
     angle = np.linspace(0.0, 2.0 * np.pi, _SAMPLES, endpoint=False)
-    circle = radius_mm * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    flat = np.asarray(points_mm, dtype=np.float64).reshape(-1, 2)
-    on_board = np.concatenate([flat[:, None], flat[:, None] + circle], axis=1)
-    image = np.asarray(project(np.concatenate([on_board, np.zeros((*on_board.shape[:2], 1))], axis=-1)))
+    circle = radius_mm * np.stack([np.cos(angle), np.sin(angle), np.zeros(_SAMPLES)], axis=-1)
+    given = np.asarray(points_mm, dtype=np.float64)
+    places = given.reshape(-1, given.shape[-1])
+    centres = np.zeros((len(places), 3))
+    centres[:, : places.shape[1]] = places
+    image = np.asarray(project(np.concatenate([centres[:, None], centres[:, None] + circle], axis=1)))
     centre, outline = image[:, 0], image[:, 1:]
     out = np.full_like(centre, np.nan)
     good = np.isfinite(image).all(axis=(1, 2))
     if good.any():
         out[good] = _ellipse_centres(outline[good]) - centre[good]
-    return out.reshape(np.shape(points_mm))
+    return out.reshape(*given.shape[:-1], 2)
 
 
 def _ellipse_centres(outline: Float) -> Float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -44,13 +46,16 @@ class Pictures:
             self._kept[side_px] = eight, float(factor)
         return self._kept[side_px]
 
-    def scales(self) -> list[tuple[NDArray[np.uint8], float]]:
-        """Return the pictures to search in turn, the smallest first, each with the image's pixels per pixel."""
-        out: list[tuple[NDArray[np.uint8], float]] = []
-        for side in (COARSE_SIDE_PX, FINE_SIDE_PX, max(self.size_px)):
-            if not out or out[-1][1] > 1.0:
-                out.append(self.reduced(side))
-        return out
+    def scales(self, most: int = 3) -> Iterator[tuple[NDArray[np.uint8], float]]:
+        """Yield ``most`` pictures to search in turn, the smallest first, each with the image's pixels per pixel.
+
+        Each is made when it is asked for: the full one costs as much as a search in the smallest.
+        """
+        for side in (COARSE_SIDE_PX, FINE_SIDE_PX, max(self.size_px))[:most]:
+            picture, factor = self.reduced(side)
+            yield picture, factor
+            if factor == 1.0:
+                return
 
 
 def full_scale(xy: NDArray[np.floating], factor: float) -> Float:

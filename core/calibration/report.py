@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from core.arrays import Float
+from core.calibration.checks.agreement import share_of_own_poses
 from core.calibration.checks.measures import CheckMeasures, Measures, mean_of_cameras, measure_points, pooled
 from core.calibration.checks.positions import PositionCheck
 from core.calibration.choice.held_out import HeldOutView, held_out_view
@@ -87,6 +88,7 @@ def build_result(
         structure=chosen.structure,
         dropped=chosen.screened.dropped,
         staged=bool(problem.staged),
+        own_poses=share_of_own_poses(results, points, pair),
     )
     sigma = np.sqrt(np.maximum(np.diagonal(adjustment.covariance), 0.0))
     return CalibrationResult(

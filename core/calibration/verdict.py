@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from core.arrays import Float
+from core.calibration.checks.agreement import DISAGREE_SHARE
 from core.calibration.checks.measures import CheckMeasures, focal_lengths_px
 from core.calibration.choice.screening import DroppedView
 from core.calibration.choice.structure import Structure
@@ -53,11 +54,12 @@ def assess(
     structure: Sequence[Structure] = (),
     dropped: Sequence[DroppedView] = (),
     staged: bool = True,
+    own_poses: float = 0.0,
 ) -> Verdict:
     """Assess a calibration.
 
     By the held-out RBE of each camera, the predicted uncertainty, the node corrections, structure left in the residuals
-    and views that were dropped.
+    and views that were dropped. ``own_poses``: see :func:`core.calibration.checks.agreement.share_of_own_poses`.
     """
     level: Level = "good"
     reasons: list[str] = []
@@ -92,6 +94,12 @@ def assess(
                 f"All points of {', '.join(v.name for v in together)} are off the same way: a camera, the stage or the "
                 "target moved there."
             )
+    if level != "good" and own_poses > DISAGREE_SHARE:
+        reasons.append(
+            f"The cameras disagree about where the target was: {100.0 * own_poses:.0f} % of the squared residuals of "
+            "free poses would be gone if each camera had poses of its own. A camera moved between the views, or images "
+            "of one number do not show one pose."
+        )
     if not uncertainty.relative_shape <= options.max_shape_uncertainty:
         level = "failed"
         reasons.append(

@@ -12,7 +12,8 @@ from core.arrays import Bool, Float, Float32
 from core.errors import TargetError
 from core.grid.lattice import Lattice, apply_homography, homography
 from core.grid.piece_table import PieceTable
-from core.grid.profile import IN, OUT
+from core.grid.profile import OUT
+from core.grid.strip import IN
 from core.grid.view import GridOptions
 from core.robust import MAD_TO_SIGMA
 from core.target import GridTarget

@@ -14,7 +14,7 @@ from numba import njit
 
 from core.arrays import Bool, Float, Float32
 from core.grid.piece_table import PieceTable
-from core.grid.profile import in_strip, strip_bounds
+from core.grid.strip import in_strip, strip_bounds
 
 # of the depth, below the ground: nearer to the ground noise rules, further down the few pixels left beat with the
 # lattice;

@@ -23,6 +23,7 @@ from core.grid.dark_pixels import THRESHOLD, dark_pixel_lines, meet_non_oblique
 from core.grid.directions import directions
 from core.grid.lattice import Lattice, find_lattice, not_found, oriented, pitch_px
 from core.grid.lines import LineFit, fit_lines
+from core.grid.misfit import without_misfit
 from core.grid.piece_table import PieceTable, line_points, piece_table
 from core.grid.profile import OUT, fit_pieces
 from core.grid.threshold import LinePicture, checked_image, coarse_factors, line_picture
@@ -256,6 +257,8 @@ def _measure(
     fits = fit_pieces(grey, table.rows, dark_lines=target.dark_lines)
     good, cause = check_pieces(table, fits, target, saturation)
     check_coverage(table, good, cause, options)
+    if blur_px is not None:
+        fits = without_misfit(grey, table.rows, fits, family=table.family, good=good)
     pp = line_points(table, fits)
     size = (grey.shape[1], grey.shape[0])
     used = good[pp.piece]

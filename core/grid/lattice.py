@@ -15,7 +15,7 @@ from core.arrays import Float
 from core.errors import TargetError
 from core.grid.chains import Chain, CoarseLine, link, order
 from core.grid.directions import Directions, family_pieces
-from core.grid.lines import meet_parabolas
+from core.grid.lines.parabolas import meet_parabolas
 from core.grid.threshold import LinePicture
 from core.grid.view import Orientation
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from core.arrays import Float
 from core.grid.lines import LinePoints
-from core.grid.profile import IN, INPUTS, OUT
+from core.grid.profile import OUT
+from core.grid.strip import IN, INPUTS
 from core.target import GridTarget
 
 _FIRST_BLUR_PX = 0.7

@@ -22,28 +22,9 @@ import numpy as np
 from numba import njit
 
 from core.arrays import Float, Float32
+from core.grid.strip import search_across, strip_bounds, strip_pixels, strip_reach
 
-# columns of the table of pieces
-INPUTS = (
-    "x",
-    "y",
-    "dir_x",
-    "dir_y",
-    "half_length",
-    "bend",
-    "start_x",
-    "start_y",
-    "start_nx",
-    "start_ny",
-    "end_x",
-    "end_y",
-    "end_nx",
-    "end_ny",
-    "width",
-    "blur",
-    "search",
-    "room",
-)
+# columns of the table of fits
 OUTPUTS = (
     "c0",
     "c1",
@@ -63,17 +44,19 @@ OUTPUTS = (
     "ok",
     "peak",
 )
-IN = {name: k for k, name in enumerate(INPUTS)}
 OUT = {name: k for k, name in enumerate(OUTPUTS)}
 
 _STEPS = 12
-_N = 8  # c0, c1, B, B_t, B_d, A, s, w
-_WIDTH_SEEN = 1.5  # px; narrower lines' width cannot be distinguished from their depth
-_WIDTH_PRIOR = 0.15  # relative standard deviation of the described width
+GUARD_BLURS = 5.0  # from a crossing line
+N_SHAPE = 8  # c0, c1, B, B_t, B_d, A, s, w
+WIDTH_SEEN = 1.5  # px; narrower lines' width cannot be distinguished from their depth
+WIDTH_PRIOR = 0.15  # relative standard deviation of the described width
 _MAX_BLUR = 8.0
 _MIN_PIXELS = 20
 _SEARCHED_PIXELS = 500
-_MIN_BOX = 0.01  # px; narrower boxes, of lines along the rows or columns, change the profile by 1e-5 of itself
+_MANY_PIXELS = 2000  # of a piece; a part of them leads all to within a step of their minimum
+_NO_GAIN = 1e-7  # of the sum of squares: hundredths of a standard deviation
+MIN_BOX = 0.01  # px; narrower boxes, of lines along the rows or columns, change the profile by 1e-5 of itself
 
 
 @njit(cache=True, nogil=True)
@@ -111,71 +94,6 @@ def profile_terms(d: float, width: float, blur: float, a: float, b: float) -> tu
 
 
 @njit(cache=True, nogil=True)
-def strip_bounds(piece: Float, half_width: float, rows: int, cols: int) -> tuple[int, int, int, int]:
-    """Pixel box (x0, x1, y0, y1), half open, that holds the piece's strip."""
-    dx, dy, h = abs(piece[2]), abs(piece[3]), piece[4]
-    rx = dx * h + dy * half_width + 1.0
-    ry = dy * h + dx * half_width + 1.0
-    x0 = max(0, int(np.floor(piece[0] - rx)))
-    x1 = min(cols, int(np.ceil(piece[0] + rx)) + 1)
-    y0 = max(0, int(np.floor(piece[1] - ry)))
-    y1 = min(rows, int(np.ceil(piece[1] + ry)) + 1)
-    return x0, x1, y0, y1
-
-
-@njit(cache=True, nogil=True)
-def in_strip(piece: Float, x: float, y: float, half_width: float, guard: float) -> tuple[bool, float, float]:
-    """Return True if a pixel lies in the piece's strip, away from both crossings, and its t and d."""
-    ex, ey = x - piece[0], y - piece[1]
-    t = ex * piece[2] + ey * piece[3]
-    d = -ex * piece[3] + ey * piece[2] - piece[5] * t * t
-    if abs(t) > piece[4] or abs(d) > half_width:
-        return False, t, d
-    if abs((x - piece[6]) * piece[8] + (y - piece[7]) * piece[9]) < guard:
-        return False, t, d
-    if abs((x - piece[10]) * piece[12] + (y - piece[11]) * piece[13]) < guard:
-        return False, t, d
-    return True, t, d
-
-
-@njit(cache=True, nogil=True)
-def _search(image: Float32, piece: Float, guard: float, sign: float) -> float:
-    """Find the deepest mean profile of the strip in the search range, by a box of the line's width."""
-    search = piece[16]
-    reach = search + 2.0 + piece[14]
-    n_bin = 2 * int(np.ceil(2.0 * reach)) + 1
-    mid = n_bin // 2
-    total = np.zeros(n_bin)
-    count = np.zeros(n_bin)
-    x0, x1, y0, y1 = strip_bounds(piece, reach, image.shape[0], image.shape[1])
-    for y in range(y0, y1):
-        for x in range(x0, x1):
-            inside, _, d = in_strip(piece, float(x), float(y), reach, guard)
-            if inside:
-                k = mid + int(np.floor(2.0 * d + 0.5))
-                if 0 <= k < n_bin:
-                    total[k] += sign * image[y, x]
-                    count[k] += 1.0
-    half = max(1, int(np.floor(piece[14] + 0.5)))
-    best, at = -np.inf, 0.0
-    for k in range(mid - int(2.0 * search), mid + int(2.0 * search) + 1):
-        inner, n_in, outer, n_out = 0.0, 0.0, 0.0, 0.0
-        for m in range(k - half - 4, k + half + 5):
-            if 0 <= m < n_bin and count[m] > 0.0:
-                if abs(m - k) <= half:
-                    inner += total[m]
-                    n_in += count[m]
-                elif abs(m - k) > half + 1:
-                    outer += total[m]
-                    n_out += count[m]
-        if n_in > 0.0 and n_out > 0.0:
-            value = inner / n_in - outer / n_out
-            if value > best:
-                best, at = value, 0.5 * (k - mid)
-    return at
-
-
-@njit(cache=True, nogil=True)
 def solve_cholesky(M: Float, b: Float, x: Float) -> bool:
     """Solve M x = b by Cholesky, overwriting M; False where M is not positive definite (a saturated or empty piece)."""
     n = M.shape[0]
@@ -205,40 +123,142 @@ def solve_cholesky(M: Float, b: Float, x: Float) -> bool:
 
 
 @njit(cache=True, nogil=True)
+def model_row(par: Float, t: float, d: float, scale: float, a: float, b: float, fit_width: bool, J: Float) -> float:
+    """Grey level at t, d; its derivatives J by c0, c1, B, B_t, B_d, A, s, w, where c1 and B_t multiply ``scale`` t."""
+    p, pd, ps, pw = profile_terms(d - par[0] - par[1] * t * scale, par[7], par[6], a, b)
+    J[0] = -par[5] * pd
+    J[1] = J[0] * t * scale
+    J[2] = 1.0
+    J[3] = t * scale
+    J[4] = d
+    J[5] = p
+    J[6] = par[5] * ps
+    J[7] = par[5] * pw if fit_width else 0.0
+    return float(par[2] + par[3] * J[3] + par[4] * d + par[5] * p)
+
+
+@njit(cache=True, nogil=True)
+def close_normal(N: Float, fit_width: bool, width: float, variance: float) -> float:
+    """Add the priors and fill in the lower half of the normal matrix; return the width's weight."""
+    prior = 0.0
+    if fit_width:
+        # without the description's width, a line of two pixels trades its width for depth and blur
+        prior = variance / (WIDTH_PRIOR * width) ** 2
+        N[7, 7] += prior
+    else:
+        N[7, 7] = 1.0
+    # slight damping on the shape keeps the matrix regular when blur or contrast are undetermined
+    N[6, 6] *= 1.0 + 1e-6
+    N[6, 6] += 1e-9
+    for i in range(N_SHAPE):
+        for j in range(i):
+            N[i, j] = N[j, i]
+    return prior
+
+
+@njit(cache=True, nogil=True)
+def _minimise(
+    ts: Float,
+    ds: Float,
+    gs: Float,
+    n: int,
+    every: int,
+    a: float,
+    b: float,
+    scale: float,
+    width: float,
+    fit_width: bool,
+    par: Float,
+    accepted: Float,
+    led: bool,
+) -> float:
+    """Fit ``par`` to every ``every``-th pixel; return the sum of squares, inf where there is no minimum.
+
+    ``accepted`` becomes the normal matrix at ``par``. ``led``: ``par`` lies near the minimum already.
+    """
+    count = (n + every - 1) // every
+    N = np.zeros((N_SHAPE, N_SHAPE))
+    g = np.zeros(N_SHAPE)
+    J = np.zeros(N_SHAPE)
+    trial = par.copy()
+    delta = np.zeros(N_SHAPE)
+    lam = 0.0
+    best = np.inf
+    kept = False
+    for step in range(_STEPS):
+        N[:] = 0.0
+        g[:] = 0.0
+        rss = 0.0
+        for k in range(0, n, every):
+            r = gs[k] - model_row(trial, ts[k], ds[k], scale, a, b, fit_width, J)
+            rss += r * r
+            for i in range(N_SHAPE):
+                g[i] += J[i] * r
+                for j in range(i, N_SHAPE):
+                    N[i, j] += J[i] * J[j]
+        if not rss <= best * (1.0 + 1e-9):  # also NaN
+            if step == 0:
+                return np.inf
+            lam = max(4.0 * lam, 1e-3)
+            # half way back
+            for i in range(N_SHAPE):
+                trial[i] = 0.5 * (trial[i] + par[i])
+            continue
+        settled = kept and best - rss < 1e-7 * best
+        best = rss
+        kept = True
+        par[:] = trial
+        prior = close_normal(N, fit_width, width, rss / (count - N_SHAPE))
+        g[7] = g[7] + prior * (width - par[7]) if fit_width else 0.0
+        accepted[:] = N
+        if settled or step == _STEPS - 1:
+            break
+        M = N.copy()
+        for i in range(N_SHAPE):
+            M[i, i] *= 1.0 + lam
+            if not M[i, i] > 0.0:
+                return np.inf
+        if not solve_cholesky(M, g, delta):
+            return np.inf
+        lam *= 0.2
+        for i in range(N_SHAPE):
+            trial[i] = par[i] + delta[i]
+        trial[0] = min(max(trial[0], par[0] - 1.0), par[0] + 1.0)
+        trial[6] = min(max(trial[6], max(0.08, 0.5 * par[6])), min(_MAX_BLUR, 2.0 * par[6] + 0.1))
+        trial[7] = min(max(trial[7], 0.6 * par[7]), 1.6 * par[7])
+        if led and step > 0 and lam == 0.0:
+            # a step that is foreseen to gain next to nothing is made, and not looked back at
+            gain = 0.0
+            for i in range(N_SHAPE):
+                gain += delta[i] * g[i]
+            if gain < _NO_GAIN * best:
+                par[:] = trial
+                break
+    return best
+
+
+@njit(cache=True, nogil=True)
 def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, out: Float) -> None:
     out[:] = np.nan
     out[15] = 0.0
     width, blur = piece[14], piece[15]
-    fit_width = width > _WIDTH_SEEN
-    a, b = max(abs(piece[2]), _MIN_BOX), max(abs(piece[3]), _MIN_BOX)
-    spread = sqrt(blur * blur + 1.0 / 12.0)
-    guard = 0.5 * width + guard_blurs * spread
-    half_width = max(min(0.5 * width + 5.0 * spread + 1.0, piece[17]), 0.5 * width + 2.0 * spread)
-    rows, cols = image.shape
-    c0 = _search(image, piece, guard, sign) if piece[16] > 0.0 else 0.0
-    x0, x1, y0, y1 = strip_bounds(piece, half_width + abs(c0), rows, cols)
+    fit_width = width > WIDTH_SEEN
+    a, b = max(abs(piece[2]), MIN_BOX), max(abs(piece[3]), MIN_BOX)
+    reach = strip_reach(piece, guard_blurs)
+    half_width = reach[0]
+    # the strip is centred on the line, or its ground would be tilted
+    c0 = search_across(image, piece, reach[1], sign) if piece[16] > 0.0 else 0.0
+    x0, x1, y0, y1 = strip_bounds(piece, half_width + abs(c0), image.shape[0], image.shape[1])
     room = (x1 - x0) * (y1 - y0)
     if room <= 0:
         return
     ts = np.empty(room)
     ds = np.empty(room)
     gs = np.empty(room)
-    n = 0
-    brightest = -np.inf
-    moved = piece.copy()  # the strip is centred on the line, or its ground would be tilted
-    moved[0] += -piece[3] * c0
-    moved[1] += piece[2] * c0
-    for y in range(y0, y1):
-        for x in range(x0, x1):
-            inside, t, d = in_strip(moved, float(x), float(y), half_width, guard)
-            if inside:
-                ts[n] = t
-                ds[n] = d + c0
-                gs[n] = image[y, x]
-                brightest = max(brightest, gs[n])
-                n += 1
+    n = strip_pixels(image, piece, reach, c0, ts, ds, gs)
     if n < _MIN_PIXELS:
         return
+    brightest = gs[:n].max()
     if piece[16] > 0.0 and n > 2 * _SEARCHED_PIXELS:
         # a first fit of a long piece only finds it for the second
         every = n // _SEARCHED_PIXELS
@@ -248,7 +268,7 @@ def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, ou
     out[7] = gs[:n].mean()  # kept also where the fit fails: it distinguishes glare from dirt
     out[14] = brightest
     scale = 1.0 / max(piece[4], 1.0)
-    par = np.zeros(_N)
+    par = np.zeros(N_SHAPE)
     par[0] = c0
     par[6] = blur
     par[7] = width
@@ -266,81 +286,21 @@ def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, ou
     par[2] = ground / n_ground
     peak, _, _, _ = profile_terms(0.0, width, blur, a, b)
     par[5] = (line / n_line - par[2]) / max(peak, 0.1)
-    N = np.zeros((_N, _N))
-    accepted = np.zeros((_N, _N))  # the normal matrix at ``par``; N may be that of a rejected trial
-    g = np.zeros(_N)
-    J = np.zeros(_N)
-    trial = par.copy()
-    delta = np.zeros(_N)
-    C = np.zeros((_N, _N))
-    lam = 0.0
-    best = np.inf
-    kept = False
-    for step in range(_STEPS):
-        N[:] = 0.0
-        g[:] = 0.0
-        rss = 0.0
-        for k in range(n):
-            p, pd, ps, pw = profile_terms(ds[k] - trial[0] - trial[1] * ts[k] * scale, trial[7], trial[6], a, b)
-            J[0] = -trial[5] * pd
-            J[1] = J[0] * ts[k] * scale
-            J[2] = 1.0
-            J[3] = ts[k] * scale
-            J[4] = ds[k]
-            J[5] = p
-            J[6] = trial[5] * ps
-            J[7] = trial[5] * pw if fit_width else 0.0
-            r = gs[k] - (trial[2] + trial[3] * J[3] + trial[4] * ds[k] + trial[5] * p)
-            rss += r * r
-            for i in range(_N):
-                g[i] += J[i] * r
-                for j in range(i, _N):
-                    N[i, j] += J[i] * J[j]
-        if not rss <= best * (1.0 + 1e-9):  # also NaN
-            if step == 0:
-                return
-            lam = max(4.0 * lam, 1e-3)
-            # half way back
-            for i in range(_N):
-                trial[i] = 0.5 * (trial[i] + par[i])
-            continue
-        settled = kept and best - rss < 1e-7 * best
-        best = rss
-        kept = True
-        par[:] = trial
-        if fit_width:
-            # without the description's width, a line of two pixels trades its width for depth and blur
-            prior = rss / (n - _N) / (_WIDTH_PRIOR * width) ** 2
-            N[7, 7] += prior
-            g[7] += prior * (width - par[7])
-        else:
-            N[7, 7] = 1.0
-            g[7] = 0.0
-        # slight damping on the shape keeps the matrix regular when blur or contrast are undetermined
-        N[6, 6] *= 1.0 + 1e-6
-        N[6, 6] += 1e-9
-        for i in range(_N):
-            for j in range(i):
-                N[i, j] = N[j, i]
-        accepted[:] = N
-        if settled or step == _STEPS - 1:
-            break
-        M = N.copy()
-        for i in range(_N):
-            M[i, i] *= 1.0 + lam
-            if not M[i, i] > 0.0:
-                return
-        if not solve_cholesky(M, g, delta):
-            return
-        lam *= 0.2
-        for i in range(_N):
-            trial[i] = par[i] + delta[i]
-        trial[0] = min(max(trial[0], par[0] - 1.0), par[0] + 1.0)
-        trial[6] = min(max(trial[6], max(0.08, 0.5 * par[6])), min(_MAX_BLUR, 2.0 * par[6] + 0.1))
-        trial[7] = min(max(trial[7], 0.6 * par[7]), 1.6 * par[7])
-    dof = n - (_N if fit_width else _N - 1)
+    accepted = np.zeros((N_SHAPE, N_SHAPE))
+    led = False
+    if n > _MANY_PIXELS:
+        start, every = par.copy(), n // _SEARCHED_PIXELS
+        best = _minimise(ts, ds, gs, n, every, a, b, scale, width, fit_width, par, accepted, False)
+        led = np.isfinite(best)
+        if not led:
+            par[:] = start
+    best = _minimise(ts, ds, gs, n, 1, a, b, scale, width, fit_width, par, accepted, led)
+    if not np.isfinite(best):
+        return
+    J, delta, C = np.zeros(N_SHAPE), np.zeros(N_SHAPE), np.zeros((N_SHAPE, N_SHAPE))
+    dof = n - (N_SHAPE if fit_width else N_SHAPE - 1)
     variance = best / dof
-    for j in range(_N):  # inverse, column by column
+    for j in range(N_SHAPE):  # inverse, column by column
         M = accepted.copy()
         J[:] = 0.0
         J[j] = 1.0
@@ -373,7 +333,7 @@ def _fit_pieces(image: Float32, pieces: Float, guard_blurs: float, sign: float, 
         _fit_piece(image, pieces[k], guard_blurs, sign, out[k])
 
 
-def fit_pieces(image: Float32, pieces: Float, *, dark_lines: bool, guard_blurs: float = 5.0) -> Float:
+def fit_pieces(image: Float32, pieces: Float, *, dark_lines: bool, guard_blurs: float = GUARD_BLURS) -> Float:
     """Fit every piece of the table.
 
     Parameters

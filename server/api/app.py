@@ -17,7 +17,7 @@ from server.api.protocol.audit import AuditLog, Recorder
 from server.api.protocol.auth import AccessRules, Door, Sessions
 from server.api.protocol.delivery import Delivery
 from server.api.protocol.guard import LOOPBACK_NAMES, Guard
-from server.api.routes.analyses import analyses, exports, gauges, picking, previews, report, results
+from server.api.routes.analyses import analyses, exports, gauges, picking, previews, region, report, results
 from server.api.routes.calibrations import calibrations, guide, noise, repair, review
 from server.api.routes.calibrations import checks as calibration_checks
 from server.api.routes.calibrations import exports as calibration_exports
@@ -127,6 +127,7 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         watch,
         analyses,
         picking,
+        region,
         results,
         gauges,
         exports,

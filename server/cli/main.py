@@ -60,7 +60,7 @@ def _joined(arguments: Sequence[str]) -> list[str]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit status (0 done, 1 failed, 2 wrong usage, 130 interrupted)."""
+    """Run the command line; return the exit status (0 done, 1 failed, 2 wrong usage, 3 steps failed, 130 stopped)."""
     arguments = _joined(sys.argv[1:] if argv is None else argv)
     parser = _OneLineParser(prog="stereorig", description="Stereo measurement of shape and displacement.")
     parser.add_argument("--version", action="version", version=f"stereorig {software_version()}")

@@ -19,7 +19,7 @@ from core.orientation.coarse import features_off_px
 from core.orientation.finding import Against
 from core.orientation.matched import MatchedPoints, matched_points
 from core.orientation.step import SAMPLE, step_points
-from server.formats.results.camera_motion import CameraMotion
+from server.formats.results.camera_motion import MOVED_REMEDY, CameraMotion
 
 _KEPT = 3
 _FAR_PX = 1.0  # starts are looked for within 1.5 px of the epipolar line, features found to 0.7 px
@@ -60,14 +60,16 @@ class CameraWatch:
         SeedError
             ``camera_moved``.
         """
+        found = cause.context.get("finding") if isinstance(cause, SeedError) else None
+        if found not in (None, "off_epipolar_lines"):
+            return  # turned, mirrored, of something else: no motion of a camera
         off_px = None if self.imported else features_off_px(self.pair, *images)
         if off_px is not None and off_px > _FAR_PX:
             raise SeedError(
                 f"Step {n}: most feature matches between both cameras lie about {off_px:.1f} px off their epipolar "
                 "lines: a camera moved, or the calibration belongs to another set-up.",
                 code="camera_moved",
-                remedy="Repair the calibration from steps taken since (stereorig calibration repair), or calibrate "
-                "again.",
+                remedy=MOVED_REMEDY,
                 offset_px=off_px,
             ) from cause
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import FileFormatError, SeedError
+from core.errors import FileFormatError, MeasurementError, SeedError
 from core.field.checks.extrapolated import mark_extrapolated
 from core.field.common import with_common_factor
 from core.field.points.images import MeasureImage, check_calibrated_size
@@ -25,6 +25,7 @@ from core.field.region.lay_points import make_grid
 from core.field.seeding.seeds import seeds_of
 from core.field.settings import MeasureOptions
 from core.measure import PreviousStep, ReferencePair, Updating
+from core.names import CAMERAS
 from core.progress import CancelToken, Progress
 from core.settings import StoredSettings
 from core.strain import StrainOptions
@@ -160,6 +161,8 @@ class SequenceMeasurement:
             No start was found.
         FileFormatError
             An earlier step's file is missing, or its images were replaced.
+        MeasurementError
+            ``nothing_measured``: no point passed the checks.
         Cancelled
             If the token was set.
         """
@@ -199,6 +202,12 @@ class SequenceMeasurement:
             raise
         if not result.valid.any():
             self._watch.refuse_moved(n, images)
+            one, two = self.steps[n].files
+            raise MeasurementError(
+                f"No point of step {n} ({one.name}, {two.name}) could be measured.",
+                code="nothing_measured",
+                remedy="Check that both cameras see the same textured surface, in this order, and the region.",
+            )
         return result
 
     def finish(
@@ -241,6 +250,10 @@ class SequenceMeasurement:
             ).document(),
             "strain": None if strain is None else summarise_strain(strain).document(),
         }
+        greys = {cam: made for cam, made in zip(CAMERAS, step.grey_from, strict=True) if made is not None}
+        if greys:
+            summary["grey_from"] = greys
+            about = {**about, **{f"{cam}_grey_from": made for cam, made in greys.items()}}
         if in_service:  # first: where the result is, they are
             write_bytes(path.with_suffix(".json"), to_json(summary))
             if result.starts is not None and keep_starts:

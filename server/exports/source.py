@@ -8,7 +8,7 @@ from core.errors import InputError
 from server.formats.results.folder import first_results, results_in
 from server.formats.results.reading import read_head
 from server.results.staleness import stale_results
-from server.results.steps import Source
+from server.results.steps import Source, failed_steps
 from server.store.durable import known_json
 
 
@@ -43,12 +43,15 @@ def source_of(folder: Path, files: list[Path]) -> Source:
     heads = [read_head(path) for path in files]
     stale, mask = stale_results(files, heads), _mask(folder, heads[0].settings)
     about: dict[str, object] = {}
+    failed = failed_steps(folder)
+    if failed:
+        about["steps_failed"] = failed
     test = folder.parent.parent  # <test>/analyses/<id>, or <test>/exports/measure
     document = known_json(test / "test.json")
     reference = heads[0].step if heads[-1].reference_step is None else heads[-1].reference_step
     image = test / "steps" / f"{reference:04d}" / "cam1.tif"
     if document or image.is_file():
-        about = {
+        about |= {
             "test_id": document.get("id", test.name),
             "test": document.get("name", ""),
             "calibration_id": document.get("calibration_id"),

@@ -1,17 +1,19 @@
-"""Image files: gray, 8 or 16 bit, in and out, with every number as the camera gave it.
+"""Image files: gray or colour, 8 or 16 bit, in and out; every number of a gray image as the camera gave it.
 
-Read: TIFF, PNG, BMP, JPEG. A colour file is taken only if its channels are equal everywhere (a gray image saved as
-colour); true colour is refused, since the conversion to gray is part of the measurement. Size and type are checked in
-the header, before anything is decoded.
+Read: TIFF, PNG, BMP, JPEG. A colour file whose channels are equal everywhere is a gray image saved as colour and keeps
+its numbers; of true colour the luminance is taken, and said so, since the conversion is part of the measurement. Size
+and type are checked in the header, before anything is decoded.
 """
 
 from __future__ import annotations
 
 import io
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
@@ -29,6 +31,27 @@ _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _PIL_FORMATS = ("PNG", "BMP", "JPEG")
 _REDUCED_PAGE = 1  # NewSubfileType bit: a thumbnail of another page
 _MIN_IS_WHITE = 0
+_TIFF_RGB = 2  # PhotometricInterpretation
+LUMINANCE = (0.299, 0.587, 0.114)
+"""Weights of red, green and blue in a grey level: those of ITU-R BT.601, as OpenCV and most cameras take them."""
+LUMINANCE_TEXT = "luminance, {} R + {} G + {} B".format(*LUMINANCE)
+_ROWS_AT_ONCE = 256
+
+
+@dataclass(frozen=True, eq=False)
+class Decoded:
+    """An image file's pixels.
+
+    Attributes
+    ----------
+    pixels
+        (rows, cols) uint8 or uint16.
+    grey_from
+        What its grey levels were made from, if they are not the file's own: ``LUMINANCE_TEXT`` of a colour image.
+    """
+
+    pixels: GrayImage
+    grey_from: str | None = None
 
 
 def _unreadable(name: str, why: str) -> ImageError:
@@ -41,9 +64,9 @@ def _unreadable(name: str, why: str) -> ImageError:
 
 def _unsupported(name: str, why: str) -> ImageError:
     return ImageError(
-        f"{name} is not a gray image of 8 or 16 bit: {why}.",
+        f"{name} is not a gray or RGB image of 8 or 16 bit: {why}.",
         code="image_unsupported",
-        remedy="Save both cameras' images as one-channel 8 or 16 bit TIFF or PNG.",
+        remedy="Save both cameras' images as one-channel 8 or 16 bit TIFF or PNG, or as RGB.",
     )
 
 
@@ -60,22 +83,32 @@ def _check_size(name: str, width: int, height: int) -> None:
         )
 
 
-def _one_channel(name: str, pixels: NDArray[Any]) -> GrayImage:
-    """Reduce (rows, cols[, channels]) of one gray image to (rows, cols), or raise an error."""
+def _one_channel(name: str, pixels: NDArray[Any], *, space: str = "RGB") -> Decoded:
+    """Reduce (rows, cols[, channels]) of one image to grey levels (rows, cols), or raise an error."""
     if pixels.dtype not in (np.uint8, np.uint16):
         raise _unsupported(name, f"its pixels are {pixels.dtype}")
     if pixels.ndim == 3:
         colour = pixels[..., :3] if pixels.shape[2] >= 3 else pixels[..., :1]
         if pixels.shape[2] in (2, 4) and (pixels[..., -1] != np.iinfo(pixels.dtype).max).any():
             raise _unsupported(name, "it has transparent pixels")
-        differ = int(np.ptp(colour, axis=2).max())
-        if differ:
-            raise _unsupported(name, f"it is a colour image, its channels differ by up to {differ} grey levels")
+        if (colour != colour[..., :1]).any():
+            if space != "RGB":
+                raise _unsupported(name, f"its colours are {space}, not RGB")
+            return Decoded(luminance(colour), LUMINANCE_TEXT)
         pixels = colour[..., 0]
-    return np.ascontiguousarray(pixels)
+    return Decoded(np.ascontiguousarray(pixels))
 
 
-def _decode_tiff(name: str, data: bytes) -> GrayImage:
+def luminance(rgb: NDArray[Any]) -> GrayImage:
+    """Return the luminance (rows, cols) of (rows, cols, 3) red, green, blue, uint8 or uint16, rounded to that type."""
+    out = np.empty(rgb.shape[:2], rgb.dtype)
+    weights = np.array(LUMINANCE)
+    for top in range(0, len(out), _ROWS_AT_ONCE):  # in bands: as float64 a large image would take gigabytes
+        out[top : top + _ROWS_AT_ONCE] = np.rint(rgb[top : top + _ROWS_AT_ONCE] @ weights)
+    return out
+
+
+def _decode_tiff(name: str, data: bytes) -> Decoded:
     try:
         with tifffile.TiffFile(io.BytesIO(data)) as tif:
             pages = [p for p in tif.pages[:4] if not p.aspage().subfiletype & _REDUCED_PAGE]
@@ -99,17 +132,19 @@ def _decode_tiff(name: str, data: bytes) -> GrayImage:
                 if "imagecodecs" not in str(error):
                     raise
                 pixels = _decode_pil(name, data, ("TIFF",))  # LZW and the like: libtiff's work
-                inverted = False
+                inverted, space = False, "RGB"  # what libtiff makes of any
             else:
                 inverted = int(page.photometric) == _MIN_IS_WHITE
+                is_rgb = int(page.photometric) == _TIFF_RGB
+                space = "RGB" if is_rgb else getattr(page.photometric, "name", str(page.photometric))
             if page.samplesperpixel > 1 and int(page.planarconfig) == 2 and pixels.ndim == 3:
                 pixels = np.moveaxis(pixels, 0, -1)
     except ImageError:
         raise
     except Exception as error:  # a damaged file can fail anywhere inside the reader
         raise _unreadable(name, f"{type(error).__name__}, {error}") from error
-    gray = _one_channel(name, pixels)
-    return np.iinfo(gray.dtype).max - gray if inverted else gray
+    gray = _one_channel(name, pixels, space=space)
+    return Decoded(np.iinfo(gray.pixels.dtype).max - gray.pixels) if inverted else gray
 
 
 def _decode_pil(name: str, data: bytes, formats: tuple[str, ...]) -> NDArray[Any]:
@@ -122,8 +157,8 @@ def _decode_pil(name: str, data: bytes, formats: tuple[str, ...]) -> NDArray[Any
                     image.load()
                     return np.asarray(image.convert("RGBA" if "transparency" in image.info else "RGB"))
                 # Pillow would cut 16 bit colour to 8 bit without a word
-                if image.mode in ("RGB", "RGBA", "LA") and any("16" in str(tile[3]) for tile in image.tile):
-                    raise _unsupported(name, "it is a colour image of 16 bit")
+                if image.mode in ("RGB", "RGBA", "LA") and any("16" in _raw_mode(tile[3]) for tile in image.tile):
+                    return _decode_deep_colour(name, data)
                 if image.mode not in ("L", "LA", "I;16", "I;16B", "I;16L", "I;16N", "RGB", "RGBA"):
                     raise _unsupported(name, f"its pixel type is {image.mode!r}")
                 image.load()
@@ -137,7 +172,26 @@ def _decode_pil(name: str, data: bytes, formats: tuple[str, ...]) -> NDArray[Any
         raise _unreadable(name, f"{type(error).__name__}, {error}") from error
 
 
+def _raw_mode(arguments: object) -> str:
+    """Return the pixel form, as RGB;16B, of a Pillow decoder's arguments: the others may be offsets with any digits."""
+    return str(arguments[0] if isinstance(arguments, tuple) and arguments else arguments)
+
+
+def _decode_deep_colour(name: str, data: bytes) -> NDArray[Any]:
+    """Return (rows, cols, 3 or 4) red, green, blue of a colour image of 16 bit; its size was checked before."""
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
+        raise _unsupported(name, "it is a colour image of 16 bit that cannot be read")
+    order = [2, 1, 0] if pixels.shape[2] == 3 else [2, 1, 0, 3]
+    return np.asarray(pixels[..., order])
+
+
 def decode_image(data: bytes, *, name: str = "the image") -> GrayImage:
+    """Decode the bytes of one TIFF, PNG, BMP or JPEG file to grey levels, see :func:`decode`."""
+    return decode(data, name=name).pixels
+
+
+def decode(data: bytes, *, name: str = "the image") -> Decoded:
     """Decode the bytes of one TIFF, PNG, BMP or JPEG file.
 
     Parameters
@@ -149,14 +203,14 @@ def decode_image(data: bytes, *, name: str = "the image") -> GrayImage:
 
     Returns
     -------
-    NDArray
-        (rows, cols) uint8 or uint16, C-contiguous.
+    Decoded
+        (rows, cols) uint8 or uint16, C-contiguous, and what they were made from.
 
     Raises
     ------
     ImageError
-        ``image_unreadable`` (damaged, truncated, no image), ``image_unsupported`` (true colour, other pixel types,
-        several images), ``image_too_large`` (checked in the header).
+        ``image_unreadable`` (damaged, truncated, no image), ``image_unsupported`` (colours that are not RGB,
+        transparent or other pixels, several images), ``image_too_large`` (checked in the header).
     """
     if data[:4] in _TIFF_MAGIC:
         return _decode_tiff(name, data)
@@ -227,6 +281,13 @@ def decode_mask(data: bytes, *, name: str = "the mask") -> NDArray[np.bool_]:
         except OSError as damaged:
             raise _unreadable(name, str(damaged)) from damaged
     return np.asarray(gray > np.iinfo(gray.dtype).max // 2)
+
+
+def encode_png(mask: NDArray[np.bool_]) -> bytes:
+    """Encode a mask (rows, cols) as a PNG, white where it is True."""
+    buffer = io.BytesIO()
+    Image.fromarray(mask.astype(np.uint8) * np.uint8(255)).save(buffer, "PNG")
+    return buffer.getvalue()
 
 
 def encode_tiff(image: GrayImage) -> bytes:

@@ -17,7 +17,7 @@ _AT_ONCE = 20
 
 @dataclass(frozen=True)
 class Event:
-    """One event: number, name (``job``, ``step``, ``result``, ``stage``, ``rig``, ``gap`` ...) and data."""
+    """One event: number, name (``job``, ``step``, ``result``, ``step_failed``, ``gap`` ...) and data."""
 
     number: int
     name: str

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from core.field.points.result import Field
 from core.names import CAMERAS
+from server.formats.results.camera_motion import MOVED_REMEDY
 from server.formats.version import software_version
 from server.report import pictures
 from server.report.calibration import CalibrationPart, calibration_gaps
@@ -103,6 +104,7 @@ def make_report(source: Source) -> Report:
         settings=settings,
         calibration=None if source.calibration is None else CalibrationPart(source.calibration),
         worst=measured.worst_epipolar,
+        moved_remedy=MOVED_REMEDY,
         max_extrapolated=max(s.summary.status.get("extrapolated", 0) for s in measured.steps),
         seen=seen,
         unseen=unseen,
@@ -135,6 +137,8 @@ def _boxes(source: Source, measured: Measured) -> list[Box]:
     worst = measured.worst_epipolar
     level = None if worst is None else worst.level
     off = "" if worst is None else f"{worst.offset_px:.3f} px off the epipolar lines"
+    if measured.camera_moved and level != "failed":
+        level = "warning"
     share = min((s.summary.valid_fraction for s in measured.steps if s.summary.valid_fraction is not None), default=0.0)
     floor = measured.floor.get("W") or measured.floor.get("Z")
     if floor is not None and floor.spatial_sd is not None:

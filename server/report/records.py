@@ -86,6 +86,20 @@ class TestRecord(Record):
     metadata: dict[str, object] = Field(default={}, validation_alias=AliasChoices(*METADATA_NAMES))
 
 
+class CameraMotionRecord(Record):
+    """What a step's epipolar offsets said about the cameras, see :class:`server.formats.results.camera_motion`."""
+
+    camera_moved: bool | None = None
+    text: str
+
+
+class StepSummaryRecord(Record):
+    """A step of ``summary.json``, or of the service's ``step_0001.json`` beside its result."""
+
+    n: int
+    camera_motion: CameraMotionRecord | None = None
+
+
 class CalibrationFile(Record):
     """The calibration that ``stereorig measure`` was given."""
 
@@ -98,6 +112,12 @@ class AnalysisRecord(Record):
     id: str = ""
     label: str = ""
     calibration: CalibrationFile | None = None
+
+
+class SummaryRecord(Record):
+    """``summary.json``."""
+
+    steps: list[StepSummaryRecord] = Field(default=[])
 
 
 class RegionRecord(Record):

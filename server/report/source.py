@@ -18,9 +18,19 @@ from server.formats.files import known_sha256
 from server.formats.images import read_image
 from server.formats.results.folder import number_of, results_in
 from server.formats.results.reading import ResultHead, read_head
-from server.report.records import AnalysisRecord, RigRecord, SettingsRecord, StepRecord, TestRecord
+from server.report.records import (
+    AnalysisRecord,
+    CameraMotionRecord,
+    RigRecord,
+    SettingsRecord,
+    StepRecord,
+    StepSummaryRecord,
+    SummaryRecord,
+    TestRecord,
+)
 from server.results.metadata import TestMetadata, parse_metadata
 from server.results.staleness import stale_results
+from server.results.steps import failed_steps
 from server.store.durable import known_json
 
 
@@ -47,7 +57,9 @@ class Source:
     stale
         Inputs that are gone or were replaced since the results were written.
     doubts
-        Warnings about inputs that were not found.
+        Warnings about inputs that were not found, and steps that failed.
+    camera_motion
+        Findings about the cameras, of the steps that have one.
     """
 
     files: dict[int, Path]
@@ -61,6 +73,7 @@ class Source:
     metadata: TestMetadata
     stale: list[str]
     doubts: list[str] = field(default_factory=list)
+    camera_motion: dict[int, CameraMotionRecord] = field(default_factory=dict)
 
     @property
     def reference(self) -> int:
@@ -154,7 +167,10 @@ def find_source(
         test_record = TestRecord.model_validate(known_json(home / "test.json"))
         steps = {n: StepRecord.model_validate(known_json(home / "steps" / f"{n:04d}" / "step.json")) for n in heads}
     made = AnalysisRecord.model_validate(known_json(folder / "analysis.json") or known_json(folder / "summary.json"))
-    doubts: list[str] = []
+    doubts = [
+        f"Step {n} could not be measured: {one.get('code', '')}: {one.get('cause', '')}"
+        for n, one in failed_steps(folder).items()
+    ]
     loaded, file = _calibration(calibration, home, made, heads, doubts)
     if loaded is not None and file is not None:
         loaded = _with_kept_checks(loaded, file, home, test_record)
@@ -172,7 +188,17 @@ def find_source(
         else metadata,
         stale=stale_results(list(files.values()), list(heads.values())),
         doubts=doubts,
+        camera_motion=_camera_motion(folder, list(heads)),
     )
+
+
+def _camera_motion(folder: Path, numbers: list[int]) -> dict[int, CameraMotionRecord]:
+    """Read the findings about the cameras: of a finished measurement, or of the steps there are so far."""
+    steps = SummaryRecord.model_validate(known_json(folder / "summary.json")).steps
+    if not steps:
+        own = ({"n": n, **known_json(folder / f"step_{n:04d}.json")} for n in numbers)
+        steps = [StepSummaryRecord.model_validate(one) for one in own]
+    return {s.n: s.camera_motion for s in steps if s.n in numbers and s.camera_motion is not None}
 
 
 def _with_kept_checks(

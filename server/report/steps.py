@@ -16,7 +16,7 @@ from server.formats.results.reading import read_field
 from server.formats.results.strain import read_strain
 from server.formats.results.summary import StepSummary, summarise
 from server.report.floor import LENGTHS, STRAINS, Floor, FloorKeeper, Quantity, reported_sigma, static_steps
-from server.report.records import QualityRecord
+from server.report.records import CameraMotionRecord, QualityRecord
 from server.report.source import Source
 
 
@@ -46,6 +46,8 @@ class StepFigures:
         Of the pair of images; None where they were not recorded.
     static
         True if it counts as static.
+    camera_motion
+        Whether a camera moved; None where that was not judged.
     """
 
     n: int
@@ -59,6 +61,14 @@ class StepFigures:
     skew_ms: float | None
     quality: QualityRecord | None
     static: bool
+    camera_motion: CameraMotionRecord | None = None
+
+    @property
+    def cameras(self) -> str:
+        """Finding about the cameras in a word; empty where there is none."""
+        if self.camera_motion is None:
+            return ""
+        return {True: "moved", False: "at rest", None: "not known"}[self.camera_motion.camera_moved]
 
     @property
     def min_zncc(self) -> float | None:
@@ -134,6 +144,11 @@ class Measured:
     def moved(self) -> list[StepFigures]:
         """Steps with displacements."""
         return [s for s in self.steps if s.summary.displacement_mm]
+
+    @property
+    def camera_moved(self) -> list[StepFigures]:
+        """Steps in which a camera is seen to have moved."""
+        return [s for s in self.steps if s.camera_motion is not None and s.camera_motion.camera_moved]
 
     @property
     def worst_epipolar(self) -> EpipolarCheck | None:
@@ -230,6 +245,7 @@ def _figures(
         skew_ms=record.skew_ms,
         quality=record.quality,
         static=static,
+        camera_motion=source.camera_motion.get(n),
     )
 
 

@@ -19,6 +19,7 @@ from server.formats.results.folder import number_of
 from server.formats.results.netcdf import opened
 from server.formats.results.settings import current_inputs, current_settings
 from server.results.reader import Variable
+from server.store.durable import known_json
 
 ALWAYS = ("x_px", "y_px", "x_mm", "y_mm", "z_mm", "status")
 _GRID = ("row", "col")
@@ -99,6 +100,12 @@ class Source:
     stale_reasons: Sequence[str] = ()
 
 
+def failed_steps(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return the problem of each step that could not be measured, by its number, as ``summary.json`` has it."""
+    failed = known_json(folder / "summary.json").get("steps_failed")
+    return {n: one for n, one in failed.items() if isinstance(one, dict)} if isinstance(failed, dict) else {}
+
+
 def chosen(source: Source, steps: Sequence[int] | None) -> list[Path]:
     """Return the result files of the steps asked for; all if none are named.
 
@@ -116,8 +123,11 @@ def chosen(source: Source, steps: Sequence[int] | None) -> list[Path]:
         )
     missing = [] if steps is None else [n for n in steps if n not in files]
     if missing:
+        failed = source.about.get("steps_failed")
+        problem = failed.get(str(missing[0])) if isinstance(failed, dict) else None
+        because = f": it failed ({problem['code']})" if isinstance(problem, dict) and "code" in problem else ""
         raise NotFoundError(
-            f"There is no result for step {missing[0]}.",
+            f"There is no result for step {missing[0]}{because}.",
             code="step_missing",
             remedy="Ask for steps that are finished.",
             available=sorted(files),

@@ -196,6 +196,7 @@ class SummaryRecord(Document):
 
     state: JobState = "interrupted"
     steps: list[StepOutcome] = Field(default_factory=list)
+    steps_failed: dict[str, JobProblem] = Field(default_factory=dict)
     job_id: str | None = None
     problem: JobProblem | None = None
 

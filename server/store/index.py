@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 from core.errors import FileFormatError
@@ -44,10 +44,13 @@ def step_entry(step: StepRecord) -> dict[str, object]:
     return {**{name: getattr(step, name) for name in names}, "quality": step.quality_code}
 
 
-def analysis_entry(analysis: AnalysisRecord, job_id: str | None = None) -> dict[str, object]:
-    """Entry of an analysis in a list, with the last job that worked on it."""
+def analysis_entry(
+    analysis: AnalysisRecord, job_id: str | None = None, steps_failed: Sequence[int] = ()
+) -> dict[str, object]:
+    """Entry of an analysis in a list, with the last job that worked on it, and the steps that failed in it."""
     names = ("id", "kind", "label", "created_utc")
-    return {**{name: getattr(analysis, name) for name in names}, "job_id": job_id}
+    entry = {**{name: getattr(analysis, name) for name in names}, "job_id": job_id}
+    return {**entry, "steps_failed": sorted(steps_failed)} if steps_failed else entry
 
 
 def entries_of_test(tests: TestStore, test_id: str, lost: LostJobs, trouble: list[str]) -> list[Entry]:
@@ -82,9 +85,12 @@ def entries_of_test(tests: TestStore, test_id: str, lost: LostJobs, trouble: lis
     def analysis(analysis_id: str) -> Entry:
         document = tests.analysis(test_id, analysis_id)
         runs = tests.analysis_jobs(test_id, analysis_id)
-        lost.analysis(document, runs, tests.summary(test_id, analysis_id))
+        summary = tests.summary(test_id, analysis_id)
+        lost.analysis(document, runs, summary)
         job_id = runs[-1].job_id if runs else None
-        return "analysis", test_id, analysis_id, analysis_entry(document, job_id)
+        known = summary is not None and summary.job_id in (None, job_id)
+        failed = [int(n) for n in summary.steps_failed] if summary is not None and known else []
+        return "analysis", test_id, analysis_id, analysis_entry(document, job_id, failed)
 
     take(f"test {test_id}", test)
     for n, document in tests.step_documents(test_id):

@@ -71,7 +71,9 @@ class LostJobs:
         for run in runs:
             known = summary if summary is not None and summary.job_id == run.job_id else SummaryRecord()
             found = [step.plain() for step in known.steps]
-            result = {**ids, "steps_finished": [step.n for step in known.steps], "steps": found}
+            result: dict[str, object] = {**ids, "steps_finished": [step.n for step in known.steps], "steps": found}
+            if known.steps_failed:
+                result["steps_failed"] = {n: problem.plain() for n, problem in known.steps_failed.items()}
             created = run.created_utc or document.created_utc or ""
             self._job(run.job_id, "analysis", ids, known.state, created, result, known.problem)
             self.made(run.request, {**ids, "job_id": run.job_id})

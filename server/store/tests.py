@@ -401,7 +401,10 @@ class TestStore:
         """
         path = self.analysis_path(test_id, analysis_id) / f"step_{n:04d}.nc"
         if not path.is_file():
-            raise NotFoundError(f"Analysis {analysis_id} has no result for step {n}.", kind="result")
+            summary = self.summary(test_id, analysis_id)
+            problem = None if summary is None else summary.steps_failed.get(str(n))
+            failed = "" if problem is None else f" It failed: {problem.code}: {problem.cause}"
+            raise NotFoundError(f"Analysis {analysis_id} has no result for step {n}.{failed}", kind="result")
         recorded = recorded_sha256(path)
         if recorded is not None and known_sha256(path) != recorded:
             raise FileFormatError(

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from core.names import CAMERAS
 from core.settings import StoredSettings
 
 
@@ -26,12 +27,22 @@ class StepImages:
         Of camera 1 and camera 2.
     averages
         How many frames each is the mean of, and what its grey levels were multiplied by.
+    grey_from
+        What the grey levels of camera 1 and camera 2 were made from, see :class:`server.formats.images.Decoded`.
     """
 
     n: int
     files: tuple[Path, Path]
     sha256: tuple[str, str]
     averages: tuple[int, float] = (1, 1.0)
+    grey_from: tuple[str | None, str | None] = (None, None)
+
+
+def grey_from_of(step: Mapping[str, Any]) -> tuple[str | None, str | None]:
+    """What the grey levels of both cameras' images of a step were made from, by its record."""
+    known = step.get("grey_from")
+    one, two = ((known if isinstance(known, dict) else {}).get(cam) for cam in CAMERAS)
+    return one, two
 
 
 def averages_of(step: Mapping[str, Any]) -> tuple[int, float]:

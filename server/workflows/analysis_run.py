@@ -22,20 +22,21 @@ from server.formats.version import software_version
 from server.jobs.job import Job, Waiting
 from server.store.documents import AnalysisRecord, Finished, StepOutcome
 from server.store.folder import now_utc
+from server.store.index import analysis_entry
 from server.store.tests import StepFiles
 from server.worker.dask_cluster import ClusterError
 from server.worker.executor import WorkerDiedError
-from server.worker.tasks import StepImages, StepTask, averages_of, measure_step
+from server.worker.tasks import StepImages, StepTask, averages_of, grey_from_of, measure_step
 from server.workflows.camera_identity import check_same_cameras
 from server.workflows.service import Service
 from server.workflows.waiting import run_side_by_side, run_task
 
 
 class StepsFailedError(MeasurementError):
-    """Some steps could not be measured; the others were, and are kept."""
+    """Steps could not be measured, and none was but the reference."""
 
     code = "steps_failed"
-    remedy = "Read each step's problem in the summary; the other steps' results are valid."
+    remedy = "Read each step's problem in the summary."
 
 
 def calibration_changed(where: str) -> FileFormatError:
@@ -72,12 +73,12 @@ class AnalysisRun:
         self._next = 0  # index of that step
 
     def __call__(self, job: Job) -> dict[str, object]:
-        """Measure what is not measured yet: a step that fails does not take the others with it.
+        """Measure what is not measured yet: a step that fails does not take the others, or the analysis, with it.
 
         Raises
         ------
         StereorigError
-            What went wrong with the reference; or, with the same code, with the first other step that failed.
+            What went wrong with the reference; or, with its code, with the first other step where all of them failed.
         Waiting
             It follows a test and has measured all that there is.
         """
@@ -126,6 +127,9 @@ class AnalysisRun:
             "steps_finished": [found.n for found in finished],
             "steps": [found.plain() for found in finished],
         }
+        if self._failed:
+            problems = {str(n): problem_of(self._failed[n]).plain() for n in sorted(self._failed)}
+            found["steps_failed"] = problems
         job.result = found
         return found
 
@@ -158,7 +162,7 @@ class AnalysisRun:
             task = task_of(service, document, n, self._done, steps[index + 1] if index + 1 < len(steps) else None)
             summary = run_task(service.executor, job, measure_step, task, progress=progress)
         except StereorigError as error:
-            self._note_failure(n, error)
+            self._note_failure(job, n, error)
             return
         self._note(job, n, summary, started)
 
@@ -180,7 +184,7 @@ class AnalysisRun:
                     self._check_cameras(n)
                     task = task_of(self._service, self._document, n, {}, None)
                 except StereorigError as error:
-                    self._note_failure(n, error)
+                    self._note_failure(job, n, error)
                     continue
                 yield n, lambda task=task: task  # type: ignore[misc]
 
@@ -195,21 +199,24 @@ class AnalysisRun:
             try:
                 summary = future.result()
             except StereorigError as error:
-                self._note_failure(n, error)
+                self._note_failure(job, n, error)
             else:
                 self._note(job, n, summary, began)
 
         run_side_by_side(self._service.executor, job, measure_step, tasks(), ended, progress)
         self._next = len(steps)
 
-    def _note_failure(self, n: int, error: StereorigError) -> None:
-        """Keep a step's own failure; raise what is not its own doing, or what nothing can go on without."""
+    def _note_failure(self, job: Job, n: int, error: StereorigError) -> None:
+        """Keep and show a step's own failure; raise what is not its doing, or what nothing can go on without."""
         displacement = self._document.kind == "displacement"
         if isinstance(error, Cancelled | StorageError | WorkerDiedError | ClusterError):
             raise error
         if displacement and n == self._document.steps[0]:
             raise error
         self._failed[n] = error
+        self._publish(job)
+        about = {"test_id": self._test_id, "analysis_id": self._document.id, "n": n, "job_id": job.id}
+        self._service.hub.publish("step_failed", {**about, "problem": problem_of(error).plain()})
 
     def _note(self, job: Job, n: int, summary: Mapping[str, object], started: float) -> None:
         """A step is finished: durable first, then announced."""
@@ -241,9 +248,9 @@ class AnalysisRun:
 
     def _result(self, job: Job) -> dict[str, object]:
         found = self._publish(job)
-        if self._failed:
+        needed = 2 if self._document.kind == "displacement" else 1
+        if self._failed and len(self._summaries) < needed:
             first = min(self._failed)
-            found["steps_failed"] = {str(n): problem_of(error).plain() for n, error in self._failed.items()}
             raise StepsFailedError(
                 f"{len(self._failed)} of {len(self._document.steps)} steps failed; step {first}: "
                 f"{self._failed[first].cause}",
@@ -305,6 +312,7 @@ def images_of(n: int, step: StepFiles) -> StepImages:
         files=(step.cam1, step.cam2),
         sha256=(sha256["cam1"], sha256["cam2"]),
         averages=averages_of(step.document.plain()),
+        grey_from=grey_from_of(step.document.plain()),
     )
 
 
@@ -324,7 +332,10 @@ def close(service: Service, job: Job, test_id: str, analysis_id: str, state: str
     problem = None if job.record.problem is None else job.record.problem.plain()
     summary |= {"analysis_id": analysis_id, "job_id": job.id, "problem": problem}
     service.tests.put_summary(test_id, analysis_id, summary)
-    if state == "succeeded":
+    if found.steps_failed:
+        entry = analysis_entry(document, job.id, [int(n) for n in found.steps_failed])
+        service.catalog.put_entry("analysis", test_id, analysis_id, entry)
+    if state == "succeeded" and not found.steps_failed:
         service.tests.drop_starts(test_id, analysis_id)
     else:
         service.tests.drop_half_written(test_id, analysis_id)  # by a worker that was ended in the middle

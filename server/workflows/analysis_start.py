@@ -227,7 +227,7 @@ def _continue(service: Service, test_id: str, analysis_id: str, request: Request
             job_id=runs[-1].job_id,
         )
     summary = service.tests.summary(test_id, analysis_id)
-    if summary is not None and summary.state == "succeeded":
+    if summary is not None and summary.state == "succeeded" and not summary.steps_failed:
         raise StateError(
             f"Analysis {analysis_id} is finished: nothing is left to continue.",
             code="analysis_finished",

@@ -10,7 +10,7 @@ from core.errors import ImageError
 from core.names import CAMERAS
 from server.base.metrics import timed_capture
 from server.formats.calibrations.recognise import load_calibration
-from server.formats.images import GrayImage, decode_image, encode_tiff
+from server.formats.images import GrayImage, decode, encode_tiff
 from server.results.quality import image_quality, pair_quality
 from server.rig.cameras import CapturedPair
 from server.store.documents import StepMetadata, StepRecord
@@ -110,11 +110,13 @@ def import_step(service: Service, test_id: str, data: dict[str, bytes], metadata
     Raises
     ------
     ImageError
-        A file is no gray image, or its size is not that of the test's calibration or other images; ``image_blank``,
-        ``same_image``.
+        A file is no gray or RGB image, or its size is not that of the test's calibration or other images;
+        ``image_blank``, ``same_image``.
     """
     service.require_room()
-    images: dict[str, GrayImage] = {cam: decode_image(data[cam], name=f"the image of {cam}") for cam in CAMERAS}
+    decoded = {cam: decode(data[cam], name=f"the image of {cam}") for cam in CAMERAS}
+    images: dict[str, GrayImage] = {cam: decoded[cam].pixels for cam in CAMERAS}
+    grey_from = {cam: made.grey_from for cam, made in decoded.items() if made.grey_from is not None}
     sizes: dict[str, list[int]] = {cam: [*reversed(images[cam].shape)] for cam in CAMERAS}
     _check_sizes(service, test_id, sizes)
     _check_content(images)
@@ -127,6 +129,7 @@ def import_step(service: Service, test_id: str, data: dict[str, bytes], metadata
         "bit_depth": depth,
         "quality": pair_quality(*(image_quality(images[cam], depth[cam]) for cam in CAMERAS)),
         "image_size_px": sizes,
+        **({"grey_from": grey_from} if grey_from else {}),
     }
     data = {cam: encode_tiff(images[cam]) for cam in CAMERAS}
     return _announce(service, test_id, service.tests.add_step(test_id, data, document))

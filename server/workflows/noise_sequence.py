@@ -7,8 +7,9 @@ from dataclasses import asdict
 from core.names import CAMERAS
 from server.base.models import Ids
 from server.jobs.idempotency import RequestMark
-from server.jobs.job import Job, Phase
+from server.jobs.job import Job
 from server.worker.tasks import NoiseTask, fit_noise
+from server.workflows.acquisition import begin_acquisition
 from server.workflows.service import Service
 from server.workflows.waiting import run_task
 
@@ -24,26 +25,22 @@ def begin(service: Service, frames: int, label: str, request: RequestMark) -> Id
         ``storage_full``.
     """
     service.require_room()
-    made: dict[str, str] = {}
 
-    def prepare(job: Job) -> Ids:
+    def create(job: Job) -> str:
         entries = {"frames": frames, "label": label, "rig": service.config.rig.name}
-        made["noise_id"] = service.noise.create({**entries, **request.document(), "job_id": job.id})
-        return dict(made)
+        return service.noise.create({**entries, **request.document(), "job_id": job.id})
 
-    job = service.jobs.submit(
+    return begin_acquisition(
+        service,
         "noise",
         "a noise measurement",
-        {},
-        [
-            Phase("hardware", lambda job: take_frames(service, job, made["noise_id"], frames)),
-            Phase("compute", lambda job: fit(service, job, made["noise_id"])),
-        ],
-        prepare=prepare,
+        "noise_id",
+        create=create,
+        hardware=lambda job, noise_id: take_frames(service, job, noise_id, frames),
+        compute=lambda job, noise_id: fit(service, job, noise_id),
+        on_end=lambda job, noise_id, state: close(service, job, noise_id, state),
         request=request,
-        on_end=lambda job, state: close(service, job, made["noise_id"], state),
     )
-    return {**made, "job_id": job.id}
 
 
 def take_frames(service: Service, job: Job, noise_id: str, frames: int) -> dict[str, object]:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from core.calibration import COVARIANCE_NAMES, CalibrationOptions, calibrate
+from tests.bench.accuracy.line_grid_covariance import detections, normalised_squares
 from tests.support.calibration_truth import HELD, NOMINAL, PAPER, Array, Grid, make_views, nodes, project
 
 TEN = ("phd", "cx", "cy", "kappa", "alpha", "beta", "gamma", "x0", "y0", "z0")
@@ -127,6 +128,14 @@ def test_the_covariance_is_what_repeated_calibrations_scatter(tolerance: float, 
     # and in space, where it matters
     spread = np.sqrt(np.mean(np.square(shapes)))
     assert spread == pytest.approx(float(np.sqrt(np.mean(sigma_shape**2))), rel=0.35)
+
+
+@pytest.mark.deep
+def test_parameters_from_pictures_of_line_grids_scatter_as_their_covariance_says() -> None:
+    replicates = 60
+    found = float(np.mean(normalised_squares(detections(replicates))))
+    # twenty parameters: sd of the mean of their squares is sqrt(2 / (20 * 60)) = 0.04
+    assert found == pytest.approx(1.0, abs=2.5 * math.sqrt(2.0 / (20 * replicates)))
 
 
 def _sd(covariance: Array) -> Array:

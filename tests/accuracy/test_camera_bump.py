@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -12,28 +11,18 @@ from core.errors import CalibrationError
 from core.measure import MeasureOptions
 from core.orientation import Repair, changes_between, repair_orientation
 from tests.support.bumped_rig import (
+    CAM1,
+    CAM2,
     SUBSET_PX,
     core_pair,
     false_strain,
     grid,
-    picture,
-    plain_camera,
     pose_points,
+    repaired,
+    seen,
     turned,
 )
 from tests.support.independent_rig import PlainCamera
-
-CAM1, CAM2 = plain_camera(-1.0), plain_camera(1.0)
-
-
-@lru_cache(maxsize=8)
-def seen(camera: PlainCamera, pose: int) -> np.ndarray:
-    return picture(camera, pose, seed=10 * pose + (camera.phd > 1300.0))
-
-
-def repaired(one: PlainCamera, two: PlainCamera, poses: tuple[int, ...] = (0, 1)) -> Repair:
-    images = [(seen(one, k), seen(two, k)) for k in poses]
-    return repair_orientation(core_pair(CAM1, CAM2), images, grid(), MeasureOptions(subset_px=SUBSET_PX))
 
 
 def left(repair: Repair, one: PlainCamera, two: PlainCamera) -> tuple[float, float]:

@@ -24,6 +24,15 @@ def test_a_lens_that_does_not_fit_is_given_up_for_the_next_without_settling_to_t
     assert (said.outcome, said.said, said.model) == ("right", "good", "opencv5")
 
 
+@pytest.mark.parametrize("seed", [1012, 1103, 1025])
+def test_a_camera_that_moved_between_free_poses_is_the_cause_that_is_named(seed: int) -> None:
+    rig = random_rig(seed)
+    assert rig.fault in ("bumped half-way", "moved in some")
+    said = answer(rig)
+    assert said.said == "failed"
+    assert "The cameras disagree about where the target was" in said.detail
+
+
 @pytest.mark.parametrize(("seed", "expected"), [(101, "image_mirrored"), (110, "failed")])
 def test_views_far_off_each_other_before_an_inexact_board_are_named_and_not_left_unsettled(
     seed: int, expected: str

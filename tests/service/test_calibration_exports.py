@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from server.formats.calibrations.plausibility import check_calibration, shared_points
 
 from core.arrays import Float
 from core.cameras.camera import Camera, RigidTransform
@@ -25,6 +24,7 @@ from core.errors import StereorigError
 from core.field.points.result import Field
 from server.cli.main import main
 from server.formats.calibrations.export import FORMS, convert_calibration
+from server.formats.calibrations.programs.plausibility import check_calibration, shared_points
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration, parse_calibration
 from server.formats.results.writing import Provenance, write_field
 from server.results.epipolar_check import check_against

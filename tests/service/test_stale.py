@@ -19,6 +19,7 @@ import pytest
 from core.errors import FileFormatError
 from core.names import CAMERAS
 from server.cli import main
+from server.cli.measurement.measure import SOME_FAILED
 from server.formats.images import write_image
 from server.workflows import analysis_start
 from server.workflows.analysis_run import task_of
@@ -103,7 +104,6 @@ REFUSED = {
     "the reference is gone": ("reference_missing", "step 0"),
     "the reference's image is gone": ("file_missing", "cam1.tif"),
     "the reference's image was replaced": ("checksum_mismatch", "cam1.tif"),
-    "a step's image was replaced": ("checksum_mismatch", "cam2.tif"),
     "the calibration was replaced": ("calibration_changed", "calibration.json"),
     "the calibration is gone": ("file_missing", "calibration.json"),
 }
@@ -132,6 +132,18 @@ def test_a_spoiled_test_is_not_measured(taken: Path, tmp_path: Path, capfd: Any,
     assert f"stereorig: {code}: " in printed
     assert word in printed
     assert not (test / "exports").exists()
+
+
+def test_a_step_whose_image_was_replaced_fails_alone(taken: Path, tmp_path: Path, capfd: Any) -> None:
+    """FAULTS 4, 42."""
+    test = tmp_path / taken.name
+    shutil.copytree(taken, test)
+    spoil(test, "a step's image was replaced")
+    assert main(["measure", str(test), *ARGUMENTS]) == SOME_FAILED
+    assert "step 2 of 3: failed: checksum_mismatch: " in capfd.readouterr().err
+    summary = json.loads((test / "exports" / "measure" / "summary.json").read_text())
+    assert [step["n"] for step in summary["steps"]] == [0, 1, 3]
+    assert "cam2.tif" in summary["steps_failed"]["2"]["cause"]
 
 
 def gauges(where: Path, out: Path) -> dict[str, Any]:
@@ -191,10 +203,6 @@ REFUSED_BY_SERVICE = {
     "the calibration was replaced": (422, "calibration_changed"),
     "the calibration is gone": (409, "not_calibrated"),
 }
-FAILED_JOB = {
-    "the reference's image was replaced": "checksum_mismatch",
-    "a step's image was replaced": "checksum_mismatch",
-}
 
 
 def copied_in(test: Path, service: Service) -> tuple[str, Path]:
@@ -232,15 +240,21 @@ def test_the_service_refuses_a_spoiled_test(taken: Path, service: Service, clien
     assert answer.json()["remedy"]
 
 
-@pytest.mark.parametrize("what", list(FAILED_JOB))
-def test_a_replaced_image_ends_the_job(taken: Path, service: Service, client: httpx.Client, what: str) -> None:
-    """FAULTS 42."""
+def test_a_replaced_image_of_the_reference_ends_the_job_and_of_a_step_the_step(
+    taken: Path, service: Service, client: httpx.Client
+) -> None:
+    """FAULTS 4, 42."""
     url, test_folder = copied_in(taken, service)
-    spoil(test_folder, what)
-    accepted = client.post(f"{url}/analyses", json=BODY)
-    done = wait_for_job(client, accepted.json()["job"], 240.0)
+    spoil(test_folder, "the reference's image was replaced")
+    done = wait_for_job(client, client.post(f"{url}/analyses", json=BODY).json()["job"], 240.0)
     assert done["state"] == "failed"
-    assert done["problem"]["code"] == FAILED_JOB[what]
+    assert done["problem"]["code"] == "checksum_mismatch"
+    url, test_folder = copied_in(taken, service)
+    spoil(test_folder, "a step's image was replaced")
+    done = wait_for_job(client, client.post(f"{url}/analyses", json=BODY).json()["job"], 240.0)
+    assert done["state"] == "succeeded", done["problem"]
+    assert done["result"]["steps_finished"] == [0, 1, 3]
+    assert done["result"]["steps_failed"]["2"]["code"] == "checksum_mismatch"
 
 
 def test_what_changes_between_asking_and_measuring_is_refused(

@@ -326,6 +326,7 @@ def _test(session: Session, calibration: str) -> str:
     call("post_channels", test, body={"load_n": 1811.0})
     call("end_watch", test)
     call("rate_texture", test, 0, summary="Subsets of 21 px", body={"region": REGION, "subset_px": 21})
+    call("find_region", test, summary="On the specimen", body={"subset_px": 21})
     call("check_seeds", test, summary="One seed", body={"seeds": [[128, 120]], "seeds_cam2": [[128, 120]]})
     call("delete_step", test, imported)
     # one step of a narrow view: whether it is repaired or refused is the job's to say

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,8 @@ from numpy.typing import NDArray
 from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
 from core.field.region.region import PointGrid
+from core.measure import MeasureOptions
+from core.orientation import Repair, repair_orientation
 from tests.support.independent_rig import Array, PlainCamera, Waves, render
 
 #: a wide view, as of an 8 mm lens on a 2/3 inch sensor: over a narrow one, offsets do not determine the vergence
@@ -96,6 +99,22 @@ def picture(camera: PlainCamera, pose: int, *, seed: int, noise: float = 2.0, n:
     wavelength = 2.6 * SIZE[0] / camera.size[0]
     texture = Waves(wavelength, seed=3)
     return render(camera, texture, frame=frame, origin=np.array(place), n=n, noise=noise, seed=seed)
+
+
+#: as they were calibrated
+CAM1, CAM2 = plain_camera(-1.0), plain_camera(1.0)
+
+
+@lru_cache(maxsize=32)
+def seen(camera: PlainCamera, pose: int, n: int = 3) -> NDArray[np.uint8]:
+    """The picture of a pose, rendered once, with each camera's own noise."""
+    return picture(camera, pose, seed=10 * pose + (camera.phd > 1300.0), n=n)
+
+
+def repaired(one: PlainCamera, two: PlainCamera, poses: tuple[int, ...] = (0, 1), n: int = 3) -> Repair:
+    """The repair of the calibrated pair from pictures of the cameras as they are now."""
+    images = [(seen(one, k, n), seen(two, k, n)) for k in poses]
+    return repair_orientation(core_pair(CAM1, CAM2), images, grid(), MeasureOptions(subset_px=SUBSET_PX))
 
 
 def pose_points(camera: PlainCamera, pose: int, xy_px: Array) -> Array:

@@ -6,10 +6,12 @@ It shares nothing with `core` or `sim`, so that what the command line finds in t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from scipy.signal import fftconvolve
 
 Array = NDArray[np.float64]
 
@@ -116,6 +118,48 @@ class LineGrid:
 FLAT = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
 
 
+class Drawn(TypedDict, total=False):
+    """How a pattern is drawn, see :func:`picture`."""
+
+    frame: Array
+    origin: Array | None
+    dz: float
+    n: int
+    low: float
+    high: float
+    blur_px: float
+
+
+def fine_picture(
+    camera: PlainCamera,
+    pattern: Waves | LineGrid,
+    *,
+    frame: Array = FLAT,
+    origin: Array | None = None,
+    dz: float = 0.0,
+    n: int = 4,
+) -> NDArray[np.float32]:
+    """The pattern at n x n points a pixel, (h n, w n), sharp."""
+    w, h = camera.size
+    fine = np.empty((h * n, w * n), dtype=np.float32)
+    for start in range(0, h, 32):
+        rows = slice(start, min(h, start + 32))
+        rays = camera.sub_pixel_rays(n, rows)
+        ab = material_points(camera, rays, frame=frame, origin=np.zeros(3) if origin is None else origin, dz=dz)
+        samples = pattern(ab).reshape(-1, w, n, n).transpose(0, 2, 1, 3)
+        fine[start * n : rows.stop * n] = samples.reshape(-1, w * n)
+    return fine
+
+
+def on_sensor(blurred: Array | NDArray[np.float32], n: int, *, low: float = 40.0, high: float = 210.0) -> Array:
+    """Integrate a blurred fine picture over each pixel, light it unevenly: grey levels without noise, not rounded."""
+    h, w = blurred.shape[0] // n, blurred.shape[1] // n
+    out = blurred.reshape(h, n, w, n).mean((1, 3))
+    yy, xx = np.mgrid[:h, :w]
+    light = 1.0 - 0.08 * ((xx / w - 0.4) ** 2 + (yy / h - 0.6) ** 2)
+    return np.asarray((low + (high - low) * out) * light)
+
+
 def picture(
     camera: PlainCamera,
     pattern: Waves | LineGrid,
@@ -129,18 +173,22 @@ def picture(
     blur_px: float = 0.6,
 ) -> Array:
     """Blur the pattern, integrate it over each pixel, light it unevenly: grey levels without noise, not rounded."""
-    w, h = camera.size
-    fine = np.empty((h * n, w * n), dtype=np.float32)
-    for start in range(0, h, 32):
-        rows = slice(start, min(h, start + 32))
-        rays = camera.sub_pixel_rays(n, rows)
-        ab = material_points(camera, rays, frame=frame, origin=np.zeros(3) if origin is None else origin, dz=dz)
-        samples = pattern(ab).reshape(-1, w, n, n).transpose(0, 2, 1, 3)
-        fine[start * n : rows.stop * n] = samples.reshape(-1, w * n)
-    out = gaussian_filter(fine, blur_px * n).reshape(h, n, w, n).mean((1, 3))
-    yy, xx = np.mgrid[:h, :w]
-    light = 1.0 - 0.08 * ((xx / w - 0.4) ** 2 + (yy / h - 0.6) ** 2)
-    return np.asarray((low + (high - low) * out) * light)
+    fine = fine_picture(camera, pattern, frame=frame, origin=origin, dz=dz, n=n)
+    return on_sensor(gaussian_filter(fine, blur_px * n), n, low=low, high=high)
+
+
+def defocused(fine: NDArray[np.float32], radius: float, blur: float) -> NDArray[np.float32]:
+    """Blur a fine picture by the disc of an open aperture and a little diffraction; both in samples."""
+    k = int(np.ceil(radius)) + 1
+    y, x = np.mgrid[-k : k + 1, -k : k + 1]
+    disc = np.clip(radius - np.hypot(x, y) + 0.5, 0.0, 1.0)
+    wide = np.pad(gaussian_filter(fine, blur), k, mode="edge")
+    return np.asarray(fftconvolve(wide, (disc / disc.sum()).astype(np.float32), mode="valid"), dtype=np.float32)
+
+
+def with_stray_light(fine: NDArray[np.float32], blur: float, wide: float, share: float) -> NDArray[np.float32]:
+    """Blur a fine picture by a Gaussian of ``blur`` samples, and ``share`` of its light by one of ``wide`` samples."""
+    return np.asarray((1.0 - share) * gaussian_filter(fine, blur) + share * gaussian_filter(fine, wide))
 
 
 def exposed(grey: Array, noise: float, rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -149,19 +197,7 @@ def exposed(grey: Array, noise: float, rng: np.random.Generator) -> NDArray[np.u
 
 
 def render(
-    camera: PlainCamera,
-    pattern: Waves | LineGrid,
-    *,
-    frame: Array = FLAT,
-    origin: Array | None = None,
-    dz: float = 0.0,
-    n: int = 4,
-    low: float = 40.0,
-    high: float = 210.0,
-    noise: float = 2.0,
-    blur_px: float = 0.6,
-    seed: int = 0,
+    camera: PlainCamera, pattern: Waves | LineGrid, *, noise: float = 2.0, seed: int = 0, **drawn: Unpack[Drawn]
 ) -> NDArray[np.uint8]:
-    """A picture of the pattern with noise, in eight bits."""
-    grey = picture(camera, pattern, frame=frame, origin=origin, dz=dz, n=n, low=low, high=high, blur_px=blur_px)
-    return exposed(grey, noise, np.random.default_rng(seed))
+    """A picture of the pattern with noise, in eight bits; ``drawn`` as of :func:`picture`."""
+    return exposed(picture(camera, pattern, **drawn), noise, np.random.default_rng(seed))

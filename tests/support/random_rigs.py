@@ -32,7 +32,7 @@ LENS_KINDS = ("pinhole", "kappa", "k1 k2", "p1 p2", "rational", "thin prism", "f
 MOTIONS = ("cameras", "target", "both_cameras", "free", "free", "cameras+free", "target+free")
 SIZES = ((1280, 1024), (1600, 1200), (2448, 2048), (4096, 3000))
 TOO_LITTLE = frozenset({"calibration_dz_too_small", "calibration_one_position", "calibration_singular"})
-#: causes by which a fault may be refused; a fault that leaves a right calibration, or one with a warning, may pass
+#: codes of the causes by which a fault may be refused
 CAUSES: dict[str, frozenset[str]] = {
     "swapped cameras": frozenset({"cameras_swapped"}),
     "one mirrored": frozenset({"image_mirrored", "cameras_swapped"}),
@@ -46,6 +46,22 @@ CAUSES: dict[str, frozenset[str]] = {
     "too few poses": frozenset({"too_few_poses"}) | TOO_LITTLE,
     "moved in some": frozenset({"pair_inconsistent", "too_few_poses"}),
 }
+#: words of the causes that the reasons of a verdict may give for a fault, where its numbers are wrong
+REASONS: dict[str, tuple[str, ...]] = {
+    "permuted files": ("left out", "moved there", "cameras disagree"),
+    "bumped half-way": ("left out", "moved there", "cameras disagree"),
+    "moved in some": ("left out", "moved there", "cameras disagree"),
+    "bent board": ("departs from a plane", "um out of plane", "Node corrections"),
+    "parallel poses": ("Predicted shape uncertainty",),
+    "too few poses": ("Predicted shape uncertainty", "nothing independent confirms"),
+}
+#: the same of a sound rig whose lens no model here has
+FOREIGN_LENSES = ("thin prism", "fisheye")
+LENS_REASON = "hold structure"
+#: faults that no part of the views escapes: a calibration of them that is called good is a violation, however wide
+EVERYWHERE = frozenset(
+    {"swapped cameras", "one mirrored", "wrong unit", "reversed sign", "wrong size", "too few poses"}
+)
 STAGE_FAULTS = (
     "swapped cameras",
     "one mirrored",
@@ -105,8 +121,8 @@ class Answer:
     Attributes
     ----------
     outcome
-        ``right``, ``warned`` (wrong, but not called good), ``refused``, or a violation: ``good and wrong``,
-        ``refused without a fault``, ``wrong cause``.
+        ``right`` within the reported uncertainty, ``warned`` (wrong, not good, for the right cause), ``refused``, or a
+        violation: ``good and wrong``, ``good in spite of the fault``, ``refused without a fault``, ``wrong cause``.
     ratio
         True over reported shape error; NaN where refused.
     said
@@ -124,7 +140,7 @@ class Answer:
     @property
     def violation(self) -> bool:
         """True for what must not be."""
-        return self.outcome in ("good and wrong", "refused without a fault", "wrong cause")
+        return self.outcome not in ("right", "warned", "refused")
 
 
 def random_rig(seed: int) -> RandomRig:
@@ -208,9 +224,25 @@ def answer(rig: RandomRig) -> Answer:
         return Answer(outcome, float("nan"), code, str(error))
     ratio = true_over_reported(rig, result)
     good = result.verdict.level == "good"
-    outcome = "right" if ratio <= SIGMAS else "good and wrong" if good else "warned"
     dropped = "; ".join(f"{d.name}: {d.reason}" for d in result.dropped)
-    return Answer(outcome, ratio, result.verdict.level, " ".join(result.verdict.reasons) + dropped, result.lens.model)
+    detail = " ".join(result.verdict.reasons) + dropped
+    if good and rig.fault in EVERYWHERE:
+        outcome = "good in spite of the fault"
+    elif ratio <= SIGMAS:
+        outcome = "right"
+    elif good:
+        outcome = "good and wrong"
+    else:
+        outcome = "warned" if _names_cause(rig, detail) else "wrong cause"
+    return Answer(outcome, ratio, result.verdict.level, detail, result.lens.model)
+
+
+def _names_cause(rig: RandomRig, detail: str) -> bool:
+    """Return True if the reasons of a verdict name what is wrong with a rig."""
+    words = REASONS.get(rig.fault, ()) if rig.fault is not None else ()
+    if rig.lens in FOREIGN_LENSES:
+        words = (*words, LENS_REASON)
+    return any(word.lower() in detail.lower() for word in words)
 
 
 def true_over_reported(rig: RandomRig, result: CalibrationResult) -> float:

@@ -197,10 +197,15 @@ def assemble(
     *,
     extras: Sequence[Extra] | None = None,
     n_extra: int = 0,
+    lins: Sequence[Linearised] | None = None,
 ) -> Normal:
-    """Build the normal equations of all views at a state; ``extras`` are held unknowns after the layout's own."""
+    """Build the normal equations of all views at a state; ``extras`` are held unknowns after the layout's own.
+
+    ``lins`` are the views' derivatives where they are known already.
+    """
     n, k, m = len(nominal_nodes_mm), priors.nodes_free, layout.size + n_extra
-    lins = linearise_all(layout, state, views, nominal_nodes_mm)
+    if lins is None:
+        lins = linearise_all(layout, state, views, nominal_nodes_mm)
     together = k > 0 and any(view.lines is not None for view in views)
     U, g = np.zeros((2, m, m)), np.zeros(m)
     W, h = np.zeros((2, n, m, k)), np.zeros((n, k))

@@ -15,6 +15,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from core.arrays import Bool, Float
 from core.calibration.fit.layout import Layout, Priors, State
+from core.calibration.fit.model import Linearised, linearise_all
 from core.calibration.fit.named import named_derivatives, parameter_names
 from core.calibration.fit.normal import Normal, assemble, inverse
 from core.calibration.fit.observations import ViewRows
@@ -23,7 +24,6 @@ from core.calibration.uncertainty import point_derivatives
 from core.cameras.camera import RigidTransform
 
 _MOST_POINTS = 100  # of a target: of more, every other stands for its neighbours too
-_NEW = -1  # number of a pose that is only thought of
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,53 +80,66 @@ class Information:
         reduced = matrix[:s, :s]
         if len(matrix) > s:
             coupling = matrix[:s, s:]
-            reduced = reduced - coupling @ cho_solve(cho_factor(matrix[s:, s:]), coupling.T)
+            factor = cho_factor(matrix[s:, s:], lower=True, check_finite=False)
+            reduced = reduced - coupling @ cho_solve(factor, coupling.T, check_finite=False)
         C = inverse(reduced)
         z, shape = (float(np.sqrt(max(np.sum(C * q), 0.0))) for q in (self.q_z, self.q_shape))
         return Spread(1e3 * z, 1e3 * shape)
 
-    def of_pose(self, pose: RigidTransform, seen_px: Sequence[Float]) -> Float:
-        """Return what both cameras' views of the target in one further pose would add to ``matrix``.
+    def of_poses(self, poses: Sequence[RigidTransform], seen_px: Sequence[tuple[Float, Float]]) -> list[Float]:
+        """Return what both cameras' views of the target in one further pose would add to ``matrix``, for each pose.
 
         Parameters
         ----------
-        pose
+        poses
             ``sys_from_target``.
         seen_px
-            (n, 2) image positions of all points in each camera, NaN where not seen.
+            Of each pose, (n, 2) image positions of all points in each camera, NaN where not seen.
         """
         e, kept = self.estimate, self.points
+        nominal = e.problem.flat_nodes_mm[kept]
+        shared, k = len(self.free), e.priors.nodes_free
         first = e.problem.system_frame is None
-        layout = replace(e.layout, frames=() if first else (_NEW,), steps=())
-        shared = len(self.free)
-        x = np.zeros(layout.size)
+        # all poses are linearised together; each stands in the normal equations of its own
+        numbers = tuple(range(len(poses)))
+        together = replace(e.layout, frames=() if first else numbers, steps=())
+        x = np.zeros(together.size)
         x[:shared] = e.state.x[:shared]
-        state = State(x, {} if first else {_NEW: pose}, e.state.nodes_mm[kept])
-        rows = []
-        for c, xy in enumerate(seen_px):
-            found = np.isfinite(xy[kept]).all(axis=-1)
-            correlation = float(np.mean([r.correlation for r in e.rows if r.camera == c] or [1.0]))
-            rows.append(
-                ViewRows(
-                    c,
-                    None,
-                    _NEW,
-                    "",
-                    xy[kept],
-                    np.asarray(found),
-                    np.asarray(found, dtype=np.float64),
-                    correlation=correlation,
-                )
-            )
-        k = e.priors.nodes_free
+        state = State(x, {} if first else dict(zip(numbers, poses, strict=True)), e.state.nodes_mm[kept])
+        correlation = [float(np.mean([r.correlation for r in e.rows if r.camera == c] or [1.0])) for c in range(2)]
+        rows = [
+            _thought_of(c, number, xy[kept], correlation[c])
+            for number, pair in zip(numbers, seen_px, strict=True)
+            for c, xy in enumerate(pair)
+        ]
+        lins = [_as_only_pose(lin, shared) for lin in linearise_all(together, state, rows, nominal)]
+        alone = replace(together, frames=() if first else numbers[:1])
         blank = Priors(
-            np.zeros(layout.size),
-            np.zeros(layout.size),
-            np.ones(layout.size, dtype=bool),
+            np.zeros(alone.size),
+            np.zeros(alone.size),
+            np.ones(alone.size, dtype=bool),
             np.where(np.arange(3) < k, 0.0, np.inf),
         )
-        normal = assemble(layout, state, rows, e.problem.flat_nodes_mm[kept], blank, _thinned(e.noise_px, e, kept))
-        return _without_poses(normal, shared, self.free)
+        state = State(x[: alone.size], {}, state.nodes_mm)
+        noise_px = _thinned(e.noise_px, e, kept)
+        normals = (
+            assemble(alone, state, rows[m : m + 2], nominal, blank, noise_px, lins=lins[m : m + 2])
+            for m in range(0, len(rows), 2)
+        )
+        return [_without_poses(normal, shared, self.free) for normal in normals]
+
+
+def _thought_of(camera: int, number: int, xy_px: Float, correlation: float) -> ViewRows:
+    """Return the rows of a view that was not taken."""
+    found = np.asarray(np.isfinite(xy_px).all(axis=-1))
+    weight = np.asarray(found, dtype=np.float64)
+    return ViewRows(camera, None, number, "", xy_px, found, weight, correlation=correlation)
+
+
+def _as_only_pose(lin: Linearised, shared: int) -> Linearised:
+    """Return the view with its pose's six unknowns right after the shared ones."""
+    own = np.where(lin.columns < shared, lin.columns, shared + (lin.columns - shared) % 6)
+    return replace(lin, columns=own)
 
 
 def information(estimate: Estimate, volume_mm: Float) -> Information:

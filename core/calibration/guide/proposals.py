@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -93,21 +93,26 @@ def propose(info: Information, sizes_px: tuple[tuple[int, int], tuple[int, int]]
     if estimate.problem.system_frame is None:
         found = scene.candidate("as far", "none", 0.0, "in the middle")
         return None if found is None else found.proposal
-    middle = [c for c in scene.in_the_middle() if c is not None]
-    rated = sorted((_rated(info, c) for c in middle), key=lambda c: _value(c, quantity))
-    for best in rated[:_REFINED]:
-        p = best.proposal
-        aside = [scene.candidate(p.distance, p.tilt, p.tilt_deg, part) for part in list(_PARTS)[1:]]
-        rated += [_rated(info, c) for c in aside if c is not None]
+    rated = sorted(_rated(info, scene.in_the_middle()), key=lambda c: _value(c, quantity))
+    best = [c.proposal for c in rated[:_REFINED]]
+    aside = [scene.candidate(p.distance, p.tilt, p.tilt_deg, part) for p in best for part in list(_PARTS)[1:]]
+    rated += _rated(info, aside)
     return min(rated, key=lambda c: _value(c, quantity)).proposal if rated else None
 
 
-def _rated(info: Information, candidate: _Candidate) -> _Candidate:
-    try:
-        spread = info.spread(info.of_pose(candidate.proposal.sys_from_target, candidate.seen_px))
-    except (CalibrationError, np.linalg.LinAlgError):
-        return candidate
-    return replace(candidate, proposal=replace(candidate.proposal, predicted=spread))
+def _rated(info: Information, candidates: Iterable[_Candidate | None]) -> list[_Candidate]:
+    """Return the candidates that both cameras see, each with the uncertainty after it where it is determined."""
+    seen = [c for c in candidates if c is not None]
+    added = info.of_poses([c.proposal.sys_from_target for c in seen], [c.seen_px for c in seen])
+    rated = []
+    for candidate, matrix in zip(seen, added, strict=True):
+        try:
+            spread = info.spread(matrix)
+        except (CalibrationError, np.linalg.LinAlgError):
+            rated.append(candidate)
+        else:
+            rated.append(replace(candidate, proposal=replace(candidate.proposal, predicted=spread)))
+    return rated
 
 
 def _value(candidate: _Candidate, quantity: str) -> float:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from core.field.checks.edges import reject_near_edges
 from core.field.checks.residual_test import residual_test
+from core.field.checks.straddling import reject_straddling
 from core.field.checks.unreached import mark_outside
 from core.field.checks.validity import apply_validity_checks
 from core.field.growth.grow import grow
@@ -49,6 +50,23 @@ def fill(inputs: FieldInputs, state: GrowthState) -> GrowthState:
         check(inputs, state.points)
         state = replace(state, checked=True)
     return state
+
+
+def check_edges(inputs: FieldInputs, state: GrowthState) -> None:
+    """Reject the points of a shape whose subset lies on two faces; a motion measures none of these."""
+    if state.fitter.comparisons == 3:
+        return
+    rejected = reject_straddling(
+        state.fitter,
+        state.points,
+        shape=inputs.grid.shape,
+        xy_px=inputs.xy_px,
+        rays=inputs.rays,
+        spacing_px=inputs.grid.spacing_px,
+        cancel=inputs.cancel,
+    )
+    if rejected:
+        check(inputs, state.points)
 
 
 def check_residuals(inputs: FieldInputs, state: GrowthState) -> None:

@@ -6,46 +6,48 @@ from dataclasses import replace
 
 from core.errors import SeedError
 from core.field.checks.unreached import mark_outside
-from core.field.growth.check import check, check_residuals, fill, grow_field
+from core.field.growth.check import check, check_edges, check_residuals, fill, grow_field
 from core.field.growth.patch import choose_patch, refit_curved
+from core.field.growth.reach import hidden, reach_further
 from core.field.growth.seed import Seeds, match_seeds, seed_motion, seed_shape
 from core.field.growth.state import FieldInputs, GrowthState, begin, fresh_attempts
 from core.field.points.assemble import assemble
 from core.field.points.result import Field
+from core.field.seeding.diagnosis import diagnose, seed_error
 from core.status import PointStatus
 
 _LEFT_OVER = 0.02
+_MOSTLY = 0.5
 
 
 def shape_field(inputs: FieldInputs, seeds: Seeds | None) -> Field:
     """Measure a shape from given seeds, or from those that are found."""
     state = seed_shape(inputs, begin(inputs), seeds)
-    return assemble_field(inputs, fill_field(inputs, state, automatic=seeds is None), None)
+    return assemble_field(inputs, fill_field(inputs, state), None)
 
 
 def motion_field(inputs: FieldInputs, shape: Field, previous: Field | None, seeds: Seeds | None) -> Field:
     """Measure a motion from the previous step, from given seeds, or from those that are found."""
     inputs = inputs.on_shape(shape, previous)
     state = seed_motion(inputs, begin(inputs), shape, previous, seeds)
-    return assemble_field(inputs, fill_field(inputs, state, automatic=seeds is None, shape=shape), shape)
+    return assemble_field(inputs, fill_field(inputs, state, shape=shape), shape)
 
 
 def assemble_field(inputs: FieldInputs, state: GrowthState, shape: Field | None) -> Field:
     """Return the field in the system frame."""
-    return assemble(
+    field = assemble(
         state.points, pair=inputs.pair, grid=inputs.grid, fits_image=inputs.fits_image, shape=shape, patch=state.patch
     )
+    return replace(field, failed_seeds_px=state.failed_seeds_px)
 
 
-def fill_field(inputs: FieldInputs, state: GrowthState, *, automatic: bool, shape: Field | None = None) -> GrowthState:
+def fill_field(inputs: FieldInputs, state: GrowthState, *, shape: Field | None = None) -> GrowthState:
     """Grow from the seeds, check, choose the patch, grow into the gaps, and check again.
 
     Parameters
     ----------
     inputs, state
         With seeds.
-    automatic
-        True if seeds may be searched for where growth did not reach.
     shape
         Of a motion: the shape that was measured before.
 
@@ -55,17 +57,23 @@ def fill_field(inputs: FieldInputs, state: GrowthState, *, automatic: bool, shap
         If no point is valid.
     """
     if not state.points.ok.any() and (shape is None or shape.valid.any()):
-        raise _no_seed(state.fitter.ref1.noise_variance)
+        raise _no_seed(inputs)
     if state.patch.patch == "quadratic" and state.fitter.terms == 3:
         state = refit_curved(inputs, state)
     state = choose_patch(inputs, fill(inputs, state))
     if not state.checked:  # measured anew
         state = fill(inputs, state)
     mark_outside(state.fitter, state.points, inputs.xy_px, inputs.usable)
-    if automatic and _unreached(inputs, state) > _LEFT_OVER and match_seeds(inputs, state) > 0:
+    if shape is not None:
+        reach_further(inputs, state)
+    if _unreached(inputs, state) > _LEFT_OVER and not hidden(inputs, state) and match_seeds(inputs, state) > 0:
         state = replace(state, attempts=fresh_attempts(inputs))
         grow_field(inputs, state)
         check(inputs, state.points)
+        reach_further(inputs, state)
+    elif shape is None:
+        reach_further(inputs, state)
+    check_edges(inputs, state)
     check_residuals(inputs, state)
     inputs.progress("done", int(state.points.ok.sum()), int(inputs.usable.sum()))
     return state
@@ -77,14 +85,14 @@ def _unreached(inputs: FieldInputs, state: GrowthState) -> float:
     return float(untouched.sum()) / max(int(inputs.usable.sum()), 1)
 
 
-def _no_seed(noise_variance: float | None) -> SeedError:
-    remedy = (
-        "Check that both cameras see the same textured surface and that the calibration belongs to these "
-        "images, or give a seed point. A texture that repeats itself gives no start."
+def _no_seed(inputs: FieldInputs) -> SeedError:
+    """Return the error for a field without a start, with what its images show about the cause."""
+    usable = inputs.usable
+    found = diagnose(
+        inputs.pair,
+        (inputs.ref1, inputs.ref2),
+        inputs.current,
+        region_px=inputs.grid.extent_px,
+        repeating=bool(usable.any() and inputs.repeating[usable].mean() > _MOSTLY),
     )
-    if noise_variance is not None:
-        remedy += (
-            f" The noise model says {noise_variance**0.5:.1f} grey levels: with too much, texture passes for noise; "
-            "try without it."
-        )
-    return SeedError("no point of the region could be matched between the images from any start.", remedy=remedy)
+    return seed_error(found, inputs.matcher.ref1.noise_variance)

@@ -108,6 +108,11 @@ class Attempts:
                 neighbours[visibility.separated_at(int(dr), int(dc)), k] = -1
         return Attempts(neighbours, np.zeros(neighbours.shape, bool), np.full(n, ATTEMPTS, np.int8))
 
+    def renew(self, which: Bool) -> None:
+        """Forget the starts of the points ``which`` (n,): fresh seeds lie near them."""
+        self.tried[which] = False
+        self.left[which] = ATTEMPTS
+
 
 def grow(
     fitter: FitsPoints,

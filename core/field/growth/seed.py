@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from core.arrays import Bool, Float
 from core.errors import SeedError
@@ -47,7 +48,8 @@ from core.status import PointStatus
 Seeds = Sequence[Seed | Sequence[float]] | NDArray[Any]
 
 _MIN_MATCHES = 12
-_SAMPLE_SHARE = 0.7
+_SAMPLE_SHARE = 0.3  # of a sample: the rest may be hidden, or have moved by itself, and is seeded after growth
+_NEAREST = 3
 _REACH_STEPS = 2.0
 _SEARCHED = 6  # positions
 
@@ -56,8 +58,9 @@ def seed_shape(inputs: FieldInputs, state: GrowthState, seeds: Seeds | None) -> 
     """Seed a shape."""
     inputs.progress("seeds", 0, 1)
     if seeds is not None:
-        _given_shape(inputs, state, as_seeds(seeds))
-    elif match_seeds(inputs, state) == 0:
+        state = _given_shape(inputs, state, as_seeds(seeds))
+    # a user's seed comes first: of a texture that repeats itself it says which period is right
+    if not state.points.ok.any() and match_seeds(inputs, state) == 0:
         _swept_shape(inputs, state)
     inputs.progress("seeds", 1, 1)
     return state
@@ -75,12 +78,13 @@ def seed_motion(
     if previous is not None and previous.starts is not None and previous.starts.G is not None:
         n = len(inputs.xy_px)
         w, G = previous.starts.w.reshape(n, -1), previous.starts.G.reshape(n, 3, -1)
-        if _sample_holds(inputs, state, w, G):
-            return _go_on(inputs, state, w, G)
+        tried = _sample_holds(inputs, state, w, G)
+        if len(tried):
+            return _go_on(inputs, state, w, G, tried)
     inputs.progress("seeds", 0, 1)
     if seeds is not None:
-        _given_motion(inputs, state, as_seeds(seeds))
-    elif not _stayed(inputs, state):
+        state = _given_motion(inputs, state, as_seeds(seeds))
+    if not state.points.ok.any() and not _stayed(inputs, state):
         state.points.status[inputs.usable] = PointStatus.NOT_SEEDED
         if match_seeds(inputs, state) == 0:
             _searched_motion(inputs, state)
@@ -134,8 +138,11 @@ def _match_seeds_at(inputs: FieldInputs, state: GrowthState, scale: int, box1: B
     return found
 
 
-def _go_on(inputs: FieldInputs, state: GrowthState, w: Float, G: Float) -> GrowthState:
-    """Start all points from the previous step's values; a fitted sample of them is valid already."""
+def _go_on(inputs: FieldInputs, state: GrowthState, w: Float, G: Float, tried: NDArray[np.intp]) -> GrowthState:
+    """Start all points from the previous step's values; a fitted sample of them is valid already.
+
+    Points in the midst of those of the sample ``tried`` that failed are hidden, probably: growth gets there if not.
+    """
     if state.patch.patch == "quadratic":
         state = refit_curved(inputs, state)
     points = state.points
@@ -143,6 +150,7 @@ def _go_on(inputs: FieldInputs, state: GrowthState, w: Float, G: Float) -> Growt
     if points.G.shape == G.shape:
         G = predict(inputs.pair, inputs.xy_px, G, sample, points.w[sample], points.G[sample])
     known = np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2))
+    known &= ~_amid_failed(inputs.xy_px, tried, points.ok[tried])
     index = np.flatnonzero(inputs.usable & known & ~points.ok)
     inputs.progress("previous", 0, len(index))
     fit_in_batches(
@@ -155,23 +163,36 @@ def _go_on(inputs: FieldInputs, state: GrowthState, w: Float, G: Float) -> Growt
 def _stayed(inputs: FieldInputs, state: GrowthState) -> bool:
     """Return True if the surface is about where it was; not tried on a texture that repeats itself."""
     w = inputs.known_w
-    return w is not None and _sample_holds(inputs, state, w, no_motion(inputs.pair, inputs.xy_px), once_only=True)
+    if w is None:
+        return False
+    return len(_sample_holds(inputs, state, w, no_motion(inputs.pair, inputs.xy_px), once_only=True)) > 0
 
 
-def _sample_holds(inputs: FieldInputs, state: GrowthState, w: Float, G: Float, *, once_only: bool = False) -> bool:
-    """Fit a spread sample from given starts; return True, and keep the sample as seeds, if nearly all of it matches."""
+def _amid_failed(xy_px: Float, tried: NDArray[np.intp], held: Bool) -> Bool:
+    """Return (n,) True where all of the nearest points of a sample failed."""
+    if held.all() or len(tried) < _NEAREST:
+        return np.zeros(len(xy_px), bool)
+    nearest = np.asarray(cKDTree(xy_px[tried]).query(xy_px, k=_NEAREST)[1])
+    return np.asarray(~held[nearest].any(axis=1))
+
+
+def _sample_holds(
+    inputs: FieldInputs, state: GrowthState, w: Float, G: Float, *, once_only: bool = False
+) -> NDArray[np.intp]:
+    """Fit a spread sample from given starts; return it, and keep its matches as seeds, if enough of it matches."""
     usable = inputs.usable & np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2))
     if once_only:
         usable &= ~inputs.repeating
+    nothing = np.zeros(0, np.intp)
     if usable.sum() < 1:
-        return False
+        return nothing
     index = spread(inputs.xy_px, usable, np.zeros(len(usable)))[0]
     fits = refine(state.fitter, inputs.xy_px[index], Starts(w[index], G[index]), far_px=SAMPLE_FAR_PX)
     if fits.ok.mean() < _SAMPLE_SHARE:
-        return False
+        return nothing
     good = np.flatnonzero(fits.ok)
     state.points.put(index[good], fits.take(good))
-    return True
+    return index
 
 
 def _swept_shape(inputs: FieldInputs, state: GrowthState) -> None:
@@ -205,7 +226,8 @@ def _nearest(inputs: FieldInputs, seeds: tuple[Seed, ...], usable: Bool) -> NDAr
     return nearest_points(seeds, inputs.xy_px, usable, reach_px=reach, visibility=inputs.visibility)
 
 
-def _given_shape(inputs: FieldInputs, state: GrowthState, seeds: tuple[Seed, ...]) -> None:
+def _given_shape(inputs: FieldInputs, state: GrowthState, seeds: tuple[Seed, ...]) -> GrowthState:
+    failed = []
     for seed, i in zip(seeds, _nearest(inputs, seeds, inputs.usable), strict=True):
         raise_if_cancelled(inputs.cancel)
         found = PointFits.empty(1, 1)
@@ -217,15 +239,26 @@ def _given_shape(inputs: FieldInputs, state: GrowthState, seeds: tuple[Seed, ...
         if not found.ok[0]:
             found = sweep_shape(state.fitter, inputs.ref1.pixels, inputs.ref2.pixels, inputs.xy_px[i])
         _put_one(state, i, found)
+        if not found.ok[0]:
+            failed.append(seed.xy_px)
+    return replace(state, failed_seeds_px=tuple(failed))
 
 
-def _given_motion(inputs: FieldInputs, state: GrowthState, seeds: tuple[Seed, ...]) -> None:
+def _given_motion(inputs: FieldInputs, state: GrowthState, seeds: tuple[Seed, ...]) -> GrowthState:
     if inputs.known_w is None:
         raise SeedError("a seed for a motion needs the shape that was measured before it.")
-    index = _nearest(inputs, seeds, inputs.usable & np.isfinite(inputs.known_w).all(axis=1))
-    for i in index[~inputs.repeating[index]]:
+    failed = []
+    for seed, i in zip(
+        seeds, _nearest(inputs, seeds, inputs.usable & np.isfinite(inputs.known_w).all(axis=1)), strict=True
+    ):
+        if inputs.repeating[i]:
+            continue
         raise_if_cancelled(inputs.cancel)
-        _put_one(state, i, search_motion(state.fitter, inputs.xy_px[i], inputs.known_w[i]))
+        found = search_motion(state.fitter, inputs.xy_px[i], inputs.known_w[i])
+        _put_one(state, i, found)
+        if not found.ok[0]:
+            failed.append(seed.xy_px)
     if not state.points.ok.any():
         # turned or stretched too far for a template: the matches about the seed give the deformation
         match_seeds(inputs, state)
+    return replace(state, failed_seeds_px=tuple(failed))

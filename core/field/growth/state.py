@@ -203,6 +203,8 @@ class GrowthState:
         Starts that growth has tried.
     checked
         True if all valid points have passed the validity checks.
+    failed_seeds_px
+        (x, y) of the seeds that were given and did not match.
     """
 
     fitter: Fitter
@@ -210,6 +212,7 @@ class GrowthState:
     points: PointFits
     attempts: Attempts
     checked: bool
+    failed_seeds_px: tuple[tuple[float, float], ...] = ()
 
 
 def begin(inputs: FieldInputs) -> GrowthState:

@@ -93,6 +93,8 @@ class Field:
     starts
         The matcher's own unknowns, (r, c, ...), from which the next step of a sequence starts; not part of a result
         file, None in a field that was read from one.
+    failed_seeds_px
+        (x, y) of the seeds that were given and did not match; the field was then measured from others.
     """
 
     x_px: Float
@@ -118,6 +120,7 @@ class Field:
     cuts: Cuts | None = None
     common: Float | None = None
     starts: Starts | None = None
+    failed_seeds_px: tuple[tuple[float, float], ...] = ()
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -77,14 +77,15 @@ def sweep(
     smooth1, smooth2 = (
         np.asarray(cv2.GaussianBlur(i.astype(np.float32), (0, 0), 1.0), np.float32) for i in (image1, image2)
     )
-    ref = _normalise(_sample(smooth1, pixels[None]))[0]
+    ref = normalise(sample(smooth1, pixels[None]))[0]
+    across = np.array([(0.0, np.sin(tilt), np.cos(tilt)) for tilt in _TILTS_RAD])
     ray = pair.cam1.rays_cam(xy_px[None]).xyz_mm[0]
     rays = pair.cam1.rays_cam(pixels).xyz_mm
     d = rays[:, :2] - ray[:2]
     pose = pair.cam2_from_cam1
     all_w: list[Float] = []
     all_z: list[Float] = []
-    for w in _tilted(pair, ray, depths):
+    for w in tilted(pair, ray, depths, across):
         zncc = np.full(len(w), -1.0)
         for start in range(0, len(w), _BLOCK):
             part = w[start : start + _BLOCK]
@@ -104,15 +105,15 @@ def sweep(
             )
             if whole.any():
                 block = zncc[start : start + _BLOCK]
-                block[whole] = _normalise(_sample(smooth2, xy2[whole])) @ ref
+                block[whole] = normalise(sample(smooth2, xy2[whole])) @ ref
         all_w.append(w)
         all_z.append(zncc)
     w, z = np.concatenate(all_w), np.concatenate(all_z)
-    return _distinct(w, z, depths, candidates)
+    return distinct(w, z, depths, candidates)
 
 
-def _distinct(w: Float, zncc: Float, depths: Float, candidates: int) -> tuple[Float, Float]:
-    """Best first, without those within three steps of a better one."""
+def distinct(w: Float, zncc: Float, depths: Float, candidates: int) -> tuple[Float, Float]:
+    """Return starts (k, 3) and their correlations, best first, without those within three steps of a better one."""
     order = np.argsort(-zncc)
     rank = np.searchsorted(depths, w[:, 0]) if depths[0] < depths[-1] else np.searchsorted(-depths, -w[:, 0])
     taken: list[int] = []
@@ -124,22 +125,26 @@ def _distinct(w: Float, zncc: Float, depths: Float, candidates: int) -> tuple[Fl
     return w[taken], zncc[taken]
 
 
-def _tilted(pair: StereoPair, ray: Float, depths: Float) -> list[Float]:
-    """Start values (m, 3) for each tilt about the bisector of the two cameras' viewing directions."""
+def tilted(pair: StereoPair, ray: Float, depths: Float, normals: Float) -> list[Float]:
+    """Return start values (m, 3) at inverse depths (m,), for each of several normals.
+
+    ``normals`` (k, 3): components along the epipolar plane's normal, within that plane across the bisector of the two
+    viewing directions, and along the bisector.
+    """
     pose = pair.cam2_from_cam1
     centre2 = pose.inverse().translation_mm
     axis = np.cross(centre2, ray)  # normal of the epipolar plane: tilts that change the foreshortening
     axis /= np.linalg.norm(axis)
     out = []
     view1 = ray / np.linalg.norm(ray)
-    for tilt in _TILTS_RAD:
+    for along, over, upright in normals:
         point = ray[None] / depths[:, None]
         view2 = point - centre2
         view2 /= np.linalg.norm(view2, axis=1, keepdims=True)
         normal = view1 + view2
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         across = np.cross(axis, normal)
-        normal = np.cos(tilt) * normal + np.sin(tilt) * across
+        normal = upright * normal + over * across + along * axis
         # plane n . P = n . point gives 1/Z = n . (x, y, 1) / (n . point)
         constant = np.sum(normal * point, axis=1)
         good = (constant > 0.05 * np.linalg.norm(point, axis=1)) & (np.sum(normal * view2, axis=1) > 0.05)
@@ -160,8 +165,8 @@ def nominal_depth(pair: StereoPair) -> float:
     return 10.0 * pair.baseline_mm
 
 
-def _sample(image: Float32, xy: Float) -> Float:
-    """Bilinear grey levels at (b, s, 2)."""
+def sample(image: Float32, xy: Float) -> Float:
+    """Return bilinear grey levels (b, s) at (b, s, 2)."""
     maps = xy.astype(np.float32)
     return np.asarray(
         cv2.remap(image, np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1]), cv2.INTER_LINEAR),
@@ -169,6 +174,7 @@ def _sample(image: Float32, xy: Float) -> Float:
     )
 
 
-def _normalise(values: Float) -> Float:
+def normalise(values: Float) -> Float:
+    """Return rows (b, s) of mean zero and length one."""
     v = values - values.mean(axis=1, keepdims=True)
     return np.asarray(v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9))

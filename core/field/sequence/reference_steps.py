@@ -26,6 +26,7 @@ from core.field.sequence.compose import Totals
 from core.field.sequence.lost_points import OLDER, find_again
 from core.field.sequence.propagated import Propagated, pattern_share
 from core.field.sequence.segment import Segment, begin_segment, measure_segment
+from core.field.sequence.still_visible import still_visible
 from core.field.settings import MeasureOptions
 from core.matching.fit import no_motion
 from core.matching.geometry import plane_from_angles
@@ -133,6 +134,10 @@ class Updating:
                 raise
             return self._against(previous.step, step)
         if reference == previous.step or not _fails(field, previous.field, self._held_by(reference)):
+            return field
+        lost = _lost(field, previous.field.valid)
+        before, subset_px = self._images_of(previous.step), self._options.subset_px
+        if not still_visible(self._pair, before, images, previous.field, field, lost, subset_px=subset_px):
             return field
         try:
             updated = self._against(previous.step, step)

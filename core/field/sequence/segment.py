@@ -263,7 +263,7 @@ def measure_segment(
     start = None if previous_step == segment.step else _started(segment, previous, pair)
     inputs = inputs.on_shape(segment.shape, start)
     state = seed_motion(inputs, keep_patch(inputs, begin(inputs), previous), segment.shape, start, None)
-    return fill_field(inputs, state, automatic=True, shape=segment.shape)
+    return fill_field(inputs, state, shape=segment.shape)
 
 
 def _started(segment: Segment, previous: Field, pair: StereoPair) -> Field:

@@ -130,6 +130,9 @@ class AnalysisSummary(Reply):
 
     state: JobState = Field("interrupted", description="Final state of its job.")
     steps: list[StepFigures] = Field(default_factory=list, description="An entry a finished step, in their order.")
+    steps_failed: dict[str, JobProblem] = Field(
+        default_factory=dict, description="The problem of each step that could not be measured, by its number."
+    )
 
 
 class AnalysisReply(Reply):
@@ -144,6 +147,9 @@ class AnalysisReply(Reply):
     steps: list[int] = Field(default_factory=list, description="Steps that it measures, the reference first.")
     settings: StoredSettings = Field(description="Settings, fixed.")
     steps_finished: list[int] = Field(description="Steps whose results can be read now.")
+    steps_failed: dict[str, JobProblem] = Field(
+        default_factory=dict, description="The problem of each step that could not be measured, by its number."
+    )
     summary: AnalysisSummary | None = Field(None, description="Counts, residuals and timings of each step.")
     stale: bool = Field(
         False, description="True if steps, the reference or the calibration are gone or were replaced since."

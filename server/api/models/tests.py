@@ -69,6 +69,7 @@ class AnalysisEntry(Reply):
     label: str | None = Field(None, description="Free text.")
     created_utc: str | None = Field(None, description="Time at which it was begun.")
     job_id: str | None = Field(None, description="Its job.")
+    steps_failed: list[int] = Field(default_factory=list, description="Steps that could not be measured.")
 
 
 class TestReply(Reply):
@@ -201,6 +202,11 @@ class StepReply(Reply):
     skew_ms: float | None = Field(None, description="Difference of the two exposures' beginnings.")
     quality: StepQuality = Field(description="`code` (`ok` or what is wrong), and figures of each camera.")
     sha256: dict[str, str] = Field(description="Checksums of both image files.")
+    grey_from: dict[str, str] | None = Field(
+        None,
+        description="By camera, what the grey levels of a colour image were made from.",
+        examples=[{"cam1": "luminance, 0.299 R + 0.587 G + 0.114 B"}],
+    )
     burst: BurstIndex | None = Field(None, description="Its index in its burst, if it is of one.")
 
 

@@ -10,7 +10,7 @@ from core.errors import InputError
 from core.orientation import RepairLimits
 from core.settings import SPACING_PX, SUBSET_PX, Region
 from server.cli.measurement.image_lists import ImagePair, pairs_of_test_folder
-from server.cli.measurement.measure import check_cameras, check_pair, checked_shapes
+from server.cli.measurement.image_pairs import check_cameras, check_pair, checked_shapes
 from server.cli.measurement.region import check_whole, parse_rectangle
 from server.cli.terminal import ProgressLine
 from server.compute.orientation_repair import repair_from_files

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from core.errors import FileFormatError, ImageError, InputError
 from core.names import CAMERAS
-from server.worker.tasks import averages_of
+from server.worker.tasks import averages_of, grey_from_of
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,7 @@ class ImagePair:
     sha256_1: str | None = None
     sha256_2: str | None = None
     averages: tuple[int, float] = (1, 1.0)
+    grey_from: tuple[str | None, str | None] = (None, None)
 
 
 def _natural(path: str) -> list[tuple[int, str]]:
@@ -122,8 +123,9 @@ def pairs_of_test_folder(folder: Path) -> list[ImagePair]:
         except (ValueError, OSError) as error:
             raise FileFormatError(f"{mark} cannot be read as a step's record ({error}).") from error
         number = int(mark.parent.name) if mark.parent.name.isdigit() else None
-        averages = averages_of(record) if isinstance(record, dict) else (1, 1.0)
-        pairs.append(ImagePair(mark.parent / "cam1.tif", mark.parent / "cam2.tif", number, *_hashes(record), averages))
+        known = record if isinstance(record, dict) else {}
+        images = mark.parent / "cam1.tif", mark.parent / "cam2.tif"
+        pairs.append(ImagePair(*images, number, *_hashes(record), averages_of(known), grey_from_of(known)))
     if not pairs:
         raise InputError(
             f"{folder} holds no complete step (steps/<nnnn>/ with cam1.tif, cam2.tif and step.json).",

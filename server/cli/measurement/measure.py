@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 from pathlib import Path
 
-from core.errors import FileFormatError, ImageError, InputError
-from core.field.points.images import check_calibrated_size
+from core.errors import FileFormatError, InputError
 from core.field.prefilter import check_prefilter
 from core.settings import (
     DEFAULT_INTERPOLATION,
@@ -27,17 +25,16 @@ from core.settings import (
     patch_name,
 )
 from server.cli.measurement.image_lists import ImagePair, expand, pair_up, pairs_of_test_folder
+from server.cli.measurement.image_pairs import check_cameras, checked_pairs, checked_shapes, first_readable
 from server.cli.measurement.region import check_region, check_whole, parse_rectangle
 from server.cli.measurement.sequence import MeasureJob, measure_sequence
+from server.cli.measurement.specimen import SPECIMEN_FILE, found_specimen
 from server.cli.terminal import ProgressLine
 from server.compute.seeds import check_positions
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
-from server.formats.images import decode_image, read_file
+from server.formats.images import read_mask
 from server.formats.noise_json import load_noise
 from server.results.projected_pattern import check_settings
-from server.store.durable import read_json
-from server.worker.tasks import StepImages
-from server.workflows.camera_identity import check_same_cameras
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,7 +48,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="calibration.json, or another program's: see stereorig calibration convert",
     )
-    add("--roi", metavar="X0,Y0,X1,Y1", help="points lie at X0 + i step, Y0 + j step up to X1, Y1")
+    add(
+        "--roi",
+        metavar="X0,Y0,X1,Y1|auto",
+        help="points lie at X0 + i step, Y0 + j step up to X1, Y1; auto: on the specimen, found by its texture and "
+        "shown in specimen.png (auto, without a mask)",
+    )
     add("--mask", metavar="PNG", help="image of camera 1's size, white where points may lie")
     add(
         "--crack",
@@ -139,14 +141,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", metavar="DIR", help="for step_0000.nc (shape), step_0001.nc ... (displacement) and summary.json")
 
 
+SOME_FAILED = 3
+"""Exit status where some steps failed and others were measured: neither 0, all done, nor 1, nothing was."""
+
+
 def run(args: argparse.Namespace) -> int:
     """Run the command; return the exit status."""
     progress = ProgressLine()
     try:
-        measure_sequence(_prepare(args, progress), progress)
+        summary = measure_sequence(_prepare(args, progress), progress)
     finally:
         progress.close()
-    return 0
+    return SOME_FAILED if summary["steps_failed"] else 0
 
 
 def _missing(option: str) -> InputError:
@@ -190,7 +196,7 @@ def _pairs(args: argparse.Namespace, progress: ProgressLine) -> list[ImagePair]:
                 remedy="Give one or the other.",
             )
         return pairs_of_test_folder(Path(args.folder))
-    for option in ("cam1", "cam2", "calibration", "roi", "out"):
+    for option in ("cam1", "cam2", "calibration", "out"):
         if getattr(args, option) is None:
             raise _missing(f"--{option}")
     lists = []
@@ -206,7 +212,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
     """Check everything that can be checked before anything is computed or written."""
     subset = check_whole("--subset", args.subset, SUBSET_PX)
     step = check_whole("--step", args.step, SPACING_PX)
-    rectangle = None if args.roi is None else parse_rectangle(args.roi)
+    rectangle = None if args.roi in (None, "auto") else parse_rectangle(args.roi)
     strain, prefilter_px = _strain(args), _prefilter_px(args, subset)
     files = _pairs(args, progress)
     folder = None if args.folder is None else Path(args.folder)
@@ -217,12 +223,14 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
     for pair in files:
         check_cameras(pair, calibration_file)
     out = Path(args.out) if args.out or folder is None else folder / "exports" / "measure"
-    shapes = checked_shapes(files[0], calibration)
-    if rectangle is None:  # of a test folder: as much of camera 1's image as takes whole subsets
-        rows, cols = shapes[0]
-        margin = float(subset // 2 + 2)
-        rectangle = (margin, margin, cols - 1 - margin, rows - 1 - margin)
+    first = first_readable(files) if args.projected else files[0]
+    shapes = checked_shapes(first, calibration)
     mask_file = None if args.mask is None else Path(args.mask)
+    specimen = None
+    if args.roi == "auto" or (rectangle is None and mask_file is None):
+        specimen = found_specimen(first, calibration, subset, None if mask_file is None else read_mask(mask_file))
+        progress.note(f"region: {specimen.text}")
+        rectangle, mask_file = specimen.rectangle_px(subset), out / SPECIMEN_FILE
     noise = None if args.noise is None else load_noise(args.noise)
     region, seeds = check_region(
         rectangle,
@@ -233,9 +241,10 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         seeds=args.seed,
         cracks=args.crack,
         holes=args.hole,
+        mask=None if specimen is None else specimen.mask,
     )
     check_positions(calibration.pair, seeds or (), (shapes[1][1], shapes[1][0]))
-    steps = [check_pair(pair, k, shapes) for k, pair in enumerate(files)]
+    steps, failed = checked_pairs(files, shapes, alone=not args.projected)
     settings = StoredSettings.model_validate(
         {
             "region": region,
@@ -263,6 +272,8 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         mask_file=mask_file,
         out=out,
         noise=noise,
+        failed=failed,
+        specimen=specimen,
     )
 
 
@@ -279,61 +290,3 @@ def _check_calibration(folder: Path, calibration: LoadedCalibration) -> None:
             code="calibration_changed",
             remedy="Restore the file, or name the calibration that is meant with --calibration.",
         )
-
-
-def check_cameras(pair: ImagePair, calibration_file: Path) -> None:
-    """Refuse a pair that was taken with other cameras than were calibrated, by its record."""
-    record = pair.cam1.parent / "step.json"
-    if record.is_file() and calibration_file.suffix == ".json":
-        check_same_cameras(calibration_file, read_json(record).get("cameras"), f"{pair.cam1.parent}")
-
-
-def checked_shapes(first: ImagePair, calibration: LoadedCalibration) -> tuple[tuple[int, int], tuple[int, int]]:
-    """(rows, cols) of both cameras' images, which the calibration must agree with where it states a size."""
-    shapes = []
-    for path, size in ((first.cam1, calibration.image_size1_px), (first.cam2, calibration.image_size2_px)):
-        rows, cols = decode_image(read_file(path), name=str(path)).shape
-        check_calibrated_size(str(path), (rows, cols), size)
-        shapes.append((rows, cols))
-    return shapes[0], shapes[1]
-
-
-def check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[int, int]]) -> StepImages:
-    """Read both images of a step once, so that a bad one is found before hours of work on the others."""
-    hashes, images = [], []
-    for path, recorded, shape in ((pair.cam1, pair.sha256_1, shapes[0]), (pair.cam2, pair.sha256_2, shapes[1])):
-        data = read_file(path)
-        hashes.append(hashlib.sha256(data).hexdigest())
-        if recorded is not None and hashes[-1] != recorded:
-            raise FileFormatError(
-                f"{path} does not match the checksum in its step.json.",
-                code="checksum_mismatch",
-                remedy="Restore the file, or leave this step out.",
-            )
-        image = decode_image(data, name=str(path))
-        if image.shape != shape:
-            is_px, first_px = f"{image.shape[1]} x {image.shape[0]} px", f"{shape[1]} x {shape[0]} px"
-            raise ImageError(
-                f"{path} (step {step}) is {is_px}, the first image {first_px}.",
-                code="image_size_mismatch",
-                remedy="All images of one camera must have one size.",
-            )
-        if int(image.max()) == int(image.min()):
-            raise ImageError(
-                f"{path} (step {step}) is blank: every pixel is {int(image.max())}.",
-                code="image_blank",
-                remedy="Check exposure, lens cap and trigger, then take the step again.",
-            )
-        images.append(image)
-    if hashes[0] == hashes[1]:
-        raise InputError(
-            f"{pair.cam1} and {pair.cam2} (step {step}) hold the same image.",
-            code="same_image",
-            remedy="Give each camera its own images.",
-        )
-    return StepImages(
-        n=step if pair.number is None else pair.number,
-        files=(pair.cam1, pair.cam2),
-        sha256=(hashes[0], hashes[1]),
-        averages=pair.averages,
-    )

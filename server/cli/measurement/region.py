@@ -99,7 +99,7 @@ def check_whole(option: str, text: str, allowed: Range) -> int:
 
 
 def check_region(
-    rectangle: Rectangle,
+    rectangle: Rectangle | None,
     *,
     image_shape: tuple[int, int],
     subset_px: int,
@@ -108,8 +108,16 @@ def check_region(
     seeds: Sequence[str],
     cracks: Sequence[str] = (),
     holes: Sequence[str] = (),
+    mask: NDArray[np.bool_] | None = None,
 ) -> tuple[StoredRegion, tuple[Seed, ...] | None]:
     """Check region, mask, cracks, holes and seeds against camera 1's image; return the region, and the seeds if any.
+
+    Parameters
+    ----------
+    rectangle, mask_path
+        One of them, or both.
+    mask
+        The mask, where its file is still to be written.
 
     Raises
     ------
@@ -119,7 +127,8 @@ def check_region(
     ImageError
         If the mask cannot be read.
     """
-    mask = None if mask_path is None else read_mask(mask_path)
+    if mask is None and mask_path is not None:
+        mask = read_mask(mask_path)
     region = StoredRegion.model_validate(
         {
             "rectangle": rectangle,
@@ -131,7 +140,7 @@ def check_region(
     mask_shape = None if mask is None else (mask.shape[0], mask.shape[1])
     points = lay_points(region, spacing_px, mask)
     check_points(points, image_shape=image_shape, subset_px=subset_px, mask_shape=mask_shape)
-    return region, _seeds(seeds, rectangle, mask)
+    return region, _seeds(seeds, rectangle or points.extent_px, mask)
 
 
 def _seeds(texts: Sequence[str], rectangle: Rectangle, mask: NDArray[np.bool_] | None) -> tuple[Seed, ...] | None:

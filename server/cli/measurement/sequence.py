@@ -6,10 +6,11 @@ While a step is measured, the next pair is read and the last result is written; 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import re
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,22 +18,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from core.compiling import COMPILING, report_compiling
-from core.errors import MeasurementError
+from core.errors import Cancelled, StereorigError, StorageError
 from core.field.points.result import Field
 from core.settings import StoredSettings
+from server.base.problem import problem_of
 from server.cli.terminal import ProgressLine, duration
 from server.compute.background_compilation import BackgroundCompilation
 from server.compute.overlap import ReadAhead, WriteBehind
 from server.compute.strain import smoothing_note
 from server.formats.calibrations.recognise import LoadedCalibration
 from server.formats.files import make_folder, sha256_of, write_bytes
-from server.formats.images import read_mask
+from server.formats.images import encode_png, read_mask
 from server.formats.noise_json import LoadedNoise
-from server.formats.results.summary import SequenceSummary, to_json
+from server.formats.results.summary import SequenceSummary, region_found, to_json
 from server.formats.version import software_version
 from server.worker.tasks import StepImages
 
 if TYPE_CHECKING:
+    from core.field.seeding.specimen import Specimen
     from server.compute.sequence import Pair, SequenceMeasurement
 
 _MIN_OF_STATED, _MAX_OF_STATED = 0.75, 1.5  # residuals hold interpolation error besides noise, never less
@@ -62,7 +65,11 @@ def _strain_noise(strain: dict[str, Any] | None) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class MeasureJob:
-    """Everything that ``stereorig measure`` was asked to do, checked."""
+    """Everything that ``stereorig measure`` was asked to do, checked.
+
+    ``steps`` are those that can be measured, the reference first; ``failed`` has the error of each other one.
+    ``specimen`` is what was found where no region was given; its mask is then to be written to ``mask_file``.
+    """
 
     calibration: LoadedCalibration
     calibration_file: Path
@@ -71,15 +78,27 @@ class MeasureJob:
     mask_file: Path | None
     out: Path
     noise: LoadedNoise | None = None
+    failed: Mapping[int, StereorigError] = field(default_factory=dict)
+    specimen: Specimen | None = None
+
+    @property
+    def last(self) -> int:
+        """Number of the last step, measured or not."""
+        return max(self.steps[-1].n, *self.failed, 0)
 
 
 def measure_sequence(job: MeasureJob, progress: ProgressLine) -> dict[str, Any]:
-    """Measure every step; write the results and ``summary.json``; return the summary.
+    """Measure every step that can be; write the results and ``summary.json``; return the summary.
+
+    A step that fails does not take the others with it: its problem is in the summary, and the next step is measured
+    from the last good one.
 
     Raises
     ------
     StereorigError
-        As the measurement raises them. Results of steps that were finished before stay; no summary is written.
+        The reference's, and then nothing is written; what no step can be measured after, such as a full disk; and the
+        first step's where none but the reference could be measured. Results of finished steps stay, and the summary
+        says what stopped the others.
     """
     started = time.monotonic()
 
@@ -92,22 +111,50 @@ def measure_sequence(job: MeasureJob, progress: ProgressLine) -> dict[str, Any]:
         _output_folder(job.out),
         BackgroundCompilation(job.settings.patch) as compilation,
         report_compiling(on_compiling),
-        WriteBehind[dict[str, Any]]() as written,
     ):
-        runner = _Runner(job, progress, written)
+        written: list[dict[str, Any]] = []
+        runner = _Runner(job, progress)
+        try:
+            written = _measure_all(runner, job, compilation)
+            error = runner.nothing_measured()
+            if error is not None and not runner.begun:
+                raise error  # an earlier run's results stay as they are
+        except (StereorigError, KeyboardInterrupt) as stopped:
+            if runner.begun:
+                with contextlib.suppress(StorageError):
+                    _write_summary(runner, time.monotonic() - started, stopped)
+            raise
+        seconds = round(time.monotonic() - started, 3)
+        summary = _write_summary(runner, seconds, error)
+    failed = f", {len(runner.failed)} failed" if runner.failed else ""
+    progress.note(f"{len(written)} steps in {duration(seconds)}{failed}: {job.out / 'summary.json'}")
+    if error is not None:
+        raise error
+    return summary
+
+
+def _measure_all(runner: _Runner, job: MeasureJob, compilation: BackgroundCompilation) -> list[dict[str, Any]]:
+    """Measure the steps in order; return the summaries of those that are written."""
+    with WriteBehind[dict[str, Any]]() as writer:
+        runner.writer = writer
         if job.settings.pattern == "projected":
-            for _ in job.steps:
-                runner.measure(None)
+            for step in job.steps:
+                runner.measure(step, None)
         else:
+            runner.begin(job.steps[0])
             with ReadAhead(runner.sequence.read, job.steps[1:]) as pairs:
-                runner.measure(None)
+                runner.measure(job.steps[0], None)
                 compilation.wait()
-                for images in pairs:
-                    runner.measure(images)
-        steps = written.finish()
-    seconds = round(time.monotonic() - started, 3)
+                for step in job.steps[1:]:
+                    runner.measure(step, pairs)
+        return writer.finish()
+
+
+def _write_summary(runner: _Runner, seconds: float, error: BaseException | None) -> dict[str, Any]:
+    """Write ``summary.json`` of what was measured and what was not."""
+    job = runner.job
     summary = SequenceSummary(
-        state="succeeded",
+        state=_state_after(error),
         software_version=software_version(),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         calibration={
@@ -116,12 +163,22 @@ def measure_sequence(job: MeasureJob, progress: ProgressLine) -> dict[str, Any]:
             "source": job.calibration.source,
         },
         settings=job.settings.model_dump(),
-        seconds=seconds,
-        steps=steps,
+        seconds=round(seconds, 3),
+        steps=runner.summaries,
+        steps_failed={str(n): problem_of(runner.failed[n]).plain() for n in sorted(runner.failed)},
+        region_found=None if job.specimen is None else region_found(job.specimen),
     ).document()
+    summary["problem"] = problem_of(error).plain() if isinstance(error, StereorigError) else None
     write_bytes(job.out / "summary.json", to_json(summary))
-    progress.note(f"{len(steps)} steps in {duration(seconds)}: {job.out / 'summary.json'}")
     return summary
+
+
+def _state_after(error: BaseException | None) -> str:
+    if error is None:
+        return "succeeded"
+    if isinstance(error, Cancelled):
+        return "cancelled"
+    return "failed" if isinstance(error, StereorigError) else "interrupted"
 
 
 @contextlib.contextmanager
@@ -142,63 +199,98 @@ def _output_folder(out: Path) -> Iterator[None]:
 class _Runner:
     """Measures the steps in order, and prints a line for each on the terminal."""
 
-    def __init__(self, job: MeasureJob, progress: ProgressLine, written: WriteBehind[dict[str, Any]]) -> None:
-        self._job = job
+    def __init__(self, job: MeasureJob, progress: ProgressLine) -> None:
+        self.job = job
+        #: errors by step, of the files too
+        self.failed: dict[int, StereorigError] = dict(job.failed)
+        #: of the steps that are written, in their order
+        self.summaries: list[dict[str, Any]] = []
+        #: True once the reference is measured, and the folder holds this run's results
+        self.begun = False
+        self.writer: WriteBehind[dict[str, Any]]
+        self.sequence: SequenceMeasurement
         self._progress = progress
-        self._written = written
-        self.sequence = self._sequence(job.steps[0])
-        self._index = 0
+        self._previous: int | None = None  # the last good step after the reference
         self._matched = job.steps[0].n
         self._chosen: tuple[str, bool] | None = None
         self._checked = "ok"
         self._moved: bool | None = False
         self._smoothing_noted = False
         self._done = 0.0
+        for n in sorted(self.failed):
+            self._note_failure(n)
+
+    def begin(self, reference: StepImages) -> None:
+        """Begin a sequence at a reference."""
+        self.sequence = self._sequence(reference)
 
     def _sequence(self, reference: StepImages) -> SequenceMeasurement:
         # the kernels' modules take seconds to load: after the input was checked is early enough
         from server.compute.sequence import SequenceMeasurement
 
-        job = self._job
+        job = self.job
+        mask, inputs = None, {}
+        if job.specimen is not None:
+            mask, inputs = job.specimen.mask, {"mask": hashlib.sha256(encode_png(job.specimen.mask)).hexdigest()}
+        elif job.mask_file is not None:
+            mask, inputs = read_mask(job.mask_file), {"mask": sha256_of(job.mask_file)}
         return SequenceMeasurement(
             calibration=job.calibration,
             settings=job.settings,
-            mask=None if job.mask_file is None else read_mask(job.mask_file),
+            mask=mask,
             reference=reference,
             folder=job.out,
             noise=job.noise,
-            inputs={} if job.mask_file is None else {"mask": sha256_of(job.mask_file)},
+            inputs=inputs,
         )
 
-    def measure(self, images: Pair | None) -> None:
-        """Measure the next step, the reference's shape first (no images), and have its file written.
+    def measure(self, step: StepImages, images: Iterator[Pair] | None) -> None:
+        """Measure a step, the reference's shape first (no images), and have its file written.
 
-        Under a projected pattern every step is its own reference.
+        Under a projected pattern every step is its own reference. An error of the step's own is kept; one of the
+        reference, and what is not the step's doing, is raised.
         """
-        started, k, steps = time.monotonic(), self._index, self._job.steps
-        if k > 0 and self._job.settings.pattern == "projected":
-            self.sequence = self._sequence(steps[k])
-        previous = steps[k - 1].n if k > 1 else None
-        result = self.sequence.measure(steps[k], images, previous=previous, progress=self._shower(k))
+        started = time.monotonic()
+        alone = self.job.settings.pattern == "projected"
+        try:
+            if alone:
+                self.begin(step)
+            pair = None if images is None else next(images)
+            result = self.sequence.measure(step, pair, previous=self._previous, progress=self._shower(step.n))
+        except StereorigError as error:
+            own = alone or self.begun
+            if not own or isinstance(error, Cancelled | StorageError):
+                raise
+            error.context |= dict(zip(("cam1", "cam2"), map(str, step.files), strict=True))
+            self.failed[step.n] = error
+            self._note_failure(step.n)
+            return
         compute_s = round(time.monotonic() - started, 3)
-        if not result.valid.any():
-            one, two = steps[k].files
-            raise MeasurementError(
-                f"No point of step {k} ({one.name}, {two.name}) could be measured.",
-                code="nothing_measured",
-                remedy="Check that both cameras see the same textured surface, in this order, and the region.",
-            )
-        if k == 0:
+        if not self.begun:
             self._remove_older()
+            if self.job.specimen is not None and self.job.mask_file is not None:
+                write_bytes(self.job.mask_file, encode_png(self.job.specimen.mask))
             self._doubt_noise(result)
-        self._written.put(self._write, self.sequence, k, result, started, compute_s)
-        self._index += 1
+            self.begun = True
+        elif not alone:
+            self._previous = step.n
+        self.writer.put(self._write, self.sequence, step, result, started, compute_s)
+
+    def nothing_measured(self) -> StereorigError | None:
+        """Return the first step's error if steps failed and none was measured but the reference."""
+        needed = 1 if self.job.settings.pattern == "projected" else 2
+        if not self.failed or len(self.summaries) >= needed:
+            return None
+        return self.failed[min(self.failed)]
+
+    def _note_failure(self, n: int) -> None:
+        self._progress.note(f"step {n} of {self.job.last}: failed: {self.failed[n]}")
 
     def _write(
-        self, sequence: SequenceMeasurement, k: int, result: Field, started: float, compute_s: float
+        self, sequence: SequenceMeasurement, step: StepImages, result: Field, started: float, compute_s: float
     ) -> dict[str, Any]:
         """Write the file of a step, print its line, return its summary."""
-        step = self._job.steps[k]
+        k = step.n
         one, two = step.files
         about = {"cam1_file": str(one), "cam2_file": str(two)}
         finished = sequence.finish(step, result, about=about, in_service=False)
@@ -215,7 +307,7 @@ class _Runner:
         rms = summary["epipolar_residual_rms_px"]
         residual = "" if rms is None else f"epipolar residual {rms:.3f} px, "
         self._progress.note(
-            f"step {k} of {len(self._job.steps) - 1}: {summary['valid']} of {summary['points']} points, "
+            f"step {k} of {self.job.last}: {summary['valid']} of {summary['points']} points, "
             f"{residual}{_camera_offset(summary['camera_motion'])}{_strain_noise(summary['strain'])}{duration(seconds)}"
         )
         self._note_patch(k, finished.field)
@@ -229,6 +321,7 @@ class _Runner:
         if motion is not None and motion["camera_moved"] is not self._moved:
             self._moved = motion["camera_moved"]
             self._progress.note(f"{'warning' if self._moved else 'note'}: step {k}: {motion['text']}")
+        self.summaries.append(summary)
         return summary
 
     def _note_smoothing(self, result: Field, strain: dict[str, Any] | None) -> None:
@@ -252,19 +345,19 @@ class _Runner:
 
     def _note_reference(self, n: int, result: Field) -> None:
         """Print where another reference took over."""
-        matched = self._job.steps[0].n if result.references is None else result.references.step
-        if n > 1 and matched != self._matched and self._job.settings.reference_update == "auto":
+        matched = self.job.steps[0].n if result.references is None else result.references.step
+        if n > 1 and matched != self._matched and self.job.settings.reference_update == "auto":
             self._progress.note(f"step {n}: step {self._matched} no longer serves as reference, step {matched} does")
         self._matched = matched
 
     def _shower(self, n: int) -> Any:
-        count = len(self._job.steps)
+        count = self.job.last + 1
 
         def show(phase: str, done: int, total: int) -> None:
             share = done / total if total > 0 else 0.0
             part = _SEEDS_SHARE * share if phase == "seeds" else _SEEDS_SHARE + (1.0 - _SEEDS_SHARE) * share
             self._done = max(self._done, (n + part) / count)
-            self._progress.show(f"step {n} of {count - 1}: {phase}", self._done)
+            self._progress.show(f"step {n} of {self.job.last}: {phase}", self._done)
 
         return show
 
@@ -284,6 +377,6 @@ class _Runner:
 
     def _remove_older(self) -> None:
         """Remove an earlier run's results: more steps than now, or its summary, would pass for this one's."""
-        for path in self._job.out.iterdir():
+        for path in self.job.out.iterdir():
             if path.name == "summary.json" or _RESULT.fullmatch(path.name):
                 path.unlink()

@@ -17,7 +17,7 @@ from core.target import GridTarget
 from server.formats.calibrations.native import calibration_content, write_calibration
 from server.formats.calibrations.target_toml import read_rig, read_target
 from server.formats.files import make_folder, sha256_of
-from server.formats.images import read_image
+from server.formats.images import decode, read_file
 from server.formats.version import software_version
 from server.formats.views import ViewFile, find_views
 
@@ -89,7 +89,8 @@ def calibrate_folder(
     """
     grid, nominal = read_target(target), read_rig(rig)
     files = find_views(views)
-    images = [ImageOfTarget(f.camera, f.dz_mm, read_image(f.path), f.path.name, f.frame) for f in files]
+    decoded = {f.path: decode(read_file(f.path), name=str(f.path)) for f in files}
+    images = [ImageOfTarget(f.camera, f.dz_mm, decoded[f.path].pixels, f.path.name, f.frame) for f in files]
     options = nominal.options(*_held_out(files, hold_out))
     found = calibrate_views(images, grid, (nominal.cam1, nominal.cam2), options, localiser=localiser, progress=progress)
     provenance: dict[str, object] = {
@@ -97,6 +98,8 @@ def calibrate_folder(
         "localiser": localiser,
         "line_model": next((g.line_model for g in found.grids if isinstance(g, GridView)), None),
         "views_sha256": {f.path.name: sha256_of(f.path) for f in files},
+        "views_grey_from": {f.path.name: made for f in files if (made := decoded[f.path].grey_from) is not None}
+        or None,
         "target_file": str(target),
         "rig_file": str(rig),
         "nominal_rig": asdict(nominal),

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 from core.orientation import OffsetFinding
 
+#: what a user can do about a camera that moved
+MOVED_REMEDY = "Repair the calibration from steps taken since (stereorig calibration repair), or calibrate again."
+
 
 @dataclass(frozen=True)
 class CameraMotion:

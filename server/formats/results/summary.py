@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,9 @@ from core.field.points.smoothing_record import Smoothing
 from core.status import PointStatus
 from server.formats.results.camera_motion import CameraMotion
 from server.formats.results.layout import COMPARISONS, FORMAT_VERSION
+
+if TYPE_CHECKING:
+    from core.field.seeding.specimen import Specimen
 
 
 def plane_residuals_mm(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -72,6 +75,9 @@ class StepSummary:
         Smoothing of the displacement, and its spatial resolution.
     patch
         The patch of the measurement, with the reason and the numbers of the choice.
+    failed_seeds_px
+        (x, y) of given seeds that did not match, though the step was measured from others; left out where there are
+        none.
     reference_step, points_by_reference, displacement_mm
         Of displacements alone: what the step was matched against, valid points by what they were matched against, and
         the components' spans.
@@ -97,13 +103,17 @@ class StepSummary:
     reference_step: int | None = None
     points_by_reference: dict[str, int] | None = None
     displacement_mm: dict[str, Span | None] | None = None
+    failed_seeds_px: tuple[tuple[float, float], ...] = ()
 
     def document(self) -> dict[str, object]:
         """Return it as plain values; a shape has no entries of displacements."""
         of_motion = ("reference_step", "points_by_reference", "displacement_mm")
         motion = None if self.camera_motion is None else self.camera_motion.document()
         plain = {**asdict(replace(self, camera_motion=None)), "camera_motion": motion}
-        return {k: v for k, v in plain.items() if self.kind == "displacement" or k not in of_motion}
+        left_out = set() if self.kind == "displacement" else set(of_motion)
+        if not self.failed_seeds_px:
+            left_out.add("failed_seeds_px")
+        return {k: v for k, v in plain.items() if k not in left_out}
 
 
 def summarise(
@@ -163,6 +173,7 @@ def summarise(
         smoothing=result.smoothing,
         patch=result.patch,
         camera_motion=camera_motion,
+        failed_seeds_px=result.failed_seeds_px,
     )
     if result.uvw_mm is None:
         return summary
@@ -198,6 +209,9 @@ class SequenceSummary:
         An entry a finished step, in their order.
     steps_failed
         The problem of each step that could not be measured, by its number.
+    region_found
+        How the specimen was found where no region was given: `text`, `outlines_px` of its parts and `holes_px` in
+        them, `share` of the image, `matches` on it; the mask is the region's.
     """
 
     state: str
@@ -208,11 +222,23 @@ class SequenceSummary:
     seconds: float
     steps: Sequence[Mapping[str, object]]
     steps_failed: Mapping[str, object] = field(default_factory=dict)
+    region_found: Mapping[str, object] | None = None
     format_version: int = FORMAT_VERSION
 
     def document(self) -> dict[str, object]:
         """Return it as plain values."""
         return asdict(self)
+
+
+def region_found(specimen: Specimen) -> dict[str, object]:
+    """Return a specimen that was found, as the summary states it."""
+    return {
+        "text": specimen.text,
+        "share": round(specimen.share, 4),
+        "matches": specimen.matches,
+        "outlines_px": [part.tolist() for part in specimen.outlines_px],
+        "holes_px": [hole.tolist() for hole in specimen.holes_px],
+    }
 
 
 def to_json(document: Any) -> bytes:

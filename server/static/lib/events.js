@@ -2,7 +2,7 @@
 import { BASE } from "./api.js";
 /** @import { Events } from "#routes" */
 
-const NAMES = ["job", "step", "result", "stage", "camera", "scene", "test", "calibration", "noise"];
+const NAMES = ["job", "step", "result", "step_failed", "stage", "camera", "scene", "test", "calibration", "noise"];
 /** @type {Map<string, Set<(data: any) => void>>} data by the name of their event; not checked at run time */
 const listeners = new Map();
 /** @type {EventSource | null} */

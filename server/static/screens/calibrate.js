@@ -1,6 +1,7 @@
 // Calibrations: plan with its expected uncertainty, run, review (accept or discard), import, compare.
 import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
+import { comparedInSpace, distanceCheck } from "./calibrate/checks.js";
 import { guidePanel } from "./calibrate/guide.js";
 import { calibrationViews } from "./calibrate/views.js";
 import { h, numeric, pen, replace, field, number, select, action, table, definitions, badge, num, count, quantity, when, notify, problemText, ask, STATE_KIND } from "../lib/dom.js";
@@ -135,7 +136,7 @@ export async function open(root, { path }) {
         h("section.panel", { "aria-label": "Verdict" }, heading, verdict(document_), decide),
         made ? h("section.panel", { "aria-label": "Views" }, h("h2", "Views"), made.root) : null,
         h("div.grid.tables", { style: { marginTop: "var(--gap)" } },
-          h("section.panel", h("h2", "Checks"), measures(document_), viewTable(document_)),
+          h("section.panel", h("h2", "Checks"), measures(document_), viewTable(document_), document_.state === "complete" ? distanceCheck(document_) : null),
           h("section.panel", h("h2", "Parameters"), parameters(document_), correlations(document_))),
       ],
       close: () => made?.close(),
@@ -442,7 +443,8 @@ async function comparison(list) {
   }
   const checks = /** @type {const} */ ([["fitted", "RBE fitted"], ["held_out", "RBE held out"]]).map(([name, text]) => [String(text), quantity(a.checks?.[name]?.rbe_px, "px", 3), quantity(b.checks?.[name]?.rbe_px, "px", 3)]);
   checks.push(["verdict", a.verdict?.level ?? "–", b.verdict?.level ?? "–"], ["made", when(a.plan.created_utc), when(b.plan.created_utc)], ["shape", um(a.uncertainty?.shape_rms_mm), um(b.uncertainty?.shape_rms_mm)]);
-  await ask("Two calibrations", h("div", { "data-role": "comparison" },
+  const inSpace = await comparedInSpace(ids[0], ids[1]).catch(problemText);
+  await ask("Two calibrations", h("div", { "data-role": "comparison" }, inSpace,
     table([["Check", (row) => row[0]], [a.plan.label || a.id, (row) => row[1], { numeric: true }], [b.plan.label || b.id, (row) => row[2], { numeric: true }]], checks, { caption: "Checks" }),
     table([["Parameter", (row) => [row[0], " ", h("span.quiet", row[1])]], [a.id, (row) => row[2], { numeric: true }], [b.id, (row) => row[3], { numeric: true }], ["difference", (row) => num(row[4], 3), { numeric: true }],
       ["in σ", (row) => (row[5] === null ? "–" : h(Math.abs(row[5]) > 3 ? "strong" : "span", num(row[5], 2))), { numeric: true }]], rows, { caption: "Parameters; a difference beyond 3 σ of both together is bold" })), [["Close", null]]);

@@ -5,6 +5,7 @@ import { Result, allTests } from "./results/analysis.js";
 import { FieldMap, measured } from "../widgets/field_map.js";
 import { Scale } from "../widgets/scale.js";
 import { about, files } from "./results/about.js";
+import { camerasNote } from "./results/cameras.js";
 import { gauges } from "./results/gauges.js";
 import { mark, pinned } from "./results/probe.js";
 import { h, replace, table, badge, when, num, count, quantity, field, select, definitions, notify, problemText, STATE_KIND } from "../lib/dom.js";
@@ -50,6 +51,7 @@ async function list(root, testId) {
         table([
           ["Analysis", (one) => h("a", { href: `#/results/${test.id}/${one.id}` }, one.label || one.id)],
           ["Kind", (one) => one.kind],
+          ["Failed steps", (one) => one.steps_failed?.join(", ") ?? ""],
           ["Begun", (one) => when(one.created_utc)],
         ], (whole.analyses ?? []).toReversed(), { caption: "Analyses of this test, newest first", empty: "This test has not been measured yet.",
           onrow: (one) => { location.hash = `#/results/${test.id}/${one.id}`; } }));
@@ -97,6 +99,7 @@ async function show(root, testId, analysisId, query) {
   const statistics = h("dl.definitions", { "data-role": "statistics" });
   const probe = h("div", { "data-role": "probe" }, h("p.quiet", "Click a point to see all its values."));
   const message = h("p.quiet", { role: "status" });
+  const cameras = h("div");
   const modes = h("div.row", { role: "group", "aria-label": "View" }, MODES.map(([name, text]) =>
     h("button", { type: "button", "data-mode": name, "aria-pressed": String(name === "image"), onclick: () => setMode(name).catch(notify) }, text)));
   const stage = h("div", map.view.root);
@@ -133,6 +136,7 @@ async function show(root, testId, analysisId, query) {
       message.textContent = "No step is finished yet. The page updates by itself.";
       return;
     }
+    replace(cameras, camerasNote(result.analysis.summary?.steps?.find((one) => one.n === state.step)));
     slider.max = String(Math.max(result.steps.length - 1, 0));
     slider.value = String(result.steps.indexOf(state.step ?? NaN));
     slider.setAttribute("aria-valuetext", result.stepText(state.step));
@@ -258,7 +262,9 @@ async function show(root, testId, analysisId, query) {
 
   function drawStatus() {
     const { analysis } = result;
-    replace(status, h("span.row", badge(analysis.state, STATE_KIND[analysis.state]), analysis.stale ? badge("out of date", "warn") : null),
+    const failed = Object.keys(analysis.steps_failed ?? {});
+    replace(status, h("span.row", badge(analysis.state, STATE_KIND[analysis.state]),
+      failed.length ? h("span", { title: `Steps ${failed.join(", ")}: see Settings, checks and warnings` }, badge(`${failed.length} ${failed.length === 1 ? "step" : "steps"} failed`, "warn")) : null, analysis.stale ? badge("out of date", "warn") : null),
       analysis.stale ? h("p", h("strong", "Out of date: "), (analysis.stale_reasons ?? []).join("; ")) : null, analysis.problem ? problemText(api.problemOf(analysis.problem)) : null);
   }
 
@@ -269,7 +275,7 @@ async function show(root, testId, analysisId, query) {
       h("div.field.grow", h("label", { for: "resultstep" }, "Step "), h("span.control",
         h("button", { type: "button", "aria-label": "Step before", onclick: () => move(-1) }, "◂"), Object.assign(slider, { id: "resultstep" }),
         h("button", { type: "button", "aria-label": "Next step", onclick: () => move(1) }, "▸"), play, stepText))),
-    h("div.grid.side.measured", h("div", stage, message),
+    h("div.grid.side.measured", h("div", stage, message, cameras),
       h("section.panel.figures", { "aria-label": "Figures" }, scale.root, h("h2", "Statistics"), statistics, h("h2", "Probe"), probe), below));
 
   drawStatus();
@@ -285,6 +291,11 @@ async function show(root, testId, analysisId, query) {
     slider.max = String(Math.max(result.steps.length - 1, 0));
     aboutPanel.draw();
     if (first) await setStep(result.steps.at(-1) ?? null);
+  }), events.on("step_failed", async (event) => {
+    if (event.analysis_id !== analysisId) return;
+    await result.refresh();
+    drawStatus();
+    aboutPanel.draw();
   }), events.on("job", async (job) => {
     if (job.id !== result.analysis.job_id || job.state === result.analysis.state) return;
     await result.refresh();

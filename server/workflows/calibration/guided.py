@@ -24,6 +24,7 @@ from server.rig.cameras import CapturedPair
 from server.store.durable import read_json, write_json
 from server.worker.embedded import ComputeWorker
 from server.worker.tasks import GuideTask, guide_views, look_at_pair
+from server.workflows.acquisition import begin_acquisition
 from server.workflows.calibration.sequence import close, fit, rig_metadata
 from server.workflows.service import Service
 from server.workflows.waiting import run_task
@@ -96,30 +97,26 @@ class Guides:
         """
         service = self._service
         service.require_room()
-        made: dict[str, str] = {}
 
-        def prepare(job: Job) -> Ids:
+        def create(job: Job) -> str:
             document = {**asdict(plan), "kind": "guided", "moves": "free", "rig": rig_metadata(service.config)}
             calibration_id = service.calibrations.create(
                 document | request.document() | {"job_id": job.id}, service.config.target.plain()
             )
-            made["calibration_id"] = calibration_id
             self._live[calibration_id] = _Live(job.id)
-            return dict(made)
+            return calibration_id
 
-        job = service.jobs.submit(
+        return begin_acquisition(
+            service,
             "calibration",
             GUIDED_PURPOSE,
-            {},
-            [
-                Phase("hardware", lambda job: self._acquire(job, made["calibration_id"], plan)),
-                Phase("compute", lambda job: fit(service, job, made["calibration_id"])),
-            ],
-            prepare=prepare,
+            "calibration_id",
+            create=create,
+            hardware=lambda job, calibration_id: self._acquire(job, calibration_id, plan),
+            compute=lambda job, calibration_id: fit(service, job, calibration_id),
+            on_end=self._end,
             request=request,
-            on_end=lambda job, state: self._end(job, made["calibration_id"], state),
         )
-        return {**made, "job_id": job.id}
 
     def state(self, calibration_id: str) -> dict[str, Any]:
         """Return what is seen now, and what the views taken say.

@@ -17,9 +17,10 @@ from core.names import CAMERAS
 from server.base.models import Ids
 from server.config.rig_file import RigConfig
 from server.jobs.idempotency import RequestMark
-from server.jobs.job import Job, Phase
+from server.jobs.job import Job
 from server.store.index import calibration_entry
 from server.worker.tasks import FitTask, LookTask, find_in_pair, fit_calibration
+from server.workflows.acquisition import begin_acquisition
 from server.workflows.capture import OFF_ZERO_MM
 from server.workflows.service import Service
 from server.workflows.waiting import run_task
@@ -107,27 +108,23 @@ def begin(service: Service, plan: CalibrationPlan, request: RequestMark) -> Ids:
         )
     check_plan(plan)
     targets_of(service, plan)
-    made: dict[str, str] = {}
 
-    def prepare(job: Job) -> Ids:
+    def create(job: Job) -> str:
         document = plan_document(plan, service.config) | request.document() | {"job_id": job.id}
-        made["calibration_id"] = service.calibrations.create(document, service.config.target.plain())
-        return dict(made)
+        return service.calibrations.create(document, service.config.target.plain())
 
-    job = service.jobs.submit(
+    return begin_acquisition(
+        service,
         "calibration",
         "a calibration",
-        {},
-        [
-            Phase("hardware", lambda job: take_views(service, job, made["calibration_id"], plan)),
-            Phase("compute", lambda job: fit(service, job, made["calibration_id"])),
-        ],
-        prepare=prepare,
+        "calibration_id",
+        create=create,
+        hardware=lambda job, calibration_id: take_views(service, job, calibration_id, plan),
+        compute=lambda job, calibration_id: fit(service, job, calibration_id),
+        on_end=lambda job, calibration_id, state: close(service, job, calibration_id, state),
         request=request,
-        on_end=lambda job, state: close(service, job, made["calibration_id"], state),
         on_cancel=service.stop_job,
     )
-    return {**made, "job_id": job.id}
 
 
 def take_views(service: Service, job: Job, calibration_id: str, plan: CalibrationPlan) -> dict[str, object]:

@@ -36,6 +36,7 @@ from tests.bench.accuracy import experiments as accuracy_experiments
 from tests.bench.accuracy import large as accuracy_large
 from tests.bench.accuracy import noise as accuracy_noise
 from tests.bench.accuracy import prefilter as accuracy_prefilter
+from tests.bench.accuracy import reliefs as accuracy_reliefs
 from tests.bench.accuracy import smoothing as accuracy_smoothing
 from tests.bench.accuracy import specimen as accuracy_specimen
 from tests.bench.accuracy import strain as accuracy_strain
@@ -69,6 +70,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "large": accuracy_large.large_motion,
     "updates": sequence.updates,
     "adversarial": accuracy_adversarial.adversarial,
+    **accuracy_reliefs.SECTIONS,
     "noise-random": accuracy_noise.random_error,
     "noise-mean": accuracy_noise.mean_error,
     "noise-model": accuracy_noise.camera_noise,

@@ -4,35 +4,23 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from numpy.typing import NDArray
 
 from core.errors import CalibrationError
-from core.measure import MeasureOptions
-from core.orientation import Repair, changes_between, judge_offsets, repair_orientation
+from core.orientation import changes_between, judge_offsets
 from core.orientation.matched import MatchedPoints
 from tests.bench.accuracy.table import Row, Section
-from tests.support.bumped_rig import (
-    SUBSET_PX,
-    core_pair,
-    false_strain,
-    grid,
-    picture,
-    plain_camera,
-    pose_points,
-    turned,
-)
+from tests.support.bumped_rig import CAM1, CAM2, SUBSET_PX, core_pair, false_strain, grid, pose_points, repaired, turned
 from tests.support.independent_rig import PlainCamera
 
-CAM1, CAM2 = plain_camera(-1.0), plain_camera(1.0)
 SIZES_DEG = (0.02, 0.2, 2.0)
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 OBLIQUE = (0.6, -0.64, 0.48)
 POSES = (0, 1, 2)
+_RAYS = 2  # a pixel's side
 MOTIONS = 300
 
 
@@ -50,18 +38,8 @@ class Bump:
     squares: float
 
 
-@lru_cache(maxsize=32)
-def _seen(camera: PlainCamera, pose: int) -> NDArray[np.uint8]:
-    return picture(camera, pose, seed=10 * pose + (camera.phd > 1300.0), n=2)
-
-
-def _repair(one: PlainCamera, two: PlainCamera) -> Repair:
-    images = [(_seen(one, pose), _seen(two, pose)) for pose in POSES]
-    return repair_orientation(core_pair(CAM1, CAM2), images, grid(), MeasureOptions(subset_px=SUBSET_PX))
-
-
 def _bump(name: str, size: float, one: PlainCamera, two: PlainCamera) -> Bump:
-    repair = _repair(one, two)
+    repair = repaired(one, two, POSES, _RAYS)
     old, new = core_pair(CAM1, CAM2), core_pair(one, two)
     xy1 = grid().xy_px.reshape(-1, 2)
     true = pose_points(one, 0, xy1)
@@ -157,7 +135,7 @@ def _refused() -> list[Row]:
     count = 0
     for two in lenses.values():
         try:
-            _repair(CAM1, two)
+            repaired(CAM1, two, POSES, _RAYS)
         except CalibrationError as error:
             count += error.code == "repair_structure"
     return [Row(f"{', '.join(lenses)}: refused", 100.0 * count / len(lenses), "%", 100.0, at_least=True)]

@@ -39,6 +39,7 @@ TOPICS = (
     Topic("gauges", "Gauges", ("gauges",)),
     Topic("long_sequences", "Long sequences", ("updates",)),
     Topic("smoothing", "Smoothing", ("smoothing",)),
+    Topic("faces", "Every face of a part", ("faces-plate", "faces-ball", "faces-misfit", "faces-cylinder")),
     Topic("difficult_images", "Difficult images", ("adversarial",)),
     Topic("experiments", "The paper's experiments, simulated", ("plate", "steel", "panel")),
     Topic("coverage", "Does the uncertainty cover", ("coverage",)),

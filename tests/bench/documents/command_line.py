@@ -10,8 +10,9 @@ from tests.bench.documents.prose import cell
 
 _HEAD = """# Command line
 
-`stereorig COMMAND --help` prints the same. Exit status: 0 done, 1 failed, 2 wrong usage, 130 interrupted. An error is one line
-with a stable code, the cause and the remedy ([errors](errors.md)). Written by `make reference`.
+`stereorig COMMAND --help` prints the same. Exit status: 0 done, 1 failed, 2 wrong usage, 3 steps of
+`measure` failed and others were measured, 130 interrupted. An error is one line with a stable code, the cause and the
+remedy ([errors](errors.md)). Written by `make reference`.
 
 """
 

@@ -31,6 +31,7 @@ export type Trouble = { cause?: string; code?: string; remedy?: string; detail?:
 export type StepSummary = {
   n: number; valid: number; points: number; epipolar_offset_rms_px?: number; wall_s?: number; zncc_median?: { [pair: string]: number };
   epipolar_check?: { level: string; reason: string }; sigma_median_mm?: Numbers; strain?: { noise_floor_microstrain?: Numbers }; patch?: { patch?: string; reason?: string };
+  camera_motion?: Schemas["CameraMotion"] | null;
 };
 export type PositionsCheck = Check & { positions_mm?: { [cam: string]: number[] }; per_camera?: { [cam: string]: Check } };
 export type TakenView = { index: number; camera: string; dz_mm: number; dz_commanded_mm?: number; role: string; file: string; frames: number };
@@ -57,6 +58,7 @@ export interface Events {
   job: Schemas["JobReply"];
   step: { test_id: string; n: number };
   result: { test_id: string; analysis_id: string };
+  step_failed: { test_id: string; analysis_id: string; n: number; problem: Trouble };
   camera: { camera: string; state: string; problem?: Trouble | null };
   stage: object;
   scene: object;

@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import xarray as xr
@@ -286,7 +287,8 @@ BAD_OPTIONS: list[tuple[dict[str, Any], str, str]] = [
     ({"seed": "1000,90"}, "seed_outside", "1000,90"),
     ({"seed": "80,85,500,85"}, "seed_outside", "camera 2"),
     ({"seed": "80,85,80,150"}, "seed_off_epipolar", "epipolar line"),
-    ({"roi": None}, "option_missing", "--roi"),
+    ({"roi": None, "subset": "101"}, "region_not_found", "101 px"),
+    ({"calibration": None}, "option_missing", "--calibration"),
     ({"out": "IN/cam1_0.tif"}, "output_unusable", "cam1_0.tif"),
 ]
 
@@ -309,20 +311,121 @@ def test_bad_options(folder: Path, tmp_path: Path, capfd: Any, changes: dict[str
     assert sorted(folder.iterdir()) == before
 
 
-def test_bad_images(folder: Path, tmp_path: Path, capfd: Any) -> None:
+def spoiled(folder: Path) -> list[tuple[np.ndarray | bytes, str, str]]:
+    """What a second camera may deliver, and what is said of it."""
     good = read_image(folder / "cam2_1.tif")
-    for data, code, word in (
+    return [
         (good[:, :-1], "image_size_mismatch", "229 x 200"),
         (np.full_like(good, 90), "image_blank", "90"),
         (good[:50], "image_size_mismatch", "step 1"),
+        ((folder / "cam2_0.tif").read_bytes()[:2000], "image_unreadable", "cam2_1.tif"),
+        ((folder / "cam1_1.tif").read_bytes(), "same_image", "cam1_1.tif"),
+    ]
+
+
+def put(path: Path, what: np.ndarray | bytes) -> None:
+    if isinstance(what, bytes):
+        path.write_bytes(what)
+    else:
+        write_image(path, what)
+
+
+def test_a_bad_reference_pair_is_refused_as_a_whole(folder: Path, tmp_path: Path, capfd: Any) -> None:
+    good = read_image(folder / "cam2_0.tif")
+    for data, code, word in (
+        (np.full_like(good, 90), "image_blank", "90"),
+        ((folder / "cam2_0.tif").read_bytes()[:2000], "image_unreadable", "cam2_0.tif"),
     ):
-        write_image(folder / "cam2_1.tif", data)
+        put(folder / "cam2_0.tif", data)
         fails(command(folder, tmp_path / "out"), code, word, capfd)
-    (folder / "cam2_1.tif").write_bytes((folder / "cam2_0.tif").read_bytes()[:2000])
-    fails(command(folder, tmp_path / "out"), "image_unreadable", "cam2_1.tif", capfd)
-    Image.fromarray(np.stack([good, good // 2, good], axis=-1)).save(folder / "cam2_1.tif")
-    fails(command(folder, tmp_path / "out"), "image_unsupported", "colour", capfd)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_bad_pair_is_a_failed_step_and_the_rest_is_measured(folder: Path, tmp_path: Path, capfd: Any) -> None:
+    options = {"roi": "60,60,120,120", "strain": "off"}
+    assert (
+        main(
+            command(
+                folder,
+                tmp_path / "alone",
+                cam1=[str(folder / f"cam1_{n}.tif") for n in (0, 2)],
+                cam2=[str(folder / f"cam2_{n}.tif") for n in (0, 2)],
+                **options,
+            )
+        )
+        == 0
+    )
+    for data, code, word in spoiled(folder):
+        put(folder / "cam2_1.tif", data)
+        capfd.readouterr()
+        assert main(command(folder, tmp_path / "out", **options)) == measure.SOME_FAILED
+        err = capfd.readouterr().err
+        assert f"step 1 of 2: failed: {code}: " in err
+        summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+        assert summary["state"] == "succeeded"
+        assert [step["n"] for step in summary["steps"]] == [0, 2]
+        problem = summary["steps_failed"]["1"]
+        assert problem["code"] == code
+        assert word in problem["cause"]
+        assert problem["remedy"]
+        assert problem["context"]["cam2"] == str(folder / "cam2_1.tif")
+        assert not (tmp_path / "out" / "step_0001.nc").exists()
+    # exports and reports say which step there is not, and why
+    assert (
+        main(["export", str(tmp_path / "out"), "--format", "csv", "--step", "2", "--out", str(tmp_path / "csv")]) == 0
+    )
+    assert '"same_image"' in next((tmp_path / "csv").glob("*.csv")).read_text()
+    assert main(["report", str(tmp_path / "out"), "--out", str(tmp_path / "report.html")]) == 0
+    assert "Step 1 could not be measured: same_image: " in (tmp_path / "report.html").read_text()
+    # the step after the bad one is what it would have been without it
+    with (
+        xr.open_dataset(tmp_path / "alone" / "step_0001.nc") as alone,
+        xr.open_dataset(tmp_path / "out" / "step_0002.nc") as among,
+    ):
+        np.testing.assert_array_equal(alone.w_mm, among.w_mm)
+
+
+@pytest.mark.parametrize("update", ["always", "auto"])
+def test_a_pair_of_another_specimen_is_a_failed_step_with_later_references_too(
+    folder: Path, tmp_path: Path, capfd: Any, update: str
+) -> None:
+    rng = np.random.default_rng(5)
+    for cam in CAMERAS:  # a texture in each, but none that is in another image
+        noise = cv2.GaussianBlur(rng.normal(size=(SIZE[1], SIZE[0])), (0, 0), 1.5)
+        write_image(folder / f"{cam}_3.tif", np.clip(120 + 40 * noise / noise.std(), 0, 255).astype(np.uint8))
+        write_image(folder / f"{cam}_4.tif", read_image(folder / f"{cam}_1.tif"))
+    more = {"roi": "60,60,120,120", "strain": "off", "reference-update": update}
+    assert main(command(folder, tmp_path / "out", **more)) == measure.SOME_FAILED
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert list(summary["steps_failed"]) == ["3"]
+    assert summary["steps_failed"]["3"]["code"] == "not_seeded"
+    assert [step["n"] for step in summary["steps"]] == [0, 1, 2, 4]
+    if update == "always":
+        assert summary["steps"][-1]["reference_step"] == 2  # the last good one
+    assert summary["steps"][-1]["valid"] > 0.9 * summary["steps"][-1]["points"]
+
+
+def test_a_series_of_which_nothing_but_the_reference_could_be_measured_has_failed(
+    folder: Path, tmp_path: Path, capfd: Any
+) -> None:
+    good = read_image(folder / "cam2_1.tif")
+    for n in (1, 2):
+        write_image(folder / f"cam2_{n}.tif", np.full_like(good, 90))
+    fails(command(folder, tmp_path / "out", roi="60,60,120,120", strain="off"), "image_blank", "step 1", capfd)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["state"] == "failed"
+    assert summary["problem"]["code"] == "image_blank"
+    assert [step["n"] for step in summary["steps"]] == [0]
+    assert list(summary["steps_failed"]) == ["1", "2"]
+
+
+def test_under_a_projected_pattern_the_first_pair_fails_alone_too(folder: Path, tmp_path: Path) -> None:
+    (folder / "cam1_0.tif").write_bytes(b"nothing")
+    options = command(folder, tmp_path / "out", roi="60,60,120,120")
+    assert main([*options, "--projected"]) == measure.SOME_FAILED
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert list(summary["steps_failed"]) == ["0"]
+    assert [step["n"] for step in summary["steps"]] == [1, 2]
 
 
 def test_bad_calibrations(folder: Path, tmp_path: Path, capfd: Any) -> None:
@@ -353,6 +456,66 @@ def test_noise_without_texture_is_refused(folder: Path, tmp_path: Path, capfd: A
         write_image(folder / f"{cam}_0.tif", rng.normal(120, 2, (SIZE[1], SIZE[0])).round().astype(np.uint8))
     fails(command(folder, tmp_path / "out"), "image_blank", "noise only", capfd)
     assert not (tmp_path / "out").exists()
+
+
+def test_without_a_region_the_specimen_is_found_and_can_be_corrected(
+    folder: Path, tmp_path: Path, capfd: Any, rig: SimRig
+) -> None:
+    for n in (1, 2):
+        for cam in CAMERAS:
+            (folder / f"{cam}_{n}.tif").unlink()
+    for cam, x in (("cam1", 120), ("cam2", 110)):  # half of the view is plain: no specimen there
+        image = read_image(folder / f"{cam}_0.tif").copy()
+        image[:, x:] = np.random.default_rng(1).normal(70.0, 2.0, image[:, x:].shape).round()
+        write_image(folder / f"{cam}_0.tif", image)
+    out = tmp_path / "out"
+    assert main(command(folder, out, roi=None)) == 0
+    assert "region: texture that camera 2 sees: 1 part" in capfd.readouterr().err
+    summary = json.loads((out / "summary.json").read_text())
+    found = summary["region_found"]
+    assert summary["settings"]["region"]["mask"] == str(out / "specimen.png")
+    (outline,) = np.array(found["outlines_px"])
+    assert 110 < outline[:, 0].max() < 125
+    white = np.array(Image.open(out / "specimen.png")) > 127
+    assert white[20:-20, 5:100].mean() > 0.95
+    assert not white[:, 130:].any()
+    with xr.open_dataset(out / "step_0000.nc") as data:
+        measured = data.status.values == 0
+        allowed = data.status.values != 2
+        assert measured[allowed].mean() > 0.8
+        assert float(data.x_px.values[measured].max()) < 125
+    # corrected by hand, it is a mask like any other
+    white[100:] = False
+    Image.fromarray(white).save(tmp_path / "mine.png")
+    assert main(command(folder, tmp_path / "corrected", roi=None, mask=str(tmp_path / "mine.png"))) == 0
+    with xr.open_dataset(tmp_path / "corrected" / "step_0000.nc") as data:
+        assert float(data.y_px.values[data.status.values == 0].max()) < 100
+    assert main(command(folder, tmp_path / "auto", roi="auto", mask=str(tmp_path / "mine.png"))) == 0
+    assert json.loads((tmp_path / "auto" / "summary.json").read_text())["region_found"] is not None
+
+
+def test_colour_images_are_measured_by_their_luminance_and_said_so(folder: Path, tmp_path: Path) -> None:
+    options = {"roi": "60,60,120,120", "strain": "off"}
+    gray, colour = {}, {}
+    for cam in CAMERAS:
+        gray[cam], colour[cam] = [], []
+        for n in (0, 1):
+            image = read_image(folder / f"{cam}_{n}.tif").astype(float)
+            rgb = np.clip(np.stack([image * 0.8, image * 0.9, image], axis=-1), 0, 255).round().astype(np.uint8)
+            colour[cam].append(str(folder / f"colour_{cam}_{n}.png"))
+            Image.fromarray(rgb).save(colour[cam][-1])
+            gray[cam].append(str(folder / f"gray_{cam}_{n}.tif"))
+            write_image(Path(gray[cam][-1]), np.rint(rgb @ np.array([0.299, 0.587, 0.114])).astype(np.uint8))
+    assert main(command(folder, tmp_path / "colour", **colour, **options)) == 0
+    assert main(command(folder, tmp_path / "gray", **gray, **options)) == 0
+    taken, plain = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("colour", "gray"))
+    said = "luminance, 0.299 R + 0.587 G + 0.114 B"
+    assert taken["steps"][1]["grey_from"] == {"cam1": said, "cam2": said}
+    assert "grey_from" not in plain["steps"][1]
+    one, two = (xr.open_dataset(tmp_path / name / "step_0001.nc") for name in ("colour", "gray"))
+    with one, two:
+        np.testing.assert_array_equal(one.w_mm, two.w_mm)
+        assert one.attrs["cam1_grey_from"] == said
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a file system that takes no new folders")

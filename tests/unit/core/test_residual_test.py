@@ -229,7 +229,7 @@ def test_depth_is_refused_for_what_is_not_noise_and_not_for_noise_that_is_told(d
     """Residuals show this many times the variances that the fit reports; of noise there is too much for any point."""
     reference, _ = pictures()
     inputs = prepare(bench.pair(), reference, None, bench.grid(spacing_px=6.0), OPTIONS)
-    state = fill_field(inputs, seed_shape(inputs, begin(inputs), None), automatic=True)
+    state = fill_field(inputs, seed_shape(inputs, begin(inputs), None))
     points, count = state.points, int(state.points.ok.sum())
     sd = np.sqrt(np.diagonal(points.covariance[points.ok], axis1=1, axis2=2)).mean(0)
     depth_px = max(sd[1], (sd[0] / depth_per_px(inputs.pair, inputs.rays, points.w[:, 0])).mean())
@@ -244,7 +244,7 @@ def test_depth_is_refused_for_what_is_not_noise_and_not_for_noise_that_is_told(d
 def test_matches_without_any_residual_stay_as_they_are():
     reference, _ = pictures()
     inputs = prepare(bench.pair(), reference, None, bench.grid(spacing_px=12.0), OPTIONS)
-    state = fill_field(inputs, seed_shape(inputs, begin(inputs), None), automatic=True)
+    state = fill_field(inputs, seed_shape(inputs, begin(inputs), None))
     points = state.points
     points.covariance[:2] = 0.0
     before = points.covariance.copy()

@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from server.formats.calibrations.plausibility import check_calibration
 
 from core.cameras.camera import Camera
 from core.cameras.lens import OpenCVLens
 from core.errors import FileFormatError
+from server.formats.calibrations.programs.plausibility import check_calibration
 from server.formats.calibrations.recognise import (
     LoadedCalibration,
     imported_content,

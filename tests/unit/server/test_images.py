@@ -13,7 +13,7 @@ import tifffile
 from PIL import Image
 
 from core.errors import ImageError, StorageError
-from server.formats.images import decode_image, encode_tiff, read_image, read_mask, write_image
+from server.formats.images import decode, decode_image, encode_tiff, read_image, read_mask, write_image
 
 RNG = np.random.default_rng(7)
 GRAY8 = RNG.integers(0, 256, (23, 31), dtype=np.uint8)
@@ -64,13 +64,53 @@ def test_white_is_zero_is_turned_round(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ending", ["tif", "png", "bmp"])
-def test_gray_saved_as_colour_is_taken_and_true_colour_refused(tmp_path: Path, ending: str) -> None:
-    rgb = np.repeat(GRAY8[..., None], 3, axis=2)
-    cv2.imwrite(str(tmp_path / f"same.{ending}"), rgb)
-    np.testing.assert_array_equal(read_image(tmp_path / f"same.{ending}"), GRAY8)
-    rgb[3, 4, 1] ^= 1
-    cv2.imwrite(str(tmp_path / f"colour.{ending}"), rgb)
-    assert code_of(tmp_path / f"colour.{ending}") == "image_unsupported"
+def test_gray_saved_as_colour_keeps_its_numbers(tmp_path: Path, ending: str) -> None:
+    cv2.imwrite(str(tmp_path / f"same.{ending}"), np.repeat(GRAY8[..., None], 3, axis=2))
+    found = decode((tmp_path / f"same.{ending}").read_bytes())
+    np.testing.assert_array_equal(found.pixels, GRAY8)
+    assert found.grey_from is None
+
+
+COLOUR = np.random.default_rng(3).integers(0, 256, (40, 50, 3)).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("ending", "alpha", "depth"),
+    [("bmp", False, 8), *((end, alpha, n) for end in ("tif", "png") for alpha in (False, True) for n in (8, 16))],
+)
+def test_the_luminance_of_a_colour_image_is_taken_and_said(
+    tmp_path: Path, ending: str, alpha: bool, depth: int
+) -> None:
+    rgb = COLOUR if depth == 8 else COLOUR.astype(np.uint16) * 257 - COLOUR
+    full = np.full((*rgb.shape[:2], 1), np.iinfo(rgb.dtype).max, rgb.dtype)
+    bgr = np.concatenate([rgb[..., ::-1], *([full] if alpha else [])], axis=2)
+    cv2.imwrite(str(tmp_path / f"a.{ending}"), bgr)
+    found = decode((tmp_path / f"a.{ending}").read_bytes())
+    assert found.pixels.dtype == rgb.dtype
+    # OpenCV's own conversion works in fixed point: a grey level of difference by rounding
+    expected = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY).astype(int)
+    assert np.abs(found.pixels.astype(int) - expected).max() <= 1
+    assert found.grey_from == "luminance, 0.299 R + 0.587 G + 0.114 B"
+
+
+def test_the_luminance_of_a_jpeg_and_of_a_palette_is_taken(tmp_path: Path) -> None:
+    smooth = cv2.GaussianBlur(COLOUR, (0, 0), 4.0)
+    Image.fromarray(smooth).save(tmp_path / "a.jpg", quality=98)
+    expected = cv2.cvtColor(smooth, cv2.COLOR_RGB2GRAY).astype(int)
+    # a JPEG stores luminance by these very weights: rounding of its blocks remains
+    assert np.abs(read_image(tmp_path / "a.jpg").astype(int) - expected).max() <= 4
+    image = Image.fromarray(smooth).quantize(32)
+    image.save(tmp_path / "a.png")
+    expected = cv2.cvtColor(np.asarray(image.convert("RGB")), cv2.COLOR_RGB2GRAY).astype(int)
+    assert np.abs(read_image(tmp_path / "a.png").astype(int) - expected).max() <= 1
+
+
+def test_planar_colour_and_other_colour_spaces(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "a.tif", np.moveaxis(COLOUR, -1, 0), photometric="rgb", planarconfig="separate")
+    expected = cv2.cvtColor(COLOUR, cv2.COLOR_RGB2GRAY).astype(int)
+    assert np.abs(read_image(tmp_path / "a.tif").astype(int) - expected).max() <= 1
+    tifffile.imwrite(tmp_path / "lab.tif", COLOUR, photometric="cielab")
+    assert code_of(tmp_path / "lab.tif") == "image_unsupported"
 
 
 def test_planar_colour_of_equal_channels_is_taken(tmp_path: Path) -> None:
@@ -84,8 +124,6 @@ def test_other_pixel_types_and_stacks_are_refused(tmp_path: Path) -> None:
         assert code_of(tmp_path / f"{i}.tif") == "image_unsupported"
     tifffile.imwrite(tmp_path / "stack.tif", np.stack([GRAY8, GRAY8]), photometric="minisblack")
     assert code_of(tmp_path / "stack.tif") == "image_unsupported"
-    cv2.imwrite(str(tmp_path / "c16.png"), np.repeat(GRAY16[..., None], 3, axis=2))
-    assert code_of(tmp_path / "c16.png") == "image_unsupported"
 
 
 def test_missing_folder_empty_and_foreign_files(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from server.api.protocol.problems import errors
 from server.base.errors import NotFoundError
 from server.base.models import Ids, JobState
 from server.jobs.idempotency import RequestMark
+from server.store.documents import Finished
 from server.workflows import analysis_start
 from server.workflows.service import Service
 
@@ -75,15 +76,17 @@ def analysis_reply(service: Service, test_id: str, analysis_id: str) -> Analysis
     state: JobState = "interrupted" if summary is None else summary.state
     shown = None if summary is None else summary.plain()
     problem = None if summary is None else summary.problem
+    failed = {} if summary is None else summary.steps_failed
     if summary is None or (summary.job_id or job_id) != job_id:  # killed, or at work, perhaps once more
         known = service.tests.step_summaries(test_id, analysis_id)
         steps = [known[n].plain() for n in document.steps if n in known]
         shown = {"analysis_id": analysis_id, "state": state, "job_id": job_id, "steps": steps} if steps else None
-        problem = None
+        problem, failed = None, {}
     if job_id is not None:
         try:
             job = service.jobs.document(str(job_id))
             state, problem = job.state, job.problem
+            failed = failed or Finished.model_validate(job.result or {}).steps_failed
         except NotFoundError:
             job_id = None  # the catalogue was lost with its jobs; the files hold the rest
     stale = analysis_start.stale_reasons(service, test_id, document)
@@ -93,6 +96,7 @@ def analysis_reply(service: Service, test_id: str, analysis_id: str) -> Analysis
         "job_id": job_id,
         "problem": None if problem is None else problem.plain(),
         "steps_finished": service.tests.finished_steps(test_id, analysis_id),
+        "steps_failed": {n: one.plain() for n, one in failed.items()},
         "summary": shown,
         "stale": bool(stale),
         "stale_reasons": stale,
@@ -127,7 +131,7 @@ def continue_analysis(
     body: ContinueRequest | None = None,
     key: KeyHeader = None,
 ) -> AnalysisAccepted:
-    """Measure what an interrupted, cancelled or failed analysis has not measured yet, in a new job.
+    """Measure what an interrupted, cancelled or failed analysis, or one with failed steps, has not measured yet.
 
     Finished steps are kept, and the others are measured from them as they would have been: the results are the same as
     without the interruption. Steps that failed are tried again.

@@ -186,7 +186,7 @@ def _readings(text: str | None) -> dict[str, float] | None:
 def import_images(
     service: ServiceDep,
     test_id: TestId,
-    cam1: Annotated[UploadFile, File(description="Image of camera 1: TIFF, PNG, BMP or JPEG, gray.")],
+    cam1: Annotated[UploadFile, File(description="Image of camera 1: TIFF, PNG, BMP or JPEG; gray, or RGB.")],
     cam2: Annotated[UploadFile, File(description="Image of camera 2.")],
     label: Annotated[Label, Form(description="Free text.")] = "",
     load_n: Annotated[FormNumber | None, Form(description="Load in newton.")] = None,
@@ -204,7 +204,10 @@ def import_images(
     ] = None,
     key: KeyHeader = None,
 ) -> StepReply:
-    """Store two images as a step. File names are not used; the pixels are kept to the bit."""
+    """Store two images as a step. File names are not used.
+
+    Grey levels are kept to the bit; of colour images the luminance is stored, and `grey_from` says so.
+    """
     service.tests.path(test_id)
     data = {"cam1": cam1.file.read(), "cam2": cam2.file.read()}
     stamp = None if timestamp_utc is None else utc_text(timestamp_utc)

@@ -2,6 +2,8 @@
 import * as api from "../../lib/api.js";
 import { h, replace, table, badge, definitions, num, tick, count, quantity, action, field, select, number, notify, when, STATE_KIND } from "../../lib/dom.js";
 
+import { REMEDY, camerasBadge } from "./cameras.js";
+
 /** @import { Viewer } from "../results.js" */
 /** @import { StepSummary } from "#routes" */
 
@@ -29,13 +31,16 @@ export function about(screen) {
   function draw() {
     const { analysis } = result;
     const steps = analysis.summary?.steps ?? [];
-    const failed = Object.entries(analysis.summary?.steps_failed ?? {});
+    const failed = Object.entries(analysis.steps_failed ?? {});
     const verdict = (/** @type {StepSummary["epipolar_check"]} */ check) => (check ? h("span", { title: check.reason }, badge(check.level, STATE_KIND[check.level] ?? "warn")) : "–");
-    const warned = steps.flatMap((one) => (one.epipolar_check && one.epipolar_check.level !== "ok" ? [`Step ${one.n}: ${one.epipolar_check.reason}`] : []));
+    const warned = steps.flatMap((one) => [
+      ...(one.epipolar_check && one.epipolar_check.level !== "ok" ? [`Step ${one.n}: ${one.epipolar_check.reason}`] : []),
+      ...(one.camera_motion?.camera_moved ? [`Step ${one.n}: ${one.camera_motion.text}. ${REMEDY}`] : []),
+    ]);
     replace(body,
       analysis.stale ? h("p", badge("out of date", "warn"), " ", (analysis.stale_reasons ?? []).join("; ")) : null,
       warned.length ? h("div", h("h3", "Warnings"), h("ul", warned.map((one) => h("li", one)))) : null,
-      failed.length ? h("div", h("h3", "Steps that failed"), h("ul", failed.map(([n, one]) => h("li", `Step ${n}: ${one.cause ?? one.detail ?? one.code} ${one.remedy ?? ""}`)))) : null,
+      failed.length ? h("div", h("h3", "Steps that failed"), h("ul", failed.map(([n, one]) => h("li", `Step ${n}: ${one.code}: ${one.cause} ${one.remedy}`)))) : null,
       h("h3", "Settings"),
       definitions([["kind", analysis.kind], ...Object.entries(analysis.settings ?? {}).map(([name, value]) => /** @type {const} */ ([name.replace(/_/g, " "), text(value)])),
         ["software", analysis.software ?? "–"], ["begun", when(analysis.created_utc)], ["calibration", analysis.inputs?.calibration_sha256 ? h("code", analysis.inputs.calibration_sha256.slice(0, 16)) : "–"]]),
@@ -44,6 +49,7 @@ export function about(screen) {
         ["Step", (one) => one.n, { numeric: true }],
         ["Valid", (one) => `${count(one.valid)} of ${count(one.points)}`, { numeric: true }],
         ["Epipolar check", (one) => verdict(one.epipolar_check)],
+        ["Cameras", (one) => camerasBadge(one.camera_motion)],
         ["Epipolar offset", (one) => quantity(one.epipolar_offset_rms_px, "px", 3), { numeric: true }],
         ["Correlation", (one) => num(Math.min(...Object.values(one.zncc_median ?? { none: NaN })), 4), { numeric: true }],
         ["σ Z", (one) => quantity(one.sigma_median_mm?.z_mm, "mm", 2), { numeric: true }],
@@ -52,7 +58,7 @@ export function about(screen) {
         ["Patch", (one) => h("span", { title: one.patch?.reason ?? "" }, one.patch?.patch ?? "–")],
         ["Time", (one) => quantity(one.wall_s, "s", 3), { numeric: true }],
       ], steps, { caption: "Summary of each step; σ are medians of the reported standard uncertainties", empty: "No step is finished yet." }),
-      definitions(steps.length ? [["epipolar check of the last step", steps.at(-1)?.epipolar_check?.reason ?? "–"], ["patch of the last step", steps.at(-1)?.patch?.reason ?? "–"]] : []));
+      definitions(steps.length ? [["epipolar check of the last step", steps.at(-1)?.epipolar_check?.reason ?? "–"], ["cameras at the last step", steps.at(-1)?.camera_motion?.text ?? "–"], ["patch of the last step", steps.at(-1)?.patch?.reason ?? "–"]] : []));
   }
   draw();
   return { root, draw };

@@ -105,6 +105,17 @@ export async function measurePanel(id, test, ends, done) {
       }
     }
 
+    const found = h("span.quiet", { role: "status", "data-role": "found" });
+    const find = action("Find the specimen", async () => {
+      found.textContent = "";
+      const answer = await api.post(`/tests/${id}/region:find`, { reference: Number(reference.value), subset_px: Number(subset.value) });
+      editor.change((state) => {
+        state.outline = { form: "polygon", points: /** @type {[number, number][]} */ (answer.region.polygon) };
+        state.holes = /** @type {[number, number][][]} */ (answer.region.holes ?? []);
+      });
+      found.textContent = `Found: ${answer.text}. Correct it by its corners.`;
+    });
+
     /** @type {string[]} */
     let shownMaps = [];
     async function layTexture() {
@@ -220,7 +231,7 @@ export async function measurePanel(id, test, ends, done) {
       h("div.grid.two.views", { style: { marginTop: "0.5rem" } }, views.map((view, k) => h("div", h("h3", `cam${k + 1}`), view.root))),
       h("div.grid.two", { style: { marginTop: "var(--gap)" } },
         h("div",
-          h("fieldset", h("legend", "Region and seeds"), editor.list,
+          h("fieldset", h("legend", "Region and seeds"), h("div.row", find, found), editor.list,
             h("p.hint", "Seeds are searched for automatically if none are given. On a periodic texture, click three points that are not on one line, each in both views.")),
           h("fieldset", h("legend", "Subsets and texture"),
             h("div.fields", field("Subset", subset, "px", "odd"), field("Spacing", spacing, "px", "distance of neighbouring points")),

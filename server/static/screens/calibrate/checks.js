@@ -1,0 +1,63 @@
+// Checks of a calibration that a user asks for: a known distance, and a second calibration compared in space.
+import * as api from "../../lib/api.js";
+import { h, replace, field, number, action, table, definitions, badge, num, quantity, when } from "../../lib/dom.js";
+
+/** @import { Model } from "#routes" */
+/** @typedef {Model<"CalibrationReply">} Calibration */
+/** @typedef {Model<"DifferenceReply">} Difference */
+
+const um = (/** @type {number | null | undefined} */ mm) => quantity(mm === null || mm === undefined ? null : 1000 * mm, "µm", 3);
+
+/**
+ * The second against the first calibration in space, in units of both covariances.
+ * @param {string} one
+ * @param {string} other
+ */
+export async function comparedInSpace(one, other) {
+  const found = await api.get(`/calibrations/${/** @type {"{calibration_id}"} */ (one)}/comparison`, { with: other });
+  const [word, kind] = found.agrees === null ? ["not known", ""] : found.agrees ? ["agree", "good"] : ["differ", "warn"];
+  /** @type {[text: string, difference: Difference, shown: (value: number | null) => string][]} */
+  const rows = [
+    ["shape, rms", found.shape_rms_mm, um], ["shape, largest", found.shape_max_mm, um],
+    ["size", found.scale, (value) => quantity(value === null ? null : 1e6 * value, "ppm", 3)],
+    ["epipolar distance, rms", found.epipolar_rms_px, (value) => quantity(value, "px", 3)], ["epipolar distance, largest", found.epipolar_max_px, (value) => quantity(value, "px", 3)],
+  ];
+  return h("section", { "aria-label": "Compared in space", "data-role": "in-space" }, h("p", badge(word, kind), " ", found.text),
+    table([["Difference in space", (row) => row[0]], ["found", (row) => row[2](row[1].value), { numeric: true }], ["expected (σ)", (row) => row[2](row[1].sigma), { numeric: true }]],
+      rows, { caption: `Over ${found.points} points of the common volume` }),
+    found.agrees === false ? h("p", found.changes.text) : null);
+}
+
+/** @param {Record<string, unknown>} kept */
+function distanceFound(kept) {
+  const found = /** @type {Model<"DistanceReply">} */ (kept);
+  return [h("p", badge(found.agrees ? "agrees" : "differs", found.agrees ? "good" : "warn"), " ", found.text),
+    definitions([["measured", `${quantity(found.measured_mm, "mm", 6)} of ${quantity(found.known_mm, "mm", 6)}`], ["ratio", num(found.ratio, 7)], ["uncertainty of the difference", um(found.sigma_mm)], ["checked", when(found.checked_utc)]])];
+}
+
+/**
+ * Two marks in both images, at a known distance: their places are read off in the live view or an image viewer.
+ * @param {Calibration} document_
+ */
+export function distanceCheck(document_) {
+  const kept = document_.kept_checks?.known_distance;
+  const found = h("div", { "aria-live": "polite", "data-role": "known-distance" }, kept ? distanceFound(kept) : null);
+  const marks = /** @type {const} */ (["cam1", "cam2"]).map((cam) => ({ cam, xy: [0, 1].map((k) => ({ x: number(null, { step: "any", "aria-label": `${cam}, mark ${k + 1}, x` }), y: number(null, { step: "any", "aria-label": `${cam}, mark ${k + 1}, y` }) })) }));
+  const distance = number(null, { min: 0, step: "any" });
+  const sigma = number(0, { min: 0, step: "any" });
+
+  async function check() {
+    const inputs = [distance, ...marks.flatMap(({ xy }) => xy.flatMap(({ x, y }) => [x, y]))];
+    if (inputs.some((input) => input.value === "")) throw api.problemOf({ cause: "Distance or marks are not all given.", remedy: "Give the distance and both marks in both images." });
+    const of = (/** @type {number} */ c) => /** @type {[[number, number], [number, number]]} */ (marks[c].xy.map(({ x, y }) => [Number(x.value), Number(y.value)]));
+    const body = { points_px: { cam1: of(0), cam2: of(1) }, distance_mm: Number(distance.value), distance_sigma_mm: Number(sigma.value) };
+    replace(found, distanceFound(await api.post(`/calibrations/${/** @type {"{calibration_id}"} */ (document_.id)}/distance:check`, body)));
+  }
+
+  return h("details", { open: Boolean(kept) }, h("summary", "Known distance"),
+    h("p.quiet", "A scale or a gauge block in both images: the only check that shows a wrong pitch of the target."),
+    found,
+    h("div.fields", field("Known distance", distance, "mm"), field("its standard deviation", sigma, "mm")),
+    marks.map(({ cam, xy }) => h("fieldset", h("legend", `Marks in ${cam}, px`), h("div.row", xy.map(({ x, y }, k) => h("span.control", `${k + 1}: x`, x, "y", y))))),
+    h("div.row", action("Check the distance", check)));
+}
