@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
+from core.field.checks.epipolar_mismatch import EpipolarLimits, epipolar_mismatches
+from core.field.checks.groups import connected, neighbour_pairs
 from core.field.points.fitter import PointFits
 from core.field.points.starts import depth_per_px
 from core.field.region.neighbours import N_QUANTITIES, compare_with_neighbours, sorting_network
@@ -80,6 +80,7 @@ def apply_validity_checks(
     xy_px: Float,
     rays: Float,
     texture: Float,
+    subset_px: int,
     options: ValidityOptions,
     visibility: Visibility | None = None,
 ) -> int:
@@ -97,6 +98,8 @@ def apply_validity_checks(
         (n, 2) px and (n, 3) normalised, of the points.
     texture
         (n,) grey-level variance of camera 1's subset.
+    subset_px
+        Width of the subset.
     options
         Limits.
     visibility
@@ -116,7 +119,7 @@ def apply_validity_checks(
         if _check_neighbours(points, pair, shape, rays, options, visibility, few=few) == 0:
             break
     if not few:
-        _check_epipolar(points, terms, options)
+        _check_epipolar(points, shape, xy_px, subset_px, options, visibility)
         _check_clusters(points, shape, options, visibility)
     return before - int(points.ok.sum())
 
@@ -139,22 +142,25 @@ def _check_correlation(points: PointFits, terms: Float, texture: Float, options:
     points.reject(_at(points, ok[worst > 0.0]), PointStatus.LOW_CORRELATION)
 
 
-def _check_epipolar(points: PointFits, terms: Float, options: ValidityOptions) -> None:
-    for _ in range(4):
-        ok = np.flatnonzero(points.ok)
-        if len(ok) < _FEW:
-            return
-        e = points.epipolar_px[ok]
-        r, sigma = _robust_residual(_at_points(terms, ok), e)
-        # plain and robust standard deviations about the field's middle too: a reader can recompute these from the file
-        about_mean, about_median = np.abs(e - e.mean()), np.abs(e - np.median(e))
-        plain = (about_mean > options.epipolar_sigmas * e.std()) & (about_mean > options.epipolar_floor_px)
-        sigma_all = MAD_TO_SIGMA * float(np.median(about_median))
-        middle = (about_median > options.epipolar_sigmas * sigma_all) & (about_median > options.epipolar_floor_px)
-        bad = (np.abs(r) > options.epipolar_sigmas * sigma + options.epipolar_floor_px) | plain | middle
-        if not bad.any():
-            return
-        points.reject(_at(points, ok[bad]), PointStatus.EPIPOLAR_MISMATCH)
+def _check_epipolar(
+    points: PointFits,
+    shape: tuple[int, int],
+    xy_px: Float,
+    subset_px: int,
+    options: ValidityOptions,
+    visibility: Visibility | None,
+) -> None:
+    off = epipolar_mismatches(
+        points.epipolar_px,
+        points.epipolar_sigma_px,
+        points.ok,
+        xy_px=xy_px,
+        shape=shape,
+        subset_px=subset_px,
+        limits=EpipolarLimits(options.epipolar_sigmas, options.epipolar_floor_px),
+        visibility=visibility,
+    )
+    points.reject(off, PointStatus.EPIPOLAR_MISMATCH)
 
 
 def neighbour_disagreement(
@@ -225,7 +231,7 @@ def _check_clusters(
     points: PointFits, shape: tuple[int, int], options: ValidityOptions, visibility: Visibility | None
 ) -> None:
     if visibility is not None:
-        group = _connected(points.ok, shape, visibility)
+        group = connected(len(points.ok), *neighbour_pairs(points.ok, shape, visibility))
         points.reject(points.ok & (np.bincount(group)[group] < options.min_cluster), PointStatus.NEIGHBOUR_MISMATCH)
         return
     n, labels, stats, _ = cv2.connectedComponentsWithStats(points.ok.reshape(shape).astype(np.uint8), connectivity=8)
@@ -234,21 +240,6 @@ def _check_clusters(
     size = stats[:, cv2.CC_STAT_AREA].copy()
     size[0] = options.min_cluster
     points.reject((size[labels] < options.min_cluster).ravel(), PointStatus.NEIGHBOUR_MISMATCH)
-
-
-def _connected(ok: Bool, shape: tuple[int, int], visibility: Visibility) -> NDArray[np.int32]:
-    """Label (n,) the groups of points that are connected through neighbours, none across a cut."""
-    rows, cols = shape
-    index = np.arange(rows * cols).reshape(shape)
-    ends = []
-    for dr, dc in ((0, 1), (1, -1), (1, 0), (1, 1)):
-        here = index[: rows - dr, max(-dc, 0) : cols - max(dc, 0)].ravel()
-        there = here + dr * cols + dc
-        together = ok[here] & ok[there] & ~visibility.separated_at(dr, dc)[here]
-        ends.append(np.stack([here[together], there[together]]))
-    a, b = np.concatenate(ends, axis=1)
-    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(rows * cols, rows * cols))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int32)
 
 
 def _at_points(terms: Float, ok: NDArray[np.intp]) -> Float:

@@ -22,6 +22,7 @@ def check(inputs: FieldInputs, points: PointFits) -> None:
         xy_px=inputs.xy_px,
         rays=inputs.rays,
         texture=inputs.texture,
+        subset_px=inputs.options.subset_px,
         options=inputs.options.validity,
         visibility=inputs.visibility,
     )
