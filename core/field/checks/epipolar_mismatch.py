@@ -1,9 +1,9 @@
 """Points whose epipolar offset is not what their neighbours show: wrong matches.
 
-A lens that is modelled a little wrong, or cameras that moved, put all points off their epipolar lines, by offsets of any
-smooth shape. So a point is compared with the points about it alone, and what a lens cannot do counts: an offset that
-jumps from one point to the next. Right points of two parts, on both sides of a crack or behind an edge, may differ by
-what the misfit changes from one place in an image to another. Wrong matches that agree with one another share their
+A lens that is modelled a little wrong, or cameras that moved, put all points off their epipolar lines, by offsets of
+any smooth shape. So a point is compared with the points about it alone, and what a lens cannot do counts: an offset
+that jumps from one point to the next. Right points of two parts, on both sides of a crack or behind an edge, may differ
+by what the misfit changes from one place in an image to another. Wrong matches that agree with one another share their
 pixels: their group is smaller than a subset, and its surroundings are what it is compared with.
 """
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from core.arrays import Bool, Float
+from core.field.checks.block_median import block_medians, reach_of, spacing_of
 from core.field.checks.groups import Indices, connected, neighbour_pairs
 from core.field.checks.local_surface import predict_from_neighbours
 from core.field.region.visibility import Visibility
@@ -29,7 +30,6 @@ _SMALL_STEP_PX = 0.02  # of a group smaller than a subset, which is one match th
 _ROUNDS = 4
 _SWEEPS = 4  # of the robust fit
 _FEW = 12
-_REACH_SUBSETS, _MIN_REACH, _MAX_REACH = 1.5, 3, 24
 _SUPPORT = 1.0  # variance of a prediction over a point's own, up to which it is a test
 _NOISIER = 3.0  # times the field's: what the points about a point may scatter by, before they are no judges
 _SIDE, _SIDE_SUBSETS = 0.25, 1.5  # of the points about a point, and in subsets: the part that is a side of a step
@@ -95,9 +95,9 @@ def _off(
     limits: EpipolarLimits,
     visibility: Visibility | None,
 ) -> Bool:
-    spacing = _spacing_px(xy_px, shape)
+    spacing = spacing_of(xy_px, shape)
     width = subset_px / spacing
-    reach = int(np.clip(np.ceil(_REACH_SUBSETS * width), _MIN_REACH, _MAX_REACH))
+    reach = reach_of(subset_px, spacing)
     e = np.where(ok, offset_px, 0.0)
     e -= np.where(ok, np.median(e[ok]), 0.0)
     sigma = np.where(ok, np.maximum(sigma_px, _TINY_PX), 1.0)
@@ -136,20 +136,14 @@ def _off(
     scatter = _local_scatter(residual / scale, supported & large[group], shape, reach)
     limit = np.minimum(limits.sigmas * scatter * scale + limits.floor_px, _MOST_PX)
     bad = supported & (np.abs(residual) > limit)
-    bad[_on_a_side(e, ok, np.flatnonzero(bad & (np.abs(residual) < limit + _STEP_PX)), limit, shape, reach, width)] = False
+    near = np.flatnonzero(bad & (np.abs(residual) < limit + _STEP_PX))
+    bad[_on_a_side(e, ok, near, limit, shape, reach, width)] = False
     bad |= _level_jumps(e, ok & ~bad, xy_px, group, size, large, supported, limits.sigmas * usual + limits.floor_px)
     return np.asarray(bad)
 
 
 def _precision(sigma: Float, usual: float, ok: Bool) -> Float:
     return np.where(ok, np.clip((usual / sigma) ** 2, 1e-2, 4.0), 0.0)
-
-
-def _spacing_px(xy_px: Float, shape: tuple[int, int]) -> float:
-    rows, cols = shape
-    if cols > 1:
-        return float(np.hypot(*(xy_px[1] - xy_px[0])))
-    return float(np.hypot(*(xy_px[cols] - xy_px[0]))) if rows > 1 else 1.0
 
 
 def _surface(
@@ -174,17 +168,8 @@ def _surface(
 
 def _local_scatter(scaled: Float, known: Bool, shape: tuple[int, int], reach: int) -> Float:
     """Return (n,) the robust scatter of the points about each, over what is expected; from 1 to three times."""
-    rows, cols = shape
-    values, used = np.abs(scaled).reshape(shape), known.reshape(shape)
-    out = np.ones(shape)
-    for top in range(0, rows, reach):
-        for start in range(0, cols, reach):
-            about = (slice(max(top - reach // 2, 0), top + reach + reach // 2 + 1),
-                     slice(max(start - reach // 2, 0), start + reach + reach // 2 + 1))
-            there = values[about][used[about]]
-            if len(there) >= _FEW:
-                out[top : top + reach, start : start + reach] = MAD_TO_SIGMA * np.median(there)
-    return np.clip(out, 1.0, _NOISIER).ravel()
+    middle = block_medians(np.abs(scaled), known, shape, reach, otherwise=1.0)
+    return np.clip(MAD_TO_SIGMA * middle, 1.0, _NOISIER)
 
 
 def _on_a_side(
@@ -196,7 +181,7 @@ def _on_a_side(
     """
     if len(index) == 0:
         return index
-    rows, cols = shape
+    cols = shape[1]
     padded = np.pad(np.where(ok, e, np.nan).reshape(shape), reach, constant_values=np.nan)
     r, c = np.divmod(index, cols)
     steps = np.arange(2 * reach + 1)

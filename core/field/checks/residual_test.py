@@ -33,22 +33,6 @@ _AT_ONCE = 4096
 
 
 @dataclass(frozen=True, kw_only=True)
-class SigmaLimits:
-    """Largest standard deviations of a match, px.
-
-    Attributes
-    ----------
-    motion_px
-        Of the point's position in camera 1's current image.
-    depth_px
-        Of the position in camera 2, along and across the epipolar line, which determines the depth.
-    """
-
-    motion_px: float
-    depth_px: float
-
-
-@dataclass(frozen=True, kw_only=True)
 class TestedResiduals:
     """Outcome of the residual test of a field.
 
@@ -74,7 +58,7 @@ def residual_test(
     *,
     xy_px: Float,
     texture: Float,
-    limits: SigmaLimits,
+    max_sigma_px: float,
     cancel: CancelToken | None = None,
 ) -> TestedResiduals:
     """Scale the covariances of points in place and reject points whose standard deviation is too large.
@@ -87,8 +71,9 @@ def residual_test(
         (n, 2) px of camera 1.
     texture
         (n,) grey-level variance of camera 1's subset.
-    limits
-        Standard deviations beyond which a point with residuals that are not noise is rejected.
+    max_sigma_px
+        Standard deviation of a match, in camera 1's current image or of what determines the depth in camera 2's, beyond
+        which a point with residuals that are not noise is rejected.
     cancel
         Stops the work.
 
@@ -126,14 +111,14 @@ def residual_test(
     _scale(points, usual, correction / np.where(correction > 1.0, _shared_texture(points, usual), 1.0))
     rejected = 0
     if (correction[:-1] > 1.0).any():
-        rejected = _reject_far(fitter, points, usual, xy_px, limits)
+        rejected = _reject_far(fitter, points, usual, xy_px, max_sigma_px)
     for first in range(0, len(alone), _AT_ONCE):
         raise_if_cancelled(cancel)
         index = alone[first : first + _AT_ONCE]
         own = _own_factors(fitter, points, index, xy_px)
         # a single estimate has an uncertainty of its own: it is not taken below the field's
         _scale(points, index, np.fmax(own, correction) / _shared_texture(points, index))
-        rejected += _reject_far(fitter, points, index, xy_px, limits)
+        rejected += _reject_far(fitter, points, index, xy_px, max_sigma_px)
     return TestedResiduals(factor=factor, one_by_one=len(alone), rejected=rejected)
 
 
@@ -172,9 +157,9 @@ def _scale(points: PointFits, index: NDArray[np.intp], variance_factor: Float) -
     points.epipolar_sigma_px[index] *= root[:, -1]
 
 
-def _reject_far(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, limits: SigmaLimits) -> int:
+def _reject_far(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, max_sigma_px: float) -> int:
     motion, depth = _sigma_px(fitter, points, index, xy_px)
-    far = ~((motion < limits.motion_px) & (depth < limits.depth_px))
+    far = ~((motion < max_sigma_px) & (depth < max_sigma_px))
     mask = np.zeros(len(points.status), bool)
     mask[index[far]] = True
     points.reject(mask, PointStatus.LOW_CORRELATION)

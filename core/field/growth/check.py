@@ -59,7 +59,7 @@ def check_residuals(inputs: FieldInputs, state: GrowthState) -> None:
         state.points,
         xy_px=inputs.xy_px,
         texture=inputs.texture,
-        limits=inputs.sigma_limits,
+        max_sigma_px=inputs.options.validity.max_sigma_px,
         cancel=inputs.cancel,
     )
     if tested.rejected:
