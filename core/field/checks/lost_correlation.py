@@ -1,7 +1,7 @@
 """Points that correlate less than they must: something else is seen in a part of the subset.
 
 A right match loses correlation to noise, the more the less texture its subset has; to the view, as a surface that turns
-away from camera 2 is blurred over more of its texture; and to what all points about it lose, such as defocus. A point
+away from one camera is blurred over more of its texture; and to what all points about it lose, such as defocus. A point
 within these is kept, however much worse than the best ones it is, and what its residuals do to it is in its standard
 deviation (:mod:`core.field.checks.residual_test`). Far beyond, it is no match of one surface.
 """
@@ -80,7 +80,12 @@ def lost_correlation(
         level = np.maximum(alike, noise / texture)
         excess = np.log(loss / level)
         scatter = MAD_TO_SIGMA * block_medians(np.abs(excess), ok, shape, reach, otherwise=np.inf)
-        expected[:, k] = level * np.clip(np.exp(limits.sigmas * scatter), limits.min_factor, limits.max_factor)
+        allowed = np.clip(np.exp(limits.sigmas * scatter), limits.min_factor, limits.max_factor)
+        if k == 2:  # of camera 2 nothing but what is new
+            level = np.maximum(level, 1.0 - points.zncc[:, 0])
+        expected[:, k] = level * allowed
+    if points.zncc.shape[1] == 3:
+        expected[:, 0] = np.inf  # both cameras at the reference: the shape was measured with it, and checked
     with np.errstate(invalid="ignore"):
         suspect = np.flatnonzero(ok & (1.0 - points.zncc > expected).any(axis=1))
     if len(suspect):
@@ -94,10 +99,14 @@ def _excess_blur(points: PointFits, pair: StereoPair, rays: Float, index: np.nda
     own, other = view_cosines(pair, rays[index], points.w[index])
     seen = np.maximum(other / np.maximum(own, 1e-6), 1e-6)  # width in camera 2 over that in camera 1
     if points.zncc.shape[1] == 1:
-        return np.minimum(np.abs(seen[:, None] ** -2.0 - 1.0), _MOST_EXCESS)
+        return _excess(seen[:, None])
     G = points.G[index]
     depth = G[:, 2, 0, None, None]
     affine = (G[:, :2, 1:3] - G[:, :2, :1] * (G[:, 2:, 1:3] / depth)) / depth
     turned = np.maximum(np.linalg.svd(affine, compute_uv=False)[:, 1], 1e-6)
-    widths = np.stack([seen, turned, seen * turned], axis=1)
-    return np.minimum(np.abs(widths**-2.0 - 1.0), _MOST_EXCESS)
+    return _excess(np.stack([seen, turned, seen * turned], axis=1))
+
+
+def _excess(width: Float) -> Float:
+    """Of the wider view's blur, on the scale of the finer one: either of the two may be the one that is turned away."""
+    return np.minimum(np.maximum(width, 1.0 / width) ** 2 - 1.0, _MOST_EXCESS)

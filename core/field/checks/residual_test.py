@@ -167,16 +167,19 @@ def _reject_far(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_p
 
 
 def _sigma_px(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float) -> tuple[Float, Float]:
-    """(m,) standard deviations, px: of the position in camera 1's current image, and the largest of those of depth."""
+    """(m,) standard deviations, px: of the position in camera 1's current image, and of what determines the depth.
+
+    The latter, in camera 2: of a shape along and across the epipolar line, of a motion that of its part along the
+    depth. Residuals that camera 2 shows at both times do not count there: they are the shape's, which was tested.
+    """
     rays = fitter.pair.cam1.rays_cam(xy_px[index]).xyz_mm
     w, sd = points.w[index, 0], np.sqrt(_diagonal(points.covariance[index]))
     per_px = depth_per_px(fitter.pair, rays, w)
-    depth = np.maximum(sd[:, 0] / per_px, sd[:, -1])
     if sd.shape[1] == 2:
-        return np.zeros(len(index)), depth
+        return np.zeros(len(index)), np.maximum(sd[:, 0] / per_px, sd[:, -1])
     z = points.G[index, 2, 0]  # of the current point, times w
     px = np.sqrt(np.abs(np.linalg.det(fitter.pair.cam1.lens.image_jacobian(rays[:, :2]))))
-    return np.maximum(sd[:, 1], sd[:, 2]) * px / z, np.maximum(depth, sd[:, 3] * w / z**2 / per_px)
+    return np.maximum(sd[:, 1], sd[:, 2]) * px / z, sd[:, 3] * w / z**2 / per_px
 
 
 def _diagonal(covariance: Float) -> Float:
