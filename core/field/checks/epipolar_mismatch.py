@@ -119,7 +119,7 @@ def _off(
     sigma, usual = noisier * sigma, noisier * reported
     linked = jump <= limits.sigmas * noisier * noise + limits.floor_px
     group = connected(len(ok), first[linked], second[linked])
-    size = np.bincount(group, weights=ok)
+    size = np.asarray(np.bincount(group, weights=ok), np.float64)
     large = size >= min(max(width**2, float(_FEW)), size.max())
     precision = _precision(sigma, usual, ok)
     # every point against the nearest large group's surface, those of a large group against their own's

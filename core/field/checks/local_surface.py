@@ -11,7 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from core.arrays import Float
+from core.arrays import Float, Float32
 
 _ORDERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 _TERMS = len(_ORDERS)
@@ -59,7 +59,7 @@ def predict_from_neighbours(
     w = np.asarray(weights, np.float32)
     v = np.asarray(weights * values, np.float32)
 
-    def moment(a: Float, i: int, j: int) -> Float:
+    def moment(a: Float32, i: int, j: int) -> Float:
         return np.asarray(
             cv2.sepFilter2D(a, cv2.CV_32F, powers[i], powers[j], borderType=cv2.BORDER_CONSTANT), np.float64
         ).ravel()
