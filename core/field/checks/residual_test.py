@@ -34,6 +34,7 @@ _TRIMMED = 0.1
 _SHRUNK = 0.5
 _ALIKE = float(np.log(2.0))  # variances within a factor of two are one kind's: their own uncertainty is a quarter
 _TINY = 1e-9
+_UNCORRELATED = (0.65, 1.5)  # variances with correlated blocks over those with independent ones: within, they are
 _KIND_UNCERTAINTY = 1.25  # of a kind's standard deviation, from few blocks
 _AT_ONCE = 4096
 
@@ -98,7 +99,7 @@ def residual_test(
     unusual: Bool = np.asarray((energy > _UNUSUAL * usual_energy).any(axis=1))
     usual = ok[~unusual]
     sample = _robust(fitter, points, usual[np.unique(spread_indices(len(usual), _SAMPLE))], xy_px)
-    own = np.diagonal(sample.independent, axis1=1, axis2=2)
+    own = sample.ratio
     factor = nothing.factor
     correction = np.ones(q)
     if len(own) >= _MIN_POINTS:
@@ -140,11 +141,12 @@ def residual_test(
 class _Robust(NamedTuple):
     """Cluster-robust covariances (m, q, q) of the field's ``points``, in units of the reported one's ``root``.
 
-    ``known`` (k,) True for those of the points asked for that have one.
+    ``known`` (k,) True for those of the points asked for that have one; ``ratio`` (m, q) of the variances.
     """
 
     points: NDArray[np.intp]
     known: Bool
+    ratio: Float
     root: Float
     independent: Float
     correlated: Float
@@ -162,6 +164,9 @@ class _Structure(NamedTuple):
         trace = np.trace(found.independent, axis1=1, axis2=2)
         usual = trace <= np.quantile(trace, 1.0 - _TRIMMED)
         one, two = found.independent[usual].mean(axis=0), found.correlated[usual].mean(axis=0)
+        ratio = np.linalg.eigvals(np.linalg.solve(one, two)).real
+        if ratio.min() > _UNCORRELATED[0] and ratio.max() < _UNCORRELATED[1]:
+            return _Structure(np.eye(len(one)), one, one)
         return _Structure(_root(two) @ np.linalg.inv(_root(one)), one, two)
 
 
@@ -169,7 +174,7 @@ def _robust(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: F
     q = points.covariance.shape[-1]
     if len(index) == 0:
         nothing = np.zeros((0, q, q))
-        return _Robust(index, np.zeros(0, bool), nothing, nothing, nothing)
+        return _Robust(index, np.zeros(0, bool), np.zeros((0, q)), nothing, nothing, nothing)
     images = [fitter.ref1, fitter.ref2]
     if fitter.cur1 is not None and fitter.cur2 is not None:
         images += [fitter.cur1, fitter.cur2]
@@ -189,7 +194,12 @@ def _robust(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: F
     inverse = np.linalg.inv(root)
     across = np.swapaxes(inverse, 1, 2)
     return _Robust(
-        index[known], known, root, inverse @ independent[known] @ across, inverse @ correlated[known] @ across
+        points=index[known],
+        known=known,
+        ratio=_diagonal(independent[known]) / _diagonal(reported[known]),
+        root=root,
+        independent=inverse @ independent[known] @ across,
+        correlated=inverse @ correlated[known] @ across,
     )
 
 

@@ -226,7 +226,7 @@ def make_cluster_robust(degree: int, images: int, parts: PointKernels, freeze: A
         # mean and slopes that were removed, as they weigh with triangular weights of one block to each side
         level, slope = 2.0 - 1.0 / across, 2.0 - 3.0 / across
         removed = level * level + 2.0 * level * slope
-        factor_beyond = factor_on * max(1.0 - few / worth, 0.2) / max(1.0 - removed / worth, 0.2)
+        factor_beyond = factor_on * max(1.0 - few / worth, 0.2) / max(1.0 - removed / (across * across), 0.2)
         for i in range(last * last):
             out[i] *= factor_on
             out[last * last + i] *= factor_beyond
