@@ -89,8 +89,13 @@ def lost_correlation(
     with np.errstate(invalid="ignore"):
         suspect = np.flatnonzero(ok & (1.0 - points.zncc > expected).any(axis=1))
     if len(suspect):
-        lost = _LOST_TO_VIEW * _excess_blur(points, pair, rays, suspect) ** 2
-        bad[suspect] = (1.0 - points.zncc[suspect] > expected[suspect] + lost).any(axis=1)
+        valid = np.flatnonzero(ok)
+        view = np.zeros_like(points.zncc)
+        view[valid] = _excess_blur(points, pair, rays, valid) ** 2
+        # what the points about a point lose to the view is in what they lose
+        about = [block_medians(v, ok, shape, reach, otherwise=float(np.median(v[ok]))) for v in view.T]
+        lost = _LOST_TO_VIEW * np.maximum(view - np.stack(about, axis=1), 0.0)
+        bad[suspect] = (1.0 - points.zncc[suspect] > expected[suspect] + lost[suspect]).any(axis=1)
     return bad
 
 
