@@ -29,6 +29,8 @@ Pattern = Literal["surface", "projected"]
 DEFAULT_PATCH: PatchSetting = "auto"
 DEFAULT_INTERPOLATION: Interpolation = "quintic"
 DEFAULT_REFERENCE_UPDATE: ReferenceUpdate = "auto"
+#: half a pixel is five of it
+DEFAULT_MAX_SIGMA_PX = 0.1
 
 
 class Range(NamedTuple):
@@ -56,6 +58,8 @@ STRAIN_WINDOW = Range(3, 101, True, 9)
 SMOOTHING_WINDOW = Range(3, 51, True, 5)
 #: a wider Gaussian would leave a handful of independent pixels in the subset
 PREFILTER_OF_SUBSET = 0.25
+#: beyond it a match is as likely one speckle off
+MAX_SIGMA_PX = 1.0
 MAX_SEEDS = MAX_CUTS = 100
 MAX_CORNERS = 1000
 
@@ -169,6 +173,11 @@ class AnalysisSettings(Settings):
     prefilter_px: Annotated[Real, Field(ge=0.0, le=PREFILTER_OF_SUBSET * SUBSET_PX.high)] = Field(
         0.0,
         description="Sd of a Gaussian that all images are blurred with, px, at most a quarter of subset_px; 0: none.",
+    )
+    max_sigma_px: Annotated[Real, Field(gt=0.0, le=MAX_SIGMA_PX)] = Field(
+        DEFAULT_MAX_SIGMA_PX,
+        description="Standard deviation of a point's match in any image, in depth too, px, beyond which it is "
+        "rejected: larger keeps what is uncertain, with its standard deviation; smaller keeps what is sure.",
     )
     seeds: Annotated[list[PixelPosition], Field(min_length=1, max_length=MAX_SEEDS)] | None = Field(
         None, description="Start points in camera 1's reference image; found automatically if left out."

@@ -79,6 +79,7 @@ class MeasureOptions:
             interpolation=settings.interpolation,
             prefilter_px=settings.prefilter_px,
             noise=noise,
+            validity=ValidityOptions(max_sigma_px=settings.max_sigma_px),
         )
 
     @property
@@ -89,4 +90,9 @@ class MeasureOptions:
     def match_options(self) -> MatchOptions:
         """Return the point-level options, with plane patches: curved ones start from their results."""
         patch: Patch = "rigid" if self.patch == "rigid" else "affine"
-        return MatchOptions(subset_px=self.subset_px, patch=patch, interpolation=self.interpolation)
+        return MatchOptions(
+            subset_px=self.subset_px,
+            patch=patch,
+            interpolation=self.interpolation,
+            max_sigma_px=self.validity.max_sigma_px,
+        )

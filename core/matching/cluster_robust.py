@@ -28,6 +28,24 @@ def cluster_robust_covariance(
 ) -> tuple[Float, Bool]:
     """Return the cluster-robust covariance of fitted points, from their residuals in blocks of the subset.
 
+    See :func:`cluster_robust_covariances`, whose first result it is.
+    """
+    independent, _, known = cluster_robust_covariances(pair, images, xy_px, w, G, epipolar_px, options, visible)
+    return independent, known
+
+
+def cluster_robust_covariances(
+    pair: StereoPair,
+    images: Sequence[ArrayLike | ImageData],
+    xy_px: ArrayLike,
+    w: ArrayLike,
+    G: ArrayLike | None,
+    epipolar_px: ArrayLike,
+    options: MatchOptions | None = None,
+    visible: VisiblePixels | None = None,
+) -> tuple[Float, Float, Bool]:
+    """Return two cluster-robust covariances of fitted points: of independent blocks, and of correlated neighbours.
+
     Parameters
     ----------
     pair
@@ -43,7 +61,7 @@ def cluster_robust_covariance(
 
     Returns
     -------
-    covariance
+    independent, correlated
         (N, 2, 2) of (w0, epipolar offset), or (N, 5, 5) of (w0, G00, G10, G20, epipolar offset).
     known
         (N,) False where a point has none: outside an image, or without texture.
@@ -59,9 +77,15 @@ def cluster_robust_covariance(
     inverses of the normal equations. It holds for residuals of any origin that are correlated over less than a block;
     its own standard deviation at a single point is some 20 % (33 px) or 25 % (21 px) of a variance.
 
+    What an image has lost to blur is the texture's second derivative. Times its first one it is a divergence: its sum
+    over a block is what flows through the block's border, into the next block. Such blocks nearly cancel one another;
+    others, of residuals that are wide, add. So the second covariance has the products of neighbouring blocks too, with
+    triangular weights. It has a fourth of the degrees of freedom, and is meant for means over points.
+
     References
     ----------
-    Liang and Zeger, Biometrika 73 (1986), doi:10.1093/biomet/73.1.13
+    Liang and Zeger, Biometrika 73 (1986), doi:10.1093/biomet/73.1.13; Newey and West, Econometrica 55 (1987),
+    doi:10.2307/1913610; Conley, Journal of Econometrics 92 (1999), doi:10.1016/S0304-4076(98)00084-0
     """
     options = options or MatchOptions()
     prepared = [prepare(image, options.interpolation) for image in images]
@@ -74,8 +98,9 @@ def cluster_robust_covariance(
     offsets = own(np.broadcast_to(np.asarray(epipolar_px, dtype=np.float64), (n,)))
     given = given_to_kernels(pair, prepared, xy, unknown_w, options, visible, G=unknown_g, epipolar_px=offsets)
     kind, q = ("shape", 2) if G is None else ("motion", 5)
-    out = np.full((n, q * q), np.nan)
+    out = np.full((n, 2 * q * q), np.nan)
     status, _ = run_kernel(cluster_robust_points[kind][degree], cluster_robust_space[kind][degree], given, out)
     known: Bool = status == 0
     out[~known] = np.nan
-    return out.reshape(n, q, q), known
+    both = out.reshape(n, 2, q, q)
+    return both[:, 0], both[:, 1], known

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from core.errors import InputError
-from core.settings import SUBSET_PX, Interpolation
+from core.settings import DEFAULT_MAX_SIGMA_PX, SUBSET_PX, Interpolation
 
 Patch = Literal["rigid", "affine", "quadratic"]
 PATCHES: tuple[Patch, ...] = get_args(Patch)
@@ -45,7 +45,7 @@ class MatchOptions:
     interpolation: Interpolation = "quintic"
     max_iterations: int = 30
     tolerance_px: float = 1e-3
-    max_sigma_px: float = 0.1
+    max_sigma_px: float = DEFAULT_MAX_SIGMA_PX
     max_step_px: float = 4.0
 
     def __post_init__(self) -> None:

@@ -10,6 +10,7 @@ themselves, are tested one by one.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from core.arrays import Bool, Float
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.starts import depth_per_px
-from core.matching.cluster_robust import cluster_robust_covariance
+from core.matching.cluster_robust import cluster_robust_covariances
 from core.progress import CancelToken, raise_if_cancelled
 from core.robust import spread_indices
 from core.status import PointStatus
@@ -29,23 +30,13 @@ _AS_NOISE = (0.8, 1.25)  # ratio of a sample's variance to the reported one: wit
 _MAX_DISAGREEMENT = 2.2  # 90 % quantile over median of white noise's own estimates is 1.5 (33 px) to 1.8 (15 px)
 _UNUSUAL = 1.5  # residual energy over the field's median
 _MOSTLY_NOT_NOISE = 2.0  # ratio of a sample's variance to the reported one: more than half of it is not noise
+_TRIMMED = 0.1
+_SHRUNK = 0.5
+_ALIKE = float(np.log(2.0))  # variances within a factor of two are one kind's: their own uncertainty is a quarter
+_TINY = 1e-9
+_UNCORRELATED = (0.65, 1.5)  # variances with correlated blocks over those with independent ones: within, they are
+_KIND_UNCERTAINTY = 1.25  # of a kind's standard deviation, from few blocks
 _AT_ONCE = 4096
-
-
-@dataclass(frozen=True, kw_only=True)
-class SigmaLimits:
-    """Largest standard deviations of a match, px.
-
-    Attributes
-    ----------
-    motion_px
-        Of the point's position in camera 1's current image.
-    depth_px
-        Of the position in camera 2, along and across the epipolar line, which determines the depth.
-    """
-
-    motion_px: float
-    depth_px: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +65,7 @@ def residual_test(
     *,
     xy_px: Float,
     texture: Float,
-    limits: SigmaLimits,
+    max_sigma_px: float,
     cancel: CancelToken | None = None,
 ) -> TestedResiduals:
     """Scale the covariances of points in place and reject points whose standard deviation is too large.
@@ -87,8 +78,9 @@ def residual_test(
         (n, 2) px of camera 1.
     texture
         (n,) grey-level variance of camera 1's subset.
-    limits
-        Standard deviations beyond which a point with residuals that are not noise is rejected.
+    max_sigma_px
+        Standard deviation of a match, in camera 1's current image or of what determines the depth in camera 2's, beyond
+        which a point with residuals that are not noise is rejected.
     cancel
         Stops the work.
 
@@ -103,11 +95,11 @@ def residual_test(
     if len(ok) == 0:
         return nothing
     energy = (1.0 - points.zncc[ok]) * texture[ok, None]
-    unusual: Bool = np.asarray((energy > _UNUSUAL * np.median(energy, axis=0)).any(axis=1))
+    usual_energy = np.median(energy, axis=0)
+    unusual: Bool = np.asarray((energy > _UNUSUAL * usual_energy).any(axis=1))
     usual = ok[~unusual]
-    sample = usual[np.unique(spread_indices(len(usual), _SAMPLE))]
-    own = _own_factors(fitter, points, sample, xy_px)
-    own = own[np.isfinite(own).all(axis=1)]
+    sample = _robust(fitter, points, usual[np.unique(spread_indices(len(usual), _SAMPLE))], xy_px)
+    own = sample.ratio
     factor = nothing.factor
     correction = np.ones(q)
     if len(own) >= _MIN_POINTS:
@@ -126,26 +118,67 @@ def residual_test(
     _scale(points, usual, correction / np.where(correction > 1.0, _shared_texture(points, usual), 1.0))
     rejected = 0
     if (correction[:-1] > 1.0).any():
-        rejected = _reject_far(fitter, points, usual, xy_px, limits)
+        rejected = _reject_far(fitter, points, usual, xy_px, max_sigma_px)
+    if len(alone) == 0:
+        return TestedResiduals(factor=factor, one_by_one=0, rejected=rejected)
+    # noise alone, where there are points that show nothing else
+    quiet = (usual_energy / np.maximum(energy[unusual], usual_energy)).min(axis=1) * (len(usual) > 0)
+    alike = _robust(fitter, points, alone[np.unique(spread_indices(len(alone), _SAMPLE))], xy_px)
+    structure = _Structure.of(alike) if len(alike.independent) >= _MIN_POINTS else None
     for first in range(0, len(alone), _AT_ONCE):
         raise_if_cancelled(cancel)
         index = alone[first : first + _AT_ONCE]
-        own = _own_factors(fitter, points, index, xy_px)
-        # a single estimate has an uncertainty of its own: it is not taken below the field's
-        _scale(points, index, np.fmax(own, correction) / _shared_texture(points, index))
-        rejected += _reject_far(fitter, points, index, xy_px, limits)
+        found = _robust(fitter, points, index, xy_px)
+        kind = _replace(points, found, structure, quiet[first : first + _AT_ONCE][found.known])
+        rejected += _reject_far(fitter, points, index, xy_px, max_sigma_px)
+        left = points.ok[found.points]
+        rejected += _reject_far(
+            fitter, points, found.points[left], xy_px, max_sigma_px, _KIND_UNCERTAINTY * np.sqrt(kind[left])
+        )
     return TestedResiduals(factor=factor, one_by_one=len(alone), rejected=rejected)
 
 
-def _own_factors(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float) -> Float:
-    """(m, q) ratios of cluster-robust to reported variances; NaN where not known."""
+class _Robust(NamedTuple):
+    """Cluster-robust covariances (m, q, q) of the field's ``points``, in units of the reported one's ``root``.
+
+    ``known`` (k,) True for those of the points asked for that have one; ``ratio`` (m, q) of the variances.
+    """
+
+    points: NDArray[np.intp]
+    known: Bool
+    ratio: Float
+    root: Float
+    independent: Float
+    correlated: Float
+
+
+class _Structure(NamedTuple):
+    """How points of a kind differ from independent blocks: the map (q, q) of the one mean covariance to the other."""
+
+    change: Float
+    independent: Float
+    correlated: Float
+
+    @staticmethod
+    def of(found: _Robust) -> _Structure:
+        trace = np.trace(found.independent, axis1=1, axis2=2)
+        usual = trace <= np.quantile(trace, 1.0 - _TRIMMED)
+        one, two = found.independent[usual].mean(axis=0), found.correlated[usual].mean(axis=0)
+        ratio = np.linalg.eigvals(np.linalg.solve(one, two)).real
+        if ratio.min() > _UNCORRELATED[0] and ratio.max() < _UNCORRELATED[1]:
+            return _Structure(np.eye(len(one)), one, one)
+        return _Structure(_root(two) @ np.linalg.inv(_root(one)), one, two)
+
+
+def _robust(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float) -> _Robust:
     q = points.covariance.shape[-1]
     if len(index) == 0:
-        return np.zeros((0, q))
+        nothing = np.zeros((0, q, q))
+        return _Robust(index, np.zeros(0, bool), np.zeros((0, q)), nothing, nothing, nothing)
     images = [fitter.ref1, fitter.ref2]
     if fitter.cur1 is not None and fitter.cur2 is not None:
         images += [fitter.cur1, fitter.cur2]
-    robust, _ = cluster_robust_covariance(
+    independent, correlated, _ = cluster_robust_covariances(
         fitter.pair,
         images,
         xy_px[index],
@@ -155,10 +188,53 @@ def _own_factors(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_
         fitter.options,
         None if fitter.visibility is None else fitter.visibility.at(xy_px[index]),
     )
-    reported = _diagonal(points.covariance[index])
-    factors = np.full(reported.shape, np.nan)
-    np.divide(_diagonal(robust), reported, out=factors, where=reported > 0.0)
-    return factors
+    reported = points.covariance[index]
+    known: Bool = np.asarray((_diagonal(reported) > 0.0).all(axis=1) & np.isfinite(independent).all(axis=(1, 2)))
+    root = _root(reported[known])
+    inverse = np.linalg.inv(root)
+    across = np.swapaxes(inverse, 1, 2)
+    return _Robust(
+        points=index[known],
+        known=known,
+        ratio=_diagonal(independent[known]) / _diagonal(reported[known]),
+        root=root,
+        independent=inverse @ independent[known] @ across,
+        correlated=inverse @ correlated[known] @ across,
+    )
+
+
+def _root(covariance: Float) -> Float:
+    """Lower triangular square roots (..., q, q) of covariances in any units."""
+    sd = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    correlation = covariance / (sd[..., :, None] * sd[..., None, :])
+    return np.asarray(sd[..., :, None] * np.linalg.cholesky(correlation + _TINY * np.eye(covariance.shape[-1])))
+
+
+def _replace(points: PointFits, found: _Robust, structure: _Structure | None, quiet: Float) -> Float:
+    """Give points their own residuals' covariance, not below what noise alone makes (``quiet`` of the reported).
+
+    Returns the variances (m, q) of points of their kind.
+    """
+    if len(found.points) == 0:
+        return np.zeros((0, points.covariance.shape[-1]))
+    own, kind = found.independent, found.independent
+    if structure is not None:
+        # a single estimate is uncertain: where it is about its kind's, both count
+        relative = np.linalg.solve(structure.independent, own)
+        size = np.trace(relative, axis1=1, axis2=2) / own.shape[1]
+        share = _SHRUNK * np.clip(2.0 - size, 0.0, 1.0)[:, None, None]
+        own = structure.change @ own @ structure.change.T
+        own = (1.0 - share) * own + share * structure.correlated
+        kind = np.where((np.abs(np.log(size)) < _ALIKE)[:, None, None], structure.correlated, own)
+    shared = _shared_texture(points, found.points)[:, :, None]
+    covariance = found.root @ own @ np.swapaxes(found.root, 1, 2) / shared
+    least = quiet[:, None] * _diagonal(points.covariance[found.points])
+    root = np.sqrt(np.maximum(least / _diagonal(covariance), 1.0))
+    covariance *= root[:, :, None] * root[:, None, :]
+    points.covariance[found.points] = covariance
+    points.epipolar_sigma_px[found.points] = np.sqrt(covariance[:, -1, -1])
+    # where a kind scatters too far, those that are within the limit are so by chance
+    return np.asarray(_diagonal(found.root @ kind @ np.swapaxes(found.root, 1, 2) / shared))
 
 
 def _shared_texture(points: PointFits, index: NDArray[np.intp]) -> Float:
@@ -172,26 +248,39 @@ def _scale(points: PointFits, index: NDArray[np.intp], variance_factor: Float) -
     points.epipolar_sigma_px[index] *= root[:, -1]
 
 
-def _reject_far(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, limits: SigmaLimits) -> int:
-    motion, depth = _sigma_px(fitter, points, index, xy_px)
-    far = ~((motion < limits.motion_px) & (depth < limits.depth_px))
+def _reject_far(
+    fitter: Fitter,
+    points: PointFits,
+    index: NDArray[np.intp],
+    xy_px: Float,
+    max_sigma_px: float,
+    sd: Float | None = None,
+) -> int:
+    """Reject points with a standard deviation beyond the limit: their own, or ``sd`` (m, q) of the unknowns."""
+    motion, depth = _sigma_px(fitter, points, index, xy_px, sd)
+    far = ~((motion < max_sigma_px) & (depth < max_sigma_px))
     mask = np.zeros(len(points.status), bool)
     mask[index[far]] = True
     points.reject(mask, PointStatus.LOW_CORRELATION)
     return int(far.sum())
 
 
-def _sigma_px(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float) -> tuple[Float, Float]:
-    """(m,) standard deviations, px: of the position in camera 1's current image, and the largest of those of depth."""
+def _sigma_px(
+    fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, sd: Float | None
+) -> tuple[Float, Float]:
+    """(m,) standard deviations, px: of the position in camera 1's current image, and of what determines the depth.
+
+    The latter, in camera 2: of a shape along and across the epipolar line, of a motion that of its part along the
+    depth. Residuals that camera 2 shows at both times do not count there: they are the shape's, which was tested.
+    """
     rays = fitter.pair.cam1.rays_cam(xy_px[index]).xyz_mm
-    w, sd = points.w[index, 0], np.sqrt(_diagonal(points.covariance[index]))
+    w, sd = points.w[index, 0], np.sqrt(_diagonal(points.covariance[index])) if sd is None else sd
     per_px = depth_per_px(fitter.pair, rays, w)
-    depth = np.maximum(sd[:, 0] / per_px, sd[:, -1])
     if sd.shape[1] == 2:
-        return np.zeros(len(index)), depth
+        return np.zeros(len(index)), np.maximum(sd[:, 0] / per_px, sd[:, -1])
     z = points.G[index, 2, 0]  # of the current point, times w
     px = np.sqrt(np.abs(np.linalg.det(fitter.pair.cam1.lens.image_jacobian(rays[:, :2]))))
-    return np.maximum(sd[:, 1], sd[:, 2]) * px / z, np.maximum(depth, sd[:, 3] * w / z**2 / per_px)
+    return np.maximum(sd[:, 1], sd[:, 2]) * px / z, sd[:, 3] * w / z**2 / per_px
 
 
 def _diagonal(covariance: Float) -> Float:

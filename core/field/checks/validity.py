@@ -1,8 +1,8 @@
-"""Validity checks: every point is compared with the statistics of its own field.
+"""Validity checks: every point is compared with the points about it.
 
 Four checks: correlation in each comparison, epipolar offset, agreement with the neighbours' patches, and the size of
-the cluster that a point belongs to. Limits are multiples of the field's own robust standard deviations, so they follow
-noise, texture and lens; the floors keep the second-best points of a nearly perfect field.
+the cluster that a point belongs to. Limits are multiples of robust standard deviations, so they follow noise, texture
+and lens; the floors keep the second-best points of a nearly perfect field.
 """
 
 from __future__ import annotations
@@ -12,25 +12,24 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from core.arrays import Bool, Float
+from core.arrays import Float
 from core.cameras.stereo import StereoPair
+from core.field.checks.epipolar_mismatch import EpipolarLimits, epipolar_mismatches
+from core.field.checks.groups import connected, neighbour_pairs
+from core.field.checks.lost_correlation import CorrelationLimits, lost_correlation
 from core.field.points.fitter import PointFits
 from core.field.points.starts import depth_per_px
 from core.field.region.neighbours import N_QUANTITIES, compare_with_neighbours, sorting_network
-from core.field.region.trend import smooth_terms
 from core.field.region.visibility import Visibility
-from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight, spread_indices
+from core.robust import MAD_TO_SIGMA
+from core.settings import DEFAULT_MAX_SIGMA_PX
 from core.status import PointStatus
 from core.threads import run_ranges
 
 _FEW = 12
 _NETWORK = sorting_network(24)
 _ROWS_AT_ONCE = 4
-_SETTLED = 0.01  # of the standard deviation: a robust fit that moves less has converged
-_TREND_POINTS = 3000  # for a trend of seven terms: its standard deviation is then a twentieth of the points' own
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,13 +39,14 @@ class ValidityOptions:
     Attributes
     ----------
     epipolar_sigmas
-        Allowed distance from the field's smooth epipolar offset, in its robust standard deviations.
+        Allowed distance from the epipolar offset that the neighbours show, in standard deviations.
     epipolar_floor_px
         Added to it, so that a noise-free field keeps its second-best points.
     correlation_sigmas
-        Allowed excess of log(1 - zncc) over its trend with texture and position, in robust standard deviations.
+        Allowed excess of log(1 - zncc) over what the points about a point lose, at its own texture, in robust standard
+        deviations.
     correlation_min_factor, correlation_max_factor
-        1 - zncc up to the first times its expectation is never rejected; above the second always.
+        1 - zncc up to the first times that is never rejected; above the second always, but for what the view takes.
     neighbour_sigmas
         Allowed disagreement with the neighbours' patches, in robust standard deviations.
     neighbour_floor_px
@@ -54,22 +54,19 @@ class ValidityOptions:
     min_cluster
         Groups of fewer connected points are rejected.
     max_sigma_px
-        Standard deviation of a point's position in camera 1, px, from its residuals, beyond which a point whose
-        residuals are not noise is rejected: five times as much is half a pixel.
-    max_depth_sigma_px
-        The same of its position in camera 2, which determines the depth and counts several times there.
+        Standard deviation of a point's match in any image, in depth too, beyond which a point whose residuals are not
+        noise is rejected.
     """
 
     epipolar_sigmas: float = 5.0
     epipolar_floor_px: float = 0.005
     correlation_sigmas: float = 6.0
-    correlation_min_factor: float = 1.35
-    correlation_max_factor: float = 12.0
+    correlation_min_factor: float = 2.0
+    correlation_max_factor: float = 6.0
     neighbour_sigmas: float = 6.0
     neighbour_floor_px: float = 0.05
     min_cluster: int = 4
-    max_sigma_px: float = 0.1
-    max_depth_sigma_px: float = 0.05
+    max_sigma_px: float = DEFAULT_MAX_SIGMA_PX
 
 
 def apply_validity_checks(
@@ -80,6 +77,7 @@ def apply_validity_checks(
     xy_px: Float,
     rays: Float,
     texture: Float,
+    subset_px: int,
     options: ValidityOptions,
     visibility: Visibility | None = None,
 ) -> int:
@@ -97,6 +95,8 @@ def apply_validity_checks(
         (n, 2) px and (n, 3) normalised, of the points.
     texture
         (n,) grey-level variance of camera 1's subset.
+    subset_px
+        Width of the subset.
     options
         Limits.
     visibility
@@ -109,52 +109,48 @@ def apply_validity_checks(
     """
     before = int(points.ok.sum())
     few = before < _FEW
-    terms = smooth_terms(xy_px)
     if not few:
-        _check_correlation(points, terms, texture, options)
+        lost = lost_correlation(
+            points,
+            pair=pair,
+            shape=shape,
+            xy_px=xy_px,
+            rays=rays,
+            texture=texture,
+            subset_px=subset_px,
+            limits=CorrelationLimits(
+                options.correlation_sigmas, options.correlation_min_factor, options.correlation_max_factor
+            ),
+        )
+        points.reject(lost, PointStatus.LOW_CORRELATION)
     for _ in range(2):
         if _check_neighbours(points, pair, shape, rays, options, visibility, few=few) == 0:
             break
     if not few:
-        _check_epipolar(points, terms, options)
+        _check_epipolar(points, shape, xy_px, subset_px, options, visibility)
         _check_clusters(points, shape, options, visibility)
     return before - int(points.ok.sum())
 
 
-def _check_correlation(points: PointFits, terms: Float, texture: Float, options: ValidityOptions) -> None:
-    ok = np.flatnonzero(points.ok)
-    if len(ok) < _FEW:
-        return
-    trend = np.column_stack([_at_points(terms, ok), np.log(np.maximum(texture[ok], 1e-6))])
-    worst = np.full(len(ok), -np.inf)
-    for k in range(points.zncc.shape[1]):
-        y = np.log(np.maximum(1.0 - points.zncc[ok, k], 1e-7))
-        r, sigma = _robust_residual(trend, y)
-        limit = np.clip(
-            options.correlation_sigmas * sigma,
-            np.log(options.correlation_min_factor),
-            np.log(options.correlation_max_factor),
-        )
-        worst = np.maximum(worst, r - limit)
-    points.reject(_at(points, ok[worst > 0.0]), PointStatus.LOW_CORRELATION)
-
-
-def _check_epipolar(points: PointFits, terms: Float, options: ValidityOptions) -> None:
-    for _ in range(4):
-        ok = np.flatnonzero(points.ok)
-        if len(ok) < _FEW:
-            return
-        e = points.epipolar_px[ok]
-        r, sigma = _robust_residual(_at_points(terms, ok), e)
-        # plain and robust standard deviations about the field's middle too: a reader can recompute these from the file
-        about_mean, about_median = np.abs(e - e.mean()), np.abs(e - np.median(e))
-        plain = (about_mean > options.epipolar_sigmas * e.std()) & (about_mean > options.epipolar_floor_px)
-        sigma_all = MAD_TO_SIGMA * float(np.median(about_median))
-        middle = (about_median > options.epipolar_sigmas * sigma_all) & (about_median > options.epipolar_floor_px)
-        bad = (np.abs(r) > options.epipolar_sigmas * sigma + options.epipolar_floor_px) | plain | middle
-        if not bad.any():
-            return
-        points.reject(_at(points, ok[bad]), PointStatus.EPIPOLAR_MISMATCH)
+def _check_epipolar(
+    points: PointFits,
+    shape: tuple[int, int],
+    xy_px: Float,
+    subset_px: int,
+    options: ValidityOptions,
+    visibility: Visibility | None,
+) -> None:
+    off = epipolar_mismatches(
+        points.epipolar_px,
+        points.epipolar_sigma_px,
+        points.ok,
+        xy_px=xy_px,
+        shape=shape,
+        subset_px=subset_px,
+        limits=EpipolarLimits(options.epipolar_sigmas, options.epipolar_floor_px),
+        visibility=visibility,
+    )
+    points.reject(off, PointStatus.EPIPOLAR_MISMATCH)
 
 
 def neighbour_disagreement(
@@ -225,7 +221,7 @@ def _check_clusters(
     points: PointFits, shape: tuple[int, int], options: ValidityOptions, visibility: Visibility | None
 ) -> None:
     if visibility is not None:
-        group = _connected(points.ok, shape, visibility)
+        group = connected(len(points.ok), *neighbour_pairs(points.ok, shape, visibility))
         points.reject(points.ok & (np.bincount(group)[group] < options.min_cluster), PointStatus.NEIGHBOUR_MISMATCH)
         return
     n, labels, stats, _ = cv2.connectedComponentsWithStats(points.ok.reshape(shape).astype(np.uint8), connectivity=8)
@@ -234,49 +230,3 @@ def _check_clusters(
     size = stats[:, cv2.CC_STAT_AREA].copy()
     size[0] = options.min_cluster
     points.reject((size[labels] < options.min_cluster).ravel(), PointStatus.NEIGHBOUR_MISMATCH)
-
-
-def _connected(ok: Bool, shape: tuple[int, int], visibility: Visibility) -> NDArray[np.int32]:
-    """Label (n,) the groups of points that are connected through neighbours, none across a cut."""
-    rows, cols = shape
-    index = np.arange(rows * cols).reshape(shape)
-    ends = []
-    for dr, dc in ((0, 1), (1, -1), (1, 0), (1, 1)):
-        here = index[: rows - dr, max(-dc, 0) : cols - max(dc, 0)].ravel()
-        there = here + dr * cols + dc
-        together = ok[here] & ok[there] & ~visibility.separated_at(dr, dc)[here]
-        ends.append(np.stack([here[together], there[together]]))
-    a, b = np.concatenate(ends, axis=1)
-    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(rows * cols, rows * cols))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int32)
-
-
-def _at_points(terms: Float, ok: NDArray[np.intp]) -> Float:
-    return terms[ok] if len(ok) > 60 else terms[ok, :1]
-
-
-def _robust_residual(design: Float, values: Float) -> tuple[Float, float]:
-    """Return residuals about a robust linear fit (Tukey's biweight) and their robust standard deviation.
-
-    Of many points a few thousand are fitted, spread over all of them by multiples of the golden section.
-    """
-    n = len(values)
-    some = slice(None) if n <= _TREND_POINTS else np.sort(spread_indices(n, _TREND_POINTS))
-    terms, wanted = design[some], values[some]
-    part = wanted - np.median(wanted)
-    for _ in range(6):
-        sigma = max(MAD_TO_SIGMA * float(np.median(np.abs(part - np.median(part)))), 1e-12)
-        weighted = terms * biweight((part / (BIWEIGHT_REACH * sigma)) ** 2)[:, None]
-        solution = np.linalg.lstsq(weighted.T @ terms, weighted.T @ wanted, rcond=1e-9)[0]
-        last, part = part, wanted - terms @ solution
-        if np.abs(part - last).max() < _SETTLED * sigma:
-            break
-    residual = values - design @ solution
-    sigma = max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), 1e-12)
-    return residual, sigma
-
-
-def _at(points: PointFits, index: NDArray[np.intp]) -> Bool:
-    mask = np.zeros(len(points.status), bool)
-    mask[index] = True
-    return mask

@@ -23,6 +23,7 @@ def check(inputs: FieldInputs, points: PointFits) -> None:
         xy_px=inputs.xy_px,
         rays=inputs.rays,
         texture=inputs.texture,
+        subset_px=inputs.options.subset_px,
         options=inputs.options.validity,
         visibility=inputs.visibility,
     )
@@ -76,7 +77,7 @@ def check_residuals(inputs: FieldInputs, state: GrowthState) -> None:
         state.points,
         xy_px=inputs.xy_px,
         texture=inputs.texture,
-        limits=inputs.sigma_limits,
+        max_sigma_px=inputs.options.validity.max_sigma_px,
         cancel=inputs.cancel,
     )
     if tested.rejected:

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.field.checks.edges import clear_of_edges
-from core.field.checks.residual_test import SigmaLimits
 from core.field.growth.grow import Attempts
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.images import MeasureImage, different, refuse_stale, same_size
@@ -83,12 +82,6 @@ class FieldInputs:
     def visibility(self) -> Visibility | None:
         """The points' visibility; None: all of every subset."""
         return self.grid.visibility
-
-    @property
-    def sigma_limits(self) -> SigmaLimits:
-        """Largest standard deviations of a point whose residuals are not noise."""
-        validity = self.options.validity
-        return SigmaLimits(motion_px=validity.max_sigma_px, depth_px=validity.max_depth_sigma_px)
 
     @cached_property
     def repeating(self) -> Bool:

@@ -76,7 +76,14 @@ def depth_per_px(pair: StereoPair, rays: Float, w0: Float) -> Float:
 
 
 def faces_both_cameras(pair: StereoPair, rays: Float, w: Float, *, min_cosine: float = 0.1) -> np.ndarray:
-    """Return (n,) True where the patch's front faces both cameras, no steeper than ``min_cosine``.
+    """Return (n,) True where the patch's front faces both cameras, no steeper than ``min_cosine``."""
+    with np.errstate(invalid="ignore"):
+        c1, c2 = view_cosines(pair, rays, w)
+        return np.asarray((w[:, 0] > 0) & (c1 > min_cosine) & (c2 > min_cosine))
+
+
+def view_cosines(pair: StereoPair, rays: Float, w: Float) -> tuple[Float, Float]:
+    """Return (n,), (n,) the cosines between the patch's normal and the rays to camera 1 and camera 2.
 
     The plane w0 + w1 X + w2 Y = 1/Z has the camera-1 normal (w1, w2, w0 - w1 Xc - w2 Yc).
     """
@@ -87,5 +94,4 @@ def faces_both_cameras(pair: StereoPair, rays: Float, w: Float, *, min_cosine: f
         centre2 = pair.cam2_from_cam1.inverse().translation_mm
         view1 = point / np.linalg.norm(point, axis=-1, keepdims=True)
         view2 = (point - centre2) / np.linalg.norm(point - centre2, axis=-1, keepdims=True)
-        c1, c2 = np.sum(normal * view1, axis=-1), np.sum(normal * view2, axis=-1)
-        return np.asarray((w[:, 0] > 0) & (c1 > min_cosine) & (c2 > min_cosine))
+        return np.sum(normal * view1, axis=-1), np.sum(normal * view2, axis=-1)

@@ -97,7 +97,12 @@ def find_again(
         own = fitter.own
         own.reject(own.ok & ~(usable & tried.ok), PointStatus.NEIGHBOUR_MISMATCH)
         residual_test(
-            matcher, own, xy_px=older.pixel_px, texture=inputs.texture, limits=whole.sigma_limits, cancel=whole.cancel
+            matcher,
+            own,
+            xy_px=older.pixel_px,
+            texture=inputs.texture,
+            max_sigma_px=whole.options.validity.max_sigma_px,
+            cancel=whole.cancel,
         )
         tried.reject(usable & tried.ok & ~own.ok, PointStatus.LOW_CORRELATION)
         index = np.flatnonzero(usable)

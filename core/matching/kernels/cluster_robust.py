@@ -78,7 +78,7 @@ def make_cluster_robust(degree: int, images: int, parts: PointKernels, freeze: A
             part=np.zeros((N_ROWS, width), np.float32),
             scores=np.empty((images, across * across, n_columns)),
             pull=np.empty((last, images, n_columns)),
-            z=np.empty(last),
+            z=np.empty((across * across, last)),
             sums=np.empty(3 + n_columns),
         )
 
@@ -124,7 +124,10 @@ def make_cluster_robust(degree: int, images: int, parts: PointKernels, freeze: A
 
     @kernel(f"{degree}_{images}", inline="always")
     def cluster_robust_point(reference, patches, which, shown, lens1, lens2, R, t, xy, w, g, e, setting, space, out):
-        """Compute the covariance (``last`` squared numbers) of a fitted point's last unknowns; return status, and 0."""
+        """Compute the covariance of a fitted point's last unknowns; return status, and 0.
+
+        ``out`` has two of ``last`` squared numbers: with independent blocks, and with neighbouring blocks correlated.
+        """
         subset, order, variances, rigid = setting.subset, setting.order, setting.variances, setting.rigid
         fit_space, part, scores, pull, z, sums = space
         ref, of_reference, warp_space, rhs, levels, M, equations, _, vectors, inverse, G, rotation, chain, _ = fit_space
@@ -192,7 +195,7 @@ def make_cluster_robust(degree: int, images: int, parts: PointKernels, freeze: A
                             along_k += columns[k, r, c] * unit[c]
                         s += weights[k, o] * along_k
                     pull[i, o, r] = s
-        for i in range(last * last):
+        for i in range(2 * last * last):
             out[i] = 0.0
         for b in range(scores.shape[1]):
             for i in range(last):
@@ -200,18 +203,33 @@ def make_cluster_robust(degree: int, images: int, parts: PointKernels, freeze: A
                 for o in range(images):
                     for r in range(n_columns):
                         s += pull[i, o, r] * scores[o, b, r]
-                z[i] = best * s
+                z[b, i] = best * s
             for i in range(last):
                 for j in range(last):
-                    out[last * i + j] += z[i] * z[j]
+                    out[last * i + j] += z[b, i] * z[b, j]
+        across = int(math.sqrt(scores.shape[1]) + 0.5)
+        for b in range(scores.shape[1]):
+            row, col = b // across, b % across
+            for other_row in range(max(row - 1, 0), min(row + 2, across)):
+                for other_col in range(max(col - 1, 0), min(col + 2, across)):
+                    # triangular weights along both axes keep the sum positive (Newey and West; Conley)
+                    near = (1.0 - 0.5 * abs(row - other_row)) * (1.0 - 0.5 * abs(col - other_col))
+                    for i in range(last):
+                        for j in range(last):
+                            out[last * (last + i) + j] += near * z[b, i] * z[across * other_row + other_col, j]
         # the fit has removed mean and slopes of the residuals from the blocks
         factor_on = 1.0 / max(1.0 - few / worth, 0.2)
         variance = (
             variances[0] if setting.known_noise else noise_from_residuals(levels, images, seen.n_pixels, float(n))
         )
         factor_on *= share_correction(gradients, variance, p, setting.slope_noise, setting.slope_share)
+        # mean and slopes that were removed, as they weigh with triangular weights of one block to each side
+        level, slope = 2.0 - 1.0 / across, 2.0 - 3.0 / across
+        removed = level * level + 2.0 * level * slope
+        factor_beyond = factor_on * max(1.0 - few / worth, 0.2) / max(1.0 - removed / (across * across), 0.2)
         for i in range(last * last):
             out[i] *= factor_on
+            out[last * last + i] *= factor_beyond
         return OK, 0
 
     return cluster_robust_point, work_space

@@ -10,9 +10,11 @@ from core.errors import FileFormatError, InputError
 from core.field.prefilter import check_prefilter
 from core.settings import (
     DEFAULT_INTERPOLATION,
+    DEFAULT_MAX_SIGMA_PX,
     DEFAULT_PATCH,
     DEFAULT_REFERENCE_UPDATE,
     INTERPOLATIONS,
+    MAX_SIGMA_PX,
     PATCH_SETTINGS,
     REFERENCE_UPDATES,
     SMOOTHING_WINDOW,
@@ -98,6 +100,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="blur all images with a Gaussian of this sd in px: less bias, more noise (0: none)",
     )
     add(
+        "--max-sigma",
+        type=float,
+        default=DEFAULT_MAX_SIGMA_PX,
+        metavar="PX",
+        help=f"reject points whose match, in depth too, has a larger standard deviation ({DEFAULT_MAX_SIGMA_PX:g})",
+    )
+    add(
         "--seed",
         action="append",
         default=[],
@@ -172,6 +181,15 @@ def _strain(args: argparse.Namespace) -> dict[str, object] | None:
 
 def _smoothing_window(args: argparse.Namespace) -> int | None:
     return None if args.smooth == "off" else check_whole("--smooth", args.smooth, SMOOTHING_WINDOW)
+
+
+def _max_sigma_px(args: argparse.Namespace) -> float:
+    value = float(args.max_sigma)
+    if not 0.0 < value <= MAX_SIGMA_PX:
+        raise InputError(
+            f"--max-sigma {value:g} must lie above 0 and be at most {MAX_SIGMA_PX:g}.", code="option_out_of_range"
+        )
+    return value
 
 
 def _prefilter_px(args: argparse.Namespace, subset_px: int) -> float:
@@ -253,6 +271,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
             "patch": args.patch,
             "interpolation": args.interpolation,
             "prefilter_px": prefilter_px,
+            "max_sigma_px": _max_sigma_px(args),
             "seeds": None if seeds is None else [seed.xy_px for seed in seeds],
             "seeds_cam2": None if seeds is None else [seed.xy2_px for seed in seeds],
             "smoothing_window": _smoothing_window(args),

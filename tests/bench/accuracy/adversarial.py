@@ -200,7 +200,7 @@ def adversarial(figures: Path) -> Section:
 
 def _sigma_px(scene: _Scene, case: Case) -> float:
     """How far matches are off in camera 1, rms, if none is refused for its scatter: what the pictures allow."""
-    free = ValidityOptions(max_sigma_px=10.0, max_depth_sigma_px=10.0)
+    free = ValidityOptions(max_sigma_px=10.0)
     options = MeasureOptions(subset_px=scene.setting.subset_px, validity=free)
     field = measure_motion(scene.rig.pair, *case.pictures, scene.grid, options)
     assert field.uvw_mm is not None

@@ -58,6 +58,7 @@ def good_points(w: np.ndarray, G: np.ndarray | None, rng: np.random.Generator) -
         points.G[:] = G
     points.zncc[:] = 1.0 - 0.01 * np.exp(0.1 * rng.standard_normal(points.zncc.shape))
     points.epipolar_px[:] = 0.05 + 0.01 * rng.standard_normal(n)
+    points.epipolar_sigma_px[:] = 0.01
     return points
 
 
@@ -69,6 +70,7 @@ def apply_checks(points: PointFits) -> None:
         xy_px=XY,
         rays=RAYS,
         texture=np.full(len(XY), 900.0),
+        subset_px=33,
         options=ValidityOptions(),
     )
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from core.errors import InputError
-from core.field.checks.residual_test import SigmaLimits, residual_test
+from core.field.checks.residual_test import residual_test
 from core.field.checks.validity import ValidityOptions
 from core.field.growth.field import fill_field
 from core.field.growth.seed import seed_shape
@@ -215,7 +215,7 @@ def test_a_point_that_scatters_too_far_is_refused_and_no_other():
     wide = ValidityOptions(correlation_min_factor=1e3, correlation_max_factor=2e3)
     statuses = {}
     for limit_px in (0.02, 1.0):
-        validity = replace(wide, max_sigma_px=limit_px, max_depth_sigma_px=limit_px)
+        validity = replace(wide, max_sigma_px=limit_px)
         field, error = measured(reference, now, replace(OPTIONS, validity=validity))
         assert (field.status[field.x_px < 160 - 21] == PointStatus.OK).mean() > 0.99
         assert np.abs(error / field.sigma_mm[..., 3:])[field.valid].max() < 6.0
@@ -235,8 +235,8 @@ def test_depth_is_refused_for_what_is_not_noise_and_not_for_noise_that_is_told(d
     depth_px = max(sd[1], (sd[0] / depth_per_px(inputs.pair, inputs.rays, points.w[:, 0])).mean())
     factors = np.array([depth_factor, offset_factor])
     points.covariance /= np.sqrt(factors[:, None] * factors)
-    limits = SigmaLimits(motion_px=0.1, depth_px=0.75 * depth_px)
-    tested = residual_test(state.fitter, points, xy_px=inputs.xy_px, texture=inputs.texture, limits=limits)
+    limit = 0.75 * depth_px
+    tested = residual_test(state.fitter, points, xy_px=inputs.xy_px, texture=inputs.texture, max_sigma_px=limit)
     assert tested.factor == pytest.approx(factors, rel=0.25)
     assert points.ok.sum() / count == pytest.approx(kept, abs=0.05)
 
@@ -248,14 +248,17 @@ def test_matches_without_any_residual_stay_as_they_are():
     points = state.points
     points.covariance[:2] = 0.0
     before = points.covariance.copy()
-    limits = SigmaLimits(motion_px=0.1, depth_px=0.05)
-    tested = residual_test(state.fitter, points, xy_px=inputs.xy_px, texture=inputs.texture, limits=limits)
+    limit = 0.1
+    tested = residual_test(state.fitter, points, xy_px=inputs.xy_px, texture=inputs.texture, max_sigma_px=limit)
     assert tested.rejected == 0
     assert np.isfinite(tested.factor).all()
     np.testing.assert_array_equal(points.covariance[:2], before[:2])
     assert np.isfinite(points.covariance[points.ok]).all()
     points.covariance[:] = 0.0
-    assert residual_test(state.fitter, points, xy_px=inputs.xy_px, texture=inputs.texture, limits=limits).rejected == 0
+    assert (
+        residual_test(state.fitter, points, xy_px=inputs.xy_px, texture=inputs.texture, max_sigma_px=limit).rejected
+        == 0
+    )
     assert not points.covariance.any()
 
 

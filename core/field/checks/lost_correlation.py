@@ -1,0 +1,117 @@
+"""Points that correlate less than they must: something else is seen in a part of the subset.
+
+A right match loses correlation to noise, the more the less texture its subset has; to the view, as a surface that turns
+away from one camera is blurred over more of its texture; and to what all points about it lose, such as defocus. A point
+within these is kept, however much worse than the best ones it is, and what its residuals do to it is in its standard
+deviation (:mod:`core.field.checks.residual_test`). Far beyond, it is no match of one surface.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from core.arrays import Bool, Float
+from core.cameras.stereo import StereoPair
+from core.field.checks.block_median import block_medians, reach_of, spacing_of
+from core.field.points.fitter import PointFits
+from core.field.points.starts import view_cosines
+from core.robust import MAD_TO_SIGMA
+
+_LOST_TO_VIEW = 0.015
+"""1 - zncc over the squared excess of the blur's variance, relative to one camera's own: three times what real speckle
+loses on faces of 45 degrees."""
+_MOST_EXCESS = 3.0  # a surface that is seen at half the width
+_FEW = 12
+_LEAST = 1e-7
+
+
+class CorrelationLimits(NamedTuple):
+    """Limit of 1 - zncc over what the points about a point lose: standard deviations of its logarithm, and bounds."""
+
+    sigmas: float
+    min_factor: float
+    max_factor: float
+
+
+def lost_correlation(
+    points: PointFits,
+    *,
+    pair: StereoPair,
+    shape: tuple[int, int],
+    xy_px: Float,
+    rays: Float,
+    texture: Float,
+    subset_px: int,
+    limits: CorrelationLimits,
+) -> Bool:
+    """Return (n,) True for valid points that have lost more correlation than they must.
+
+    Parameters
+    ----------
+    points
+        n = rows x columns points, row by row.
+    pair
+        The calibrated cameras.
+    shape
+        Rows and columns.
+    xy_px, rays
+        (n, 2) px and (n, 3) normalised.
+    texture
+        (n,) grey-level variance of camera 1's subset.
+    subset_px
+        Width of the subset.
+    limits
+        Allowed loss over that of the points about a point, at its own texture.
+    """
+    ok = points.ok
+    bad = np.zeros(len(ok), bool)
+    if ok.sum() < _FEW:
+        return bad
+    reach = reach_of(subset_px, spacing_of(xy_px, shape))
+    texture = np.maximum(texture, 1e-6)
+    expected = np.zeros_like(points.zncc)
+    for k in range(points.zncc.shape[1]):
+        loss = np.where(ok, np.maximum(1.0 - points.zncc[:, k], _LEAST), 1.0)
+        alike = block_medians(loss, ok, shape, reach, otherwise=float(np.median(loss[ok])))
+        energy = loss * texture
+        noise = block_medians(energy, ok, shape, reach, otherwise=float(np.median(energy[ok])))
+        level = np.maximum(alike, noise / texture)
+        excess = np.log(loss / level)
+        scatter = MAD_TO_SIGMA * block_medians(np.abs(excess), ok, shape, reach, otherwise=np.inf)
+        allowed = np.clip(np.exp(limits.sigmas * scatter), limits.min_factor, limits.max_factor)
+        if k == 2:  # of camera 2 nothing but what is new
+            level = np.maximum(level, 1.0 - points.zncc[:, 0])
+        expected[:, k] = level * allowed
+    if points.zncc.shape[1] == 3:
+        expected[:, 0] = np.inf  # both cameras at the reference: the shape was measured with it, and checked
+    with np.errstate(invalid="ignore"):
+        suspect = np.flatnonzero(ok & (1.0 - points.zncc > expected).any(axis=1))
+    if len(suspect):
+        valid = np.flatnonzero(ok)
+        view = np.zeros_like(points.zncc)
+        view[valid] = _excess_blur(points, pair, rays, valid) ** 2
+        # what the points about a point lose to the view is in what they lose
+        about = [block_medians(v, ok, shape, reach, otherwise=float(np.median(v[ok]))) for v in view.T]
+        lost = _LOST_TO_VIEW * np.maximum(view - np.stack(about, axis=1), 0.0)
+        bad[suspect] = (1.0 - points.zncc[suspect] > expected[suspect] + lost[suspect]).any(axis=1)
+    return bad
+
+
+def _excess_blur(points: PointFits, pair: StereoPair, rays: Float, index: np.ndarray) -> Float:
+    """(m, k) variance of the blur across a comparison's image, on the reference's scale, less the reference's own."""
+    own, other = view_cosines(pair, rays[index], points.w[index])
+    seen = np.maximum(other / np.maximum(own, 1e-6), 1e-6)  # width in camera 2 over that in camera 1
+    if points.zncc.shape[1] == 1:
+        return _excess(seen[:, None])
+    G = points.G[index]
+    depth = G[:, 2, 0, None, None]
+    affine = (G[:, :2, 1:3] - G[:, :2, :1] * (G[:, 2:, 1:3] / depth)) / depth
+    turned = np.maximum(np.linalg.svd(affine, compute_uv=False)[:, 1], 1e-6)
+    return _excess(np.stack([seen, turned, seen * turned], axis=1))
+
+
+def _excess(width: Float) -> Float:
+    """Of the wider view's blur, on the scale of the finer one: either of the two may be the one that is turned away."""
+    return np.minimum(np.maximum(width, 1.0 / width) ** 2 - 1.0, _MOST_EXCESS)

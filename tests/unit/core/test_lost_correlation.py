@@ -1,0 +1,44 @@
+"""A face seen aslant may correlate less than the flat part beside it; a spot in the plane may not."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from core.field.checks.lost_correlation import CorrelationLimits, lost_correlation
+from core.field.points.fitter import PointFits
+from core.status import PointStatus
+from tests.support.field_bench import grid, pair
+from tests.unit.core.test_field_parts import plane_w
+
+GRID = grid()
+XY = GRID.xy_px.reshape(-1, 2)
+RAYS = pair().cam1.rays_cam(XY).xyz_mm
+
+
+def test_a_slope_keeps_its_points_and_a_spot_in_the_plane_does_not() -> None:
+    rng = np.random.default_rng(4)
+    points = PointFits.empty(len(XY), 1)
+    points.status[:] = PointStatus.OK
+    # the rig's angle is some 60 degrees: the first is seen alike by both cameras, the other at 65 degrees by camera 2
+    flat, steep = plane_w(-0.55, 0.0), plane_w(-0.05, 0.0)
+    column = np.arange(len(XY)) % GRID.shape[1]
+    row = np.arange(len(XY)) // GRID.shape[1]
+    face = column >= GRID.shape[1] - 4  # narrower than what it is compared with
+    points.w[:] = np.where(face[:, None], steep, flat)
+    # of a public pair: 0.998 on flat parts, 0.991 on faces of 45 degrees
+    loss = np.where(face, 0.009, 0.002) * np.exp(0.1 * rng.standard_normal(len(XY)))
+    spot = (np.abs(column - 8) < 2) & (np.abs(row - 8) < 2)
+    loss[spot] *= 8.0
+    points.zncc[:, 0] = 1.0 - loss
+    lost = lost_correlation(
+        points,
+        pair=pair(),
+        shape=GRID.shape,
+        xy_px=XY,
+        rays=RAYS,
+        texture=np.full(len(XY), 900.0),
+        subset_px=33,
+        limits=CorrelationLimits(6.0, 2.0, 6.0),
+    )
+    assert lost[spot].all()
+    assert not lost[~spot].any()
