@@ -82,8 +82,8 @@ def test_what_was_written_comes_back(tmp_path: Path, motion: bool, curved: bool)
     single = {"zncc", "epipolar_px", "noise_grey", "covariance"}  # kept with seven digits
     for item in dataclasses.fields(Field):
         a, b = getattr(field, item.name), getattr(back, item.name)
-        if a is None:
-            assert b is None
+        if a is None or item.name == "failed_seeds_px":  # of the summary alone
+            assert not b
         elif item.name == "patch":
             assert b == a
         elif item.name == "cuts":
