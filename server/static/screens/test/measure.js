@@ -109,9 +109,10 @@ export async function measurePanel(id, test, ends, done) {
     const find = action("Find the specimen", async () => {
       found.textContent = "";
       const answer = await api.post(`/tests/${id}/region:find`, { reference: Number(reference.value), subset_px: Number(subset.value) });
+      const region = /** @type {{ polygon: [number, number][], holes?: [number, number][][] }} */ (answer.region);
       editor.change((state) => {
-        state.outline = { form: "polygon", points: /** @type {[number, number][]} */ (answer.region.polygon) };
-        state.holes = /** @type {[number, number][][]} */ (answer.region.holes ?? []);
+        state.outline = { form: "polygon", points: region.polygon };
+        state.holes = region.holes ?? [];
       });
       found.textContent = `Found: ${answer.text}. Correct it by its corners.`;
     });
