@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -10,7 +11,7 @@ from core.field.points.result import Field
 from core.field.region.region import PointGrid
 from core.measure import MeasureOptions, ReferencePair, measure_shape
 from server.formats.results.summary import summarise
-from tests.support.relief_rig import PLATEAU, Body, Feature, Texture, two_cameras
+from tests.support.relief_rig import HOLE, PLATEAU, Body, Feature, Texture, trace, two_cameras
 from tests.support.relief_truth import Part
 
 SUBSET_PX = 21
@@ -55,6 +56,19 @@ def test_all_pillars_are_reached_from_any_corner_of_the_region(
     assert found.empty_faces == []
     assert found.unreached <= 0.01  # asked; what the validity checks refuse is theirs
     assert found.wrong == 0  # subsets on two faces included
+
+
+def test_the_rim_of_a_hole_is_not_extended_into_it() -> None:
+    hole = Feature(HOLE, (1.0, 0.5), (4.0, 4.0), 3.5)
+    part = Part(two_cameras((200, 180)), (Body((hole,), texture=Texture(wavelength_mm=0.7)),))
+    grid = PointGrid.rectangle(20.0, 20.0, 180.0, 160.0, spacing_px=3.0)
+    field = measure_shape(part.pair, *part.images(), grid, MeasureOptions(subset_px=27))
+    face = trace(part.cameras[0], part.bodies, grid.xy_px).face
+    # by a sixth of a subset at most: so far the subset's centre holds some of the surface
+    there = cv2.distanceTransform((face < 0).astype(np.uint8), cv2.DIST_L2, 5) * 3.0
+    assert (there > 15.0).any()
+    assert not (field.valid & (there > 27.0 / 6.0 + 3.0)).any()
+    assert field.valid[there == 0.0].mean() > 0.6
 
 
 def test_a_given_seed_adds_to_the_automatic_ones(steps: Part, images: tuple[np.ndarray, np.ndarray]) -> None:

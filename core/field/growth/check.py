@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from core.field.checks.blank_centres import centre_px, reject_blank_centres
 from core.field.checks.edges import reject_near_edges
 from core.field.checks.residual_test import residual_test
 from core.field.checks.straddling import reject_straddling
@@ -54,7 +55,7 @@ def fill(inputs: FieldInputs, state: GrowthState) -> GrowthState:
 
 
 def check_edges(inputs: FieldInputs, state: GrowthState) -> None:
-    """Reject the points of a shape whose subset lies on two faces; a motion measures none of these."""
+    """Reject the points of a shape whose subset lies on two faces or whose centre is plain; a motion measures none."""
     if state.fitter.comparisons == 3:
         return
     rejected = reject_straddling(
@@ -66,6 +67,16 @@ def check_edges(inputs: FieldInputs, state: GrowthState) -> None:
         spacing_px=inputs.grid.spacing_px,
         cancel=inputs.cancel,
     )
+    options = inputs.options
+    if not state.points.ok.all():
+        rejected += reject_blank_centres(
+            state.points,
+            shape=inputs.grid.shape,
+            texture=inputs.texture,
+            centre_texture=inputs.ref1.subset_variance(inputs.xy_px, centre_px(options.subset_px)),
+            subset_px=options.subset_px,
+            spacing_px=inputs.grid.spacing_px,
+        )
     if rejected:
         check(inputs, state.points)
 
