@@ -6,19 +6,25 @@ quadratic surface through the points' offsets has little noise left, so hundredt
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
 
+from core.arrays import Bool, Float
+from core.field.checks.block_median import block_medians
 from core.field.points.result import Field
 from core.field.region.trend import smooth_terms
+from core.robust import MAD_TO_SIGMA
 
 Level = Literal["ok", "warning", "failed"]
 
 WARNING_PX, FAILED_PX = 0.05, 0.1
 _MIN_POINTS_FOR_SURFACE = 60
 _MIN_POINTS = 4
+MISFIT_PX, MISFIT_MAX_PX = 0.01, 0.02
+"""Variation beyond a quadratic from which on it is stated: root mean square, and local over the noise."""
+_BLOCKS, _MIN_REACH = 12, 3  # blocks along the longer side of the field, points of a block at least
 
 
 @dataclass(frozen=True)
@@ -35,17 +41,25 @@ class EpipolarCheck:
     own_px
         The calibration's own, from the residuals of its grid; None where it is not known (it counts as zero).
     reason
-        One sentence.
+        One sentence, and another where there is a misfit.
+    misfit_px, misfit_max_px
+        Root mean square and largest value of what the offset's local medians leave over the smooth part, less the
+        noise: a shape that no moved camera makes, so an error of the lens model or of the calibration.
+    misfit_um
+        ``misfit_px`` on the surface; None where the points' distance is not known.
     """
 
     level: Level
     offset_px: float
     own_px: float | None
     reason: str
+    misfit_px: float = 0.0
+    misfit_max_px: float = 0.0
+    misfit_um: float | None = None
 
     def document(self) -> dict[str, Any]:
         """Return the check as plain numbers and texts."""
-        return {"level": self.level, "offset_px": self.offset_px, "own_px": self.own_px, "reason": self.reason}
+        return asdict(self)
 
 
 def check_epipolar(field: Field, rbe_px: float | None, *, imported: bool = False) -> EpipolarCheck | None:
@@ -88,4 +102,39 @@ def check_epipolar(field: Field, rbe_px: float | None, *, imported: bool = False
         text += "; the imported calibration's own error is not known: hold later steps against the reference"
     elif level != "ok":
         text += "; a camera was moved since, or the calibration belongs to another set-up: calibrate again"
-    return EpipolarCheck(level, found, own, text)
+    rms, largest = _misfit(valid, offset - smooth)
+    um = _um_per_px(field)
+    um = None if um is None else rms * um
+    if rms > MISFIT_PX or largest > MISFIT_MAX_PX:
+        about = "" if um is None else f", about {um:.2g} um on the surface"
+        text += (
+            f"; beyond what a moved camera does, the offset varies by {rms:.3f} px rms ({largest:.3f} px at most)"
+            f"{about}: an error of the lens model or of the calibration, which no point's uncertainty holds"
+        )
+    return EpipolarCheck(level, found, own, text, rms, largest, um)
+
+
+def _misfit(valid: Bool, rest_px: Float) -> tuple[float, float]:
+    """Root mean square and largest value of the local medians of what is left (n,) at valid points, less noise."""
+    rows, cols = valid.shape
+    if len(rest_px) < _MIN_POINTS_FOR_SURFACE:
+        return 0.0, 0.0
+    on_grid = np.zeros(valid.shape)
+    on_grid[valid] = rest_px
+    reach = max(_MIN_REACH, max(rows, cols) // _BLOCKS)
+    medians = block_medians(on_grid.ravel(), valid.ravel(), valid.shape, reach, otherwise=0.0)[valid.ravel()]
+    # neighbours within a subset share their noise, so that a block's median keeps more of it than of independent points
+    noise = MAD_TO_SIGMA * float(np.median(np.abs(rest_px - medians)))
+    square = float(np.mean(medians**2)) - (noise / 2.0) ** 2
+    if square <= 0.0:
+        return 0.0, 0.0
+    return float(np.sqrt(square)), max(float(np.abs(medians).max()) - noise, 0.0)
+
+
+def _um_per_px(field: Field) -> float | None:
+    """Median length of a pixel of camera 1 on the surface, um."""
+    along = np.linalg.norm(np.diff(field.xyz_mm, axis=1), axis=-1) if field.shape[1] > 1 else np.empty(0)
+    along = along[np.isfinite(along)] if along.size else along
+    if not along.size:
+        return None
+    return float(1e3 * np.median(along) / (field.x_px[0, 1] - field.x_px[0, 0]))
