@@ -151,6 +151,7 @@ class SettingsRecord(Record):
     subset_px: float | None = None
     spacing_px: float | None = None
     prefilter_px: float | None = None
+    max_sigma_px: float | None = None
     interpolation: str | None = None
     reference_update: str | None = None
     patch: str | None = None

@@ -59,6 +59,13 @@ def analysis(source: Source, measured: Measured, found: Geometry | None) -> list
             None if interpolation is None else Value(f"{interpolation} B-spline", None, SETTINGS),
             needs,
         ),
+        one(
+            "max_sigma",
+            "Largest sigma of a match",
+            length(settings.max_sigma_px),
+            needs,
+            "points beyond it are rejected",
+        ),
         one("reference_update", "Reference", _reference(settings), needs, _matched(measured)),
         one("smoothing", "Smoothing of displacements", _smoothing(measured)),
         *_strain_items(source, measured),

@@ -171,6 +171,7 @@ export async function measurePanel(id, test, ends, done) {
     const patch = select([["auto", "auto: affine or quadratic"], ["affine", "affine (plane)"], ["rigid", "rigid (the paper's)"], ["quadratic", "quadratic (curved)"]], "auto");
     const interpolation = select([["quintic", "quintic B-spline"], ["cubic", "cubic B-spline"]], "quintic");
     const prefilter = number(0, { min: 0, max: 64 });
+    const maxSigma = number(0.1, { min: 0.001, max: 1, step: "any" });
     const smoothing = number(null, { min: 3, step: 2, placeholder: "none" });
     const strain = h("input", { type: "checkbox", checked: true });
     const window_ = number(9, { min: 3, step: 2 });
@@ -196,7 +197,7 @@ export async function measurePanel(id, test, ends, done) {
       if (!region) throw api.problemOf({ cause: "There is no region.", remedy: "Draw a rectangle or a polygon over camera 1's image." });
       /** @type {Request} */
       const body_ = {
-        kind: /** @type {Request["kind"]} */ (kind.value), region, subset_px: Number(subset.value), spacing_px: Number(spacing.value), patch: /** @type {Request["patch"]} */ (patch.value), interpolation: /** @type {Request["interpolation"]} */ (interpolation.value), prefilter_px: Number(prefilter.value),
+        kind: /** @type {Request["kind"]} */ (kind.value), region, subset_px: Number(subset.value), spacing_px: Number(spacing.value), patch: /** @type {Request["patch"]} */ (patch.value), interpolation: /** @type {Request["interpolation"]} */ (interpolation.value), prefilter_px: Number(prefilter.value), max_sigma_px: Number(maxSigma.value),
         reference: Number(reference.value), reference_update: /** @type {Request["reference_update"]} */ (update.value), noise_id: noiseChoice.value || null, label: label.value, ...editor.seeds(),
         smoothing_window: smoothing.value === "" ? null : Number(smoothing.value), strain: strain.checked ? /** @type {Request["strain"]} */ ({ window: Number(window_.value), order: order.value === "auto" ? "auto" : Number(order.value), tensor: tensor.value }) : null,
       };
@@ -239,7 +240,7 @@ export async function measurePanel(id, test, ends, done) {
             h("div.row", h("label.check", showSample, "draw them to scale"), h("button", { type: "button", onclick: () => views[0].centreOn(...editor.middle(), 6) }, "Zoom to the subsets"), h("label.check", showTexture, "texture map"), legend), texture)),
         h("div",
           h("fieldset", h("legend", "Correlation"),
-            h("div.fields", field("Measure", kind), field("Shape function", patch), field("Interpolation", interpolation), field("Prefilter, sd", prefilter, "px", "0: none"), field("Noise", noiseChoice),
+            h("div.fields", field("Measure", kind), field("Shape function", patch), field("Interpolation", interpolation), field("Prefilter, sd", prefilter, "px", "0: none"), field("Largest sigma of a match", maxSigma, "px", "points beyond it are rejected"), field("Noise", noiseChoice),
               field("Reference is updated", update), field("Smoothing window", smoothing, "points", "odd; empty: none"))),
           h("fieldset", h("legend", "Strain"), h("label.check", strain, "compute strain"), h("div.fields", field("Window", window_, "points", "odd"), field("Fit", order), field("Tensor", tensor)), gauge),
           h("div.fields", field("Steps", which, "", "such as 1-5, 8; empty: all"), field("Label", label)), h("label.check", follow_, "continue with each new step"),
