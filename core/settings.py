@@ -179,6 +179,11 @@ class AnalysisSettings(Settings):
         description="Standard deviation of a point's match in any image, in depth too, px, beyond which it is "
         "rejected: larger keeps what is uncertain, with its standard deviation; smaller keeps what is sure.",
     )
+    keep_rejected: bool = Field(
+        False,
+        description="Keep what was measured at rejected points, apart and without uncertainty: `rejected_*` of the "
+        "result files. To look at, not to use.",
+    )
     seeds: Annotated[list[PixelPosition], Field(min_length=1, max_length=MAX_SEEDS)] | None = Field(
         None, description="Start points in camera 1's reference image; found automatically if left out."
     )

@@ -47,6 +47,8 @@ class MeasureOptions:
     noise
         Noise models of camera 1 and camera 2 (:func:`core.noise.measure_noise`): they weigh the pixels and give the
         covariances. None: noise from the residuals of each match, all pixels alike.
+    keep_rejected
+        Keep, apart, the numbers of points that a check rejects.
     """
 
     subset_px: int = SUBSET_PX.default
@@ -56,6 +58,7 @@ class MeasureOptions:
     validity: ValidityOptions = field(default_factory=ValidityOptions)
     prefilter_px: float = 0.0
     noise: tuple[NoiseModel | None, NoiseModel | None] = (None, None)
+    keep_rejected: bool = False
 
     def __post_init__(self) -> None:
         check_subset(self.subset_px)
@@ -80,6 +83,7 @@ class MeasureOptions:
             prefilter_px=settings.prefilter_px,
             noise=noise,
             validity=ValidityOptions(max_sigma_px=settings.max_sigma_px),
+            keep_rejected=settings.keep_rejected,
         )
 
     @property

@@ -157,6 +157,7 @@ def prepare(
         options=options.match_options(),
         min_zncc=options.min_zncc,
         visibility=grid.visibility,
+        keep_rejected=options.keep_rejected,
     )
     compared = None if blur is None else matcher.ref1
     texture = ref1.subset_variance(xy_px, subset_px, compared)

@@ -8,7 +8,7 @@ from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.field.points.fitter import PointFits
 from core.field.points.patch import PatchChoice
-from core.field.points.result import Field
+from core.field.points.result import Field, Rejected
 from core.field.points.starts import Starts
 from core.field.region.region import PointGrid
 from core.matching.geometry import (
@@ -19,6 +19,27 @@ from core.matching.geometry import (
     shape_geometry,
 )
 from core.status import PointStatus
+
+
+def _rejected(points: PointFits, pair: StereoPair, grid: PointGrid) -> Rejected | None:
+    """What was measured at points that were rejected in the end."""
+    w, G, epipolar, zncc = (points.rejected_w, points.rejected_g, points.rejected_epipolar_px, points.rejected_zncc)
+    if w is None or G is None or epipolar is None or zncc is None:
+        return None
+    n = len(points.status)
+    index = np.flatnonzero(~points.ok & np.isfinite(epipolar) & np.isfinite(w).all(axis=1))
+    xy = grid.xy_px.reshape(-1, 2)[index]
+
+    def spread(values: Float) -> Float:
+        out = np.full((n, *values.shape[1:]), np.nan)
+        out[index] = values
+        return out.reshape(*grid.shape, *values.shape[1:])
+
+    motion = zncc.shape[1] == 3
+    with np.errstate(invalid="ignore", divide="ignore"):
+        xyz = shape_geometry(pair, xy, w[index]).xyz_mm
+        uvw = motion_geometry(pair, xy, w[index], G[index]).uvw_mm if motion else None
+    return Rejected(spread(xyz), None if uvw is None else spread(uvw), spread(zncc[index]), spread(epipolar[index]))
 
 
 def assemble(
@@ -99,5 +120,6 @@ def assemble(
         curvature_per_mm=spread_over_grid(principal_curvatures(pair, xy, w), 2) if w.shape[1] == 6 else None,
         patch=patch,
         cuts=grid.cuts,
+        rejected=_rejected(points, pair, grid),
         starts=Starts(spread_over_grid(w, w.shape[1]), spread_over_grid(G, 3, w.shape[1]) if motion else None),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from core.status import PointStatus
 
 _MAX_EPIPOLAR_PX = 3.0
 _MAX_SHEAR = 4.0
+_KEPT = ("w", "G", "epipolar_px", "zncc")
 
 
 @dataclass(eq=False)
@@ -38,6 +40,8 @@ class PointFits:
         (n,) int32.
     status
         (n,) int8.
+    rejected_w, rejected_g, rejected_epipolar_px, rejected_zncc
+        The same numbers as they were when a check rejected the point, NaN where none did; None: not kept.
     """
 
     w: Float
@@ -49,6 +53,16 @@ class PointFits:
     covariance: Float
     iterations: NDArray[np.int32]
     status: NDArray[np.int8]
+    rejected_w: Float | None = None
+    rejected_g: Float | None = None
+    rejected_epipolar_px: Float | None = None
+    rejected_zncc: Float | None = None
+
+    def keep_rejected(self) -> PointFits:
+        """Keep the numbers of points that are rejected from now on; returns itself."""
+        for name in _KEPT:
+            setattr(self, f"rejected_{name.lower()}", np.full(getattr(self, name).shape, np.nan))
+        return self
 
     @staticmethod
     def empty(n: int, comparisons: int, terms: int = 3) -> PointFits:
@@ -77,17 +91,32 @@ class PointFits:
         return np.where(self.ok, np.nan_to_num(self.zncc, nan=-1.0).min(axis=1), -1.0)
 
     def put(self, index: NDArray[np.intp], other: PointFits) -> None:
-        """Write ``other``'s points to the indices ``index``."""
+        """Write ``other``'s points to the indices ``index``; what is kept of rejected ones stays until they are ok."""
         for f in fields(self):
-            getattr(self, f.name)[index] = getattr(other, f.name)
+            if not f.name.startswith("rejected_"):
+                getattr(self, f.name)[index] = getattr(other, f.name)
+        if self.rejected_w is None:
+            return
+        for name in _KEPT:
+            mine, theirs = getattr(self, f"rejected_{name.lower()}"), getattr(other, f"rejected_{name.lower()}")
+            mine[index[other.ok]] = np.nan
+            if theirs is not None:
+                there = np.isfinite(other.rejected_epipolar_px)  # type: ignore[arg-type]
+                mine[index[there]] = theirs[there]
 
     def take(self, index: NDArray[np.intp]) -> PointFits:
         """Return a copy of the points ``index``."""
-        return PointFits(**{f.name: getattr(self, f.name)[index].copy() for f in fields(self)})
+        arrays: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        part: dict[str, Any] = {name: None if a is None else a[index].copy() for name, a in arrays.items()}
+        return PointFits(**part)
 
     def reject(self, which: Bool, status: PointStatus) -> None:
         """Reject points: their numbers become NaN, their status the reason."""
         self.status[which] = status
+        if self.rejected_w is not None:
+            known = np.asarray(which) & np.isfinite(self.epipolar_px)
+            for name in _KEPT:
+                getattr(self, f"rejected_{name.lower()}")[known] = getattr(self, name)[known]
         for name in ("w", "G", "epipolar_px", "epipolar_sigma_px", "covariance"):
             getattr(self, name)[which] = np.nan
 
@@ -100,6 +129,8 @@ class Fitter:
     ----------
     min_zncc
         Correlation below which no comparison counts as a match.
+    keep_rejected
+        Keep the numbers of points that a check rejects.
     visibility
         The points' visibility; None: all of every subset.
     """
@@ -112,6 +143,7 @@ class Fitter:
     options: MatchOptions
     min_zncc: float
     visibility: Visibility | None = None
+    keep_rejected: bool = False
 
     @property
     def comparisons(self) -> int:
@@ -125,7 +157,8 @@ class Fitter:
 
     def empty(self, n: int) -> PointFits:
         """Return n points not yet reached."""
-        return PointFits.empty(n, self.comparisons, self.terms)
+        points = PointFits.empty(n, self.comparisons, self.terms)
+        return points.keep_rejected() if self.keep_rejected else points
 
     def shape_only(self) -> Fitter:
         """Return the fitter of the reference's shape."""
@@ -158,6 +191,8 @@ class Fitter:
             fits = PointFits(
                 m.w, m.G, m.zncc, m.epipolar_px, m.epipolar_sigma_px, m.noise, m.covariance, m.iterations, m.status
             )
+        if self.keep_rejected:
+            fits.keep_rejected()
         with np.errstate(invalid="ignore"):
             low = fits.ok & ~(fits.zncc.min(axis=1) >= self.min_zncc)
             fits.reject(low, PointStatus.LOW_CORRELATION)

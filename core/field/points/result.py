@@ -38,6 +38,26 @@ class References:
     pattern_px2: Float
 
 
+@dataclass(frozen=True, eq=False)
+class Rejected:
+    """What was measured at (r, c) points that a check rejected; NaN elsewhere.
+
+    Attributes
+    ----------
+    xyz_mm, uvw_mm
+        (r, c, 3) position and, of a motion, displacement, system frame.
+    zncc
+        (r, c, k).
+    epipolar_px
+        (r, c).
+    """
+
+    xyz_mm: Float
+    uvw_mm: Float | None
+    zncc: Float
+    epipolar_px: Float
+
+
 @dataclass(frozen=True)
 class Field:
     """Shape, and where a motion was measured displacement, at (r, c) points.
@@ -90,6 +110,8 @@ class Field:
         (r, c, 3 or 6, k) common factor F, mm for unit causes: what the points share of the uncertainty, from the
         calibration. The whole covariance of points i and j is that of their matching plus F_i F_j'. None where the
         calibration's covariance is not known.
+    rejected
+        What was measured at rejected points; None unless it was asked for.
     starts
         The matcher's own unknowns, (r, c, ...), from which the next step of a sequence starts; not part of a result
         file, None in a field that was read from one.
@@ -119,6 +141,7 @@ class Field:
     smoothing: Smoothing | None = None
     cuts: Cuts | None = None
     common: Float | None = None
+    rejected: Rejected | None = None
     starts: Starts | None = None
     failed_seeds_px: tuple[tuple[float, float], ...] = ()
 

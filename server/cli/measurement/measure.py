@@ -106,6 +106,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PX",
         help=f"reject points whose match, in depth too, has a larger standard deviation ({DEFAULT_MAX_SIGMA_PX:g})",
     )
+    add("--keep-rejected", action="store_true", help="keep what was measured at rejected points, apart: rejected_*")
     add(
         "--seed",
         action="append",
@@ -272,6 +273,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
             "interpolation": args.interpolation,
             "prefilter_px": prefilter_px,
             "max_sigma_px": _max_sigma_px(args),
+            "keep_rejected": args.keep_rejected,
             "seeds": None if seeds is None else [seed.xy_px for seed in seeds],
             "seeds_cam2": None if seeds is None else [seed.xy2_px for seed in seeds],
             "smoothing_window": _smoothing_window(args),

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.field.points.result import Field, References
+from core.field.points.result import Field, References, Rejected
 from core.field.region.cuts import Cuts, as_arrays
 from core.status import STATUS_MEANINGS, PointStatus
 from core.strain import StrainField
@@ -143,6 +143,8 @@ def fill(dataset: Any, result: Field, provenance: Provenance, strain: StrainFiel
     )
     dataset.variables["zncc"].comparisons = " ".join(COMPARISONS[: result.zncc.shape[-1]])
     _put_covariance(dataset, result, sparse=sparse)
+    if result.rejected is not None:
+        _put_rejected(dataset, result.rejected)
     if result.cuts:
         _put_cuts(dataset, result.cuts)
     if strain is not None:
@@ -213,6 +215,44 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
             dtype="f4",
             sparse=sparse,
         )
+
+
+def _put_rejected(dataset: Any, rejected: Rejected) -> None:
+    of_point = [("x_mm", rejected.xyz_mm[..., 0]), ("y_mm", rejected.xyz_mm[..., 1]), ("z_mm", rejected.xyz_mm[..., 2])]
+    if rejected.uvw_mm is not None:
+        of_point += [(f"{name}_mm", rejected.uvw_mm[..., k]) for k, name in enumerate("uvw")]
+    what = "at a point that a check rejected, see its status; not checked, without uncertainty"
+    for name, values in of_point:
+        _put(
+            dataset,
+            f"rejected_{name}",
+            values,
+            ("row", "col"),
+            units="mm",
+            long_name=f"{name} {what}",
+            dtype="f8",
+            sparse=True,
+        )
+    _put(
+        dataset,
+        "rejected_epipolar_px",
+        rejected.epipolar_px,
+        ("row", "col"),
+        units="pixel",
+        long_name=f"offset across the epipolar line {what}",
+        dtype="f4",
+        sparse=True,
+    )
+    _put(
+        dataset,
+        "rejected_zncc",
+        rejected.zncc,
+        ("row", "col", "comparison"),
+        units="1",
+        long_name=f"correlation of each comparison {what}",
+        dtype="f4",
+        sparse=True,
+    )
 
 
 def _put_cuts(dataset: Any, cuts: Cuts) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import netCDF4
 import numpy as np
 
-from core.field.points.result import Field, References
+from core.field.points.result import Field, References, Rejected
 from core.field.points.smoothing_record import Smoothing
 from core.status import STATUS_MEANINGS, PointStatus
 from core.strain import STRAIN_STATUS_MEANINGS, StrainOptions, surface_strain
@@ -133,7 +133,10 @@ def _everything() -> tuple[Field, Field]:
         raw=0,
     )
     common = np.zeros((*field.shape, 6, 1))
-    field = replace(field, curvature_per_mm=np.zeros((*field.shape, 2)), references=references, common=common)
+    rejected = Rejected(field.xyz_mm, field.uvw_mm, field.zncc, field.epipolar_px)
+    field = replace(
+        field, curvature_per_mm=np.zeros((*field.shape, 2)), references=references, common=common, rejected=rejected
+    )
     return replace(field, smoothing=smoothing, covariance=2.0 * field.covariance), field
 
 
