@@ -21,9 +21,8 @@ def test_a_wrong_match_that_was_refused_can_be_looked_at(tmp_path: Path) -> None
     now[1][100:112, 110:122] = now[1][100:112, 160:172]  # a patch of something else in camera 2 at t
     grid = bench.grid(spacing_px=4.0)
     options = MeasureOptions(subset_px=21, keep_rejected=True)
-    assert (
-        ReferencePair(bench.pair(), *first).motion(*now, grid, replace(options, keep_rejected=False)).rejected is None
-    )
+    without = replace(options, keep_rejected=False)
+    assert ReferencePair(bench.pair(), *first).motion(*now, grid, without).rejected is None
     field = ReferencePair(bench.pair(), *first).motion(*now, grid, options)
     kept = field.rejected
     assert kept is not None

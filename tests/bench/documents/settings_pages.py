@@ -16,6 +16,7 @@ OPTIONS = {
     "patch": "`--patch`",
     "interpolation": "`--interpolation`",
     "prefilter_px": "`--prefilter`",
+    "keep_rejected": "`--keep-rejected`",
     "max_sigma_px": "`--max-sigma`",
     "seeds": "`--seed`",
     "seeds_cam2": "`--seed X,Y,X2,Y2`",
