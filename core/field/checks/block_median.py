@@ -11,11 +11,16 @@ _FEW = 12
 
 
 def spacing_of(xy_px: Float, shape: tuple[int, int]) -> float:
-    """Return the distance of neighbouring points of a grid, px, from their positions (n, 2) row by row."""
+    """Return the median distance of neighbouring points, px, from their positions (n, 2) row by row.
+
+    Points of a later reference lie where they have moved; those that it does not show may lie anywhere.
+    """
     rows, cols = shape
-    if cols > 1:
-        return float(np.hypot(*(xy_px[1] - xy_px[0])))
-    return float(np.hypot(*(xy_px[cols] - xy_px[0]))) if rows > 1 else 1.0
+    grid = xy_px.reshape(rows, cols, 2)
+    steps = np.diff(grid, axis=1) if cols > 1 else np.diff(grid, axis=0)
+    distance = np.hypot(steps[..., 0], steps[..., 1])
+    known = distance[np.isfinite(distance) & (distance > 0.0)]
+    return float(np.median(known)) if known.size else 1.0
 
 
 def reach_of(subset_px: int, spacing_px: float) -> int:
@@ -23,7 +28,9 @@ def reach_of(subset_px: int, spacing_px: float) -> int:
     return int(np.clip(np.ceil(_REACH_SUBSETS * subset_px / spacing_px), _MIN_REACH, _MAX_REACH))
 
 
-def block_medians(values: Float, known: Bool, shape: tuple[int, int], reach: int, *, otherwise: float) -> Float:
+def block_medians(
+    values: Float, known: Bool, shape: tuple[int, int], reach: int, *, otherwise: float, quantile: float = 0.5
+) -> Float:
     """Return (n,) the median of the known values about each point; ``otherwise`` where there are too few.
 
     Parameters
@@ -36,6 +43,8 @@ def block_medians(values: Float, known: Bool, shape: tuple[int, int], reach: int
         Points; the median is that of a block ``reach`` points wide and of as many about it.
     otherwise
         Value where fewer than a dozen are known.
+    quantile
+        Another one than the median.
     """
     rows, cols = shape
     level, used = values.reshape(shape), known.reshape(shape)
@@ -48,5 +57,7 @@ def block_medians(values: Float, known: Bool, shape: tuple[int, int], reach: int
             )
             there = level[about][used[about]]
             if len(there) >= _FEW:
-                out[top : top + reach, left : left + reach] = np.median(there)
+                out[top : top + reach, left : left + reach] = (
+                    np.median(there) if quantile == 0.5 else np.quantile(there, quantile)
+                )
     return out.ravel()

@@ -23,6 +23,10 @@ _LOST_TO_VIEW = 0.015
 """1 - zncc over the squared excess of the blur's variance, relative to one camera's own: three times what real speckle
 loses on faces of 45 degrees."""
 _MOST_EXCESS = 3.0  # a surface that is seen at half the width
+_SIGMAS_OF_QUARTER, _SIGMAS_OF_TENTH = 0.6745, 1.2816  # below the middle of a normal distribution
+_LEAST_IN_TIME = 1.35
+_FINE = 2.0
+_WIDER = 3  # so far about a point that a crack is in a small part of it
 _FEW = 12
 _LEAST = 1e-7
 
@@ -81,6 +85,12 @@ def lost_correlation(
         excess = np.log(loss / level)
         scatter = MAD_TO_SIGMA * block_medians(np.abs(excess), ok, shape, reach, otherwise=np.inf)
         allowed = np.clip(np.exp(limits.sigmas * scatter), limits.min_factor, limits.max_factor)
+        if k == 1:
+            best, strict = _of_the_best(loss, texture, ok, shape, _WIDER * reach, limits)
+            # a face that loses much between the cameras before anything moves is a fine texture: it loses in time, too
+            first = np.where(ok, np.maximum(1.0 - points.zncc[:, 0], _LEAST), 1.0)
+            fine = first > _FINE * _of_the_best(first, texture, ok, shape, _WIDER * reach, limits)[0]
+            level, allowed = np.where(fine, level, best), np.where(fine, allowed, strict)
         if k == 2:  # of camera 2 nothing but what is new
             level = np.maximum(level, 1.0 - points.zncc[:, 0])
         expected[:, k] = level * allowed
@@ -97,6 +107,27 @@ def lost_correlation(
         lost = _LOST_TO_VIEW * np.maximum(view - np.stack(about, axis=1), 0.0)
         bad[suspect] = (1.0 - points.zncc[suspect] > expected[suspect] + lost[suspect]).any(axis=1)
     return bad
+
+
+def _of_the_best(
+    loss: Float, texture: Float, ok: Bool, shape: tuple[int, int], reach: int, limits: CorrelationLimits
+) -> tuple[Float, Float]:
+    """Level and allowed factor of camera 1 in time, from the points about a point that lose least.
+
+    View and lens are the same in both images, so that all points of a texture lose alike but for noise. An open crack
+    takes more from half of the points about it, whose median is then no measure.
+    """
+    energy = np.log(loss * texture)
+
+    def lower(values: Float, quantile: float) -> Float:
+        return block_medians(
+            values, ok, shape, reach, otherwise=float(np.quantile(values[ok], quantile)), quantile=quantile
+        )
+
+    quarter = lower(energy, 0.25)
+    scatter = np.maximum((quarter - lower(energy, 0.1)) / (_SIGMAS_OF_TENTH - _SIGMAS_OF_QUARTER), 0.0)
+    level = np.exp(quarter + _SIGMAS_OF_QUARTER * scatter) / texture
+    return level, np.clip(np.exp(limits.sigmas * scatter), _LEAST_IN_TIME, limits.max_factor)
 
 
 def _excess_blur(points: PointFits, pair: StereoPair, rays: Float, index: np.ndarray) -> Float:
