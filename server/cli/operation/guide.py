@@ -95,12 +95,14 @@ class _Session:
         path = f"/calibrations/{self.calibration_id}/guide"
         while True:
             state = self.client.get(path)
+            guidance = state["guidance"]
+            new = guidance is not None and guidance["taken"] != self._taken
+            if new:
+                self._taken, self._last = guidance["taken"], guidance
+                self._tell(guidance)  # of the last view, too, after which the acquisition may be over
             if state["state"] != "acquiring":
                 return
-            guidance = state["guidance"]
-            if guidance is not None and guidance["taken"] != self._taken:
-                self._taken, self._last = guidance["taken"], guidance
-                self._tell(guidance)
+            if new:
                 if self.most_views is not None and guidance["used"] >= self.most_views:
                     self.client.call("POST", f"{path}:finish")
                 elif self.hand is not None and guidance["proposal"] is not None:
