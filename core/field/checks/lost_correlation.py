@@ -24,7 +24,7 @@ _LOST_TO_VIEW = 0.015
 loses on faces of 45 degrees."""
 _MOST_EXCESS = 3.0  # a surface that is seen at half the width
 _SIGMAS_OF_QUARTER, _SIGMAS_OF_TENTH = 0.6745, 1.2816  # below the middle of a normal distribution
-_LEAST_IN_TIME = 1.35
+_LEAST_IN_TIME = 0.675  # of the bound where something may have changed the view
 _FINE = 2.0
 _WIDER = 3  # so far about a point that a crack is in a small part of it
 _FEW = 12
@@ -127,7 +127,8 @@ def _of_the_best(
     quarter = lower(energy, 0.25)
     scatter = np.maximum((quarter - lower(energy, 0.1)) / (_SIGMAS_OF_TENTH - _SIGMAS_OF_QUARTER), 0.0)
     level = np.exp(quarter + _SIGMAS_OF_QUARTER * scatter) / texture
-    return level, np.clip(np.exp(limits.sigmas * scatter), _LEAST_IN_TIME, limits.max_factor)
+    least = max(_LEAST_IN_TIME * limits.min_factor, 1.0)
+    return level, np.clip(np.exp(limits.sigmas * scatter), least, limits.max_factor)
 
 
 def _excess_blur(points: PointFits, pair: StereoPair, rays: Float, index: np.ndarray) -> Float:
