@@ -68,6 +68,12 @@ HEADLINES: dict[tuple[str, str], dict[str, str]] = {
     ("calibration", "A wrong calibration"): {
         "camera 2's cy wrong by 0.1 px: mean false displacement, worst component": "false displacement, camera 2 off by 0.1 px"
     },
+    ("faces", "Plate with wedges"): {
+        "27 px, 20 placements: found of the points on one face, least": "wedges and steps without a seed: found of the points on one face"
+    },
+    ("coverage", "Does the calibration's part cover"): {
+        "grid of 4 um: length of 25 mm, within 95 %": "lengths within their 95 % interval, grid known to 4 um"
+    },
     ("any_rig", "Lenses"): {
         "p1 p2 of 3e-4: true shape error, rms (20 opencv5, 20 good)": "shape error after calibration of a decentred lens",
         "p1 p2 of 3e-4: reported over true": "reported over true shape error, the same",
