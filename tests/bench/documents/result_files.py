@@ -100,7 +100,7 @@ or steps share the second part, so that
 
 ```python
 own_a, own_b = covariance[a] - F[a] @ F[a].T, covariance[b] - F[b] @ F[b].T
-variance_of_b_minus_a = own_a + own_b + (F[b] - F[a]) @ (F[b] - F[a]).T    # apart by a subset or more
+variance_of_b_minus_a = own_a + own_b + (F[b] - F[a]) @ (F[b] - F[a]).T  # apart by a subset or more
 ```
 
 Without `common_factor` the calibration's covariance is not known, and its part not included (attribute `includes`).
