@@ -44,8 +44,6 @@ class RigidMotion:
         (3,) c.
     covariance
         (6, 6) of the rotation vector (rad) and the translation (mm).
-    small_covariance
-        (6, 6) the same with the small rotation that follows R in place of the rotation vector.
     points
         Number of points with a weight above zero.
     residual_rms_mm
@@ -59,14 +57,13 @@ class RigidMotion:
     translation_mm: Float
     centre_mm: Float
     covariance: Float
-    small_covariance: Float
     points: int
     residual_rms_mm: float
     noise_ratio: float
     gain: Float
     """(r, c, 6, 3) the fit's derivative over each point's r, zero for points without weight."""
     own_covariance: Float
-    """(6, 6) ``small_covariance`` without the common part."""
+    """(6, 6) of the small rotation that follows R and the translation, without the common part."""
     common: Float | None
     """(6, k) common factor of the small rotation and the translation; None where the field has none."""
     sigma_common: Float
@@ -150,7 +147,6 @@ def rigid_motion(
         translation_mm=d,
         centre_mm=centre,
         covariance=to_vector @ small @ to_vector.T,
-        small_covariance=small,
         points=int(kept.sum()),
         residual_rms_mm=float(np.sqrt(np.mean(np.sum(r[kept] ** 2, axis=1)))),
         noise_ratio=float(np.sqrt(np.mean(distance2[kept]) / 3.0)),
