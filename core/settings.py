@@ -6,6 +6,7 @@ models; the functions of `core` take their bounds and defaults from here.
 
 from __future__ import annotations
 
+from statistics import NormalDist
 from typing import Annotated, Any, Literal, NamedTuple, Self, get_args
 
 from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -60,6 +61,9 @@ SMOOTHING_WINDOW = Range(3, 51, True, 5)
 PREFILTER_OF_SUBSET = 0.25
 #: beyond it a match is as likely one speckle off
 MAX_SIGMA_PX = 1.0
+#: nobody knows a distribution's tails so far out
+MAX_COVERAGE_FACTOR = 10.0
+MAX_COVERAGE = 0.999999
 MAX_SEEDS = MAX_CUTS = 100
 MAX_CORNERS = 1000
 
@@ -274,3 +278,40 @@ class StoredSettings(AnalysisSettings):
     region: StoredRegion = Field(description="Region of interest.")
     reference: int = Field(0, description="Reference step.")
     noise: NoiseRecord | None = Field(None, description="Noise models that weighed the pixels; null: none.")
+
+
+class CoverageFields(BaseModel):
+    """How wide the interval is that is stated beside a value; by default one standard uncertainty."""
+
+    k: Annotated[Real, Field(gt=0.0, le=MAX_COVERAGE_FACTOR)] | None = Field(
+        None,
+        description="Coverage factor: expanded uncertainties are k standard uncertainties. 1 if left out.",
+        examples=[2.0],
+    )
+    coverage: Annotated[Real, Field(gt=0.0, le=MAX_COVERAGE)] | None = Field(
+        None,
+        description="In place of k: the share of a normal distribution (infinite degrees of freedom) that the interval "
+        "is to hold; 0.95 is k = 1.96.",
+    )
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        if self.k is not None and self.coverage is not None:
+            raise disagreement("give k or coverage, not both")
+        return self
+
+    @property
+    def factor(self) -> float:
+        """The coverage factor k."""
+        if self.coverage is not None:
+            return NormalDist().inv_cdf(0.5 * (1.0 + self.coverage))
+        return 1.0 if self.k is None else self.k
+
+    @property
+    def share(self) -> float:
+        """The share of a normal distribution within k standard uncertainties."""
+        return 2.0 * NormalDist().cdf(self.factor) - 1.0 if self.coverage is None else self.coverage
+
+
+class Coverage(CoverageFields, Settings):
+    """A coverage factor, given by itself or by the share of a normal distribution."""

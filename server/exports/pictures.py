@@ -105,18 +105,13 @@ def common_style(source: Source, steps: Sequence[int] | None, name: str, style: 
     if style.limits is not None:
         return style
     samples = []
-    for step in each(source, steps, _read_for(name)):
+    for step in each(source, steps, [name]):
         variable = columns_of(step).get(name)
         if variable is not None and variable.flags is None:
             finite = variable.values[np.isfinite(variable.values)]
             samples.append(finite[:: max(1, finite.size // _MAX_SAMPLES)])
     limits = scale_of(np.concatenate(samples), style) if samples else None
     return FigureStyle(limits, style.percentiles, style.colours, style.width_px, style.opacity)
-
-
-def _read_for(name: str) -> list[str]:
-    # comparisons are parts of one variable of the file
-    return ["zncc"] if name.startswith("zncc_") else [name]
 
 
 def frames(
@@ -132,7 +127,7 @@ def frames(
     common = common_style(source, steps, name, style)
     size: tuple[int, int] | None = None
     last: StepResult | None = None
-    for step in each(source, steps, _read_for(name)):
+    for step in each(source, steps, [name]):
         last = step
         if name not in columns_of(step):
             continue  # a reference has no displacement

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from core.errors import InputError
+from core.settings import Coverage, CoverageFields
 from server.formats.figure_options import FigureStyle
 
 ExportFormat = Literal["nc", "csv", "vtu", "mat", "h5", "png", "svg", "gif", "mp4"]
@@ -43,6 +44,8 @@ class ExportRequest:
         Draw over camera 1's reference image.
     fps
         Steps a second in a film.
+    coverage
+        Of the expanded uncertainties beside the standard ones; one standard uncertainty: none.
     """
 
     format: ExportFormat
@@ -51,6 +54,7 @@ class ExportRequest:
     style: FigureStyle = field(default_factory=FigureStyle)
     over_image: bool = False
     fps: float = 2.0
+    coverage: CoverageFields = field(default_factory=lambda: Coverage.model_validate({}))
 
 
 def steps_in(text: str) -> list[int]:

@@ -7,6 +7,7 @@ import json
 import shutil
 import zipfile
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -21,7 +22,17 @@ from server.formats.files import written_temporary
 from server.formats.images import read_mask
 from server.formats.results.folder import number_of
 from server.results.provenance import provenance
-from server.results.steps import Source, chosen, columns_of, each, read_step, require_known, variables_of
+from server.results.steps import (
+    Source,
+    chosen,
+    columns_of,
+    each,
+    read_step,
+    require_known,
+    variables_of,
+    with_coverage,
+)
+from server.results.uncertainty import in_file
 
 _PACKED = (".nc", ".png", ".gif", ".mp4", ".mat", ".h5")
 
@@ -40,6 +51,7 @@ def export(source: Source, request: ExportRequest, out: Path) -> Iterator[Path]:
     StorageError
         ``storage_full``, ``storage_failed``.
     """
+    source = replace(source, coverage=request.coverage)
     files = chosen(source, request.steps)
     if request.format in ("gif", "mp4"):
         check_fps(request.fps)
@@ -48,7 +60,7 @@ def export(source: Source, request: ExportRequest, out: Path) -> Iterator[Path]:
     elif request.format == "csv":
         for step in each(source, request.steps, request.variables):
             path = _path(out, source, step.n, "csv")
-            write_table(path, step, source)
+            write_table(path, step, source, matrices=request.variables is not None)
             yield path
     elif request.format == "vtu":
         yield from _as_vtu(source, files, request, out)
@@ -91,6 +103,12 @@ def _as_stored(source: Source, files: Sequence[Path], request: ExportRequest, ou
             code="option_conflict",
             remedy="Leave the variables out, or choose h5.",
         )
+    if request.coverage.factor != 1.0:
+        raise InputError(
+            "NetCDF files are given as they are stored, with standard uncertainties.",
+            code="option_conflict",
+            remedy="Leave k and coverage out, or choose h5.",
+        )
     for path in files:
         copy = _path(out, source, number_of(path), "nc")
         with written_temporary(copy) as temporary:
@@ -102,13 +120,14 @@ def _as_vtu(source: Source, files: Sequence[Path], request: ExportRequest, out: 
     mask = None if source.mask is None else read_mask(source.mask)
     there = {path: variables_of(path) for path in source.files}
     moves = any("u_mm" in names for names in there.values())
-    require_known(files, request.variables)
+    asked = None if request.variables is None else [in_file(name, source.coverage) for name in request.variables]
+    require_known(files, asked)
     written = []
     for path in files:
-        names = request.variables
+        names = asked
         if names is not None:
             names = [name for name in (*names, *NEEDS) if name in there[path]]
-        step = read_step(path, names)
+        step = with_coverage(read_step(path, names), source)
         target = _path(out, source, step.n, "vtu")
         write_vtu(target, step, source, mask=mask, at_rest=moves and "u_mm" not in there[path])
         written.append((step.n, target.name))
@@ -125,8 +144,7 @@ def _drawn(source: Source, files: Sequence[Path], request: ExportRequest, out: P
         moves = any("w_mm" in variables_of(path) for path in files)
         names = ["w_mm" if moves else "z_mm"]
     for name in names:
-        of_file = "zncc" if name.startswith("zncc_") else name  # comparisons are parts of one variable
-        require_known(files, [of_file])
+        require_known(files, [in_file(name, source.coverage)])
         if request.format in ("gif", "mp4"):
             path = out / f"{source.name}_{name}.{request.format}"
             drawn = frames(source, request.steps, name, request.style, image)
@@ -137,7 +155,7 @@ def _drawn(source: Source, files: Sequence[Path], request: ExportRequest, out: P
                 write_mp4(path, drawn, request.fps)
             yield path
             continue
-        for step in each(source, request.steps, [of_file]):
+        for step in each(source, request.steps, [name]):
             if name in columns_of(step) or step.n == number_of(files[-1]):
                 path = out / f"{source.name}_step_{step.n:04d}_{name}.{request.format}"
                 form: Literal["png", "svg"] = "svg" if request.format == "svg" else "png"

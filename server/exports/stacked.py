@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from server.formats.results.netcdf import written_dataset
 from server.results.provenance import provenance
+from server.results.reader import list_variables
 from server.results.steps import Source, StepResult, chosen, each, require_same_grid
 
 _NO_STATE = -1  # of an integer variable in a step that does not have it
@@ -23,14 +25,16 @@ def write_stacked(path: Path, source: Source, steps: Sequence[int] | None, names
     Datasets have the axes step, row, col (MATLAB, which counts from the other end, has col, row, step); ``x_px`` and
     ``y_px`` are the same in every step and have row, col. ``step``, ``load_n``, ``label`` and ``provenance`` (JSON
     text) have one entry a step. A variable that a step lacks is NaN there, or -1 if it counts. Units and meanings are
-    attributes. The file is netCDF-4, which is HDF5.
+    attributes. Common factors of steps with fewer columns are filled up with zeros. The file is netCDF-4, which is
+    HDF5.
 
     Raises
     ------
     InputError
         ``steps_mixed`` if the steps lie on different points.
     """
-    count = len(chosen(source, steps))
+    files = chosen(source, steps)
+    count, columns = len(files), _most_columns(files)
     first: StepResult | None = None
     with written_dataset(path, classic=False) as data:
         for k, step in enumerate(each(source, steps, names)):
@@ -38,7 +42,28 @@ def write_stacked(path: Path, source: Source, steps: Sequence[int] | None, names
                 _begin(data, step, count)
                 first = step
             require_same_grid(step, first)
-            _put(data, k, step, source)
+            _put(data, k, _filled_up(step, columns), source)
+
+
+def _most_columns(files: Sequence[Path]) -> dict[str, int]:
+    """Return the largest number of columns of each common factor: a step has as few as hold its own variance."""
+    most: dict[str, int] = {}
+    for head in (v for path in files for v in list_variables(path) if "common_factor" in v.name and len(v.shape) == 4):
+        most[head.name] = max(most.get(head.name, 0), head.shape[-1])
+    return most
+
+
+def _filled_up(step: StepResult, columns: dict[str, int]) -> StepResult:
+    """Return a step whose common factors have so many columns: those of no variance are zero."""
+    variables = dict(step.variables)
+    for name, count in columns.items():
+        if name in variables:
+            values = variables[name].values
+            more = [(0, 0)] * 3 + [(0, count - values.shape[-1])]
+            # a point without numbers stays without them
+            filled = np.where(np.isnan(values[..., :1, :1]), np.nan, np.pad(values, more)).astype(values.dtype)
+            variables[name] = replace(variables[name], values=filled)
+    return replace(step, variables=variables)
 
 
 def _begin(data: Any, step: StepResult, count: int) -> None:

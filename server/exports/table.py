@@ -17,14 +17,25 @@ from server.results.steps import Source, StepResult, columns_of
 _LINES_AT_ONCE = 2000
 
 
-def write_table(path: Path, step: StepResult, source: Source) -> None:
+def write_table(path: Path, step: StepResult, source: Source, *, matrices: bool = False) -> None:
     """Write one step as CSV.
 
+    Parameters
+    ----------
+    path
+        Of the file.
+    step, source
+        Its numbers, and where they come from.
+    matrices
+        Write covariances (upper triangle) and common factors among its variables too, an entry a column.
+
+    Notes
+    -----
     Lines that begin with ``#`` state the provenance name by name, and each column's unit and meaning. The header
     follows, then one line a grid point: ``row, col``, then the variables. A number that is not there is empty; a
     variable of states is written as its number, with the name in the next column.
     """
-    columns = columns_of(step)
+    columns = columns_of(step, matrices=matrices)
     with written_temporary(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as out:
         for name, value in provenance(step, source).items():
             out.write(f"# {name}: {_one_line(value)}\n")

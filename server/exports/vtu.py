@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 from xml.sax.saxutils import escape, quoteattr
@@ -16,7 +16,8 @@ from server.exports.mesh import triangles_of, turned_as
 from server.formats.files import write_bytes, written_temporary
 from server.results.provenance import provenance
 from server.results.reader import Variable
-from server.results.steps import Source, StepResult, columns_of
+from server.results.steps import Source, StepResult, columns_of, statement_of
+from server.results.uncertainty import matrix_columns
 
 NEEDS = ("x_px", "y_px", "x_mm", "y_mm", "z_mm", "status", "u_mm", "v_mm", "w_mm", "normal_x", "normal_y", "normal_z")
 _VECTORS = {"displacement": ("u_mm", "v_mm", "w_mm"), "normal": ("normal_x", "normal_y", "normal_z")}
@@ -48,7 +49,8 @@ def write_vtu(
     Points that failed are not in the file. ``displacement`` and ``normal`` are vectors; warping by ``displacement``
     gives the surface as it is at the step. A point of no triangle is written as a vertex. Triangles turn so that their
     normals point as ``normal`` does. Units, frame and settings are JSON in a comment at the top, and in the field data
-    (``provenance_json_utf8``, its bytes); arrays carry VTK's UNITS_LABEL.
+    (``provenance_json_utf8``, its bytes), what the uncertainties include in ``uncertainty_utf8``; arrays carry VTK's
+    UNITS_LABEL. ``covariance`` has the entries of its upper triangle as components, ``common_factor`` its own.
     """
     columns = columns_of(step)
     keep = np.flatnonzero(step.valid.ravel())
@@ -70,7 +72,7 @@ def write_vtu(
             'version="1.0" byte_order="LittleEndian" header_type="UInt64">\n<UnstructuredGrid>\n'
             "<FieldData>\n"
         )
-        _field_data(out, step, about)
+        _field_data(out, step, source, about)
         out.write(f'</FieldData>\n<Piece NumberOfPoints="{keep.size}" NumberOfCells="{kinds.size}">\n<Points>\n')
         _array(out, "Points", xyz[keep], units="mm")
         out.write("</Points>\n<Cells>\n")
@@ -86,6 +88,12 @@ def write_vtu(
             _array(out, name, np.unravel_index(keep, step.shape)[k].astype(np.int32))
         for name, variable in columns.items():
             _array(out, name, variable.values.ravel()[keep], units=variable.units)
+        for name, variable in step.variables.items():
+            entries = matrix_columns(name, variable)
+            if entries:
+                matrix = np.stack([one.values.ravel()[keep] for one in entries.values()], axis=1)
+                parts = [one.removeprefix(f"{name}_") for one in entries]
+                _array(out, name, matrix, units=variable.units, components=parts)
         out.write("</PointData>\n</Piece>\n</UnstructuredGrid>\n</VTKFile>\n")
 
 
@@ -110,13 +118,15 @@ def _vector(columns: dict[str, Variable], parts: tuple[str, ...]) -> NDArray[np.
     return np.stack([columns[name].values.ravel().astype(np.float64) for name in parts], axis=1)
 
 
-def _field_data(out: TextIO, step: StepResult, about: str) -> None:
+def _field_data(out: TextIO, step: StepResult, source: Source, about: str) -> None:
     _array(out, "TimeValue", np.array([float(step.n)]), tuples=1)
     if step.load_n is not None:
         _array(out, "load_n", np.array([step.load_n]), tuples=1)
     # as bytes: readers other than VTK's own do not take its arrays of text
     text = np.frombuffer(about.encode(), dtype=np.uint8)
     _array(out, "provenance_json_utf8", text, tuples=text.size)
+    said = np.frombuffer(statement_of(step, source).text.encode(), dtype=np.uint8)
+    _array(out, "uncertainty_utf8", said, tuples=said.size)
 
 
 def _about(step: StepResult, source: Source, columns: dict[str, Variable]) -> str:
@@ -128,10 +138,17 @@ def _about(step: StepResult, source: Source, columns: dict[str, Variable]) -> st
 
 
 def _array(
-    out: TextIO, name: str, values: NDArray[Any], *, tuples: int | None = None, units: str | None = None
+    out: TextIO,
+    name: str,
+    values: NDArray[Any],
+    *,
+    tuples: int | None = None,
+    units: str | None = None,
+    components: Sequence[str] = (),
 ) -> None:
     kind = _TYPES[values.dtype.str[1:]]
     parts = f' NumberOfComponents="{values.shape[1]}"' if values.ndim == 2 else ""
+    parts += "".join(f" ComponentName{k}={quoteattr(one)}" for k, one in enumerate(components))
     size = "" if tuples is None else f' NumberOfTuples="{tuples}"'
     data = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<")).tobytes()
     text = base64.b64encode(np.uint64(len(data)).tobytes() + data).decode("ascii")

@@ -8,7 +8,7 @@ from typing import Any
 
 from server.formats.files import sha256_of
 from server.formats.version import software_version
-from server.results.steps import Source, StepResult
+from server.results.steps import Source, StepResult, statement_of
 
 
 def provenance(step: StepResult, source: Source, *, path: Path | None = None) -> dict[str, object]:
@@ -30,6 +30,7 @@ def provenance(step: StepResult, source: Source, *, path: Path | None = None) ->
         "settings": _json(step, "settings"),
         "calibration_sha256": calibration_of(step),
         "inputs_sha256": _json(step, "inputs_sha256"),
+        "uncertainty": statement_of(step, source).document(),
         **({"stale_reasons": list(source.stale_reasons)} if source.stale_reasons else {}),
         **source.about,
     }
@@ -74,7 +75,11 @@ def notes_of(step: StepResult, source: Source) -> list[str]:
     calibration = source.about.get("calibration_id"), (calibration_of(step) or "")[:12]
     known = " ".join(str(part) for part in calibration if part) or "not known"
     frame, measured_with = (step.attributes.get(name, "") for name in ("frame", "source"))
-    return [f"frame: {frame}", f"{', '.join(parts)}; calibration {known}; {measured_with}"]
+    return [
+        f"frame: {frame}",
+        f"{', '.join(parts)}; calibration {known}; {measured_with}",
+        statement_of(step, source).text,
+    ]
 
 
 def _json(step: StepResult, name: str) -> dict[str, Any]:

@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 
 from core.errors import FileFormatError, InputError
 from core.field.region.cuts import Cuts, from_arrays
+from core.settings import Coverage, CoverageFields
 from core.status import PointStatus
 from server.base.errors import NotFoundError
 from server.formats.results.folder import number_of
 from server.formats.results.netcdf import opened
 from server.formats.results.settings import current_inputs, current_settings
+from server.formats.results.uncertainty import Included, Statement
 from server.results.reader import Variable
+from server.results.uncertainty import in_file, matrix_columns, with_intervals
 from server.store.durable import known_json
 
 ALWAYS = ("x_px", "y_px", "x_mm", "y_mm", "z_mm", "status")
@@ -39,12 +42,15 @@ class StepResult:
         The file's own, as text and numbers.
     cuts
         Cracks and borders of holes.
+    included
+        What its uncertainties include.
     """
 
     n: int
     variables: dict[str, Variable]
     attributes: dict[str, object]
     cuts: Cuts | None
+    included: Included
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -89,6 +95,8 @@ class Source:
         Mask of the points, where there was one.
     stale_reasons
         Inputs that are gone or were replaced since they were measured.
+    coverage
+        Of the expanded uncertainties that stand beside the standard ones; one standard uncertainty: none do.
     """
 
     files: Sequence[Path]
@@ -98,6 +106,7 @@ class Source:
     about: dict[str, object] = field(default_factory=dict)
     mask: Path | None = None
     stale_reasons: Sequence[str] = ()
+    coverage: CoverageFields = field(default_factory=lambda: Coverage.model_validate({}))
 
 
 def failed_steps(folder: Path) -> dict[str, dict[str, Any]]:
@@ -180,7 +189,8 @@ def _read(path: Path, data: Any, names: Sequence[str] | None, always: Sequence[s
     attributes = {name: _plain(data.getncattr(name)) for name in data.ncattrs()}
     for name, current in (("settings", current_settings), ("inputs_sha256", current_inputs)):
         attributes[name] = json.dumps(current(json.loads(str(attributes.get(name, "{}")))))
-    return StepResult(int(str(attributes.get("step", number_of(path)))), variables, attributes, cuts)
+    n = int(str(attributes.get("step", number_of(path))))
+    return StepResult(n, variables, attributes, cuts, Included.of(data))
 
 
 def _plain(value: object) -> object:
@@ -198,13 +208,23 @@ def each(source: Source, steps: Sequence[int] | None, names: Sequence[str] | Non
         ``field_missing`` for a variable that no step has.
     """
     files = chosen(source, steps)
-    if names is None:
-        yield from (read_step(path) for path in files)
-        return
+    if names is not None:
+        names = [in_file(name, source.coverage) for name in names]
     require_known(files, names)
     for path in files:
-        there = variables_of(path)
-        yield read_step(path, [name for name in names if name in there])
+        there = [] if names is None else variables_of(path)
+        wanted = None if names is None else [name for name in names if name in there]
+        yield with_coverage(read_step(path, wanted), source)
+
+
+def with_coverage(step: StepResult, source: Source) -> StepResult:
+    """Return a step with the expanded uncertainties that its source is asked for."""
+    return replace(step, variables=with_intervals(step.variables, step.included, source.coverage))
+
+
+def statement_of(step: StepResult, source: Source) -> Statement:
+    """Return what is stated beside a step's uncertainties."""
+    return Statement(step.included, source.coverage)
 
 
 def require_known(files: Sequence[Path], names: Sequence[str] | None) -> None:
@@ -246,12 +266,21 @@ def require_same_grid(step: StepResult, first: StepResult) -> None:
         )
 
 
-def columns_of(step: StepResult) -> dict[str, Variable]:
-    """Return a step's variables with one number a point each: comparisons separate, without covariance matrices."""
+def columns_of(step: StepResult, *, matrices: bool = False) -> dict[str, Variable]:
+    """Return a step's variables with one number a point each: comparisons separate.
+
+    Parameters
+    ----------
+    matrices
+        Covariances (their upper triangle) and common factors too.
+    """
     flat: dict[str, Variable] = {}
     for name, variable in step.variables.items():
         values = variable.values
-        if values.ndim == 2:
+        entries = matrix_columns(name, variable)
+        if entries is not None:
+            flat |= entries if matrices else {}
+        elif values.ndim == 2:
             flat[name] = variable
         elif values.ndim == 3:
             for k in range(values.shape[2]):

@@ -1,0 +1,128 @@
+"""What is stated beside every uncertainty: its coverage factor, what it includes, and what it does not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from core.settings import Coverage, CoverageFields
+from server.formats.results.netcdf import opened
+
+NOT_INCLUDED = "calibration not included"
+#: what no file's uncertainties hold
+SYSTEMATIC = (
+    "systematic terms (interpolation, order of the patch, strain window)",
+    "errors of the calibration that were not declared",
+)
+DISTRIBUTION = "normal, infinite degrees of freedom"
+
+
+@dataclass(frozen=True)
+class Included:
+    """What the uncertainties of a result include.
+
+    Attributes
+    ----------
+    calibration
+        False where the calibration's covariance is not known, as of another program's.
+    causes
+        By name, in their order, `matching` first; those of the calibration are left out where they are not known.
+    """
+
+    calibration: bool
+    causes: tuple[str, ...]
+
+    @staticmethod
+    def of(dataset: Any) -> Included:
+        """Read it from an open result file."""
+        if "common_factor" not in dataset.variables:
+            return Included(False, ("matching",))
+        return Included(True, ("matching", "calibration"))
+
+    @staticmethod
+    def in_all(each: Sequence[Included]) -> Included:
+        """Return what all of some results include."""
+        causes = [c for c in each[0].causes if all(c in one.causes for one in each)] if each else []
+        return Included(bool(each) and all(one.calibration for one in each), tuple(causes))
+
+    @property
+    def lacking(self) -> str:
+        """What stands beside every number: empty, or that the calibration is not included."""
+        return "" if self.calibration else NOT_INCLUDED
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        only = "" if self.calibration else f" only; {NOT_INCLUDED}"
+        return f"{', '.join(self.causes)}{only}"
+
+
+def read_included(path: Path) -> Included:
+    """Return what a result file's uncertainties include.
+
+    Raises
+    ------
+    FileFormatError
+        ``file_missing``, ``file_unreadable``.
+    """
+    with opened(path) as dataset:
+        return Included.of(dataset)
+
+
+@dataclass(frozen=True)
+class Statement:
+    """The interval that is stated beside values, and what it covers.
+
+    Parameters
+    ----------
+    included
+        What the uncertainties include.
+    asked
+        Coverage factor or share of the interval.
+    """
+
+    included: Included
+    asked: CoverageFields = field(default_factory=lambda: Coverage.model_validate({}))
+
+    @property
+    def k(self) -> float:
+        """The coverage factor."""
+        return self.asked.factor
+
+    @property
+    def expanded(self) -> bool:
+        """True if an interval other than one standard uncertainty was asked for."""
+        return self.k != 1.0
+
+    @property
+    def symbol(self) -> str:
+        """The uncertainty's sign with its coverage factor: u (k = 1), U (k = 1.96, 95 %)."""
+        return f"U (k = {self.k:.3g}, {percent(self.asked.share)})" if self.expanded else "u (k = 1)"
+
+    @property
+    def text(self) -> str:
+        """In one line, as under a picture."""
+        return f"{self.symbol} includes {self.included.text}"
+
+    @property
+    def missing(self) -> list[str]:
+        """What is not included."""
+        return [*([] if self.included.calibration else ["calibration"]), *SYSTEMATIC]
+
+    def document(self) -> dict[str, object]:
+        """Return it as plain values."""
+        return {
+            "k": self.k,
+            "coverage": self.asked.share,
+            "distribution": DISTRIBUTION,
+            "includes": list(self.included.causes),
+            "not_included": self.missing,
+            "text": self.text,
+        }
+
+
+def percent(share: float) -> str:
+    """Write a share of a distribution: 95 %, 99.73 %."""
+    return f"{100.0 * share:.4g} %"

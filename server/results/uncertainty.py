@@ -1,0 +1,92 @@
+"""Uncertainties of a step as exports hold them: expanded ones beside standard ones, matrices as columns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.settings import CoverageFields
+from server.formats.results.layout import COVARIANCE_NAMES
+from server.formats.results.uncertainty import Included, Statement
+from server.results.reader import Variable
+
+SIGMA, EXPANDED = "sigma_", "expanded_"
+_STRAINS = ("exx", "eyy", "exy")
+
+
+def in_file(name: str, asked: CoverageFields) -> str:
+    """Return the name of a result file's variable that an export's variable is made of."""
+    if name.startswith("zncc_"):  # comparisons are parts of one variable
+        return "zncc"
+    if asked.factor != 1.0 and name.startswith(EXPANDED):
+        return SIGMA + name.removeprefix(EXPANDED)
+    return name
+
+
+def with_intervals(variables: dict[str, Variable], included: Included, asked: CoverageFields) -> dict[str, Variable]:
+    """Return variables with the expanded uncertainty beside each standard one, where one is asked for.
+
+    ``expanded_NAME`` is k times ``sigma_NAME``. The meaning of both says what they include.
+    """
+    statement = Statement(included, asked)
+    out: dict[str, Variable] = {}
+    for name, variable in variables.items():
+        if not name.startswith(SIGMA):
+            out[name] = variable
+            continue
+        out[name] = replace(variable, long_name=f"{variable.long_name}, includes {included.text}")
+        if statement.expanded:
+            of = name.removeprefix(SIGMA)
+            text = f"expanded uncertainty of {of}, {statement.text}"
+            values = (statement.k * variable.values).astype(variable.values.dtype)
+            out[EXPANDED + of] = replace(variable, values=values, long_name=text)
+    return out
+
+
+def matrix_columns(name: str, variable: Variable) -> dict[str, Variable] | None:
+    """Return the entries of a covariance's upper triangle, or of a common factor, by name; None for other variables.
+
+    Parameters
+    ----------
+    name
+        Of the variable in the result file.
+    variable
+        (r, c, n, n) or packed (r, c, n (n + 1) / 2) covariance, row by row; (r, c, n, k) factor.
+    """
+    values = variable.values
+    if name.endswith("covariance") and values.ndim == 4:
+        n = values.shape[-1]
+        rows, cols = np.triu_indices(n)
+        return _columns(name, variable, values[..., rows, cols], _pairs(n))
+    if name.endswith("covariance") and values.ndim == 3:
+        n = round((np.sqrt(8 * values.shape[-1] + 1) - 1) / 2)
+        return _columns(name, variable, values, _pairs(n))
+    if "common_factor" in name and values.ndim == 4:
+        n, k = values.shape[2:]
+        names = _STRAINS if "strain" in name else COVARIANCE_NAMES
+        causes = _numbered(variable.parts, k)
+        each = [f"{names[i]}_{causes[j]}" for i in range(n) for j in range(k)]
+        return _columns(name, variable, values.reshape(*values.shape[:2], n * k), each)
+    return None
+
+
+def _pairs(n: int) -> list[str]:
+    return [f"{COVARIANCE_NAMES[i]}_{COVARIANCE_NAMES[j]}" for i in range(n) for j in range(i, n)]
+
+
+def _numbered(causes: Sequence[str], count: int) -> list[str]:
+    """Name each column by its cause and its number among all."""
+    named = causes if len(causes) == count else ["cause"] * count
+    return [f"{cause}_{k + 1}" for k, cause in enumerate(named)]
+
+
+def _columns(
+    name: str, variable: Variable, values: NDArray[np.floating], each: Sequence[str]
+) -> dict[str, Variable]:
+    return {
+        f"{name}_{one}": replace(variable, values=values[..., k], long_name=f"{variable.long_name}: {one}", parts=())
+        for k, one in enumerate(each)
+    }
