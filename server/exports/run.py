@@ -22,16 +22,7 @@ from server.formats.files import written_temporary
 from server.formats.images import read_mask
 from server.formats.results.folder import number_of
 from server.results.provenance import provenance
-from server.results.steps import (
-    Source,
-    chosen,
-    columns_of,
-    each,
-    read_step,
-    require_known,
-    variables_of,
-    with_coverage,
-)
+from server.results.steps import Source, chosen, columns_of, each, read_step, require_known, variables_of, with_coverage
 from server.results.uncertainty import in_file
 
 _PACKED = (".nc", ".png", ".gif", ".mp4", ".mat", ".h5")

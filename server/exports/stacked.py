@@ -61,7 +61,7 @@ def _filled_up(step: StepResult, columns: dict[str, int]) -> StepResult:
             values = variables[name].values
             more = [(0, 0)] * 3 + [(0, count - values.shape[-1])]
             # a point without numbers stays without them
-            filled = np.where(np.isnan(values[..., :1, :1]), np.nan, np.pad(values, more)).astype(values.dtype)
+            filled = np.where(step.valid[..., None, None], np.pad(values, more), np.nan).astype(values.dtype)
             variables[name] = replace(variables[name], values=filled)
     return replace(step, variables=variables)
 

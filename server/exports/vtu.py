@@ -92,8 +92,8 @@ def write_vtu(
             entries = matrix_columns(name, variable)
             if entries:
                 matrix = np.stack([one.values.ravel()[keep] for one in entries.values()], axis=1)
-                parts = [one.removeprefix(f"{name}_") for one in entries]
-                _array(out, name, matrix, units=variable.units, components=parts)
+                named = [one.removeprefix(f"{name}_") for one in entries]
+                _array(out, name, matrix, units=variable.units, components=named)
         out.write("</PointData>\n</Piece>\n</UnstructuredGrid>\n</VTKFile>\n")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -28,6 +29,7 @@ MEDIA_TYPES: dict[FieldForm, str] = {
 RANGE_PATTERN = r"^[0-9]{0,6}:[0-9]{0,6}$"
 _MAX_PX = 1200
 _BAR_PX, _TEXT_PX, _MARGIN_PX, _TITLE_PX = 22, 130, 12, 34
+_LETTER_PX, _LINE_PX = 8, 16  # of the foot
 _BLANK = (255, 255, 255)
 
 
@@ -86,6 +88,8 @@ class FieldPart:
         Indices of its rows and columns in the whole grid.
     position
         Gives (r, c) of ``x_px`` or ``y_px``: the points' positions in camera 1's reference image.
+    note
+        What is stated beside the uncertainties: under a picture, and in a file.
     """
 
     name: str
@@ -94,6 +98,7 @@ class FieldPart:
     rows: NDArray[np.intp]
     cols: NDArray[np.intp]
     position: Callable[[str], NDArray[np.float64]]
+    note: str = ""
 
     @property
     def headers(self) -> dict[str, str]:
@@ -111,8 +116,8 @@ def _range(indices: NDArray[np.intp]) -> str:
     return f"{int(indices[0])}:{int(indices[-1]) + 1}:{step}"
 
 
-def take(name: str, read: Callable[[str], Variable], part: Part) -> FieldPart:
-    """Take a part of a variable.
+def take(name: str, read: Callable[[str], Variable], part: Part, note: str = "") -> FieldPart:
+    """Take a part of a variable; ``note`` is stated beside the uncertainties.
 
     Raises
     ------
@@ -135,6 +140,7 @@ def take(name: str, read: Callable[[str], Variable], part: Part) -> FieldPart:
         np.arange(shape[0])[rows],
         np.arange(shape[1])[cols],
         lambda of: read(of).values[rows, cols],
+        note,
     )
 
 
@@ -185,6 +191,8 @@ def _netcdf(part: FieldPart) -> bytes:
 
     def fill(data: Any) -> None:
         data.setncattr("Conventions", "CF-1.8")
+        if part.note:
+            data.setncattr("uncertainty", part.note)
         for name, indices in (("row", part.rows), ("col", part.cols)):
             data.createDimension(name, len(indices))
             data.createVariable(name, "i4", (name,))[:] = indices
@@ -228,7 +236,12 @@ def _png(part: FieldPart) -> bytes:
     else:
         colours = np.repeat(np.repeat(colours, factor, 0), factor, 1)
     height, width = max(colours.shape[0], 160), max(colours.shape[1], 160)
-    picture = np.full((height + _TITLE_PX + _MARGIN_PX, width + 2 * _MARGIN_PX + _BAR_PX + _TEXT_PX, 3), 255, np.uint8)
+    whole = width + 2 * _MARGIN_PX + _BAR_PX + _TEXT_PX
+    foot = textwrap.wrap(part.note, (whole - 2 * _MARGIN_PX) // _LETTER_PX)
+    below = _TITLE_PX + height + _MARGIN_PX
+    picture = np.full((below + _LINE_PX * len(foot), whole, 3), 255, np.uint8)
+    for k, line in enumerate(foot):
+        _write(picture, line, _MARGIN_PX, below + _LINE_PX * k + 6, 0.4)
     picture[_TITLE_PX : _TITLE_PX + colours.shape[0], _MARGIN_PX : _MARGIN_PX + colours.shape[1]] = colours
     ramp = np.linspace(255, 0, height).astype(np.uint8)[:, None].repeat(_BAR_PX, 1)
     left = 2 * _MARGIN_PX + width

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from core.settings import CoverageFields
 from core.status import PointStatus
 from server.base.errors import NotFoundError
 from server.formats.results.netcdf import opened
+from server.formats.results.uncertainty import Included, Statement
 
 
 @dataclass(frozen=True)
@@ -173,37 +175,59 @@ def read_residuals(path: Path) -> list[ViewResiduals]:
 
 @dataclass(frozen=True)
 class ProbeValue:
-    """A number, or several, of a point; None where it failed."""
+    """A number, or several, of a point, with its standard and expanded uncertainty; None where it failed."""
 
     value: Any
     units: str
+    sigma: float | None = None
+    expanded: float | None = None
+    not_included: str = ""
 
 
 @dataclass(frozen=True)
 class Probe:
-    """A measurement point with all that is known of it; ``distance_px`` from the pixel that was asked for."""
+    """A measurement point with all that is known of it.
+
+    Attributes
+    ----------
+    distance_px
+        From the pixel that was asked for.
+    uncertainty
+        What its uncertainties are, see :class:`server.formats.results.uncertainty.Statement`.
+    """
 
     row: int
     col: int
     distance_px: float
     status: str
     values: dict[str, ProbeValue]
+    uncertainty: dict[str, object]
 
 
-def probe_result(path: Path, x_px: float, y_px: float) -> Probe:
+def probe_result(path: Path, x_px: float, y_px: float, asked: CoverageFields) -> Probe:
     """Return the point nearest to a pixel; the covariance is left out, it is read as a field."""
     with opened(path) as data:
+        statement = Statement(Included.of(data), asked)
         variables = {name: Variable.of(v) for name, v in data.variables.items() if len(v.dimensions) >= 2}
     distance = np.hypot(variables["x_px"].values - x_px, variables["y_px"].values - y_px)
     row, col = (int(i) for i in np.unravel_index(int(np.nanargmin(distance)), distance.shape))
+
+    def number(name: str, variable: Variable) -> ProbeValue:
+        value = ProbeValue(_number(variable.values[row, col]), variable.units)
+        known = variables.get(f"sigma_{name}")
+        sigma = None if known is None else _number(known.values[row, col])
+        if sigma is None:
+            return value
+        expanded = statement.k * sigma if statement.expanded else None
+        return replace(value, sigma=sigma, expanded=expanded, not_included=statement.included.lacking)
+
     return Probe(
         row=row,
         col=col,
         distance_px=float(distance[row, col]),
         status=PointStatus(int(variables["status"].values[row, col])).name.lower(),
-        values={
-            n: ProbeValue(_number(v.values[row, col]), v.units) for n, v in variables.items() if v.values.ndim <= 3
-        },
+        values={n: number(n, v) for n, v in variables.items() if v.values.ndim <= 3},
+        uncertainty=statement.document(),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from core.settings import CoverageFields
 from server.formats.results.layout import COVARIANCE_NAMES
 from server.formats.results.uncertainty import Included, Statement
-from server.results.reader import Variable
+from server.results.reader import Variable, read_variable
 
 SIGMA, EXPANDED = "sigma_", "expanded_"
 _STRAINS = ("exx", "eyy", "exy")
@@ -24,6 +25,21 @@ def in_file(name: str, asked: CoverageFields) -> str:
     if asked.factor != 1.0 and name.startswith(EXPANDED):
         return SIGMA + name.removeprefix(EXPANDED)
     return name
+
+
+def read_interval(path: Path, name: str, statement: Statement) -> Variable:
+    """Read one variable; ``expanded_NAME`` as the statement's interval.
+
+    Raises
+    ------
+    NotFoundError
+        ``field_missing``, with the names that there are.
+    """
+    of_file = in_file(name, statement.asked)
+    read = read_variable(path, of_file)
+    if of_file.startswith(SIGMA):
+        return with_intervals({of_file: read}, statement.included, statement.asked)[name]
+    return read if of_file == name else read_variable(path, name)
 
 
 def with_intervals(variables: dict[str, Variable], included: Included, asked: CoverageFields) -> dict[str, Variable]:
@@ -83,9 +99,7 @@ def _numbered(causes: Sequence[str], count: int) -> list[str]:
     return [f"{cause}_{k + 1}" for k, cause in enumerate(named)]
 
 
-def _columns(
-    name: str, variable: Variable, values: NDArray[np.floating], each: Sequence[str]
-) -> dict[str, Variable]:
+def _columns(name: str, variable: Variable, values: NDArray[np.floating], each: Sequence[str]) -> dict[str, Variable]:
     return {
         f"{name}_{one}": replace(variable, values=values[..., k], long_name=f"{variable.long_name}: {one}", parts=())
         for k, one in enumerate(each)

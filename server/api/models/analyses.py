@@ -163,6 +163,22 @@ class AnalysisList(Listing):
     analyses: list[AnalysisEntry] = Field(description="Short entry of each.")
 
 
+class Uncertainty(Reply):
+    """What the uncertainties of an answer are, and what they include."""
+
+    k: float = Field(description="Coverage factor of `expanded`; `sigma` is one standard uncertainty.", examples=[1.0])
+    coverage: float = Field(description="Share of the distribution within k standard uncertainties.", examples=[0.6827])
+    distribution: str = Field(description="The distribution, and the number of degrees of freedom.")
+    includes: list[str] = Field(description="Causes that are included.", examples=[["matching", "calibration"]])
+    not_included: list[str] = Field(
+        description="What is not: `calibration` where its covariance is not known; systematic terms."
+    )
+    text: str = Field(
+        description="The same in one line; `calibration not included` where that is so.",
+        examples=["u (k = 1) includes matching, calibration"],
+    )
+
+
 class FieldVariable(Reply):
     """A variable of a result."""
 
@@ -182,6 +198,7 @@ class FieldList(Reply):
     cuts_px: list[tuple[float, float, float, float]] = Field(
         description="Straight pieces x0, y0, x1, y1 of the cuts, px of camera 1's reference image; empty: none."
     )
+    uncertainty: Uncertainty = Field(description="What the step's uncertainties include.")
 
 
 class FieldReply(Reply):
@@ -194,6 +211,7 @@ class FieldReply(Reply):
     rows: str = Field("", description="Rows of the grid, start:stop:step.")
     cols: str = Field("", description="Columns of the grid, start:stop:step.")
     values: Nested = Field(description="Nested rows; null where the point failed.")
+    uncertainty: Uncertainty | None = Field(None, description="What the step's uncertainties include.")
 
 
 class ProbeValue(Reply):
@@ -201,6 +219,9 @@ class ProbeValue(Reply):
 
     value: float | int | Nested | None = Field(description="The value; null where the point failed.")
     units: str = Field(description="Its unit; `1` of what has none.", examples=["mm"])
+    sigma: float | None = Field(None, description="Standard uncertainty; null where it is not known.")
+    expanded: float | None = Field(None, description="k times it, where another k than 1 was asked for.")
+    not_included: str = Field("", description="`calibration not included` where that is so.")
 
 
 class ProbeReply(Reply):
@@ -212,6 +233,7 @@ class ProbeReply(Reply):
     distance_px: float = Field(description="Distance of the pixel asked for from the point.")
     status: str = Field(description="Status of the point.")
     values: dict[str, ProbeValue] = Field(description="Its numbers, by variable.")
+    uncertainty: Uncertainty = Field(description="What the uncertainties are, and what they include.")
 
 
 class GaugeStep(Reply):
@@ -243,4 +265,5 @@ class GaugesReply(Reply):
     subset_px: float = Field(description="Subset of the measurement; determines which pixels neighbours share.")
     smoothing_window: int | None = Field(None, description="Points over which displacements were smoothed.")
     alignment: FrameReading | None = Field(None, description="The frame that was laid, and its uncertainty.")
+    uncertainty: Uncertainty = Field(description="What the uncertainties are, and what they include in all steps.")
     steps: list[GaugeStep] = Field(description="Readings of each step.")

@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 from typing import Annotated
 
-from fastapi import Depends, Header, Path, Request
+from fastapi import Depends, Header, Path, Query, Request
 from pydantic import BaseModel
 from starlette.convertors import StringConvertor, register_url_convertor
 
 from core.names import CameraName
+from core.settings import MAX_COVERAGE, MAX_COVERAGE_FACTOR, Coverage, CoverageFields
+from server.formats.results.uncertainty import coverage_of
 from server.jobs.idempotency import RequestMark
 from server.workflows.service import Service
 
@@ -53,6 +55,20 @@ CalibrationId = Annotated[str, Path(max_length=40, description="Id of a calibrat
 JobId = Annotated[str, Path(max_length=40, description="Id of a job.")]
 Camera = Annotated[CameraName, Path(description="Which camera.")]
 StepNumber = Annotated[int, Path(ge=0, le=9999, description="Number of a step.")]
+_ABOUT_COVERAGE = {name: field.description for name, field in CoverageFields.model_fields.items()}
+
+
+def get_coverage(
+    k: Annotated[
+        float | None, Query(gt=0.0, le=MAX_COVERAGE_FACTOR, description=_ABOUT_COVERAGE["k"], examples=[2.0])
+    ] = None,
+    coverage: Annotated[float | None, Query(gt=0.0, le=MAX_COVERAGE, description=_ABOUT_COVERAGE["coverage"])] = None,
+) -> Coverage:
+    """Return the coverage of the intervals that a request asks for."""
+    return coverage_of(k, coverage)
+
+
+CoverageDep = Annotated[Coverage, Depends(get_coverage)]
 
 
 def mark(scope: str, key: str | None, body: BaseModel | None, *parts: bytes) -> RequestMark:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from core.errors import InputError
+from server.cli.measurement.coverage import add_coverage, coverage_from
 from server.exports.request import FORMATS, ExportRequest, steps_in
 from server.exports.run import export
 from server.exports.source import find_source
@@ -48,6 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--over-image", action="store_true", help="draw over camera 1's reference image")
     add("--image", type=Path, metavar="FILE", help="camera 1's reference image, where it lies elsewhere now")
     add("--fps", type=float, default=2.0, metavar="N", help="steps a second in a film (2)")
+    add_coverage(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -65,6 +67,7 @@ def run(args: argparse.Namespace) -> int:
         fps=args.fps,
         variables=[name for text in args.variable for name in text.split(",")] or None,
         over_image=args.over_image or args.image is not None,
+        coverage=coverage_from(args),
     )
     source = find_source(args.folder, args.analysis)
     if args.image is not None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from core.errors import InputError
+from server.cli.measurement.coverage import add_coverage, coverage_from
 from server.formats.files import make_folder, write_bytes
 from server.formats.gauges.matlab import gauges_mat
 from server.formats.gauges.readings import GaugeReadings, LineReading, Number, StepReadings
@@ -93,6 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--robust", action="store_true", help="let no outlier draw the rigid motion")
     add("--step", action="append", default=[], type=int, metavar="N", help="read this step only; repeatable (all)")
+    add_coverage(parser)
     add(
         "--field-out",
         metavar="DIR",
@@ -143,6 +145,7 @@ def _request(args: argparse.Namespace) -> GaugeRequest:
         "areas": [_named("--area", t, _area, None) for t in args.area],
         "variables": args.variable or None,
         "steps": args.step or None,
+        **coverage_from(args).model_dump(exclude_none=True),
     }
     if args.remove_rigid is not None:
         body["remove_rigid"] = {**_named("--remove-rigid", args.remove_rigid, _area, None), "robust": args.robust}
@@ -227,7 +230,7 @@ def _numbers(option: str, text: str, counts: tuple[int, ...] | None) -> list[flo
 def report(readings: GaugeReadings) -> list[str]:
     """Return the readings as tables over the steps, one gauge after the other."""
     lines = [f"STALE: {reason} since this was measured; measure again" for reason in readings.stale_reasons]
-    lines.append(f"frame: {readings.frame}")
+    lines += [f"frame: {readings.frame}", f"uncertainty: {readings.statement.text}"]
     frame = readings.alignment
     if frame is not None:
         turns = ", ".join(f"{1e6 * s:.1f}" for s in frame.sigma_rad)
@@ -283,10 +286,10 @@ def _table(rows: Sequence[tuple[StepReadings, Mapping[str, Number], str]]) -> li
 
 
 def _shown(number: Number | None) -> str:
-    """A number to the second digit of its uncertainty."""
+    """A number to the second digit of its uncertainty: the expanded one where that was asked for."""
     if number is None or number.value is None:
         return "-"
-    value, sigma = number.value, number.sigma
+    value, sigma = number.value, number.sigma if number.expanded is None else number.expanded
     if sigma is None or sigma <= 0.0:
         return f"{value:.6g}"
     digits = min(max(1 - math.floor(math.log10(sigma)), 0), 12)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from server.formats.gauges.readings import GaugeReadings
 from server.formats.gauges.table import COLUMNS, table_rows
 
-_TEXTS = frozenset({"label", "gauge", "kind", "quantity", "units", "missing"})
+_TEXTS = frozenset({"label", "gauge", "kind", "quantity", "units", "missing", "not_included"})
 
 
 def gauges_mat(readings: GaugeReadings) -> bytes:

@@ -8,6 +8,11 @@ from typing import Annotated
 
 from pydantic import Field
 
+from server.formats.results.uncertainty import Statement
+
+EXPANDED = "k times the standard uncertainty, where another k than 1 was asked for."
+LACKING = "`calibration not included` where that is so."
+
 
 @dataclass(frozen=True)
 class Number:
@@ -19,6 +24,8 @@ class Number:
     sigma_calibration: Annotated[
         float | None, Field(description="The calibration's part of sigma; null where it is not known and not included.")
     ] = None
+    expanded: Annotated[float | None, Field(description=EXPANDED)] = None
+    not_included: Annotated[str, Field(description=LACKING)] = ""
 
 
 @dataclass(frozen=True)
@@ -55,6 +62,8 @@ class Numbers:
         Sequence[float | None],
         Field(description="The calibration's part of each sigma; null where it is not known and not included."),
     ] = ()
+    expanded: Annotated[Sequence[float | None], Field(description=f"{EXPANDED} Empty: none was asked for.")] = ()
+    not_included: Annotated[str, Field(description=LACKING)] = ""
 
 
 @dataclass(frozen=True)
@@ -91,11 +100,20 @@ class AreaStatistics:
         float | None,
         Field(description="The calibration's part of mean_sigma; null where it is not known and not included."),
     ] = None
+    mean_expanded: Annotated[float | None, Field(description=EXPANDED)] = None
+    not_included: Annotated[str, Field(description=LACKING)] = ""
 
     @property
     def mean_number(self) -> Number:
         """The mean with its standard deviation."""
-        return Number(self.mean, self.mean_sigma, self.units, self.mean_sigma_calibration)
+        return Number(
+            self.mean,
+            self.mean_sigma,
+            self.units,
+            self.mean_sigma_calibration,
+            expanded=self.mean_expanded,
+            not_included=self.not_included,
+        )
 
 
 @dataclass(frozen=True)
@@ -188,6 +206,8 @@ class GaugeReadings:
         Of the displacements; None: as measured.
     alignment
         None where the frame is the system's.
+    statement
+        What the uncertainties are, and what they include in all steps.
     """
 
     software_version: str
@@ -199,6 +219,7 @@ class GaugeReadings:
     subset_px: float
     smoothing_window: int | None
     alignment: FrameReading | None
+    statement: Statement
     steps: Sequence[StepReadings] = field(repr=False)
 
     @property
@@ -217,9 +238,12 @@ class GaugeReadings:
             "settings": self.settings,
             "inputs_sha256": self.inputs_sha256,
             "alignment": None if self.alignment is None else asdict(self.alignment),
+            "uncertainty": self.statement.document(),
         }
 
     def document(self) -> dict[str, object]:
         """Return it as plain values."""
-        whole = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        return whole | {"alignment": self.about()["alignment"], "steps": [step.document() for step in self.steps]}
+        whole = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "statement"}
+        about = self.about()
+        steps = [step.document() for step in self.steps]
+        return whole | {"alignment": about["alignment"], "uncertainty": about["uncertainty"], "steps": steps}

@@ -30,6 +30,9 @@ class Row:
     sigma: float | None = None
     units: str = ""
     missing: str = ""
+    sigma_calibration: float | None = None
+    expanded: float | None = None
+    not_included: str = ""
 
 
 COLUMNS = tuple(f.name for f in fields(Row))
@@ -38,7 +41,8 @@ COLUMNS = tuple(f.name for f in fields(Row))
 def gauges_csv(readings: GaugeReadings) -> bytes:
     """Return the readings as CSV, settings and inputs in comment lines (#) above the header.
 
-    Missing numbers are empty, with the reason in the last column.
+    Missing numbers are empty, with the reason in the column ``missing``; ``not_included`` says where the uncertainty
+    lacks the calibration.
     """
     text = io.StringIO(newline="")
     for name, value in readings.about().items():
@@ -78,7 +82,14 @@ def _of_step(step: StepReadings) -> Iterator[Row]:
         for quantity, numbers in line.values.items():
             for k, (x, y, at) in enumerate(zip(line.x_px, line.y_px, line.distance_px, strict=True)):
                 position = replace(head, gauge=line.name, kind="line", x_px=x, y_px=y, distance_px=at)
-                number = Number(numbers.value[k], numbers.sigma[k], numbers.units)
+                number = Number(
+                    numbers.value[k],
+                    numbers.sigma[k],
+                    numbers.units,
+                    numbers.sigma_calibration[k] if numbers.sigma_calibration else None,
+                    expanded=numbers.expanded[k] if numbers.expanded else None,
+                    not_included=numbers.not_included,
+                )
                 yield from _rows(position, {quantity: number}, line.missing[k])
 
 
@@ -86,7 +97,17 @@ def _rows(head: Row, values: Mapping[str, Number], missing: str) -> Iterator[Row
     for quantity, number in values.items():
         # the position may be valid, but this variable has no value there
         why = missing or ("no value" if number.value is None else "")
-        yield replace(head, quantity=quantity, value=number.value, sigma=number.sigma, units=number.units, missing=why)
+        yield replace(
+            head,
+            quantity=quantity,
+            value=number.value,
+            sigma=number.sigma,
+            units=number.units,
+            missing=why,
+            sigma_calibration=number.sigma_calibration,
+            expanded=number.expanded,
+            not_included="" if number.sigma is None else number.not_included,
+        )
 
 
 def _cell(value: object) -> object:

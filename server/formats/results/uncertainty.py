@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
+from core.errors import InputError
 from core.settings import Coverage, CoverageFields
 from server.formats.results.netcdf import opened
 
@@ -121,6 +124,31 @@ class Statement:
             "not_included": self.missing,
             "text": self.text,
         }
+
+
+def coverage_of(k: float | None, coverage: float | None) -> Coverage:
+    """Return the coverage that a query or a command line asks for.
+
+    Raises
+    ------
+    InputError
+        ``option_conflict`` if both are given; ``coverage_invalid`` for one out of its bounds.
+    """
+    if k is not None and coverage is not None:
+        raise InputError(
+            f"k = {k:g} and coverage = {coverage:g} are both given.",
+            code="option_conflict",
+            remedy="Give one of them: each follows from the other.",
+        )
+    try:
+        return Coverage(k=k, coverage=coverage)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(
+            f"{first['loc'][0]}: {first['msg']}, got {first['input']}.",
+            code="coverage_invalid",
+            remedy="Give k as 2, or the share that the interval is to hold as 0.95.",
+        ) from error
 
 
 def percent(share: float) -> str:

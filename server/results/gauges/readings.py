@@ -36,9 +36,11 @@ from server.formats.gauges.readings import (
     RigidMotionReading,
     StepReadings,
 )
+from server.formats.gauges.stated import stated
 from server.formats.results.folder import number_of
 from server.formats.results.layout import COVARIANCE_NAMES
 from server.formats.results.reading import ResultHead, read_field, read_head
+from server.formats.results.uncertainty import Included, Statement, read_included
 from server.formats.version import software_version
 from server.results.gauges.fields import FieldWriter
 from server.results.gauges.request import ExtensometerGauge, GaugeRequest, LineGauge, PlaneAlignment, PointGauge
@@ -62,6 +64,7 @@ class _Step:
     head: ResultHead
     field: Field
     shared: SharedPixels
+    included: Included
 
     def reading(self, **found: Any) -> StepReadings:
         head = self.head
@@ -95,7 +98,7 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
     alignment: Alignment | None = None
     first: ResultHead | None = None
     grid: tuple[Float, Float] | None = None
-    hashes, steps, heads = {}, [], []
+    hashes, steps, heads, included = {}, [], [], []
     moved_by: set[str] = set()
     found: set[str] = set()
     positions: _Positions = {}
@@ -119,7 +122,9 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
                 remedy="Ask for fewer positions, variables or steps.",
             )
         heads.append(step.head)
-        steps.append(_read_step(step, alignment, request, positions, found, fields))
+        included.append(step.included)
+        readings = _read_step(step, alignment, request, positions, found, fields)
+        steps.append(stated(readings, Statement(step.included, request)))
     for name in request.variables or ():
         if name not in found and any(s.problem is None for s in steps):
             read_variable(chosen[-1], name)  # the error names those that there are
@@ -138,6 +143,7 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
         subset_px=first.settings["subset_px"],
         smoothing_window=first.settings.get("smoothing_window"),
         alignment=None if alignment is None else _frame_reading(alignment),
+        statement=Statement(Included.in_all(included), request),
         steps=steps,
     )
 
@@ -174,7 +180,7 @@ def _read(path: Path) -> _Step:
             code="settings_missing",
             remedy="Measure again with this program.",
         )
-    return _Step(path, sha256_of(path), head, field, SharedPixels.of(field, float(subset)))
+    return _Step(path, sha256_of(path), head, field, SharedPixels.of(field, float(subset)), read_included(path))
 
 
 def _check_same(step: _Step, first: ResultHead, grid: tuple[Float, Float], path: Path, refs: set[str]) -> None:

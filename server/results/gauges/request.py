@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AliasChoices, ConfigDict, Field, StringConstraints, model_validator
 
-from core.settings import Pixel, Whole, disagreement
+from core.settings import CoverageFields, Pixel, Whole, disagreement
 from server.base.models import Number, Request, StepNumber, Switch, any_of, given, not_both, one_of
 
 PositionPx = tuple[Pixel, Pixel]
@@ -145,7 +145,7 @@ class ThreeTwoOneAlignment(Request):
 Alignment = Annotated[PlaneAlignment | ThreeTwoOneAlignment, Field(discriminator="kind")]
 
 
-class GaugeRequest(Request):
+class GaugeRequest(CoverageFields, Request):
     """A set of gauges, read in every step."""
 
     model_config = ConfigDict(

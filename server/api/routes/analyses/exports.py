@@ -14,7 +14,7 @@ from fastapi.responses import FileResponse, Response, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
 from core.errors import Cancelled
-from server.api.protocol.dependencies import AnalysisId, ServiceDep, TestId
+from server.api.protocol.dependencies import AnalysisId, CoverageDep, ServiceDep, TestId
 from server.api.protocol.problems import errors
 from server.base.errors import NotFoundError
 from server.exports.request import MEDIA_TYPES, ExportFormat, ExportRequest, steps_in
@@ -91,6 +91,7 @@ async def export(
     test_id: TestId,
     analysis_id: AnalysisId,
     drawn: Annotated[_Drawn, Depends(_drawn)],
+    coverage: CoverageDep,
     format: Annotated[  # noqa: A002
         ExportFormat,
         Query(
@@ -120,17 +121,18 @@ async def export(
 ) -> Response:
     """Answer with the file once it is made; several files are one ZIP archive.
 
-    Every form states units, frame, settings, calibration and version; docs/reference/exports.md describes each. The
+    Every form states units, frame, settings, calibration and version, and what its uncertainties include;
+    docs/reference/exports.md describes each. With k or coverage `expanded_NAME` stands beside `sigma_NAME`. The
     header X-Stale lists what is gone or was replaced since the analysis. A client that goes away ends its export.
     """
     wanted = [step] if step is not None else None if steps is None else steps_in(steps)
     files, headers = await run_in_threadpool(_prepared, service, test_id, analysis_id, wanted)
-    if format == "nc" and len(files) == 1 and variables is None:
+    if format == "nc" and len(files) == 1 and variables is None and coverage.factor == 1.0:
         return FileResponse(
             files[0], media_type=MEDIA_TYPES["nc"], headers=headers, filename=f"{test_id}_{analysis_id}_{files[0].name}"
         )
     names = None if variables is None else variables.split(",")
-    export_request = ExportRequest(format, None, names, drawn.style, drawn.over_image, drawn.fps)
+    export_request = ExportRequest(format, None, names, drawn.style, drawn.over_image, drawn.fps, coverage)
     folder = await run_in_threadpool(service.exports.new_folder)
     try:
         made = Path(await _made(request, service, files, export_request, folder))

@@ -13,12 +13,14 @@ from pydantic_core import to_json
 
 from server.api.models import FieldList, FieldReply, ProbeReply
 from server.api.protocol.conditional import etag_of, tags_in
-from server.api.protocol.dependencies import AnalysisId, Camera, ServiceDep, StepNumber, TestId
+from server.api.protocol.dependencies import AnalysisId, Camera, CoverageDep, ServiceDep, StepNumber, TestId
 from server.api.protocol.problems import errors
 from server.formats.files import known_sha256
+from server.formats.results.uncertainty import Statement, read_included
 from server.results.field_forms import MEDIA_TYPES, RANGE_PATTERN, FieldForm, Part, encode, nested, take
 from server.results.positions import image_positions
-from server.results.reader import list_variables, probe_result, read_cut_pieces, read_variable
+from server.results.reader import list_variables, probe_result, read_cut_pieces
+from server.results.uncertainty import read_interval
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
 FieldName = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,63}$", description="Variable of the result file.")]
@@ -54,6 +56,7 @@ def get_field(
     n: StepNumber,
     name: FieldName,
     request: Request,
+    coverage: CoverageDep,
     format: Annotated[  # noqa: A002
         FieldForm,
         Query(
@@ -65,15 +68,20 @@ def get_field(
     cols: RangeText = None,
     stride: Annotated[int, Query(ge=1, le=10000, description="Each so many-th row and column.")] = 1,
 ) -> Response:
-    """Return values over the grid of points, or a part of it; null, NaN or nothing where a point failed."""
+    """Return values over the grid of points, or a part of it; null, NaN or nothing where a point failed.
+
+    `sigma_NAME` is the standard uncertainty; with k or coverage there is `expanded_NAME` too. The header X-Uncertainty
+    says what they include.
+    """
     path = service.tests.result_file(test_id, analysis_id, n)
     # a result never changes: what was asked for, and of which file, name the answer
-    etag = etag_of([known_sha256(path), name, format, rows, cols, stride])
+    etag = etag_of([known_sha256(path), name, format, rows, cols, stride, coverage.factor])
     headers = {"ETag": etag, "Cache-Control": "private, no-cache"}
     if etag in tags_in(request.headers.get("if-none-match", "")):
         return Response(status_code=304, headers=headers)
-    part = take(name, lambda wanted: read_variable(path, wanted), Part(rows, cols, stride))
-    headers |= part.headers
+    statement = Statement(read_included(path), coverage)
+    part = take(name, lambda wanted: read_interval(path, wanted, statement), Part(rows, cols, stride), statement.text)
+    headers |= part.headers | {"X-Uncertainty": statement.text}
     if format != "json":
         return Response(encode(part, format), media_type=MEDIA_TYPES[format], headers=headers)
     document = {
@@ -84,6 +92,7 @@ def get_field(
         "rows": headers["X-Rows"],
         "cols": headers["X-Cols"],
         "values": nested(part.values),
+        "uncertainty": statement.document(),
     }
     return _json(document, headers)
 
@@ -103,7 +112,11 @@ def list_fields(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, n
     """Return name, unit, meaning and dimensions of every variable; what the values of a status mean; the cuts."""
     path = service.tests.result_file(test_id, analysis_id, n)
     return FieldList.model_validate(
-        {"fields": [asdict(v) for v in list_variables(path)], "cuts_px": read_cut_pieces(path)}
+        {
+            "fields": [asdict(v) for v in list_variables(path)],
+            "cuts_px": read_cut_pieces(path),
+            "uncertainty": Statement(read_included(path)).document(),
+        }
     )
 
 
@@ -147,9 +160,9 @@ def get_probe(
     analysis_id: AnalysisId,
     x_px: Annotated[float, Query(ge=0.0, le=32767.0, allow_inf_nan=False, description="Column in camera 1's image.")],
     y_px: Annotated[float, Query(ge=0.0, le=32767.0, allow_inf_nan=False, description="Row in camera 1's image.")],
+    coverage: CoverageDep,
     step: Annotated[int, Query(ge=0, le=9999, description="Number of the step.")] = 0,
 ) -> ProbeReply:
-    """Return every number of the nearest point."""
-    return ProbeReply.model_validate(
-        {"step": step, **asdict(probe_result(service.tests.result_file(test_id, analysis_id, step), x_px, y_px))}
-    )
+    """Return every number of the nearest point, with its uncertainty."""
+    path = service.tests.result_file(test_id, analysis_id, step)
+    return ProbeReply.model_validate({"step": step, **asdict(probe_result(path, x_px, y_px, coverage))})
