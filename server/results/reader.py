@@ -181,6 +181,7 @@ class ProbeValue:
     units: str
     sigma: float | None = None
     expanded: float | None = None
+    budget: dict[str, float | None] | None = None
     not_included: str = ""
 
 

@@ -221,6 +221,9 @@ class ProbeValue(Reply):
     units: str = Field(description="Its unit; `1` of what has none.", examples=["mm"])
     sigma: float | None = Field(None, description="Standard uncertainty; null where it is not known.")
     expanded: float | None = Field(None, description="k times it, where another k than 1 was asked for.")
+    budget: dict[str, float | None] | None = Field(
+        None, description="Standard uncertainty by cause; their squares add up to that of sigma. Null: not known."
+    )
     not_included: str = Field("", description="`calibration not included` where that is so.")
 
 

@@ -8,15 +8,17 @@ import { about, files } from "./results/about.js";
 import { camerasNote } from "./results/cameras.js";
 import { gauges } from "./results/gauges.js";
 import { mark, pinned } from "./results/probe.js";
+import { interval } from "./results/uncertainty.js";
 import { h, replace, table, badge, when, num, count, quantity, field, select, definitions, notify, problemText, STATE_KIND } from "../lib/dom.js";
 
 /** @import { Here } from "../main.js" */
 /** @import { Ends } from "#dom" */
 /** @import { Over } from "../widgets/field_map.js" */
 /** @import { Shown } from "./results/analysis.js" */
+/** @import { Interval } from "./results/uncertainty.js" */
 /** @typedef {"image" | "surface" | "compare"} Mode */
 /** @typedef {{ step: number | null, field: string | null, image: Over, mode: Mode, info: Shown | null, playing: object | null, pinned?: number }} State */
-/** @typedef {{ result: Result, state: State, map: FieldMap, scale: Scale, ends: Ends, probe: HTMLElement, message: HTMLElement, readonly step: number | null,
+/** @typedef {{ result: Result, state: State, map: FieldMap, scale: Scale, interval: Interval, ends: Ends, probe: HTMLElement, message: HTMLElement, readonly step: number | null,
  *   readonly info: Shown | null, onpick: (x: number, y: number, event: Event) => unknown, drawn: Set<() => unknown> }} Viewer shared by the parts of the screen; `drawn` is called after each change of step, field or scale */
 /** @typedef {{ root: HTMLElement, update: () => Promise<void>, close: () => void, attach?: () => void }} OtherView shown instead of the map */
 
@@ -107,12 +109,13 @@ async function show(root, testId, analysisId, query) {
   const play = h("button", { type: "button", "aria-pressed": "false", title: "Play through the steps", onclick: () => playing(!state.playing) }, "▶ Play");
   /** @type {Viewer} */
   const screen = {
-    result, state, map, scale, ends, probe, message,
+    result, state, map, scale, ends, probe, message, interval: /** @type {any} */ (null),
     get step() { return state.step; },
     get info() { return state.info; },
     onpick: (x, y) => pick(x, y),
     drawn: new Set(),
   };
+  screen.interval = interval(screen);
 
   async function drawFields() {
     if (state.step === null) return;
@@ -276,7 +279,7 @@ async function show(root, testId, analysisId, query) {
         h("button", { type: "button", "aria-label": "Step before", onclick: () => move(-1) }, "◂"), Object.assign(slider, { id: "resultstep" }),
         h("button", { type: "button", "aria-label": "Next step", onclick: () => move(1) }, "▸"), play, stepText))),
     h("div.grid.side.measured", h("div", stage, message, cameras),
-      h("section.panel.figures", { "aria-label": "Figures" }, scale.root, h("h2", "Statistics"), statistics, h("h2", "Probe"), probe), below));
+      h("section.panel.figures", { "aria-label": "Figures" }, scale.root, h("h2", "Statistics"), statistics, screen.interval.root, h("h2", "Probe"), probe), below));
 
   drawStatus();
   screen.drawn.add(() => mark(screen));

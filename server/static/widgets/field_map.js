@@ -34,6 +34,8 @@ export class FieldMap {
     /** @type {Now | null} */
     this.now = null;
     this.asked = 0;
+    this.factor = 1; // of the standard uncertainties shown under the mouse
+    this.lacking = ""; // what they do not include
     this.noImage = false;
     this.address = "";
     /** @type {Raster | null} */
@@ -185,7 +187,8 @@ export class FieldMap {
     this.view.readout.dataset.value = String(values[i]);
     if (info.flags) return `${info.text}: ${(info.flags[values[i]] ?? values[i]).toString().replace(/_/g, " ")}`;
     if (!grid.valid[i] || !Number.isFinite(values[i])) return `${info.text}: no valid value`;
-    const uncertainty = sigma && Number.isFinite(sigma[i]) ? ` ± ${num(sigma[i], 2)}` : "";
-    return `${info.text} ${uncertainty ? num(values[i], 5) + uncertainty : ""}${uncertainty ? `\u00a0${info.unit}` : quantity(values[i], info.unit, 5)}`;
+    if (!sigma || !Number.isFinite(sigma[i])) return `${info.text} ${quantity(values[i], info.unit, 5)}`;
+    const k = this.factor === 1 ? "u, k = 1" : `U, k = ${num(this.factor, 3)}`;
+    return `${info.text} ${num(values[i], 5)} ± ${num(this.factor * sigma[i], 2)}\u00a0${info.unit} (${k}${this.lacking ? `; ${this.lacking}` : ""})`;
   }
 }

@@ -30,19 +30,21 @@ interface Unnamed {
 export type Trouble = { cause?: string; code?: string; remedy?: string; detail?: string; title?: string; errors?: unknown[] };
 export type StepSummary = {
   n: number; valid: number; points: number; epipolar_offset_rms_px?: number; wall_s?: number; zncc_median?: { [pair: string]: number };
-  epipolar_check?: { level: string; reason: string }; sigma_median_mm?: Numbers; strain?: { noise_floor_microstrain?: Numbers }; patch?: { patch?: string; reason?: string };
+  epipolar_check?: { level: string; reason: string }; sigma_median_mm?: Numbers; sigma_calibration_median_mm?: Numbers | null; strain?: { noise_floor_microstrain?: Numbers }; patch?: { patch?: string; reason?: string };
   camera_motion?: Schemas["CameraMotion"] | null;
 };
 export type PositionsCheck = Check & { positions_mm?: { [cam: string]: number[] }; per_camera?: { [cam: string]: Check } };
 export type TakenView = { index: number; camera: string; dz_mm: number; dz_commanded_mm?: number; role: string; file: string; frames: number };
 
-type Gauged = { value: number | null; sigma: number | null };
+/** What stands beside a standard uncertainty: its parts by cause, null where one is not known, and what it lacks. */
+type Stated<Part> = { budget?: { [cause: string]: Part } | null; not_included?: string };
+type Gauged = { value: number | null; sigma: number | null } & Stated<number | null>;
 
 /** A step's gauge readings; \`missing\` is the reason for a missing value. */
 export type GaugeReadings = Omit<Schemas["GaugeStep"], "lines" | "extensometers" | "areas"> & {
-  lines?: { distance_px: number[]; missing: (string | null)[]; values: { [variable: string]: { value: (number | null)[]; sigma: (number | null)[]; units: string } } }[];
+  lines?: { distance_px: number[]; missing: (string | null)[]; values: { [variable: string]: { value: (number | null)[]; sigma: (number | null)[]; units: string } & Stated<(number | null)[]> } }[];
   extensometers?: { missing?: string | null; values: { [quantity: string]: Gauged } }[];
-  areas?: { valid: number; points: number; values: { [variable: string]: { units: string } & { [S in "mean" | "mean_sigma" | "sd" | "rms" | "min" | "max"]: number | null } } }[];
+  areas?: { valid: number; points: number; values: { [variable: string]: { units: string; not_included?: string; mean_budget?: { [cause: string]: number | null } | null } & { [S in "mean" | "mean_sigma" | "sd" | "rms" | "min" | "max"]: number | null } } }[];
 };
 
 // the same type, not merely one that fits: replies with few required fields fit each other

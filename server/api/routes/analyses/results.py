@@ -108,14 +108,16 @@ def _json(document: dict[str, Any], headers: dict[str, str] | None = None) -> Re
     response_model_exclude_none=True,
     responses=errors(404, 422),
 )
-def list_fields(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, n: StepNumber) -> FieldList:
+def list_fields(
+    service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, n: StepNumber, coverage: CoverageDep
+) -> FieldList:
     """Return name, unit, meaning and dimensions of every variable; what the values of a status mean; the cuts."""
     path = service.tests.result_file(test_id, analysis_id, n)
     return FieldList.model_validate(
         {
             "fields": [asdict(v) for v in list_variables(path)],
             "cuts_px": read_cut_pieces(path),
-            "uncertainty": Statement(read_included(path)).document(),
+            "uncertainty": Statement(read_included(path), coverage).document(),
         }
     )
 

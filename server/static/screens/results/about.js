@@ -3,6 +3,7 @@ import * as api from "../../lib/api.js";
 import { h, replace, table, badge, definitions, num, tick, count, quantity, action, field, select, number, notify, when, STATE_KIND } from "../../lib/dom.js";
 
 import { REMEDY, camerasBadge } from "./cameras.js";
+import { NOT_INCLUDED } from "./uncertainty.js";
 
 /** @import { Viewer } from "../results.js" */
 /** @import { StepSummary } from "#routes" */
@@ -57,7 +58,7 @@ export function about(screen) {
         ["Strain noise floor", (one) => quantity(one.strain?.noise_floor_microstrain?.exx, "µm/m", 3), { numeric: true }],
         ["Patch", (one) => h("span", { title: one.patch?.reason ?? "" }, one.patch?.patch ?? "–")],
         ["Time", (one) => quantity(one.wall_s, "s", 3), { numeric: true }],
-      ], steps, { caption: "Summary of each step; σ are medians of the reported standard uncertainties", empty: "No step is finished yet." }),
+      ], steps, { caption: `Summary of each step; σ are medians of the reported standard uncertainties (k = 1)${steps.some((one) => !one.sigma_calibration_median_mm) ? `, ${NOT_INCLUDED}` : ""}`, empty: "No step is finished yet." }),
       definitions(steps.length ? [["epipolar check of the last step", steps.at(-1)?.epipolar_check?.reason ?? "–"], ["cameras at the last step", steps.at(-1)?.camera_motion?.text ?? "–"], ["patch of the last step", steps.at(-1)?.patch?.reason ?? "–"]] : []));
   }
   draw();

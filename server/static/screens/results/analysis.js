@@ -125,7 +125,7 @@ export class Result {
    */
   fields(n) {
     return this.#keep(`${n}`, async () => {
-      const { fields, cuts_px: cuts } = await api.get(`${this.path}/steps/${n}/fields`);
+      const { fields, cuts_px: cuts, uncertainty } = await api.get(`${this.path}/steps/${n}/fields`);
       /** @type {Shown[]} */
       const shown = [];
       for (const one of fields) {
@@ -142,7 +142,7 @@ export class Result {
       }
       const order = GROUPS.map(([name]) => name);
       shown.sort((a, b) => order.indexOf(a.group) - order.indexOf(b.group));
-      return { shown, cuts, all: new Set(fields.map((one) => one.name)) };
+      return { shown, cuts, uncertainty, all: new Set(fields.map((one) => one.name)) };
     });
   }
 

@@ -113,6 +113,7 @@ export async function compare(screen) {
     const mine = asked;
     if (!map.now) return;
     fade();
+    Object.assign(right, { factor: map.factor, lacking: map.lacking });
     if (!other) {
       right.view.blank("There is no other analysis to compare with.");
       panel.hidden = true;
@@ -157,11 +158,11 @@ export async function compare(screen) {
     d.sigma?.forEach((sigma, i) => { if (Number.isFinite(d.values[i]) && Number.isFinite(sigma)) { squares += sigma ** 2; reported += 1; } });
     const rmsReported = reported ? Math.sqrt(squares / reported) : null;
     replace(figures, [...definitions([
-      ["mean difference", quantity(s.mean, found.unit)], ["rms", quantity(s.rms, found.unit)], ["sd", quantity(s.sd, found.unit)], ["reported σ of a difference, rms", quantity(rmsReported, found.unit)],
+      ["mean difference", quantity(s.mean, found.unit)], ["rms", quantity(s.rms, found.unit)], ["sd", quantity(s.sd, found.unit)], [`reported ${screen.interval.symbol} of a difference, rms`, quantity(rmsReported === null ? null : screen.interval.factor * rmsReported, found.unit)],
       ["min", quantity(s.min, found.unit)], ["max", quantity(s.max, found.unit)], ["points compared", `${count(s.count)} of ${count(a.values.length)}`],
     ]).children]);
     Object.assign(figures.dataset, { rms: String(s.rms), mean: String(s.mean), count: String(s.count), reported: String(rmsReported) });
-    note.textContent = `This analysis less the other${d.interpolated ? "; the points differ, so the other's values are taken between its points" : ", point by point"}${found.unit ? `, in ${found.unit}` : ""}. The reported σ assumes that both are independent; analyses of the same images are not.`;
+    note.textContent = `This analysis less the other${d.interpolated ? "; the points differ, so the other's values are taken between its points" : ", point by point"}${found.unit ? `, in ${found.unit}` : ""}. The reported ${screen.interval.symbol} assumes that both are independent; analyses of the same images, or by one calibration, are not. ${screen.interval.text}.`;
     await histogram(right.measured, s, found, rmsReported);
     there();
   }
@@ -189,6 +190,8 @@ export async function compare(screen) {
       data: [x, bins, ...(normal ? [normal] : [])], label: "Histogram of the difference" });
   }
 
+  const again = () => update().catch(notify);
+  screen.interval.changed.add(again);
   await fillAnalyses().catch(notify);
   return {
     root, update,
@@ -196,6 +199,7 @@ export async function compare(screen) {
     attach: () => { left.append(map.view.root); map.view.fit(); },
     close: () => {
       asked += 1;
+      screen.interval.changed.delete(again);
       map.view.root.removeEventListener("viewchange", there);
       right.view.root.removeEventListener("viewchange", back);
       plot?.close();

@@ -4,6 +4,7 @@ import { chart } from "../../widgets/plots.js";
 import { h, svg, numeric, replace, table, num, count, number, select, field, action, notify, problemText } from "../../lib/dom.js";
 import { nudge, onGrab } from "../../widgets/view.js";
 import { shownUnit } from "./analysis.js";
+import { budgetTable, withBudget } from "./uncertainty.js";
 /** @import { Attributes } from "#dom" */
 /** @import { Body, GaugeReadings, Model } from "#routes" */
 /** @import { Viewer } from "../results.js" */
@@ -23,7 +24,7 @@ const EXTENSOMETER = [["strain", "strain"], ["elongation_mm", "elongation (mm)"]
 
 /** @param {Viewer} screen */
 export function gauges(screen) {
-  const { result, map } = screen;
+  const { result, map, interval } = screen;
   const { view } = map;
   const layer = svg("g", { class: "gauges" });
   view.svg.append(layer);
@@ -238,8 +239,8 @@ export function gauges(screen) {
 
   // reading ----------------------------------------------------------------------------------------------------
   /** @typedef {NonNullable<GaugeReadings["lines"]>[number]} Line */
-  /** @type {{ line: { line: Line, from: [Spot, Spot], name: string } | null, extensometer: GaugeReadings[] | null }} */
-  const answers = { line: null, extensometer: null };
+  /** @type {{ line: { line: Line, from: [Spot, Spot], name: string } | null, extensometer: GaugeReadings[] | null, area: { name: string, steps: GaugeReadings[] } | null }} */
+  const answers = { line: null, extensometer: null, area: null };
   /** @type {Partial<Record<Kind, Awaited<ReturnType<typeof chart>> | null>>} */
   const plots = {};
   /**
@@ -272,14 +273,19 @@ export function gauges(screen) {
   }
   /** @type {(values: (number | null)[], sigma: (number | null)[], sign: 1 | -1) => (number | null)[]} */
   const beside = (values, sigma, sign) => values.map((v, k) => { const s = sigma[k]; return v === null || s === null ? null : v + sign * s; });
+  /** @type {(budget: { [cause: string]: (number | null)[] } | null | undefined) => { [cause: string]: number | null }} */
+  const rms = (budget) => Object.fromEntries(Object.entries(budget ?? {}).map(([cause, parts]) => {
+    const known = parts.filter((part) => part !== null);
+    return [cause, known.length ? Math.sqrt(known.reduce((sum, part) => sum + part * part, 0) / known.length) : null];
+  }));
   async function drawLine() {
     if (!answers.line) return;
     const { line, from, name } = answers.line;
-    const { value, sigma, units } = line.values[name];
+    const { value, sigma, units, budget, not_included: lacking } = line.values[name];
     const { unit, factor } = shownUnit(name, units);
     const scaled = (/** @type {(number | null)[]} */ list) => list.map((v) => (v === null ? null : v * factor));
     const values = scaled(value);
-    const errors = scaled(sigma);
+    const errors = scaled(sigma).map((v) => (v === null ? null : interval.factor * v));
     const positions = values.map((_, k) => ["x_mm", "y_mm", "z_mm"].map((axis) => line.values[axis].value[k] ?? NaN));
     let length = 0;
     const mm = values.map((_, k) => {
@@ -294,10 +300,11 @@ export function gauges(screen) {
     const missing = value.filter((v) => v === null).length;
     replace(lineText, h("p.quiet", `${count(value.length)} positions from (${from[0].join(", ")}) to (${from[1].join(", ")}) px`,
       missing ? `; ${missing} without a value: ${[...new Set(line.missing.filter(Boolean))].join(", ").replace(/_/g, " ")}` : "",
-      along.value === "mm" && !whole ? "; the distance in mm is unknown where points are missing, so it is given in px" : "", errors.some((v) => v !== null) ? "; the band is one standard uncertainty" : "; no standard uncertainty is known"));
+      along.value === "mm" && !whole ? "; the distance in mm is unknown where points are missing, so it is given in px" : "", errors.some((v) => v !== null) ? `; the band is ± ${interval.symbol}: ${interval.text}` : "; no standard uncertainty is known"),
+      budgetTable(rms(budget), unit, factor, lacking ?? ""));
     lineChart.dataset.answer = JSON.stringify({ x, value, sigma });
     await plot("line", lineChart, { x: inMm ? "distance (mm)" : "distance (px)", y: `${screen.info?.text ?? name}${unit ? ` (${unit})` : ""}`, height: 230,
-      series: [{ label: name }, { label: "+ σ", edge: true }, { label: "− σ", edge: true }], bands: [[2, 3]], data: [x, values, band(1), band(-1)], label: `${name} along the line` });
+      series: [{ label: name }, { label: `+ ${interval.symbol}`, edge: true }, { label: `− ${interval.symbol}`, edge: true }], bands: [[2, 3]], data: [x, values, band(1), band(-1)], label: `${name} along the line` });
   }
 
   const extChart = h("div", { "data-role": "extensometer-chart" });
@@ -369,20 +376,26 @@ export function gauges(screen) {
     const data = [rows.map((one) => one.x)];
     state.extensometers.forEach((gauge, k) => {
       const value = rows.map((one) => of(one, k, "value")).map((v) => (v === null ? null : v * factor));
-      const sigma = rows.map((one) => of(one, k, "sigma")).map((v) => (v === null ? null : v * factor));
+      const sigma = rows.map((one) => of(one, k, "sigma")).map((v) => (v === null ? null : v * factor * interval.factor));
       const at = data.length;
       data.push(value, beside(value, sigma, 1), beside(value, sigma, -1));
-      series.push({ label: gauge.name, colour: k, dots: true }, { label: `${gauge.name} + σ`, edge: true, colour: k }, { label: `${gauge.name} − σ`, edge: true, colour: k });
+      series.push({ label: gauge.name, colour: k, dots: true }, ...["+", "−"].map((sign) => ({ label: `${gauge.name} ${sign} ${interval.symbol}`, edge: true, colour: k })));
       bands.push([at + 1, at + 2]);
     });
     extChart.dataset.answer = JSON.stringify({ x: data[0], value: rows.map((one) => state.extensometers.map((_, k) => of(one, k, "value"))), sigma: rows.map((one) => state.extensometers.map((_, k) => of(one, k, "sigma"))) });
     const unit = strain ? "µm/m" : "mm";
     await plot("extensometer", extChart, { x: over.selectedOptions[0].text, y: `${what.selectedOptions[0].text.replace(" (mm)", "")} (${unit})`, height: 250, series, bands, data, label: `${name} of the extensometers` });
-    const valueText = (/** @type {Row} */ one, /** @type {number} */ k) => { const v = of(one, k, "value"); const s = of(one, k, "sigma"); return v === null ? one.each[k]?.missing?.replace(/_/g, " ") || "–" : `${num(v * factor, 5)}${s === null ? "" : ` ± ${num(s * factor, 2)}`}`; };
+    const valueText = (/** @type {Row} */ one, /** @type {number} */ k) => {
+      const [v, s] = [of(one, k, "value"), of(one, k, "sigma")];
+      if (v === null) return one.each[k]?.missing?.replace(/_/g, " ") || "–";
+      if (s === null) return num(v * factor, 5);
+      const { budget, not_included: lacking } = one.each[k].values[name];
+      return withBudget(`${num(v * factor, 5)} ± ${num(s * factor * interval.factor, 2)}`, budgetTable(budget, unit, factor, lacking ?? ""));
+    };
     replace(extTable, table([
       ["Step", (one) => one.n], ["Label", (one) => one.label], ...(over.value === "n" ? [] : [numeric(over.selectedOptions[0].text, (/** @type {Row} */ one) => num(one.x, 6))]),
       ...state.extensometers.map((gauge, k) => numeric(`${gauge.name} (${unit})`, (/** @type {Row} */ one) => valueText(one, k))),
-    ], rows, { caption: "With one standard uncertainty" }),
+    ], rows, { caption: `± ${interval.text}` }),
     h("div.row", state.extensometers.map((gauge) => h("button", { type: "button", onclick: () => { state.extensometers = state.extensometers.filter((one) => one !== gauge); changed("extensometer"); } }, `Remove ${gauge.name}`))));
   }
 
@@ -393,19 +406,33 @@ export function gauges(screen) {
     const { name } = screen.info;
     if (!areaBox.firstChild) replace(areaBox, h("p.quiet", "Reading …"));
     const answer = await api.post(`${result.path}/gauges`, body({ areas: [{ rectangle_px: state.area }], variables: [name] }));
-    const { unit, factor } = shownUnit(name, answer.steps.at(-1)?.areas?.[0]?.values[name]?.units ?? "");
+    drawArea(name, answer.steps);
+  }
+  /**
+   * @param {string} name
+   * @param {GaugeReadings[]} steps
+   */
+  function drawArea(name, steps) {
+    answers.area = { name, steps };
+    const { unit, factor } = shownUnit(name, steps.at(-1)?.areas?.[0]?.values[name]?.units ?? "");
     /** @type {(one: GaugeReadings, part: "mean" | "mean_sigma" | "sd" | "rms" | "min" | "max", digits?: number) => string} */
     const cell = (one, part, digits = 5) => num((one.areas?.[0]?.values[name]?.[part] ?? NaN) * factor, digits);
-    areaBox.dataset.answer = JSON.stringify(answer.steps.map((one) => one.areas?.[0]?.values[name] ?? null));
+    const uncertain = (/** @type {GaugeReadings} */ one) => {
+      const v = one.areas?.[0]?.values[name];
+      if (!v || v.mean_sigma === null) return "–";
+      return withBudget(num(v.mean_sigma * factor * interval.factor, 2), budgetTable(v.mean_budget, unit, factor, v.not_included ?? ""));
+    };
+    areaBox.dataset.answer = JSON.stringify(steps.map((one) => one.areas?.[0]?.values[name] ?? null));
     replace(areaBox, table([
-      ["Step", (one) => one.n], ["Label", (one) => one.label], ["Mean", (one) => cell(one, "mean"), { numeric: true }], ["± σ", (one) => cell(one, "mean_sigma", 2), { numeric: true }],
+      ["Step", (one) => one.n], ["Label", (one) => one.label], ["Mean", (one) => cell(one, "mean"), { numeric: true }], [`± ${interval.symbol}`, uncertain, { numeric: true }],
       ["sd", (one) => cell(one, "sd", 3), { numeric: true }], ["rms", (one) => cell(one, "rms"), { numeric: true }], ["Min", (one) => cell(one, "min"), { numeric: true }], ["Max", (one) => cell(one, "max"), { numeric: true }],
       ["Points", (one) => (one.problem ? one.problem.cause ?? "–" : `${one.areas?.[0].valid} of ${one.areas?.[0].points}`), { numeric: true }],
-    ], answer.steps, { caption: `${name}${unit ? ` in ${unit}` : ""} over the rectangle` }));
+    ], steps, { caption: `${name}${unit ? ` in ${unit}` : ""} over the rectangle; ${interval.text}` }));
   }
 
+  interval.changed.add(() => Promise.all([drawLine(), drawExtensometers(), answers.area && drawArea(answers.area.name, answers.area.steps)]));
   rigid.addEventListener("change", () => { for (const read of [readLine, readArea, readExtensometers]) read().catch(notify); });
-  const clear = (/** @type {"line" | "area"} */ tool) => h("button", { type: "button", onclick: () => { state[tool] = null; if (tool === "line") { answers.line = null; plots.line?.close(); plots.line = null; lineChart.replaceChildren(); lineText.replaceChildren(); } else areaBox.replaceChildren(); draw(); } }, "Clear");
+  const clear = (/** @type {"line" | "area"} */ tool) => h("button", { type: "button", onclick: () => { state[tool] = null; if (tool === "line") { answers.line = null; plots.line?.close(); plots.line = null; lineChart.replaceChildren(); lineText.replaceChildren(); } else { answers.area = null; areaBox.replaceChildren(); } draw(); } }, "Clear");
   const panels = {
     line: h("details.panel", h("summary", "Line"), h("p.quiet", "Choose the tool Line above the picture and drag, or give its ends."), lineInputs.row, h("div.row", field("Along", along), clear("line")), lineText, lineChart),
     extensometer: h("details.panel", h("summary", "Extensometers"), h("p.quiet", "Choose the tool Extensometer and click its two ends, or give them."), extInputs.row, h("div.row", field("Show", what), field("Against", over)), extChart, extTable),

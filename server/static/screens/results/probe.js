@@ -1,35 +1,50 @@
 // The pinned point: all its values.
 import { h, svg, replace, table, num, badge, STATE_KIND } from "../../lib/dom.js";
 import { shownUnit } from "./analysis.js";
+import { budgetTable, withBudget, withUncertainty } from "./uncertainty.js";
 
 /** @import { Reply } from "#routes" */
 /** @import { Viewer } from "../results.js" */
 
 const CORRELATIONS = 3;
+/** @typedef {Reply<"get", "/tests/{test_id}/analyses/{analysis_id}/probe">} Answer */
+/** @type {WeakMap<Viewer, Answer>} */
+const answers = new WeakMap(); // the one shown, for another interval
 
 /**
  * Show a probe's answer and mark its point in the picture.
  * @param {Viewer} screen
- * @param {Reply<"get", "/tests/{test_id}/analyses/{analysis_id}/probe">} answer
+ * @param {Answer} answer
  */
 export function pinned(screen, answer) {
-  /** @type {{ name: string, value: number | null, unit: string, sigma: number | null }[]} */
+  if (!answers.has(screen)) screen.interval.changed.add(() => draw(screen, /** @type {Answer} */ (answers.get(screen))));
+  answers.set(screen, answer);
+  draw(screen, answer);
+}
+
+/**
+ * @param {Viewer} screen
+ * @param {Answer} answer
+ */
+function draw(screen, answer) {
+  /** @type {{ name: string, text: string | HTMLElement }[]} */
   const rows = [];
-  for (const [name, { value, units }] of Object.entries(answer.values)) {
+  for (const [name, { value, units, sigma, not_included: lacking, budget }] of Object.entries(answer.values)) {
     if (name.startsWith("sigma_") || name === "status" || name === "strain_status") continue;
     const { unit, factor } = shownUnit(name, units);
     if (Array.isArray(value)) {
-      if (value.length <= CORRELATIONS) rows.push(.../** @type {(number | null)[]} */ (value).map((one, k) => ({ name: `${name} ${k + 1}`, value: one, unit, sigma: null })));
+      if (value.length <= CORRELATIONS) rows.push(.../** @type {(number | null)[]} */ (value).map((one, k) => ({ name: `${name} ${k + 1}`, text: num(one, 5) })));
       continue;
     }
-    const sigma = /** @type {number | null} */ (answer.values[`sigma_${name}`]?.value ?? null);
-    rows.push({ name, value: value === null ? null : value * factor, unit, sigma: sigma === null ? null : sigma * factor });
+    const shown = value === null || value === undefined ? null : value * factor;
+    const u = sigma === null || sigma === undefined || shown === null ? null : sigma * factor;
+    const text = withUncertainty(shown, u, unit, screen.interval.factor);
+    rows.push({ name, text: u === null ? text : /** @type {string | HTMLElement} */ (withBudget(text, budgetTable(budget, unit, factor, lacking ?? ""))) });
   }
+  const { text } = screen.interval;
   replace(screen.probe,
     h("div.spread", h("span", `row ${answer.row}, column ${answer.col}, step ${answer.step}`), badge(answer.status.replace(/_/g, " "), STATE_KIND[answer.status] ?? "warn")),
-    table([
-      ["Number", (row) => row.name], ["Value ± σ", (row) => `${num(row.value, 5)}${row.sigma === null ? "" : ` ± ${num(row.sigma, 2)}`}${row.unit ? `\u00a0${row.unit}` : ""}`, { numeric: true }],
-    ], rows, { caption: "All values of the point" }));
+    table([["Number", (row) => row.name], [`Value ± ${screen.interval.symbol}`, (row) => row.text, { numeric: true }]], rows, { caption: `All values of the point; ${text}` }));
   mark(screen);
 }
 
