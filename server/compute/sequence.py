@@ -249,7 +249,7 @@ class SequenceMeasurement:
                 imported=self.calibration.imported,
                 camera_motion=self._motions.pop(step.n, None),
             ).document(),
-            "strain": None if strain is None else summarise_strain(strain).document(),
+            "strain": None if strain is None else summarise_strain(strain, shown).document(),
         }
         greys = {cam: made for cam, made in zip(CAMERAS, step.grey_from, strict=True) if made is not None}
         if greys:

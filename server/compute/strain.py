@@ -14,6 +14,7 @@ from core.field.points.smoothing_record import Smoothing
 from core.field.smoothed import smoothed_displacement
 from core.settings import StrainOrder
 from core.strain import StrainField, StrainOptions, StrainStatus, surface_strain
+from server.formats.results.budgets import strain_budgets
 
 _NAMES = ("exx", "eyy", "exy")
 
@@ -82,6 +83,8 @@ class StrainSummary:
         Over the field, of exx, eyy, exy.
     noise_floor_microstrain
         Median of the standard deviation that the points' covariances predict.
+    budget_median_microstrain
+        By component, the medians of its parts, as `budget_median_mm` has them.
     patch
         Strain of the patches themselves.
     """
@@ -96,6 +99,7 @@ class StrainSummary:
     mean_microstrain: dict[str, float | None]
     sd_microstrain: dict[str, float | None]
     noise_floor_microstrain: dict[str, float | None]
+    budget_median_microstrain: dict[str, dict[str, float]]
     patch: PatchStrain | None
 
     def document(self) -> dict[str, Any]:
@@ -103,9 +107,10 @@ class StrainSummary:
         return asdict(self)
 
 
-def summarise_strain(strain: StrainField) -> StrainSummary:
-    """Summarise one step's strain."""
+def summarise_strain(strain: StrainField, field: Field) -> StrainSummary:
+    """Summarise one step's strain, and the field that it was made of."""
     valid, patch = strain.valid, None
+    budgets = strain_budgets(field, strain, valid)
     if strain.patch is not None:
         both = valid & np.isfinite(strain.patch).all(axis=-1)
         difference = strain.patch[both] - strain.strain[both]
@@ -125,6 +130,9 @@ def summarise_strain(strain: StrainField) -> StrainSummary:
         mean_microstrain=_figures(strain.strain[valid], np.mean),
         sd_microstrain=_figures(strain.strain[valid], np.std),
         noise_floor_microstrain=_figures(strain.sigma[valid], np.median),
+        budget_median_microstrain={
+            name: {part: 1e6 * value for part, value in one.median.items()} for name, one in budgets.items()
+        },
         patch=patch,
     )
 

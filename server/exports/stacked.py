@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from server.formats.results.netcdf import written_dataset
+from core.common.factor import Causes, joined
+from server.formats.results.netcdf import opened, written_dataset
 from server.results.provenance import provenance
-from server.results.reader import list_variables
-from server.results.steps import Source, StepResult, chosen, each, require_same_grid
+from server.results.steps import Source, StepResult, causes_in, chosen, each, require_same_grid
+from server.results.uncertainty import COMMON_FACTOR
 
 _NO_STATE = -1  # of an integer variable in a step that does not have it
 _COMMON = ("x_px", "y_px")
@@ -25,8 +27,8 @@ def write_stacked(path: Path, source: Source, steps: Sequence[int] | None, names
     Datasets have the axes step, row, col (MATLAB, which counts from the other end, has col, row, step); ``x_px`` and
     ``y_px`` are the same in every step and have row, col. ``step``, ``load_n``, ``label`` and ``provenance`` (JSON
     text) have one entry a step. A variable that a step lacks is NaN there, or -1 if it counts. Units and meanings are
-    attributes. Common factors of steps with fewer columns are filled up with zeros. The file is netCDF-4, which is
-    HDF5.
+    attributes. A column of a common factor is the same cause in all steps (attribute ``parts``), zero where a step
+    does without it. The file is netCDF-4, which is HDF5.
 
     Raises
     ------
@@ -34,7 +36,7 @@ def write_stacked(path: Path, source: Source, steps: Sequence[int] | None, names
         ``steps_mixed`` if the steps lie on different points.
     """
     files = chosen(source, steps)
-    count, columns = len(files), _most_columns(files)
+    count, causes = len(files), _all_causes(files)
     first: StepResult | None = None
     with written_dataset(path, classic=False) as data:
         for k, step in enumerate(each(source, steps, names)):
@@ -42,27 +44,33 @@ def write_stacked(path: Path, source: Source, steps: Sequence[int] | None, names
                 _begin(data, step, count)
                 first = step
             require_same_grid(step, first)
-            _put(data, k, _filled_up(step, columns), source)
+            _put(data, k, _aligned(step, causes), source)
 
 
-def _most_columns(files: Sequence[Path]) -> dict[str, int]:
-    """Return the largest number of columns of each common factor: a step has as few as hold its own variance."""
-    most: dict[str, int] = {}
-    for head in (v for path in files for v in list_variables(path) if "common_factor" in v.name and len(v.shape) == 4):
-        most[head.name] = max(most.get(head.name, 0), head.shape[-1])
-    return most
+def _all_causes(files: Sequence[Path]) -> Causes | None:
+    """Return the causes of the columns of all steps together: a step has as few as hold its own variance."""
+    found = []
+    for path in files:
+        with opened(path) as data:
+            found.append(causes_in(data))
+    known = [causes for causes in found if causes is not None]
+    return functools.reduce(joined, known) if known else None
 
 
-def _filled_up(step: StepResult, columns: dict[str, int]) -> StepResult:
-    """Return a step whose common factors have so many columns: those of no variance are zero."""
-    variables = dict(step.variables)
-    for name, count in columns.items():
-        if name in variables:
-            values = variables[name].values
-            more = [(0, 0)] * 3 + [(0, count - values.shape[-1])]
-            # a point without numbers stays without them
-            filled = np.where(step.valid[..., None, None], np.pad(values, more), np.nan).astype(values.dtype)
-            variables[name] = replace(variables[name], values=filled)
+def _aligned(step: StepResult, causes: Causes | None) -> StepResult:
+    """Return a step whose common factors have the columns of all steps: those that it lacks are zero."""
+    if causes is None or step.causes is None:
+        return step
+    variables = {
+        name: replace(v, values=step.causes.aligned(v.values, causes).astype(v.values.dtype), parts=causes.columns)
+        if name.startswith(COMMON_FACTOR)
+        else v
+        for name, v in step.variables.items()
+    }
+    # a point without numbers stays without them
+    for name in variables:
+        if name.startswith(COMMON_FACTOR):
+            variables[name].values[~step.valid] = np.nan
     return replace(step, variables=variables)
 
 

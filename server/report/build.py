@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.field.points.result import Field
-from core.names import CAMERAS
+from core.names import BUDGET, CAMERAS
+from core.settings import CoverageFields
 from server.formats.results.camera_motion import MOVED_REMEDY
+from server.formats.results.uncertainty import NOT_INCLUDED, Statement
 from server.formats.version import software_version
 from server.report import pictures
 from server.report.calibration import CalibrationPart, calibration_gaps
@@ -24,6 +26,7 @@ from server.report.page import PNG, Picture, render
 from server.report.settings import analysis
 from server.report.source import Source
 from server.report.steps import Measured, Shown, read_steps
+from server.report.uncertainty import field_budgets, sentence
 
 _COMPONENTS = (("U", 0), ("V", 1), ("W", 2))
 _LEVELS = {"ok": "good", "good": "good", "warning": "warning", "failed": "failed"}
@@ -67,15 +70,22 @@ class Origin:
     inputs: list[tuple[str, list[tuple[str, str]]]]
 
 
-def make_report(source: Source) -> Report:
+def make_report(source: Source, coverage: CoverageFields | None = None) -> Report:
     """Return the report.
+
+    Parameters
+    ----------
+    source
+        What it is made from.
+    coverage
+        Of the uncertainties that it states; left out: that of the metadata's gauges, or one standard uncertainty.
 
     Raises
     ------
     FileFormatError
         A result file that cannot be read.
     """
-    measured = read_steps(source)
+    measured = read_steps(source, coverage)
     found = None
     if source.calibration is not None:
         found = geometry(source.calibration.pair, measured.reference, image_sizes(source))
@@ -111,6 +121,9 @@ def make_report(source: Source) -> Report:
         fields=_fields(measured),
         courses=courses(measured),
         gauges=gauges(source, measured),
+        uncertainty=sentence(measured),
+        budget=field_budgets(measured),
+        budget_names=list(BUDGET),
         missing=missing,
         origin=_origin(source),
     )
@@ -145,7 +158,9 @@ def _boxes(source: Source, measured: Measured) -> list[Box]:
         noise, small = f"{1e3 * floor.spatial_sd:.2g} {UM}", f"sd of W over the points, {floor.steps} static steps"
     else:
         sigma = measured.reported.get("W", measured.reported.get("Z"))
-        noise, small = ("-" if sigma is None else f"{1e3 * sigma:.2g} {UM}"), "predicted, no static steps"
+        noise, small = ("-" if sigma is None else f"{1e3 * sigma:.2g} {UM}"), "predicted (k = 1), no static steps"
+        if not measured.statement.included.calibration:
+            small += f"; {NOT_INCLUDED}"
     return [
         Box("Calibration", verdict or "no record", held_text, _LEVELS.get(verdict or "", "")),
         Box("Cameras since then", level or "not known", off, _LEVELS.get(level or "", "")),
@@ -248,7 +263,7 @@ def _fields(measured: Measured) -> list[tuple[str, list[Picture]]]:
     drawn = [Picture(height, PNG, "map of the reference's Z", "Shape of the reference: Z")]
     if not measured.shown:
         drawn.append(_status(reference, "the reference"))
-    return [("", drawn), *((f"Step {shown.n}: {shown.why}", _maps(shown)) for shown in measured.shown)]
+    return [("", drawn), *((f"Step {shown.n}: {shown.why}", _maps(shown, measured.statement)) for shown in measured.shown)]
 
 
 def _status(field: Field, subject: str) -> Picture:
@@ -256,7 +271,7 @@ def _status(field: Field, subject: str) -> Picture:
     return Picture(data, PNG, f"map of the points' states, {subject}", f"States of the points, {subject}")
 
 
-def _maps(shown: Shown) -> list[Picture]:
+def _maps(shown: Shown, statement: Statement) -> list[Picture]:
     field, drawn = shown.field, []
     layers: list[tuple[str, NDArray[np.float64], bool]] = []
     if field.uvw_mm is not None:
@@ -269,10 +284,11 @@ def _maps(shown: Shown) -> list[Picture]:
         title = f"{name}, step {shown.n}"
         data = pictures.field_map(field, values, name, title, strain=strain)
         drawn.append(Picture(data, PNG, f"map of {name} in step {shown.n}", title))
-    sigma, name = field.sigma_mm[..., -1], "W" if field.has_motion else "Z"
-    data = pictures.field_map(field, sigma, "standard deviation", f"sigma of {name}, step {shown.n}")
-    text = f"map of the predicted standard deviation in step {shown.n}"
-    drawn.append(Picture(data, PNG, text, f"Predicted standard deviation of {name}"))
+    interval, name = statement.k * field.sigma_mm[..., -1], "W" if field.has_motion else "Z"
+    label = "expanded uncertainty" if statement.expanded else "standard uncertainty"
+    data = pictures.field_map(field, interval, label, f"{statement.symbol} of {name}, step {shown.n}")
+    text = f"map of the predicted uncertainty in step {shown.n}"
+    drawn.append(Picture(data, PNG, text, f"Predicted {label} of {name}; {statement.text}"))
     drawn.append(_status(field, f"step {shown.n}"))
     return drawn
 

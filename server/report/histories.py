@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from core.errors import StereorigError
 from server.formats.gauges.readings import LineReading, Number, StepReadings
+from server.formats.results.uncertainty import Statement
 from server.report.floor import STRAINS, UM
 from server.report.items import Value
 from server.report.page import SVG, Picture
 from server.report.pictures import Lines, course
 from server.report.source import Source
 from server.report.steps import Measured, StepFigures
+from server.report.uncertainty import Budget, gauge_budgets
 from server.results.gauges.readings import read_gauges
 
 #: a gauge's values in every step, or the reason why there are none
@@ -34,11 +36,19 @@ class GaugeTable:
 
 @dataclass(frozen=True)
 class Gauges:
-    """All gauges; the curves are None where they could not be read at all."""
+    """All gauges; the curves are None where they could not be read at all.
+
+    Attributes
+    ----------
+    budgets, budget_step
+        Of their uncertainties in one step, and its number.
+    """
 
     curves: list[Picture] | None
     problems: list[str]
     tables: list[GaugeTable]
+    budgets: list[Budget] = field(default_factory=list)
+    budget_step: int | None = None
 
 
 @dataclass(frozen=True)
@@ -101,7 +111,8 @@ def gauges(source: Source, measured: Measured) -> Gauges | None:
     if source.metadata.gauges is None:
         return None
     try:
-        readings = read_gauges(list(source.files.values()), source.metadata.gauges)
+        asked = source.metadata.gauges.model_copy(update=measured.statement.asked.model_dump(include={"k", "coverage"}))
+        readings = read_gauges(list(source.files.values()), asked)
     except StereorigError as error:
         return Gauges(None, [f"The gauges could not be read: {error.cause}"], [])
     problems = [f"Step {s.n}: {s.problem.cause}" for s in readings.steps if s.problem is not None]
@@ -116,7 +127,7 @@ def gauges(source: Source, measured: Measured) -> Gauges | None:
         read: _Readings = [(s.extensometers[k].values, s.extensometers[k].missing) for s in steps]
         title = f"Extensometer {extensometer.name}"
         tables.append(_table(extensometer.name, title, _EXTENSOMETER, steps, read))
-        curves += _curves(title, _EXTENSOMETER[-1:], [values for values, _ in read], axis)
+        curves += _curves(title, _EXTENSOMETER[-1:], [values for values, _ in read], axis, measured.statement)
     others: list[tuple[str | None, str, _Readings]] = []
     for k, point in enumerate(steps[0].points):
         others.append((point.name, "Point", [(s.points[k].values, s.points[k].missing) for s in steps]))
@@ -127,10 +138,10 @@ def gauges(source: Source, measured: Measured) -> Gauges | None:
         last = read[-1][0]
         tables.append(_table(name, f"{kind} {name}", list(last), steps, read))
         moved = [n for n in last if n in ("u_mm", "v_mm", "w_mm")]
-        curves += _curves(f"{kind} {name}", moved, [values for values, _ in read], axis)
+        curves += _curves(f"{kind} {name}", moved, [values for values, _ in read], axis, measured.statement)
     for line in steps[-1].lines:
         curves += _line(line, steps[-1].n)
-    return Gauges(curves, problems, tables)
+    return Gauges(curves, problems, tables, gauge_budgets(steps[-1], measured.statement), steps[-1].n)
 
 
 def _table(
@@ -149,11 +160,14 @@ def _table(
 def _value(number: Number | None, missing: str) -> Value:
     if number is None or number.value is None:
         return Value(missing or "no value")
-    sd = "" if number.sigma is None else f" \u00b1 {number.sigma:.2g}"
+    u = number.sigma if number.expanded is None else number.expanded
+    sd = "" if u is None else f" \u00b1 {u:.2g}"
     return Value(f"{number.value:.6g}{sd}", number.value)
 
 
-def _curves(title: str, wanted: Sequence[str], read: Sequence[Mapping[str, Number]], axis: _Axis) -> list[Picture]:
+def _curves(
+    title: str, wanted: Sequence[str], read: Sequence[Mapping[str, Number]], axis: _Axis, statement: Statement
+) -> list[Picture]:
     if not wanted:
         return []
     factor, unit = (1e3, UM) if wanted[0].endswith("_mm") else (1e6, "microstrain")
@@ -161,9 +175,9 @@ def _curves(title: str, wanted: Sequence[str], read: Sequence[Mapping[str, Numbe
     for n in wanted:
         numbers = [values.get(n) for values in read]
         value = [None if v is None or v.value is None else factor * v.value for v in numbers]
-        sigma = [None if v is None or v.sigma is None else factor * v.sigma for v in numbers]
+        sigma = [None if v is None or v.sigma is None else statement.k * factor * v.sigma for v in numbers]
         lines[n.removesuffix("_mm")] = (value, sigma)
-    caption = f"{title}; bars are \u00b1 1 standard deviation"
+    caption = f"{title}; bars are \u00b1 {statement.text}"
     return [axis.draw(lines, unit, title, text=title, caption=caption)]
 
 

@@ -9,11 +9,13 @@ import numpy as np
 
 from core.field.checks.epipolar_offset import EpipolarCheck
 from core.field.points.result import Field
+from core.settings import Coverage, CoverageFields
 from core.strain import StrainField
 from server.compute.strain import StrainSummary, summarise_strain
 from server.formats.calibrations.volume import rbe_of
 from server.formats.results.reading import read_field
 from server.formats.results.strain import read_strain
+from server.formats.results.uncertainty import Included, Statement, read_included
 from server.formats.results.summary import StepSummary, summarise
 from server.report.floor import LENGTHS, STRAINS, Floor, FloorKeeper, Quantity, reported_sigma, static_steps
 from server.report.records import CameraMotionRecord, QualityRecord
@@ -109,6 +111,8 @@ class Measured:
         Median of the predicted standard deviations by quantity, of the first displacement or else of the shape.
     noise_grey
         Median noise of the reference image from the residuals of the matching.
+    statement
+        What is stated beside uncertainties: the coverage factor, and what they include in all steps.
     """
 
     steps: list[StepFigures]
@@ -120,6 +124,7 @@ class Measured:
     static_left_out: list[int]
     reported: dict[str, float | None]
     noise_grey: float | None
+    statement: Statement
 
     @property
     def quantities(self) -> list[Quantity]:
@@ -157,14 +162,23 @@ class Measured:
         return max(checks, key=lambda c: c.offset_px, default=None)
 
 
-def read_steps(source: Source) -> Measured:
-    """Read every result file once; at most three fields are held at a time, and the static steps' values."""
+def read_steps(source: Source, coverage: CoverageFields | None = None) -> Measured:
+    """Read every result file once; at most three fields are held at a time, and the static steps' values.
+
+    Parameters
+    ----------
+    source
+        Where they are.
+    coverage
+        Of the uncertainties that are stated; that of the metadata's gauges if left out or without a factor.
+    """
     labels = {n: _label(source, n) for n in source.files}
     static, static_source = static_steps(source.metadata.static_steps, labels, source.reference)
     rbe = None if source.calibration is None else rbe_of(source.calibration)
     imported = source.calibration is not None and source.calibration.imported
     keeper = FloorKeeper()
     figures: list[StepFigures] = []
+    included: list[Included] = []
     reference: Field | None = None
     peak: Shown | None = None
     last: Shown | None = None
@@ -178,6 +192,7 @@ def read_steps(source: Source) -> Measured:
             keeper.add(n, field, strain)
         step = _figures(source, n, field, strain, rbe, labels[n], static=n in static, imported=imported)
         figures.append(step)
+        included.append(read_included(path))
         if reference is None:
             reference = field
         if not reported or ("U" not in reported and field.has_motion):
@@ -207,7 +222,15 @@ def read_steps(source: Source) -> Measured:
         static_left_out=keeper.left_out,
         reported=reported,
         noise_grey=float(np.median(grey)) if grey.size else None,
+        statement=Statement(Included.in_all(included), _coverage(source, coverage)),
     )
+
+
+def _coverage(source: Source, asked: CoverageFields | None) -> CoverageFields:
+    for one in (asked, source.metadata.gauges):
+        if one is not None and (one.k is not None or one.coverage is not None):
+            return Coverage(k=one.k, coverage=one.coverage)
+    return Coverage(k=None, coverage=None)
 
 
 def _label(source: Source, n: int) -> str:
@@ -241,7 +264,7 @@ def _figures(
         seconds=_seconds(source, n),
         captured_utc=record.captured_utc,
         summary=summarise(field, rbe_px=rbe, reference=source.reference, imported=imported),
-        strain=None if strain is None else summarise_strain(strain),
+        strain=None if strain is None else summarise_strain(strain, field),
         skew_ms=record.skew_ms,
         quality=record.quality,
         static=static,

@@ -13,7 +13,10 @@ from numpy.typing import NDArray
 from core.settings import CoverageFields
 from core.status import PointStatus
 from server.base.errors import NotFoundError
+from server.formats.results.budgets import PointBudget, field_budgets, strain_budgets
 from server.formats.results.netcdf import opened
+from server.formats.results.reading import read_field
+from server.formats.results.strain import read_strain
 from server.formats.results.uncertainty import Included, Statement
 
 
@@ -212,6 +215,7 @@ def probe_result(path: Path, x_px: float, y_px: float, asked: CoverageFields) ->
         variables = {name: Variable.of(v) for name, v in data.variables.items() if len(v.dimensions) >= 2}
     distance = np.hypot(variables["x_px"].values - x_px, variables["y_px"].values - y_px)
     row, col = (int(i) for i in np.unravel_index(int(np.nanargmin(distance)), distance.shape))
+    budgets = _budgets_at(path, row, col)
 
     def number(name: str, variable: Variable) -> ProbeValue:
         value = ProbeValue(_number(variable.values[row, col]), variable.units)
@@ -220,7 +224,9 @@ def probe_result(path: Path, x_px: float, y_px: float, asked: CoverageFields) ->
         if sigma is None:
             return value
         expanded = statement.k * sigma if statement.expanded else None
-        return replace(value, sigma=sigma, expanded=expanded, not_included=statement.included.lacking)
+        budget = budgets[name].at(0) if name in budgets else None
+        lacking = statement.included.lacking
+        return replace(value, sigma=sigma, expanded=expanded, budget=budget, not_included=lacking)
 
     return Probe(
         row=row,
@@ -230,6 +236,13 @@ def probe_result(path: Path, x_px: float, y_px: float, asked: CoverageFields) ->
         values={n: number(n, v) for n, v in variables.items() if v.values.ndim <= 3},
         uncertainty=statement.document(),
     )
+
+
+def _budgets_at(path: Path, row: int, col: int) -> dict[str, PointBudget]:
+    field, strain = read_field(path), read_strain(path)
+    here = np.zeros(field.shape, dtype=bool)
+    here[row, col] = True
+    return field_budgets(field, here) | ({} if strain is None else strain_budgets(field, strain, here))
 
 
 def _number(value: Any) -> Any:

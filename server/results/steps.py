@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from core.common.factor import Causes
 from core.errors import FileFormatError, InputError
 from core.field.region.cuts import Cuts, from_arrays
 from core.settings import Coverage, CoverageFields
@@ -18,10 +19,11 @@ from core.status import PointStatus
 from server.base.errors import NotFoundError
 from server.formats.results.folder import number_of
 from server.formats.results.netcdf import opened
+from server.formats.results.reading import causes_of
 from server.formats.results.settings import current_inputs, current_settings
 from server.formats.results.uncertainty import Included, Statement
 from server.results.reader import Variable
-from server.results.uncertainty import in_file, matrix_columns, with_intervals
+from server.results.uncertainty import COMMON_FACTOR, in_file, matrix_columns, with_intervals
 from server.store.durable import known_json
 
 ALWAYS = ("x_px", "y_px", "x_mm", "y_mm", "z_mm", "status")
@@ -44,6 +46,8 @@ class StepResult:
         Cracks and borders of holes.
     included
         What its uncertainties include.
+    causes
+        Of the columns of its common factors; None without any.
     """
 
     n: int
@@ -51,6 +55,7 @@ class StepResult:
     attributes: dict[str, object]
     cuts: Cuts | None
     included: Included
+    causes: Causes | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -190,7 +195,18 @@ def _read(path: Path, data: Any, names: Sequence[str] | None, always: Sequence[s
     for name, current in (("settings", current_settings), ("inputs_sha256", current_inputs)):
         attributes[name] = json.dumps(current(json.loads(str(attributes.get(name, "{}")))))
     n = int(str(attributes.get("step", number_of(path))))
-    return StepResult(n, variables, attributes, cuts, Included.of(data))
+    causes = causes_in(data)
+    if causes is not None:
+        variables |= {
+            name: replace(v, parts=causes.columns) for name, v in variables.items() if name.startswith(COMMON_FACTOR)
+        }
+    return StepResult(n, variables, attributes, cuts, Included.of(data), causes)
+
+
+def causes_in(data: Any) -> Causes | None:
+    """Return the causes of the columns of an open file's common factors; None where it has none."""
+    held = data.variables
+    return causes_of(held, held[COMMON_FACTOR].shape[-1]) if COMMON_FACTOR in held else None
 
 
 def _plain(value: object) -> object:

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.settings import CoverageFields
+from server.formats.results.budgets import STRAIN_NAMES
 from server.formats.results.layout import COVARIANCE_NAMES
 from server.formats.results.uncertainty import Included, Statement
 from server.results.reader import Variable, read_variable
 
 SIGMA, EXPANDED = "sigma_", "expanded_"
-_STRAINS = ("exx", "eyy", "exy")
+COMMON_FACTOR = "common_factor"
 
 
 def in_file(name: str, asked: CoverageFields) -> str:
@@ -78,11 +79,13 @@ def matrix_columns(name: str, variable: Variable) -> dict[str, Variable] | None:
         rows, cols = np.triu_indices(n)
         return _columns(name, variable, values[..., rows, cols], _pairs(n))
     if name.endswith("covariance") and values.ndim == 3:
+        if len(variable.parts) == values.shape[-1]:
+            return _columns(name, variable, values, variable.parts)
         n = round((np.sqrt(8 * values.shape[-1] + 1) - 1) / 2)
         return _columns(name, variable, values, _pairs(n))
-    if "common_factor" in name and values.ndim == 4:
+    if name.startswith(COMMON_FACTOR) and values.ndim == 4:
         n, k = values.shape[2:]
-        names = _STRAINS if "strain" in name else COVARIANCE_NAMES
+        names = STRAIN_NAMES if "strain" in name else COVARIANCE_NAMES
         causes = _numbered(variable.parts, k)
         each = [f"{names[i]}_{causes[j]}" for i in range(n) for j in range(k)]
         return _columns(name, variable, values.reshape(*values.shape[:2], n * k), each)

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from core.errors import InputError
+from server.cli.measurement.coverage import add_coverage, coverage_from
 from server.formats.files import make_folder, write_bytes
 from server.results.metadata import load_metadata
 
@@ -30,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="lenses, light, pattern, specimen, static steps ...; what is kept with the test if left out",
     )
     add("--out", metavar="FILE", type=Path, default=Path("report.html"), help="the report (report.html)")
+    add_coverage(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -48,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     source = find_source(
         args.folder, test=args.test, analysis=args.analysis, calibration=args.calibration, metadata=metadata
     )
-    made = make_report(source)
+    made = make_report(source, coverage_from(args))
     make_folder(args.out.absolute().parent)
     write_bytes(args.out, made.page)
     for doubt in (*(f"{reason} since this was measured" for reason in source.stale), *source.doubts):

@@ -69,7 +69,7 @@ def read_field(path: str | Path) -> Field:
         if "common_factor" in variables:
             common = np.asarray(variables["common_factor"][...], dtype=np.float64)
             total = total - common @ np.swapaxes(common, -1, -2)
-            causes = _causes_of(variables, common.shape[-1])
+            causes = causes_of(variables, common.shape[-1])
         choice, smoothing = (getattr(dataset, name, None) for name in ("patch_choice", "smoothing"))
         return Field(
             **arrays,
@@ -197,7 +197,8 @@ def _references_of(dataset: Any) -> References | None:
     return References(int(dataset.reference_step), steps, values["noise"], values["pattern"])
 
 
-def _causes_of(variables: Any, count: int) -> Causes:
+def causes_of(variables: Any, count: int) -> Causes:
+    """Return the causes of the columns of an open result file's common factor, which has so many."""
     if "cause" not in variables:  # files before they were told apart
         return Causes.untold(count)
     names = [str(name) for name in variables["cause"][...]]

@@ -16,8 +16,10 @@ from core.field.points.patch import PatchChoice
 from core.field.points.result import Field
 from core.field.points.smoothing_record import Smoothing
 from core.status import PointStatus
+from server.formats.results.budgets import field_budgets
 from server.formats.results.camera_motion import CameraMotion
 from server.formats.results.layout import COMPARISONS, FORMAT_VERSION
+from server.formats.results.uncertainty import Included
 
 if TYPE_CHECKING:
     from core.field.seeding.specimen import Specimen
@@ -71,6 +73,12 @@ class StepSummary:
         By comparison, and by coordinate (``x_mm`` ...).
     sigma_calibration_median_mm
         The calibration's part of it; None where it is not known, and then not included.
+    budget_median_mm
+        By coordinate, the medians of the parts of the standard uncertainty: `matching`, `reference` (noise of the
+        reference pair, common to all steps), `calibration`, `stage`, `target`. A part that is not told apart is left
+        out, and in the one before it.
+    uncertainty_includes
+        In words; ``calibration not included`` where that is so.
     smoothing
         Smoothing of the displacement, and its spatial resolution.
     patch
@@ -97,6 +105,8 @@ class StepSummary:
     zncc_median: dict[str, float | None]
     sigma_median_mm: dict[str, float | None]
     sigma_calibration_median_mm: dict[str, float | None] | None
+    budget_median_mm: dict[str, dict[str, float]]
+    uncertainty_includes: str
     smoothing: Smoothing | None
     patch: PatchChoice | None
     camera_motion: CameraMotion | None = None
@@ -170,6 +180,8 @@ def summarise(
             name: float(np.median(np.linalg.norm(result.common[valid][:, k], axis=-1))) if n else None
             for k, name in enumerate(names)
         },
+        budget_median_mm={name: one.median for name, one in field_budgets(result, valid).items()},
+        uncertainty_includes=Included.of_field(result).text,
         smoothing=result.smoothing,
         patch=result.patch,
         camera_motion=camera_motion,

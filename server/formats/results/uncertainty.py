@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from dataclasses import field as field_of
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
 from core.errors import InputError
+from core.field.points.result import Field
 from core.settings import Coverage, CoverageFields
 from server.formats.results.netcdf import opened
 
@@ -31,7 +33,8 @@ class Included:
     calibration
         False where the calibration's covariance is not known, as of another program's.
     causes
-        By name, in their order, `matching` first; those of the calibration are left out where they are not known.
+        By name (:data:`core.names.BUDGET`), in their order; without ``reference`` it is in ``matching``, without
+        ``stage`` and ``target`` these are in ``calibration``.
     """
 
     calibration: bool
@@ -40,9 +43,24 @@ class Included:
     @staticmethod
     def of(dataset: Any) -> Included:
         """Read it from an open result file."""
-        if "common_factor" not in dataset.variables:
-            return Included(False, ("matching",))
-        return Included(True, ("matching", "calibration"))
+        variables = dataset.variables
+        # a shape's noise is all of the reference pair
+        at_reference = "reference_covariance" in variables or getattr(dataset, "kind", "") == "shape"
+        causes = ("matching", *(("reference",) if at_reference else ()))
+        if "common_factor" not in variables:
+            return Included(False, causes)
+        told = str(getattr(variables["common_factor"], "causes", "calibration")).split()
+        return Included(True, (*causes, *told))
+
+    @staticmethod
+    def of_field(field: Field) -> Included:
+        """Return what the uncertainties of a field in memory include."""
+        causes: tuple[str, ...] = ("matching",)
+        if field.frozen_covariance is not None:
+            causes += ("reference",)
+        if field.common is None:
+            return Included(False, causes)
+        return Included(True, (*causes, *(("calibration",) if field.causes is None else field.causes.told)))
 
     @staticmethod
     def in_all(each: Sequence[Included]) -> Included:
@@ -87,7 +105,7 @@ class Statement:
     """
 
     included: Included
-    asked: CoverageFields = field(default_factory=lambda: Coverage.model_validate({}))
+    asked: CoverageFields = field_of(default_factory=lambda: Coverage.model_validate({}))
 
     @property
     def k(self) -> float:

@@ -81,7 +81,7 @@ def test_summary_in_microstrain():
     field = make_field(plane, lambda p: p @ F.T + rng.normal(0.0, 3e-4, p.shape))
     # white from point to point: a step as wide as the subset
     strain = surface_strain(field, StrainOptions(window=5, tensor="infinitesimal"), subset_px=9)
-    summary = summarise_strain(strain).document()
+    summary = summarise_strain(strain, field).document()
     mean, sd, floor = (summary[f"{n}_microstrain"] for n in ("mean", "sd", "noise_floor"))
     for name, truth in (("exx", 1000.0), ("eyy", -500.0), ("exy", 100.0)):
         assert mean[name] == pytest.approx(truth, abs=0.4 * sd[name])
@@ -93,8 +93,9 @@ def test_summary_in_microstrain():
 
 
 def test_summary_of_nothing():
-    strain = surface_strain(make_field(plane, lambda p: p, shape=(4, 4)), StrainOptions(window=21), subset_px=9)
-    summary = summarise_strain(strain).document()
+    field = make_field(plane, lambda p: p, shape=(4, 4))
+    strain = surface_strain(field, StrainOptions(window=21), subset_px=9)
+    summary = summarise_strain(strain, field).document()
     assert (summary["points"], summary["gauge_mm"], summary["mean_microstrain"]["exx"]) == (0, None, None)
     json.dumps(summary, allow_nan=False)
 

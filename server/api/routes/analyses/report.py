@@ -8,7 +8,7 @@ from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, Response
 from starlette.concurrency import run_in_threadpool
 
-from server.api.protocol.dependencies import AnalysisId, ServiceDep, TestId
+from server.api.protocol.dependencies import AnalysisId, CoverageDep, ServiceDep, TestId
 from server.api.protocol.problems import errors
 from server.api.routes.analyses.exports import finished
 from server.base.errors import NotFoundError
@@ -31,7 +31,9 @@ router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["resu
         }
     },
 )
-async def get_report(request: Request, service: ServiceDep, test_id: TestId, analysis_id: AnalysisId) -> Response:
+async def get_report(
+    request: Request, service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, coverage: CoverageDep
+) -> Response:
     """Answer with the report of the finished steps: rig, settings, noise floor, calibration, pictures, tables, courses.
 
     What no device reports comes from `PUT /tests/{test_id}/metadata`; what is not stated is listed as such.
@@ -40,7 +42,7 @@ async def get_report(request: Request, service: ServiceDep, test_id: TestId, ana
     service.require_room()
     folder = await run_in_threadpool(service.exports.new_folder)
     try:
-        policy, missing = await finished(request, service.exports.run(report_task, results, str(folder)))
+        policy, missing = await finished(request, service.exports.run(report_task, results, str(folder), coverage))
         page = await run_in_threadpool((folder / NAME).read_bytes)
     finally:
         await run_in_threadpool(shutil.rmtree, folder, ignore_errors=True)

@@ -1,0 +1,120 @@
+"""Budgets of all points of a field: how much of each coordinate's and strain's uncertainty comes from where."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from core.arrays import Bool, Float
+from core.common.factor import Causes
+from core.field.points.result import Field
+from core.names import BUDGET, BudgetName
+from core.strain import StrainField
+from server.formats.results.layout import COVARIANCE_NAMES
+
+STRAIN_NAMES = ("exx", "eyy", "exy")
+
+
+@dataclass(frozen=True, eq=False)
+class PointBudget:
+    """Budget of one quantity at n points.
+
+    Attributes
+    ----------
+    parts
+        (n,) standard uncertainty by name, of those that are known, in the order of :data:`core.names.BUDGET`; their
+        squares add up to the square of the whole.
+    """
+
+    parts: Mapping[BudgetName, Float]
+
+    @property
+    def sigma(self) -> Float:
+        """(n,) the whole."""
+        return np.asarray(np.sqrt(np.sum([part**2 for part in self.parts.values()], axis=0)))
+
+    @property
+    def median(self) -> dict[str, float]:
+        """The median of each part over the points that have it; empty without any."""
+        found = {name: part[np.isfinite(part)] for name, part in self.parts.items()}
+        return {name: float(np.median(part)) for name, part in found.items() if part.size}
+
+    def at(self, k: int) -> dict[str, float | None]:
+        """Return one point's."""
+        return {name: float(part[k]) if np.isfinite(part[k]) else None for name, part in self.parts.items()}
+
+
+def field_budgets(field: Field, points: Bool) -> dict[str, PointBudget]:
+    """Return the budgets of positions and displacements.
+
+    Parameters
+    ----------
+    field
+        In the system frame.
+    points
+        (r, c) True at the points that are asked for.
+
+    Returns
+    -------
+    dict
+        By the quantity's name in result files: ``x_mm`` ...
+    """
+    own = np.diagonal(field.covariance[points], axis1=-2, axis2=-1)
+    at_reference = field.frozen_covariance
+    frozen = None if at_reference is None else np.diagonal(at_reference[points], axis1=-2, axis2=-1)
+    common = None if field.common is None else field.common[points]
+    return {
+        name: _budget(
+            own[:, k], None if frozen is None else frozen[:, k], None if common is None else common[:, k], field.causes
+        )
+        for k, name in enumerate(COVARIANCE_NAMES[: own.shape[-1]])
+    }
+
+
+def strain_budgets(field: Field, strain: StrainField, points: Bool) -> dict[str, PointBudget]:
+    """Return the budgets of exx, eyy and exy; the reference has the share in them that it has in the displacements.
+
+    Parameters
+    ----------
+    field
+        What the strain was made of.
+    strain
+        Of the same points.
+    points
+        (r, c) True at the points that are asked for.
+    """
+    own = np.diagonal(strain.covariance[points], axis1=-2, axis2=-1)
+    share = reference_share(field)
+    common = None if strain.common is None else strain.common[points]
+    return {
+        name: _budget(
+            own[:, k],
+            None if share is None else share[points] * own[:, k],
+            None if common is None else common[:, k],
+            field.causes,
+        )
+        for k, name in enumerate(STRAIN_NAMES)
+    }
+
+
+def reference_share(field: Field) -> Float | None:
+    """Return the reference pair's share (r, c) of the displacement's own variance; None where it is not told apart."""
+    if field.frozen is None:
+        return None
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(
+            np.einsum("rcii->rc", field.frozen[..., :2, :2]) / np.einsum("rcii->rc", field.covariance[..., 3:5, 3:5])
+        )
+
+
+def _budget(own: Float, frozen: Float | None, common: Float | None, causes: Causes | None) -> PointBudget:
+    known: dict[BudgetName, Float] = {"matching": own if frozen is None else own - frozen}
+    if frozen is not None:
+        known["reference"] = np.minimum(frozen, own)
+    if common is not None:
+        told = Causes.untold(common.shape[-1]) if causes is None else causes
+        for cause, square in told.squares(common).items():
+            known[cause] = square
+    return PointBudget({name: np.sqrt(np.maximum(known[name], 0.0)) for name in BUDGET if name in known})
