@@ -263,7 +263,10 @@ def _fields(measured: Measured) -> list[tuple[str, list[Picture]]]:
     drawn = [Picture(height, PNG, "map of the reference's Z", "Shape of the reference: Z")]
     if not measured.shown:
         drawn.append(_status(reference, "the reference"))
-    return [("", drawn), *((f"Step {shown.n}: {shown.why}", _maps(shown, measured.statement)) for shown in measured.shown)]
+    return [
+        ("", drawn),
+        *((f"Step {shown.n}: {shown.why}", _maps(shown, measured.statement)) for shown in measured.shown),
+    ]
 
 
 def _status(field: Field, subject: str) -> Picture:

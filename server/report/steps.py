@@ -15,8 +15,8 @@ from server.compute.strain import StrainSummary, summarise_strain
 from server.formats.calibrations.volume import rbe_of
 from server.formats.results.reading import read_field
 from server.formats.results.strain import read_strain
-from server.formats.results.uncertainty import Included, Statement, read_included
 from server.formats.results.summary import StepSummary, summarise
+from server.formats.results.uncertainty import Included, Statement, read_included
 from server.report.floor import LENGTHS, STRAINS, Floor, FloorKeeper, Quantity, reported_sigma, static_steps
 from server.report.records import CameraMotionRecord, QualityRecord
 from server.report.source import Source

@@ -53,18 +53,18 @@ def sentence(measured: Measured) -> str:
     k = f"k = {statement.k:.4g}, {percent(statement.asked.share)} of a distribution taken as {DISTRIBUTION}"
     own = (
         f"{kind} uncertainties ({k}) of positions, displacements and strains measured by {shape} correlation of two "
-        "cameras with exact perspective. They hold the noise of the images through each point's own covariance, with the "
-        "correlation of neighbours"
+        "cameras with exact perspective. They hold the noise of the images through each point's own covariance, with "
+        "the correlation of neighbours"
     )
     if statement.included.calibration:
         common = (
-            "; and the calibration's uncertainty as a common factor of all points, propagated through the measurement's "
-            "own estimator from the covariance of the cameras' parameters"
+            "; and the calibration's uncertainty as a common factor of all points, propagated through the "
+            "measurement's own estimator from the covariance of the cameras' parameters"
         )
         return f"{own}{common}. Not included: {'; '.join(SYSTEMATIC)}."
     return (
-        f"{own}. {NOT_INCLUDED.capitalize()}: the calibration's covariance is not known, as of one imported from another "
-        f"program; true uncertainties are larger. Not included either: {'; '.join(SYSTEMATIC)}."
+        f"{own}. {NOT_INCLUDED.capitalize()}: the calibration's covariance is not known, as of one imported from "
+        f"another program; true uncertainties are larger. Not included either: {'; '.join(SYSTEMATIC)}."
     )
 
 
@@ -99,9 +99,7 @@ def gauge_budgets(step: StepReadings, statement: Statement) -> list[Budget]:
             if number.value is not None and number.budget:
                 factor, unit = _UNITS.get(number.units, (1.0, number.units))
                 label = f"{kind} {gauge}, {name}"
-                rows.append(
-                    _row(f"budget.{gauge}.{name}", label, unit, factor, number.budget, number.sigma, statement)
-                )
+                rows.append(_row(f"budget.{gauge}.{name}", label, unit, factor, number.budget, number.sigma, statement))
 
     for point in step.points:
         add("point", point.name, point.values)

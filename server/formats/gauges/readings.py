@@ -12,6 +12,12 @@ from server.formats.results.uncertainty import Statement
 
 EXPANDED = "k times the standard uncertainty, where another k than 1 was asked for."
 LACKING = "`calibration not included` where that is so."
+_BUDGET = (
+    "Standard uncertainties by where they come from, whose squares add up to the whole's: `matching` (noise that is new "
+    "at each step), `reference` (noise of the reference pair, the same in all steps of a test), `calibration` (noise "
+    "of the calibration's views), `stage`, `target`. What is not known is not among them, see `not_told` of the step; "
+    "null where nothing is."
+)
 
 
 @dataclass(frozen=True)
@@ -24,6 +30,7 @@ class Number:
     sigma_calibration: Annotated[
         float | None, Field(description="The calibration's part of sigma; null where it is not known and not included.")
     ] = None
+    budget: Annotated[Mapping[str, float] | None, Field(description=_BUDGET)] = None
     expanded: Annotated[float | None, Field(description=EXPANDED)] = None
     not_included: Annotated[str, Field(description=LACKING)] = ""
 
@@ -62,6 +69,7 @@ class Numbers:
         Sequence[float | None],
         Field(description="The calibration's part of each sigma; null where it is not known and not included."),
     ] = ()
+    budget: Annotated[Mapping[str, Sequence[float | None]] | None, Field(description=_BUDGET)] = None
     expanded: Annotated[Sequence[float | None], Field(description=f"{EXPANDED} Empty: none was asked for.")] = ()
     not_included: Annotated[str, Field(description=LACKING)] = ""
 
@@ -100,6 +108,7 @@ class AreaStatistics:
         float | None,
         Field(description="The calibration's part of mean_sigma; null where it is not known and not included."),
     ] = None
+    mean_budget: Annotated[Mapping[str, float] | None, Field(description=_BUDGET)] = None
     mean_expanded: Annotated[float | None, Field(description=EXPANDED)] = None
     not_included: Annotated[str, Field(description=LACKING)] = ""
 
@@ -111,6 +120,7 @@ class AreaStatistics:
             self.mean_sigma,
             self.units,
             self.mean_sigma_calibration,
+            self.mean_budget,
             expanded=self.mean_expanded,
             not_included=self.not_included,
         )
@@ -139,6 +149,10 @@ class FrameReading:
     ]
     residual_rms_mm: Annotated[float, Field(description="Root mean square distance of the points from the fit.")]
     points: Annotated[int, Field(description="Points that it was laid through.")]
+    budget_rad: Annotated[Sequence[Mapping[str, float]], Field(description="Budget of each rotation's sigma.")] = ()
+    budget_origin_mm: Annotated[
+        Sequence[Mapping[str, float]], Field(description="Budget of the origin's sigma along each axis.")
+    ] = ()
 
 
 @dataclass(frozen=True)
@@ -167,7 +181,13 @@ class Problem:
 
 @dataclass(frozen=True)
 class StepReadings:
-    """The readings of one step; none where it has a problem."""
+    """The readings of one step; none where it has a problem.
+
+    Attributes
+    ----------
+    not_told
+        What the budgets do not tell apart, and what they do not include.
+    """
 
     n: int
     kind: str
@@ -179,6 +199,7 @@ class StepReadings:
     extensometers: Sequence[ExtensometerReading] = ()
     lines: Sequence[LineReading] = ()
     areas: Sequence[AreaReading] = ()
+    not_told: Sequence[str] = ()
 
     def document(self) -> dict[str, object]:
         """Return it as plain values."""

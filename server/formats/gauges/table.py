@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 from server.formats.gauges.readings import GaugeReadings, Number, StepReadings
@@ -33,6 +33,11 @@ class Row:
     sigma_calibration: float | None = None
     expanded: float | None = None
     not_included: str = ""
+    u_matching: float | None = None
+    u_reference: float | None = None
+    u_calibration: float | None = None
+    u_stage: float | None = None
+    u_target: float | None = None
 
 
 COLUMNS = tuple(f.name for f in fields(Row))
@@ -42,7 +47,7 @@ def gauges_csv(readings: GaugeReadings) -> bytes:
     """Return the readings as CSV, settings and inputs in comment lines (#) above the header.
 
     Missing numbers are empty, with the reason in the column ``missing``; ``not_included`` says where the uncertainty
-    lacks the calibration.
+    lacks the calibration, ``u_matching`` ... are its parts by cause.
     """
     text = io.StringIO(newline="")
     for name, value in readings.about().items():
@@ -87,16 +92,23 @@ def _of_step(step: StepReadings) -> Iterator[Row]:
                     numbers.sigma[k],
                     numbers.units,
                     numbers.sigma_calibration[k] if numbers.sigma_calibration else None,
+                    _at(numbers.budget, k),
                     expanded=numbers.expanded[k] if numbers.expanded else None,
                     not_included=numbers.not_included,
                 )
                 yield from _rows(position, {quantity: number}, line.missing[k])
 
 
+def _at(budget: Mapping[str, Sequence[float | None]] | None, k: int) -> dict[str, float] | None:
+    found = {name: values[k] for name, values in (budget or {}).items()}
+    return {name: value for name, value in found.items() if value is not None}
+
+
 def _rows(head: Row, values: Mapping[str, Number], missing: str) -> Iterator[Row]:
     for quantity, number in values.items():
         # the position may be valid, but this variable has no value there
         why = missing or ("no value" if number.value is None else "")
+        budget = number.budget or {}
         yield replace(
             head,
             quantity=quantity,
@@ -107,6 +119,11 @@ def _rows(head: Row, values: Mapping[str, Number], missing: str) -> Iterator[Row
             sigma_calibration=number.sigma_calibration,
             expanded=number.expanded,
             not_included="" if number.sigma is None else number.not_included,
+            u_matching=budget.get("matching"),
+            u_reference=budget.get("reference"),
+            u_calibration=budget.get("calibration"),
+            u_stage=budget.get("stage"),
+            u_target=budget.get("target"),
         )
 
 
