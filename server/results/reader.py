@@ -19,6 +19,8 @@ from server.formats.results.reading import read_field
 from server.formats.results.strain import read_strain
 from server.formats.results.uncertainty import Included, Statement
 
+_GRID = ("row", "col")
+
 
 @dataclass(frozen=True)
 class Variable:
@@ -212,7 +214,7 @@ def probe_result(path: Path, x_px: float, y_px: float, asked: CoverageFields) ->
     """Return the point nearest to a pixel; the covariance is left out, it is read as a field."""
     with opened(path) as data:
         statement = Statement(Included.of(data), asked)
-        variables = {name: Variable.of(v) for name, v in data.variables.items() if len(v.dimensions) >= 2}
+        variables = {name: Variable.of(v) for name, v in data.variables.items() if v.dimensions[:2] == _GRID}
     distance = np.hypot(variables["x_px"].values - x_px, variables["y_px"].values - y_px)
     row, col = (int(i) for i in np.unravel_index(int(np.nanargmin(distance)), distance.shape))
     budgets = _budgets_at(path, row, col)

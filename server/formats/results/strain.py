@@ -27,8 +27,11 @@ _AXES = (
 _COMPONENTS = (("exx", "along axis 1"), ("eyy", "along axis 2"), ("exy", "shear of the tensor"))
 
 
-def put_strain(dataset: Any, strain: StrainField, *, sparse: bool = False) -> None:
-    """Add the strain's variables (``row``, ``col``) to an open result file; strain as a pure number."""
+def put_strain(dataset: Any, strain: StrainField, *, included: str, sparse: bool = False) -> None:
+    """Add the strain's variables (``row``, ``col``) to an open result file; strain as a pure number.
+
+    ``included`` says what its uncertainties include.
+    """
     tensor = _TENSOR[strain.options.tensor]
     principal, sigma, sigma_principal = strain.principal, strain.sigma, strain.sigma_principal
     found: list[tuple[str, Any, str, str]] = []
@@ -44,9 +47,11 @@ def put_strain(dataset: Any, strain: StrainField, *, sparse: bool = False) -> No
         ("von_mises", strain.von_mises, "1", "equivalent strain, sqrt(e1^2 - e1 e2 + e2^2)"),
     ]
     for name, values, units, long_name in found:
-        _variable(dataset, name, values, units, long_name, sparse=sparse).setncatts(
-            {"gauge_px": strain.gauge_px, "gauge_mm": strain.gauge_mm, "window_points": np.int32(strain.options.window)}
-        )
+        about = {"gauge_px": strain.gauge_px, "gauge_mm": strain.gauge_mm}
+        variable = _variable(dataset, name, values, units, long_name, sparse=sparse)
+        variable.setncatts(about | {"window_points": np.int32(strain.options.window)})
+        if name.startswith("sigma_"):
+            variable.includes = included
     if strain.patch is not None:
         for k, (name, component) in enumerate(_COMPONENTS):
             _variable(

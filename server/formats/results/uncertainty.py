@@ -76,8 +76,7 @@ class Included:
     @property
     def text(self) -> str:
         """In words."""
-        only = "" if self.calibration else f" only; {NOT_INCLUDED}"
-        return f"{', '.join(self.causes)}{only}"
+        return ", ".join(self.causes) if self.calibration else f"matching only; {NOT_INCLUDED}"
 
 
 def read_included(path: Path) -> Included:

@@ -36,15 +36,12 @@ from server.formats.results.layout import (
 )
 from server.formats.results.netcdf import written_dataset
 from server.formats.results.strain import put_strain
+from server.formats.results.uncertainty import Included
 
 # measured numbers end in random bits: deflating them takes three quarters of the writing time and saves a quarter of
 # the file. Repeating values are always deflated; everything is where at least this share of the points has no numbers
 _MANY_EMPTY = 0.2
 _REPETITIVE = ("x_px", "y_px", "status", "iterations", "zncc")
-_INCLUDES = {
-    False: "the matching of the point and, as F F', the calibration",
-    True: "the matching of the point; the calibration is not included: its covariance is not known",
-}
 _FRAMES = {
     "target": "sys: X_sys, Y_sys in the calibration target's plane at its first position, Z_sys away from the cameras",
     "camera1": "sys = camera 1: X along the rows, Y down the columns, Z along the optical axis, away from the camera",
@@ -156,7 +153,7 @@ def fill(dataset: Any, result: Field, provenance: Provenance, strain: StrainFiel
     if result.cuts:
         _put_cuts(dataset, result.cuts)
     if strain is not None:
-        put_strain(dataset, strain, sparse=sparse)
+        put_strain(dataset, strain, sparse=sparse, included=Included.of_field(result).text)
     if result.references is not None:
         _put_references(dataset, result.references)
     dataset.setncatts(_attributes(provenance, moved=result.has_motion))
@@ -180,6 +177,7 @@ def fill(dataset: Any, result: Field, provenance: Provenance, strain: StrainFiel
 def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
     n = result.covariance.shape[-1]
     names = COVARIANCE_NAMES[:n]
+    included = Included.of_field(result).text
     dataset.createDimension("i", n)
     dataset.createDimension("j", n)
     _put(
@@ -192,9 +190,7 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
         dtype="f4",
         sparse=sparse,
     )
-    dataset.variables["covariance"].setncatts(
-        {"components": " ".join(names), "includes": _INCLUDES[result.common is None]}
-    )
+    dataset.variables["covariance"].setncatts({"components": " ".join(names), "includes": included})
     if result.common is not None:
         dataset.createDimension("component", n)
         causes = Causes.untold(result.common.shape[-1]) if result.causes is None else result.causes
@@ -247,6 +243,7 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
             dtype="f4",
             sparse=sparse,
         )
+        dataset.variables[f"sigma_{name}"].includes = included
 
 
 def _put_causes(dataset: Any, causes: Causes) -> None:
