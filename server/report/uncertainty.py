@@ -13,6 +13,7 @@ from server.report.steps import Measured, StepFigures
 
 #: of gauges' numbers, the factor to a unit that reads well
 _UNITS = {"mm": (1e3, UM), "1": (1e6, "microstrain"), "rad": (1e6, "microrad")}
+_ROUNDING = 1e-6  # of the whole: what rounding leaves of a part that is none
 _LENGTHS = (("x_mm", "X"), ("y_mm", "Y"), ("z_mm", "Z"), ("u_mm", "U"), ("v_mm", "V"), ("w_mm", "W"))
 
 
@@ -120,6 +121,7 @@ def _row(
     statement: Statement,
 ) -> Budget:
     each: Sequence[float | None] = [parts.get(name) for name in BUDGET]
-    scaled = tuple(None if part is None else factor * part for part in each)
     whole = None if total is None else factor * total
+    floor = 0.0 if whole is None else _ROUNDING * whole
+    scaled = tuple(None if part is None else factor * part if factor * part > floor else 0.0 for part in each)
     return Budget(key, label, unit, scaled, whole, None if whole is None else statement.k * whole)
