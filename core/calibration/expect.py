@@ -46,6 +46,10 @@ class Expectation:
         Of each camera, the share of the inner intersections in the nominal camera's image at the worst position.
     reasons
         Reasons for which :func:`core.calibration.calibrate` would refuse such views; empty if it would not.
+    pair
+        The nominal cameras.
+    covariance
+        (n, n) of ``parameters``, in their order.
     """
 
     parameters: dict[str, float]
@@ -55,6 +59,8 @@ class Expectation:
     sigma_mm: Float
     seen: tuple[float, float]
     reasons: tuple[str, ...]
+    pair: StereoPair
+    covariance: Float
 
 
 def correlation_of_lines(target: AnyTarget, line_model: LineModel | None) -> float:
@@ -158,6 +164,8 @@ def expect(
         sigma_mm=np.sqrt(np.maximum(spread, 0.0)),
         seen=(seen[0], seen[1]),
         reasons=_reasons(volume, centre_px, target, options),
+        pair=pair,
+        covariance=covariance,
     )
 
 
