@@ -79,7 +79,7 @@ def match_gain(
     alone = ray[..., None] * solved[:, :1]
     image2 = pair.cam2.project(points_mm).xy
     if displaced_mm is None:
-        return Matches(image2[:, None], first[:, None], across[:, None], alone, laid)
+        return Matches(image2[:, None], first[:, None], across[:, None], alone, np.asarray(laid))
     moved = tangents if tangents_now is None else tangents_now
     now1, now2 = pair.cam1.point_jacobian(displaced_mm), pair.cam2.point_jacobian(displaced_mm)
     maps = [now1 @ moved @ laid, now2 @ moved @ laid]
@@ -97,7 +97,7 @@ def match_gain(
     gain[:, 3:] = joint[:, 2:] - ray[..., None] * joint[:, :1]
     images = np.stack([image2, pair.cam1.project(displaced_mm).xy, pair.cam2.project(displaced_mm).xy], axis=1)
     offsets = np.stack([across, np.zeros_like(across), across_now], axis=1)
-    return Matches(images, np.stack([first, *maps], axis=1), offsets, gain, laid)
+    return Matches(images, np.stack([first, *maps], axis=1), offsets, gain, np.asarray(laid))
 
 
 def noise_covariances(gain: Float, laid: Float, variance_px2: float) -> tuple[Float, Float]:

@@ -190,7 +190,7 @@ class _Reader:
         return [_quantity(n, "strain", "1", size, motion, found[:, k]) for k, n in enumerate(names)]
 
     def _middle(self, field: Field) -> np.ndarray:
-        return (field.x_px == self.middle_px[0]) & (field.y_px == self.middle_px[1])
+        return np.asarray((field.x_px == self.middle_px[0]) & (field.y_px == self.middle_px[1]))
 
 
 def _strain_sigma(field: Field, half: int, shared: SharedPixels) -> Float:
@@ -211,10 +211,10 @@ def _strain_sigma(field: Field, half: int, shared: SharedPixels) -> Float:
     v[at] = np.einsum("iab,an->nib", D, weights)
     window = (slice(0, side), slice(0, side))
     if field.common is not None:
-        return np.linalg.norm(np.einsum("rcij,rcjk->ik", v[window], field.common[window]), axis=1)
+        return np.asarray(np.linalg.norm(np.einsum("rcij,rcjk->ik", v[window], field.common[window]), axis=1))
     each = np.zeros_like(v)
     each[window] = v[window] @ roots_of(field.covariance[window])
-    return np.sqrt(np.maximum(np.einsum("rcij,rcij->i", each, shared.summed(field, each)), 0.0))
+    return np.asarray(np.sqrt(np.maximum(np.einsum("rcij,rcij->i", each, shared.summed(field, each)), 0.0)))
 
 
 def _quantity(
@@ -230,10 +230,6 @@ def _quantity(
 
 
 def _missing(
-    name: str,
-    of: Of,
-    unit: Literal["mm", "1"],
-    size_mm: float | None,
-    motion: tuple[float, float, float] | None,
+    name: str, of: Of, unit: Literal["mm", "1"], size_mm: float | None, motion: tuple[float, float, float] | None
 ) -> PlannedQuantity:
     return PlannedQuantity(name, of, unit, size_mm, motion, None, {}, _SEEN)

@@ -39,7 +39,8 @@ class PlannedMeasurement(Settings):
         2.0, description="Standard deviation of a pixel's noise, grey levels; 2 of 255 is an ordinary camera of 8 bits."
     )
     contrast_grey: Annotated[Real, Field(ge=0.1, le=1e5)] = Field(
-        40.0, description="Standard deviation of the pattern's grey levels; 40 of 255 is a well-lit black and white one."
+        40.0,
+        description="Standard deviation of the pattern's grey levels; 40 of 255 is a well-lit black and white one.",
     )
     speckle_px: Annotated[Real, Field(ge=1.0, le=100.0)] = Field(
         5.0,
@@ -71,9 +72,9 @@ class PlannedRig(Settings):
     focal_mm: Positive | None = Field(None, description="Focal length of both lenses; needs pixel_um.")
     pixel_um: Annotated[Real, Field(ge=0.1, le=100.0)] | None = Field(None, description="Width of a sensor's pixel.")
     phd_px: Positive | None = Field(None, description="Pinhole distance of both cameras, in place of focal_mm.")
-    image_size_px: (
-        tuple[Annotated[Whole, Field(ge=16, le=32767)], Annotated[Whole, Field(ge=16, le=32767)]] | None
-    ) = Field(None, description="Width and height of both images.")
+    image_size_px: tuple[Annotated[Whole, Field(ge=16, le=32767)], Annotated[Whole, Field(ge=16, le=32767)]] | None = (
+        Field(None, description="Width and height of both images.")
+    )
     standoff_mm: Positive | None = Field(None, description="Distance of both cameras from the target.")
     angle_deg: Annotated[Real, Field(gt=0.0, lt=170.0)] | None = Field(
         None, description="Angle between the optical axes; each camera stands at half of it."
