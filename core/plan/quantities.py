@@ -21,13 +21,13 @@ from core.field.region.window import window_offsets
 from core.gauge.area import area_statistics
 from core.gauge.extensometer import extensometer
 from core.matching.geometry import tangent_frames
+from core.names import BUDGET, BudgetName
 from core.plan.settings import PlannedMeasurement
 from core.plan.synthetic import PlannedField, Sizes, laid_about, planned_field
 from core.strain.tensors import strain_of, strain_slopes
 from core.strain.window import plane_weights
 
 Of = Literal["point", "length", "mean", "strain"]
-CAUSES = ("matching", "reference", "calibration", "stage", "target")
 _AXES = "XYZ"
 _MOST_ACROSS = 41  # points of an area's mean: more do not change what is common
 _SEEN = "a camera does not see all of it"
@@ -63,12 +63,12 @@ class PlannedQuantity:
     size_mm: float | None
     translation_mm: tuple[float, float, float] | None
     sigma: float | None
-    budget: Mapping[str, float]
+    budget: Mapping[BudgetName, float]
     missing: str = ""
 
 
 def planned_quantities(
-    pair: StereoPair, sizes: Sizes, sources: Mapping[str, ParameterCovariance], plan: PlannedMeasurement
+    pair: StereoPair, sizes: Sizes, source: ParameterCovariance, plan: PlannedMeasurement
 ) -> list[PlannedQuantity]:
     """Return the expected uncertainties of a measurement in the middle of the target.
 
@@ -76,12 +76,12 @@ def planned_quantities(
     ----------
     pair, sizes
         The cameras and their images' (width, height).
-    sources
-        Covariance of the cameras' parameters by its cause; together they are the calibration's.
+    source
+        Covariance of the cameras' parameters, by cause.
     plan
         The measurement.
     """
-    reader = _Reader(pair, sizes, sources, plan)
+    reader = _Reader(pair, sizes, source, plan)
     out = reader.of_shape()
     for size in plan.translations_mm:
         for axis in range(3):
@@ -93,10 +93,8 @@ def planned_quantities(
 class _Reader:
     """Reads quantities off fields that share the plan."""
 
-    def __init__(
-        self, pair: StereoPair, sizes: Sizes, sources: Mapping[str, ParameterCovariance], plan: PlannedMeasurement
-    ) -> None:
-        self.pair, self.sizes, self.sources, self.plan = pair, sizes, sources, plan
+    def __init__(self, pair: StereoPair, sizes: Sizes, source: ParameterCovariance, plan: PlannedMeasurement) -> None:
+        self.pair, self.sizes, self.source, self.plan = pair, sizes, source, plan
         self.shared = SharedPixels(plan.subset_px)
         self.middle_px = np.round(pair.cam1.project(np.zeros(3)).xy)
         # mm on the surface per px: the mean over both directions
@@ -137,10 +135,13 @@ class _Reader:
 
     def _budget(self, planned: PlannedField, read: Callable[[Field], Float]) -> Float:
         """(causes, q) standard uncertainties of q numbers that ``read`` gives for a field, by cause."""
-        fields = {"matching": planned.of_noise(planned.matching), "reference": planned.of_noise(planned.reference)}
-        fields |= {cause: planned.of_cause(source) for cause, source in self.sources.items()}
+        fields: dict[BudgetName, Field] = {
+            "matching": planned.of_noise(planned.matching),
+            "reference": planned.of_noise(planned.reference),
+            **planned.of_causes(self.source),
+        }
         none = np.zeros_like(read(fields["matching"]))
-        return np.stack([read(fields[cause]) if cause in fields else none for cause in CAUSES])
+        return np.stack([read(fields[cause]) if cause in fields else none for cause in BUDGET])
 
     def _of_point(
         self, planned: PlannedField, name: str, k: int, motion: tuple[float, float, float] | None
@@ -225,7 +226,7 @@ def _quantity(
     motion: tuple[float, float, float] | None,
     sigmas: Float,
 ) -> PlannedQuantity:
-    budget = dict(zip(CAUSES, sigmas.tolist(), strict=True))
+    budget: dict[BudgetName, float] = dict(zip(BUDGET, sigmas.tolist(), strict=True))
     return PlannedQuantity(name, of, unit, size_mm, motion, float(np.linalg.norm(sigmas)), budget)
 
 

@@ -13,9 +13,10 @@ import numpy as np
 
 from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
-from core.common.factor import ParameterCovariance, common_factor
+from core.common.factor import ParameterCovariance, factor_of
 from core.common.matches import match_gain, noise_covariances
 from core.field.points.result import Field
+from core.names import Cause
 from core.plan.settings import PlannedMeasurement
 from core.plan.texture import match_variance_px2
 from core.status import PointStatus
@@ -50,13 +51,17 @@ class PlannedField:
         """Return the field with one part of the noise alone."""
         return replace(self.field, covariance=covariance, common=None)
 
-    def of_cause(self, source: ParameterCovariance) -> Field:
-        """Return the field with the common part alone that a covariance of the cameras' parameters makes."""
-        found = common_factor(source, self.points, self.displaced)
-        common = np.full((*self.field.shape, *found.shape[1:]), np.nan)
-        common[self.field.valid] = found
-        covariance = np.where(self.field.valid[..., None, None], 0.0, np.nan)
-        return replace(self.field, covariance=covariance + np.zeros(self.field.covariance.shape[-2:]), common=common)
+    def of_causes(self, source: ParameterCovariance) -> dict[Cause, Field]:
+        """Return by cause the field with the common part alone that it makes."""
+        found = factor_of(source, self.points, self.displaced)
+        covariance = np.where(self.field.valid[..., None, None], np.zeros_like(self.field.covariance), np.nan)
+        out = {}
+        for cause in found.causes.told:
+            own = found.values[..., [name == cause for name in found.causes.columns]]
+            common = np.full((*self.field.shape, *own.shape[1:]), np.nan)
+            common[self.field.valid] = own
+            out[cause] = replace(self.field, covariance=covariance, common=common)
+        return out
 
 
 def laid_about(positions_px: Sequence[Float], step_px: float, reach: int) -> tuple[Float, Float, Bool]:

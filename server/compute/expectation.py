@@ -89,8 +89,8 @@ def expectation_document(rig: dict[str, Any], plan: PlannedCalibration, measured
         plan.positions_mm, target, nominals, options, noise_px=noise, roll_deg=plan.roll_deg, line_model=model
     )
     sizes = nominals[0].image_size_px, nominals[1].image_size_px
-    source = ParameterCovariance(found.pair, tuple(found.parameters), found.covariance)
-    quantities = planned_quantities(found.pair, sizes, {"calibration": source}, measured)
+    source = ParameterCovariance(found.pair, tuple(found.parameters), found.covariance, found.by_cause)
+    quantities = planned_quantities(found.pair, sizes, source, measured)
     return {
         "assumed": {
             "noise_px": noise,
@@ -144,6 +144,6 @@ def _measured_text(measured: PlannedMeasurement) -> str:
         f"A flat surface in the target's plane, seen to {1e3 * (2.0 * match_variance_px2(measured)) ** 0.5:.2g} "
         f"thousandths of a pixel a comparison: subset {measured.subset_px} px, gradient {slope:.3g} grey levels a "
         f"pixel (rms, one direction), noise {measured.image_noise_grey:g} grey levels, plane patches. Standard "
-        "uncertainties (k = 1). Not included: interpolation's bias, bias of patches and windows on what bends, a lens beyond the "
-        "model."
+        "uncertainties (k = 1). Not included: interpolation's bias, bias of patches and windows on what bends, a lens "
+        "beyond the model."
     )

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from core.errors import InputError
-from core.plan.quantities import CAUSES
+from core.names import BUDGET
 from core.plan.settings import PlannedMeasurement, PlannedRig
 
 #: options that other commands have by these names
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
 
 def table(document: Mapping[str, Any]) -> str:
     """Write an expectation as a table: micrometres and microstrain."""
-    head = ["quantity", "after, mm", "u (k = 1)", *CAUSES]
+    head = ["quantity", "after, mm", "u (k = 1)", *BUDGET]
     rows = [head]
     for one in document["quantities"]:
         unit = "ue" if one["unit"] == "1" else "um"
@@ -83,7 +83,7 @@ def table(document: Mapping[str, Any]) -> str:
         if one["sigma"] is None:
             row += [f"- ({one['missing']})"]
         else:
-            row += [f"{scale * one['sigma']:.3g} {unit}", *(f"{scale * one['budget'][c]:.3g}" for c in CAUSES)]
+            row += [f"{scale * one['sigma']:.3g} {unit}", *(f"{scale * one['budget'][c]:.3g}" for c in BUDGET)]
         rows.append(row)
     widths = [max(len(r[k]) for r in rows if len(r) == len(head)) for k in range(len(head))]
     lines = [
