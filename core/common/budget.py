@@ -61,7 +61,7 @@ class Budget:
             return (*out, CALIBRATION_UNKNOWN)
         return tuple(out if self.stage is not None else [*out, CAUSES_UNTOLD])
 
-    def document(self) -> dict[BudgetName, float]:
+    def document(self) -> dict[str, float]:
         """Return what is known by name, in the order of :data:`core.names.BUDGET`."""
         values = {name: getattr(self, name) for name in BUDGET}
         return {name: float(value) for name, value in values.items() if value is not None and np.isfinite(value)}
@@ -131,3 +131,31 @@ def budget_of_difference(
     two = Causes.untold(len(row_b)) if causes_b is None else causes_b
     both = joined(one, two)
     return budget_of(own, 0.0 if told_apart else None, two.aligned(row_b, one) - one.aligned(row_a, two), both)
+
+
+def budgets_through(
+    slope: Float, own: Float, frozen: Float | None, common: Float | None, causes: Causes | None
+) -> tuple[Budget, ...]:
+    """Return the budgets of m numbers that change by ``slope`` (m, n) with n others.
+
+    Parameters
+    ----------
+    slope
+        (m, n).
+    own, frozen
+        (n, n) covariance of the others from the points' own noise, and the reference pair's part of it.
+    common, causes
+        (n, k) their common factor, and the causes of its columns; None where it is not known.
+    """
+    variance = np.einsum("mi,ij,mj->m", slope, own, slope)
+    at_reference = None if frozen is None else np.einsum("mi,ij,mj->m", slope, frozen, slope)
+    rows = None if common is None else slope @ common
+    return tuple(
+        budget_of(
+            float(variance[k]),
+            None if at_reference is None else float(at_reference[k]),
+            None if rows is None else rows[k],
+            causes,
+        )
+        for k in range(len(slope))
+    )

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from core.cameras.stereo import StereoPair
+from core.common.budget import budget_of
 from core.common.derivatives import new_noise_share
 from core.common.factor import ParameterCovariance, factor_of
 from core.field.points.result import Field
@@ -37,6 +38,13 @@ def with_common_factor(field: Field, source: ParameterCovariance | None) -> Fiel
     out = np.full((*field.shape, *found.values.shape[1:]), np.nan)
     out[valid] = found.values
     return replace(field, common=out, causes=found.causes)
+
+
+def notes_of(field: Field) -> tuple[str, ...]:
+    """Return what budgets of a field's quantities do not tell apart, and what they do not include."""
+    at_reference = None if field.frozen_covariance is None else 0.0
+    row = None if field.common is None else np.zeros(field.common.shape[-1])
+    return budget_of(0.0, at_reference, row, field.causes).notes
 
 
 def with_frozen_noise(field: Field, pair: StereoPair) -> Field:

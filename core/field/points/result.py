@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -186,6 +186,12 @@ class Field:
         out = self.covariance.copy()
         out[..., 3:, 3:] = self.frozen
         return out
+
+    @property
+    def reference_alone(self) -> Field | None:
+        """The field with the reference pair's noise alone in its covariance; None where it is not told apart."""
+        frozen = self.frozen_covariance
+        return None if frozen is None else replace(self, covariance=frozen, frozen=None, common=None, causes=None)
 
     @property
     def sigma_mm(self) -> Float:

@@ -23,6 +23,7 @@ from core.names import CAUSES
 from core.status import STATUS_MEANINGS, PointStatus
 from core.strain import StrainField
 from server.formats.results.layout import (
+    COLUMN_BY_COLUMN,
     COMPARISONS,
     COVARIANCE_NAMES,
     CURVATURE,
@@ -93,7 +94,11 @@ def _put(
     sparse: bool = False,
 ) -> None:
     fill = np.nan if dtype.startswith("f") else False
-    pack = {"compression": "zlib", "complevel": 1, "shuffle": True} if sparse or name in _REPETITIVE else {}
+    pack: dict[str, Any] = {}
+    if sparse or name in _REPETITIVE:
+        pack = {"compression": "zlib", "complevel": 1, "shuffle": True}
+    if dims[-1] == "cause":  # column by column: each is smooth over the points, and has few digits
+        pack = COLUMN_BY_COLUMN | {"chunksizes": (*values.shape[:2], 1, 1)}
     variable = dataset.createVariable(name, dtype, dims, fill_value=fill, **pack)
     variable.setncatts({"units": units, "long_name": long_name})
     variable[...] = values
@@ -207,7 +212,7 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
         )
         dataset.variables["common_factor"].setncatts(
             {
-                "comment": "the covariance of points a and b is F_a F_b'; of a point with itself covariance = own + F F'",
+                "comment": "points a and b have the covariance F_a F_b', a point with itself covariance = own + F F'",
                 "causes": " ".join(causes.told),
             }
         )
