@@ -138,8 +138,9 @@ class _Reader:
         fields: dict[BudgetName, Field] = {
             "matching": planned.of_noise(planned.matching),
             "reference": planned.of_noise(planned.reference),
-            **planned.of_causes(self.source),
         }
+        for cause, field in planned.of_causes(self.source).items():
+            fields[cause] = field
         none = np.zeros_like(read(fields["matching"]))
         return np.stack([read(fields[cause]) if cause in fields else none for cause in BUDGET])
 
