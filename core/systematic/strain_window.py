@@ -46,7 +46,7 @@ def window_term(field: Field, strain: StrainField, *, subset_px: int) -> Term:
     if min(field.shape) < 2 * lag + 1:
         return Term("Not told: the field is hardly wider than the window.")
     along, across = (3.0 * half**2 + 3.0 * half - 1.0) / 15.0, half * (half + 1) / 3.0
-    plane = field.patch is None or field.patch.patch != "quadratic"
+    plane = field.patch is not None and field.patch.patch != "quadratic"
     patch = tuple((subset_px**2 - 1) / 12.0 / s**2 if plane else 0.0 for s in step)
     # whole windows alone: in cut ones planes and quadratics have biases of their own, which are in sigma
     used = strain.status == StrainStatus.OK
