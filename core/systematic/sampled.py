@@ -30,76 +30,84 @@ def _weights(t, order, w):
     w[4] = 1.0 - (w[0] + w[1] + w[2] + w[3] + w[5])
 
 
+@inner
+def _value(coefficients, order, x, y, wx, wy):
+    """Spline value; NaN where a tap lies outside the padded image."""
+    lead, taps = order // 2, order + 1
+    ix, iy = int(np.floor(x)), int(np.floor(y))
+    x0, y0 = ix - lead, iy - lead
+    if x0 < 0 or y0 < 0 or x0 + taps > coefficients.shape[1] or y0 + taps > coefficients.shape[0]:
+        return np.nan
+    _weights(x - ix, order, wx)
+    _weights(y - iy, order, wy)
+    total = 0.0
+    if order == 5:
+        for i in range(6):
+            row = coefficients[y0 + i]
+            total += wy[i] * (
+                wx[0] * row[x0]
+                + wx[1] * row[x0 + 1]
+                + wx[2] * row[x0 + 2]
+                + wx[3] * row[x0 + 3]
+                + wx[4] * row[x0 + 4]
+                + wx[5] * row[x0 + 5]
+            )
+    else:
+        for i in range(4):
+            row = coefficients[y0 + i]
+            total += wy[i] * (wx[0] * row[x0] + wx[1] * row[x0 + 1] + wx[2] * row[x0 + 2] + wx[3] * row[x0 + 3])
+    return total
+
+
+@inner
+def _shift(pixels, current, gx, gy, ax, ay, x0, y0, half, gain, mean_r, mean_c):
+    """Shift x, y that residuals show through the gradients ``ax, ay``."""
+    a00 = a01 = a10 = a11 = b0 = b1 = 0.0
+    for i in range(2 * half + 1):
+        for j in range(2 * half + 1):
+            y, x = y0 - half + i, x0 - half + j
+            rest = gain * (current[i, j] - mean_c) - (pixels[y, x] - mean_r)
+            u, v, g, h = ax[y, x], ay[y, x], gx[y, x], gy[y, x]
+            a00 += u * g
+            a01 += u * h
+            a10 += v * g
+            a11 += v * h
+            b0 += u * rest
+            b1 += v * rest
+    det = a00 * a11 - a01 * a10
+    return -(a11 * b0 - a01 * b1) / det, -(a00 * b1 - a10 * b0) / det
+
+
 @entry
 def _residual_shifts(pixels, gx, gy, lx, ly, coefficients, order, centres, images, maps, half, pad, out):
-    rows, cols = coefficients.shape
-    taps = order + 1
-    lead = order // 2
     wx, wy = np.empty(6), np.empty(6)
-    sums = np.empty((4, 3))
-    gram = np.empty((4, 2))
+    side = 2 * half + 1
+    current = np.empty((side, side))
+    n = side * side
     for k in range(len(centres)):
         x0, y0 = centres[k]
         out[k, :] = np.nan
         if x0 < half or y0 < half or x0 + half >= pixels.shape[1] or y0 + half >= pixels.shape[0]:
             continue
-        sums[:, :] = 0.0
-        gram[:, :] = 0.0
         s_r = s_c = s_rc = s_cc = 0.0
-        inside = True
-        for dy in range(-half, half + 1):
-            for dx in range(-half, half + 1):
+        for i in range(side):
+            for j in range(side):
+                dx, dy = j - half, i - half
                 x = images[k, 0] + maps[k, 0, 0] * dx + maps[k, 0, 1] * dy + pad
                 y = images[k, 1] + maps[k, 1, 0] * dx + maps[k, 1, 1] * dy + pad
-                ix, iy = int(np.floor(x)), int(np.floor(y))
-                if ix < lead or iy < lead or ix - lead + taps > cols or iy - lead + taps > rows:
-                    inside = False
-                    break
-                _weights(x - ix, order, wx)
-                _weights(y - iy, order, wy)
-                value = 0.0
-                for i in range(taps):
-                    row = 0.0
-                    for j in range(taps):
-                        row += wx[j] * coefficients[iy - lead + i, ix - lead + j]
-                    value += wy[i] * row
-                r, c = pixels[y0 + dy, x0 + dx], value
+                c, r = _value(coefficients, order, x, y, wx, wy), pixels[y0 + dy, x0 + dx]
+                current[i, j] = c
                 s_r += r
                 s_c += c
                 s_rc += r * c
                 s_cc += c * c
-                g0, g1 = gx[y0 + dy, x0 + dx], gy[y0 + dy, x0 + dx]
-                for f in range(4):
-                    if f == 0:
-                        a = g0
-                    elif f == 1:
-                        a = g1
-                    elif f == 2:
-                        a = lx[y0 + dy, x0 + dx]
-                    else:
-                        a = ly[y0 + dy, x0 + dx]
-                    sums[f, 0] += a
-                    sums[f, 1] += a * r
-                    sums[f, 2] += a * c
-                    gram[f, 0] += a * g0
-                    gram[f, 1] += a * g1
-            if not inside:
-                break
-        n = (2 * half + 1) ** 2
         contrast = s_cc - s_c * s_c / n
-        if not inside or not contrast > 0.0:
+        if not contrast > 0.0:
             continue
         gain = (s_rc - s_r * s_c / n) / contrast
-        for f in range(2):
-            a00, a01, a10, a11 = gram[2 * f, 0], gram[2 * f, 1], gram[2 * f + 1, 0], gram[2 * f + 1, 1]
-            det = a00 * a11 - a01 * a10
-            if det == 0.0:
-                continue
-            b0 = gain * (sums[2 * f, 2] - s_c / n * sums[2 * f, 0]) - (sums[2 * f, 1] - s_r / n * sums[2 * f, 0])
-            g = 2 * f + 1
-            b1 = gain * (sums[g, 2] - s_c / n * sums[g, 0]) - (sums[g, 1] - s_r / n * sums[g, 0])
-            out[k, 2 * f] = -(a11 * b0 - a01 * b1) / det
-            out[k, 2 * f + 1] = -(a00 * b1 - a10 * b0) / det
+        known = gain, s_r / n, s_c / n
+        out[k, 0], out[k, 1] = _shift(pixels, current, gx, gy, gx, gy, x0, y0, half, *known)
+        out[k, 2], out[k, 3] = _shift(pixels, current, gx, gy, lx, ly, x0, y0, half, *known)
 
 
 def residual_shifts(
