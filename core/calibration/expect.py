@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from core.arrays import Float
 from core.calibration.fit.layout import State, camera_of, camera_seeing
-from core.calibration.fit.named import named_covariance, parameter_names
+from core.calibration.fit.named import named_by_cause, named_covariance, parameter_names
 from core.calibration.inputs import (
     AnyTarget,
     BoardLike,
@@ -20,11 +20,11 @@ from core.calibration.inputs import (
     extent_mm,
     nodes_of,
 )
-from core.calibration.prepare import EXPECTED_NOISE_PX, covariance_at, problem_of
+from core.calibration.prepare import EXPECTED_NOISE_PX, covariance_at, covariance_parts_at, problem_of
 from core.calibration.uncertainty import VolumeUncertainty, point_derivatives, volume_uncertainty
 from core.cameras.stereo import StereoPair
 from core.errors import CalibrationInputError
-from core.names import CAMERAS
+from core.names import CAMERAS, Cause
 
 LineModel = Literal["straight", "parabola", "local"]
 _PER_LINE = {"straight": 2, "parabola": 3}
@@ -46,6 +46,10 @@ class Expectation:
         Of each camera, the share of the inner intersections in the nominal camera's image at the worst position.
     reasons
         Reasons for which :func:`core.calibration.calibrate` would refuse such views; empty if it would not.
+    pair
+        The nominal cameras.
+    covariance, by_cause
+        (n, n) of ``parameters``, in their order, and its parts by cause, which add up to it.
     """
 
     parameters: dict[str, float]
@@ -55,6 +59,9 @@ class Expectation:
     sigma_mm: Float
     seen: tuple[float, float]
     reasons: tuple[str, ...]
+    pair: StereoPair
+    covariance: Float
+    by_cause: Mapping[Cause, Float]
 
 
 def correlation_of_lines(target: AnyTarget, line_model: LineModel | None) -> float:
@@ -137,7 +144,8 @@ def expect(
     problem = problem_of(views, target, nominals, options)
     priors = problem.priors(layout)
     names = parameter_names(layout, priors)
-    covariance = named_covariance(layout, priors, x, covariance_at(problem, layout, state, noise_px=noise_px))
+    unknowns, parts = covariance_parts_at(problem, layout, state, noise_px=noise_px)
+    covariance = named_covariance(layout, priors, x, unknowns)
     pair = StereoPair(*(camera_of(layout, x, c) for c in range(2)))
     volume = volume_uncertainty(pair, covariance, target, names)
     # a declared tilt of the stage axis makes the centre uncertain at any travel: only what the travel leaves is judged
@@ -158,6 +166,9 @@ def expect(
         sigma_mm=np.sqrt(np.maximum(spread, 0.0)),
         seen=(seen[0], seen[1]),
         reasons=_reasons(volume, centre_px, target, options),
+        pair=pair,
+        covariance=covariance,
+        by_cause=named_by_cause(layout, priors, x, unknowns, parts),
     )
 
 

@@ -17,7 +17,7 @@ from core.calibration.uncertainty import image_derivatives
 from core.cameras.stereo import StereoPair
 
 #: of the comparisons camera 2 at t0, camera 1 and camera 2 at t: the inverse of noise I plus the reference's in all
-_WEIGHTS = np.eye(3) - 0.25
+WEIGHTS = np.eye(3) - 0.25
 _NOISE = np.kron(np.eye(3) + 1.0, np.eye(2))
 
 
@@ -45,7 +45,7 @@ def measured_derivatives(
     n, p = len(points_mm), len(names)
     A1, A2 = pair.cam1.point_jacobian(points_mm), pair.cam2.point_jacobian(points_mm)
     B = image_derivatives(pair, points_mm, names)
-    across = _across(pair, points_mm)
+    across = across_lines(pair, points_mm)
     # unknowns X Y Z, offset; equations camera 1 exactly, camera 2
     first = np.zeros((n, 4, 4))
     first[:, :2, :3], first[:, 2:, :3], first[:, 2:, 3] = A1, A2, across
@@ -102,9 +102,9 @@ def _equations(pair: StereoPair, points_mm: Float, displaced_mm: Float) -> tuple
     A2 = pair.cam2.point_jacobian(points_mm)
     ray = points_mm - pair.cam1.centre_sys_mm
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    across = _across(pair, points_mm)
+    across = across_lines(pair, points_mm)
     now1, now2 = pair.cam1.point_jacobian(displaced_mm), pair.cam2.point_jacobian(displaced_mm)
-    across_now = _carried(pair, points_mm, displaced_mm, across)
+    across_now = carried_offset(pair, points_mm, displaced_mm, across)
     A = np.zeros((len(points_mm), 6, 5))
     A[:, :2, 0], A[:, :2, 1] = (A2 @ ray[..., None])[..., 0], across
     A[:, 2:4, 2:], A[:, 4:, 2:], A[:, 4:, 1] = now1, now2, across_now
@@ -113,19 +113,19 @@ def _equations(pair: StereoPair, points_mm: Float, displaced_mm: Float) -> tuple
 
 def _gain(A: Float) -> Float:
     """(n, 5, 6) of the unknowns over what the comparisons show."""
-    At = np.swapaxes(A, 1, 2) @ np.kron(_WEIGHTS, np.eye(2))
+    At = np.swapaxes(A, 1, 2) @ np.kron(WEIGHTS, np.eye(2))
     return np.asarray(np.linalg.solve(At @ A, At))
 
 
-def _across(pair: StereoPair, points_mm: Float) -> Float:
-    """(n, 2) unit vectors across the epipolar lines in camera 2's image."""
+def across_lines(pair: StereoPair, points_mm: Float) -> Float:
+    """Return (n, 2) unit vectors across the epipolar lines in camera 2's image."""
     along = pair.cam2.point_jacobian(points_mm) @ (points_mm - pair.cam1.centre_sys_mm)[..., None]
     along = along[..., 0] / np.linalg.norm(along[..., 0], axis=1, keepdims=True)
     return np.stack([-along[:, 1], along[:, 0]], axis=-1)
 
 
-def _carried(pair: StereoPair, points_mm: Float, displaced_mm: Float, across: Float) -> Float:
-    """(n, 2) the same shift of the normalised image, in px at the current position."""
+def carried_offset(pair: StereoPair, points_mm: Float, displaced_mm: Float, across: Float) -> Float:
+    """Return (n, 2) the same shift of the normalised image, in px at the current position."""
 
     def lens_jacobian(points: Float) -> Float:
         p = pair.cam2.cam_from_sys.apply(points)

@@ -23,6 +23,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "rigfile": ("server.cli.operation.rigfile", "check rig files; print every key with its meaning"),
     "simstage": ("server.cli.operation.simstage", "run a simulated motion controller on a socket or pty"),
     "calibrate": ("server.cli.measurement.calibrate", "calibrate a pair of cameras from grid images"),
+    "expect": ("server.cli.operation.expect", "predict what a planned measurement will leave uncertain"),
     "guide": ("server.cli.operation.guide", "calibrate on a running service from a target held by hand"),
     "noise": ("server.cli.measurement.noise", "measure the cameras' noise from repeated frames"),
     "measure": ("server.cli.measurement.measure", "measure shape and displacement from image files"),

@@ -6,6 +6,7 @@ depends on the files alone: nothing is kept from the step before but the content
 
 from __future__ import annotations
 
+import json
 import time
 import weakref
 from collections.abc import Callable, Mapping
@@ -29,6 +30,8 @@ from core.names import CAMERAS
 from core.progress import CancelToken, Progress
 from core.settings import StoredSettings
 from core.strain import StrainOptions
+from core.systematic.interpolation import SmoothSlopes
+from core.systematic.terms import Systematic, terms_of, with_strain
 from server.compute.camera_watch import CameraWatch
 from server.compute.strain import smoothed_step, strain_of_step, summarise_strain
 from server.formats.calibrations.native import covariance_in
@@ -111,6 +114,8 @@ class SequenceMeasurement:
         self._last_images: tuple[int, Pair] | None = None
         self._sequence: Updating | None = None
         self._motions: dict[int, CameraMotion | None] = {}
+        self._terms: dict[int, Systematic] = {}
+        self._smooth: SmoothSlopes | None = None
         self._watch = CameraWatch(
             self.calibration.pair,
             self.options,
@@ -190,8 +195,20 @@ class SequenceMeasurement:
             previous=previous,
             before=lambda n: (self._field(n), self._previous_images(n)),
         )
+        self._terms[step.n] = self._systematic(result, images)
         self._fields = {n: f for n, f in self._fields.items() if n == self.reference.n} | {step.n: result}
         return result
+
+    def _systematic(self, result: Field, images: Pair | None) -> Systematic:
+        """Systematic terms of a step's field; ``images`` are the step's, which the reference itself needs none of."""
+        prepared = [
+            image.prepared(self.options.interpolation, None, self.options.blur)
+            for image in (self.pair.image1, self.pair.image2, *(images or ()))
+        ]
+        if self._smooth is None:
+            self._smooth = SmoothSlopes.of(prepared[0])
+        others = prepared[1 : 4 if result.has_motion else 2]
+        return terms_of(result, self.calibration.pair, self._smooth, others, subset_px=self.settings.subset_px)
 
     def _matched(self, n: int, images: Pair, measure: Callable[[], Field]) -> Field:
         """Return what is measured; where nothing matches, say so if a camera turned too far."""
@@ -238,6 +255,10 @@ class SequenceMeasurement:
         shown = with_frozen_noise(shown, self.calibration.pair)
         strain = strain_of_step(shown, StrainOptions.of(self.settings.strain), subset_px=subset_px)
         path = self.file_of(step.n)
+        terms = self._terms.pop(step.n, None)
+        systematic = None if terms is None else with_strain(terms, shown, strain, subset_px=subset_px).document()
+        if systematic is not None:
+            about = {**about, "systematic": json.dumps(systematic, sort_keys=True)}
         summary = {
             "n": step.n,
             "step": step.n,
@@ -248,6 +269,7 @@ class SequenceMeasurement:
                 reference=self.reference.n,
                 imported=self.calibration.imported,
                 camera_motion=self._motions.pop(step.n, None),
+                systematic=systematic,
             ).document(),
             "strain": None if strain is None else summarise_strain(strain, shown).document(),
         }

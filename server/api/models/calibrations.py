@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, StringConstraints, with_config
 from typing_extensions import TypedDict
 
+from core.plan.settings import PlannedMeasurement, PlannedRig
 from core.settings import SUBSET_PX, Real, SpacingPx, SubsetPx, Whole
 from server.api.models.analyses import Region
 from server.api.models.calibration_checks import KeptCheck
@@ -72,6 +73,12 @@ class ExpectRequest(Request):
     roll_deg: Annotated[Real, Field(ge=-180.0, le=180.0)] = Field(
         0.0, description="Turn of the grid in the images; matters where its corners leave them."
     )
+    rig: PlannedRig | None = Field(
+        None, description="What differs from the rig file, of a rig that is not there yet; the stage is not asked then."
+    )
+    measurement: PlannedMeasurement | None = Field(
+        None, description="The measurement that is planned; null: the defaults of each of its fields."
+    )
 
 
 class ExpectedNumber(Reply):
@@ -100,6 +107,43 @@ class Assumed(Reply):
     text: str = Field(description="The same in a sentence.")
 
 
+class AssumedMeasurement(Reply):
+    """Assumptions of the measurement's part of an expectation."""
+
+    subset_px: int = Field(description="Subset.", examples=[33])
+    spacing_px: int = Field(description="Distance of neighbouring points.", examples=[10])
+    strain_window: int = Field(description="Points across the strain's gauge.", examples=[9])
+    image_noise_grey: float = Field(description="Standard deviation of a pixel's noise.", examples=[2.0])
+    contrast_grey: float = Field(description="Standard deviation of the pattern's grey levels.", examples=[40.0])
+    gradient_grey_per_px: float = Field(description="Rms gradient along one direction that follows.", examples=[18.8])
+    match_px: float = Field(
+        description="Standard deviation of one comparison's shift, per direction, px.", examples=[0.0046]
+    )
+    text: str = Field(description="The same in a sentence.")
+
+
+class PlannedQuantityReply(Reply):
+    """Expected uncertainty of one quantity of a measurement, k = 1."""
+
+    name: str = Field(
+        description="`X` `Y` `Z` `u` `v` `w` `exx` `eyy` `exy`, `length along X` or `length along Y`.", examples=["w"]
+    )
+    of: Literal["point", "length", "mean", "strain"] = Field(
+        description="A point in the middle of the target, a length, the mean over a square, a strain gauge."
+    )
+    unit: Literal["mm", "1"] = Field(description="Unit of its uncertainty.")
+    size_mm: float | None = Field(description="Of the length, square or gauge; null: a point.")
+    translation_mm: tuple[float, float, float] | None = Field(
+        description="Of the body since the reference; null: a quantity of its shape."
+    )
+    sigma: float | None = Field(description="Standard uncertainty; null where it cannot be told.", examples=[0.0012])
+    budget: dict[str, float] = Field(
+        description="The same by cause: `matching` (new at each step), `reference` (noise of the reference pair, "
+        "common to all steps), `calibration`, `stage`, `target`; their squares add up. Empty where it cannot be told."
+    )
+    missing: str = Field(description="Why it cannot be told.", examples=[""])
+
+
 class ExpectReply(Reply):
     """Expected uncertainty of a plan."""
 
@@ -113,6 +157,8 @@ class ExpectReply(Reply):
     seen_share: dict[str, float] = Field(description="Share of the intersections seen at the worst position.")
     refused: bool = Field(description="True if views at these positions would be refused.")
     reasons: list[str] = Field(description="Reasons.")
+    measurement: AssumedMeasurement = Field(description="Assumptions of the quantities.")
+    quantities: list[PlannedQuantityReply] = Field(description="Quantities of a measurement about the middle.")
 
 
 class ReviewRequest(Request):

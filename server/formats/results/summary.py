@@ -86,6 +86,11 @@ class StepSummary:
     failed_seeds_px
         (x, y) of given seeds that did not match, though the step was measured from others; left out where there are
         none.
+    systematic
+        What no standard uncertainty holds: `interpolation` (of sharp texture), `patch_order`, `strain_window`, each
+        with `text` (how it was estimated, or why it cannot be told) and `figures` by quantity and unit: `rms` and
+        `largest` over the points (null where noise hides them), and what the rms is `below`; null where it was not
+        estimated.
     reference_step, points_by_reference, displacement_mm
         Of displacements alone: what the step was matched against, valid points by what they were matched against, and
         the components' spans.
@@ -110,6 +115,7 @@ class StepSummary:
     smoothing: Smoothing | None
     patch: PatchChoice | None
     camera_motion: CameraMotion | None = None
+    systematic: Mapping[str, object] | None = None
     reference_step: int | None = None
     points_by_reference: dict[str, int] | None = None
     displacement_mm: dict[str, Span | None] | None = None
@@ -133,6 +139,7 @@ def summarise(
     reference: int = 0,
     imported: bool = False,
     camera_motion: CameraMotion | None = None,
+    systematic: Mapping[str, object] | None = None,
 ) -> StepSummary:
     """Summarise one field.
 
@@ -148,6 +155,8 @@ def summarise(
         True for another program's calibration, whose own error is not known.
     camera_motion
         What was found about the cameras when the step was measured.
+    systematic
+        The systematic terms, as :meth:`core.systematic.terms.Systematic.document` gives them.
     """
     status = result.status
     valid = result.valid
@@ -185,6 +194,7 @@ def summarise(
         smoothing=result.smoothing,
         patch=result.patch,
         camera_motion=camera_motion,
+        systematic=systematic,
         failed_seeds_px=result.failed_seeds_px,
     )
     if result.uvw_mm is None:

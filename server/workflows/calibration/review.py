@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
-from core.boards import BoardTarget
-from core.calibration.expect import LineModel, expect
-from core.calibration.prepare import EXPECTED_NOISE_PX
 from core.errors import StateError
-from server.compute.calibration_inputs import nominals_of, options_of, target_of
+from core.plan.settings import PlannedMeasurement, PlannedRig
+from server.compute.expectation import PlannedCalibration, expectation_document, rig_as_planned
 from server.store.folder import now_utc
 from server.store.index import calibration_entry
 from server.workflows.calibration.sequence import CalibrationPlan, check_plan, rig_metadata, targets_of
@@ -17,7 +15,15 @@ from server.workflows.service import Service
 Decision = Literal["accepted", "discarded"]
 
 
-def expectation(service: Service, plan: CalibrationPlan, noise_px: float | None, roll_deg: float) -> dict[str, object]:
+def expectation(
+    service: Service,
+    plan: CalibrationPlan,
+    *,
+    noise_px: float | None,
+    roll_deg: float,
+    rig: PlannedRig,
+    measurement: PlannedMeasurement,
+) -> dict[str, object]:
     """Return what a plan may be expected to leave uncertain, as the API shows it.
 
     Raises
@@ -28,43 +34,16 @@ def expectation(service: Service, plan: CalibrationPlan, noise_px: float | None,
         Where the stage cannot go there.
     """
     check_plan(plan)
-    if service.rig.config.stage is not None:
+    as_it_is = rig == PlannedRig()
+    if service.rig.config.stage is not None and as_it_is:
         targets_of(service, plan)
-    rig = rig_metadata(service.config)
-    target = target_of(rig["target"])
-    model: LineModel = "parabola"
-    if isinstance(target, BoardTarget):
-        model = "local"  # points are found one by one
-    elif plan.localiser == "profile":
-        # as core.calibration.from_images chooses
-        model = "local" if target.node_tolerance_mm > 0.0 else "straight"
-    noise = EXPECTED_NOISE_PX if noise_px is None else noise_px
-    options = options_of(rig)
-    expected = expect(
-        plan.positions_mm, target, nominals_of(rig), options, noise_px=noise, roll_deg=roll_deg, line_model=model
+    return expectation_document(
+        rig_as_planned(rig_metadata(service.config), rig),
+        PlannedCalibration(
+            positions_mm=plan.positions_mm, localiser=plan.localiser, noise_px=noise_px, roll_deg=roll_deg
+        ),
+        measurement,
     )
-    names = ("middle", *(f"{z} {y} {x}" for z in ("back", "front") for y in ("-Y", "+Y") for x in ("-X", "+X")))
-    return {
-        "assumed": {
-            "noise_px": noise,
-            "line_model": model,
-            "roll_deg": roll_deg,
-            "text": f"Each intersection is found to {noise:g} px a coordinate ({model} lines); the cameras are the rig "
-            f"file's, look at the target's centre and see it turned by {roll_deg:g} degrees.",
-        },
-        "parameters": {n: {"value": v, "sigma": expected.sigma[n]} for n, v in expected.parameters.items()},
-        "points": [
-            {"name": name, "xyz_mm": xyz, "sigma_mm": sigma}
-            for name, xyz, sigma in zip(names, expected.points_mm.tolist(), expected.sigma_mm.tolist(), strict=True)
-        ],
-        "shape_rms_mm": expected.volume.shape_rms_mm,
-        "scale": expected.volume.scale,
-        "centre_px": expected.volume.centre_px,
-        "standoff_relative": expected.volume.standoff_relative,
-        "seen_share": {"cam1": expected.seen[0], "cam2": expected.seen[1]},
-        "refused": bool(expected.reasons),
-        "reasons": list(expected.reasons),
-    }
 
 
 def decide(service: Service, calibration_id: str, decision: Decision | None, note: str, by: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fastapi import APIRouter, Request, Response
 
+from core.plan.settings import PlannedMeasurement, PlannedRig
 from server.api.models import CalibrationReply
 from server.api.models.calibrations import ExpectReply, ExpectRequest, ReviewRequest
 from server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
@@ -17,9 +18,10 @@ router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 
 @router.post(":expect", summary="Expected uncertainty of a plan", responses=errors(409, 422, 503))
 def expect_calibration(service: ServiceDep, body: ExpectRequest | None = None) -> ExpectReply:
-    """Predict each parameter's standard deviation, and what they do to points; nothing moves, nothing is kept.
+    """Predict what a calibration and a measurement will leave uncertain; nothing moves, nothing is kept.
 
-    The rig file's nominal cameras image the target; the adjustment's own derivatives there give the covariance.
+    The rig file's nominal cameras image the target; the adjustment's own derivatives there give the covariance. Points
+    on the target's plane, with the noise of an assumed pattern, give what a measurement will report.
     """
     body = body or ExpectRequest.model_validate({})
     usual = service.config.calibration
@@ -29,7 +31,15 @@ def expect_calibration(service: ServiceDep, body: ExpectRequest | None = None) -
         frames=usual.frames,
         localiser=body.localiser or usual.localiser,
     )
-    return ExpectReply.model_validate(calibration_review.expectation(service, plan, body.noise_px, body.roll_deg))
+    found = calibration_review.expectation(
+        service,
+        plan,
+        noise_px=body.noise_px,
+        roll_deg=body.roll_deg,
+        rig=body.rig or PlannedRig(),
+        measurement=body.measurement or PlannedMeasurement.model_validate({}),
+    )
+    return ExpectReply.model_validate(found)
 
 
 @router.put("/{calibration_id}/judgement", include_in_schema=False)  # its earlier address

@@ -1,0 +1,206 @@
+"""The bias that interpolation of sharp texture gives matches, seen in their own residuals.
+
+A spline through the pixels, and the pixels of a texture finer than they are, shift all matches alike by an amount that
+goes with the sine of the sub-pixel phase. What does it lies near the highest frequencies: a match of smoothed images is
+nearly free of it. At a sample of points the residuals say what such a match would change, and the part of that which
+goes with the phase's sine is the bias. Where the map from image to image runs through phases within a subset they
+cancel there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from core.arrays import Float, Float32
+from core.cameras.stereo import StereoPair
+from core.common.matches import Matches, match_gain
+from core.field.points.result import Field
+from core.matching.blur import Blur
+from core.matching.filters import correlate
+from core.matching.geometry import tangent_frames
+from core.matching.image import ImageData
+from core.robust import MAD_TO_SIGMA
+from core.status import PointStatus
+from core.systematic.sampled import residual_shifts
+from core.systematic.term import Figure, Term
+
+SMOOTH_PX = 1.5
+"""Of the smoother gradients: little of the bias is left in them. Wider ones see it less surely."""
+_PROBED_PX = 21  # of a subset, its middle: a wider one costs more and tells little more
+_SAMPLE = 256
+_MIN_SAMPLE = 32
+_SURE = 2.0
+_MIN_SINE2 = 0.02  # mean square of the sines below which no phase tells
+_OUTLIER = 4.0
+_QUANTITIES = ("x_um", "y_um", "z_um", "u_um", "v_um", "w_um")
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothSlopes:
+    """The reference image of camera 1 with its gradients, smoothed: made once for all steps.
+
+    Attributes
+    ----------
+    image
+        As it was matched.
+    along_x, along_y
+        (rows, cols) its gradients after a Gaussian of :data:`SMOOTH_PX`.
+    """
+
+    image: ImageData
+    along_x: Float32
+    along_y: Float32
+
+    @staticmethod
+    def of(image: ImageData) -> SmoothSlopes:
+        """Return those of a prepared image."""
+        taps = Blur(SMOOTH_PX).taps
+        out = []
+        for slope in image.gradients:
+            smooth = np.empty(slope.shape, np.float32)
+            correlate(slope, taps, taps, smooth)
+            out.append(smooth)
+        return SmoothSlopes(image, out[0], out[1])
+
+
+def interpolation_term(
+    field: Field, pair: StereoPair, reference: SmoothSlopes, others: Sequence[ImageData], *, subset_px: int
+) -> Term:
+    """Estimate the bias of interpolation in a field.
+
+    Parameters
+    ----------
+    field
+        As it was measured.
+    pair
+        The cameras.
+    reference
+        Camera 1's reference image.
+    others
+        Camera 2's reference image and, of a displacement, camera 1's and camera 2's current ones.
+    subset_px
+        Width of the subset.
+
+    Returns
+    -------
+    Term
+        ``match_px`` over points, comparisons and directions, and each coordinate in um.
+    """
+    if field.references is not None:
+        return Term("Not told: the step was matched against a later reference.")
+    index = np.flatnonzero((field.status == PointStatus.OK).ravel() & np.isfinite(field.normal_sys[..., 0].ravel()))
+    if len(index) < _MIN_SAMPLE:
+        return Term(f"Not told: {len(index)} points are too few.")
+    index = index[np.linspace(0, len(index) - 1, min(_SAMPLE, len(index))).astype(np.int64)]
+    centres = np.stack([field.x_px.ravel()[index], field.y_px.ravel()[index]], axis=-1)
+    found = _matches(field, pair, index)
+    images = found.images_px.copy()
+    offset = field.epipolar_px.ravel()[index]
+    images += np.where(np.isfinite(offset), offset, 0.0)[:, None, None] * found.across
+    slopes, smooth = reference.image.gradients, (reference.along_x, reference.along_y)
+    probed_px = min(subset_px, _PROBED_PX)
+    shifts, sines, left = [], [], []
+    for k, other in enumerate(others):
+        seen = residual_shifts(
+            reference.image.pixels,
+            slopes,
+            smooth,
+            other.coefficients,
+            other.order,
+            centres,
+            images[:, k],
+            found.maps[:, k],
+            probed_px,
+        )
+        # in px of the other image, along whose rows and columns its pixels lie
+        shifts.append((found.maps[:, k] @ (seen[:, :2] - seen[:, 2:])[..., None])[..., 0])
+        sine = np.sin(2.0 * np.pi * images[:, k])
+        sines.append(sine * _left_of_phase(found.maps[:, k], probed_px))
+        left.append(sine * _left_of_phase(found.maps[:, k], subset_px))
+    together = np.stack(shifts, axis=1), np.stack(sines, axis=1), np.stack(left, axis=1)
+    return _judged(*together, found, field.has_motion)
+
+
+def _judged(shifts: Float, sines: Float, left: Float, found: Matches, moved: bool) -> Term:
+    """Term of shifts (n, comparisons, 2), of the sines in what was probed, and of those in the whole subsets."""
+    amplitude, sd = np.full(2, np.nan), np.full(2, np.nan)
+    for axis in range(2):
+        found_here = _amplitude(sines[..., axis].ravel(), shifts[..., axis].ravel())
+        if found_here is not None:
+            amplitude[axis], sd[axis] = found_here
+    told = np.isfinite(amplitude)
+    if not told.any():
+        return Term(
+            "Not told: within the subsets the phase runs through whole pixels, so that the bias cancels, or all points "
+            "lie at whole or half pixels, where there is none."
+        )
+    # where one direction does not tell, there is little of it: the texture is taken to be as sharp as along the other
+    amplitude, sd = (np.where(told, values, values[told].max()) for values in (amplitude, sd))
+    shown = bool((np.abs(amplitude) > _SURE * sd).any())
+    text = (
+        f"From {len(shifts)} points' residuals: what a match through gradients smoothed by {SMOOTH_PX:g} px would "
+        f"change with the sub-pixel phase's sine, amplitude {1e3 * amplitude[0]:.2g} and {1e3 * amplitude[1]:.2g} "
+        f"thousandths of a pixel along rows and columns (standard deviation {1e3 * sd[0]:.1g}, {1e3 * sd[1]:.1g}); at "
+        "this field's phases."
+    )
+    bias = left * np.where(np.abs(amplitude) > _SURE * sd, amplitude, 0.0)
+    bound = left * (np.abs(amplitude) + _SURE * sd)
+    figures = {"match_px": _figure(bias, bound, shown)}
+    for k, (value, limit) in enumerate(zip(_to_mm(bias, found), _to_mm(bound, found), strict=True)):
+        if k >= 3 or not moved:
+            figures[_QUANTITIES[k]] = _figure(1e3 * value, 1e3 * limit, shown)
+    return Term(text, figures)
+
+
+def _amplitude(sines: Float, shifts: Float) -> tuple[float, float] | None:
+    """Amplitude of the shifts that go with the sines (n,), and its standard deviation; None where no phase tells."""
+    known = np.isfinite(sines) & np.isfinite(shifts)
+    s, d = sines[known], shifts[known]
+    if len(s) < _MIN_SAMPLE or not np.mean(s**2) > _MIN_SINE2:
+        return None
+    off = np.abs(d - np.median(d))
+    kept = off <= _OUTLIER * MAD_TO_SIGMA * np.median(off)
+    s, d = s[kept], d[kept]
+    square = float(s @ s)
+    found = float(s @ d) / square
+    return found, float(np.sqrt(np.mean((d - found * s) ** 2) / square))
+
+
+def _figure(bias: Float, bound: Float, shown: bool) -> Figure:
+    below = float(np.sqrt(np.nanmean(bound**2)))
+    if not shown:
+        return Figure(None, None, below)
+    return Figure(float(np.sqrt(np.nanmean(bias**2))), float(np.nanmax(np.abs(bias))), below)
+
+
+def _to_mm(shifts_px: Float, found: Matches) -> Float:
+    """(3 or 6, n) of X, Y, Z, U, V, W, mm, of shifts (n, comparisons, 2) in px of the other images."""
+    in_reference = np.linalg.solve(found.maps, shifts_px[..., None])[..., 0]
+    return np.asarray(np.einsum("nij,nj->in", found.gain, in_reference.reshape(len(shifts_px), -1)))
+
+
+def _left_of_phase(maps: Float, subset_px: int) -> Float:
+    """(n, 2) what is left, after the mean over a subset, of a sine of the phase along the other image's axes."""
+    # whole pixels of the reference: a map's whole numbers change no phase
+    off = np.pi * (maps - np.rint(maps))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        each = np.where(np.abs(off) < 1e-9, 1.0, np.sin(subset_px * off) / (subset_px * np.sin(off)))
+    return np.asarray(each[..., 0] * each[..., 1])
+
+
+def _matches(field: Field, pair: StereoPair, index: np.ndarray) -> Matches:
+    points, normals = field.xyz_mm.reshape(-1, 3)[index], field.normal_sys.reshape(-1, 3)[index]
+    if field.uvw_mm is None:
+        return match_gain(pair, points, normals)
+    displaced = points + field.uvw_mm.reshape(-1, 3)[index]
+    moved = None
+    if field.rotation_rad is not None and field.stretch is not None:
+        e = field.stretch.reshape(-1, 3)[index]
+        stretched = np.eye(2) + np.stack([e[:, 0], e[:, 2], e[:, 2], e[:, 1]], axis=-1).reshape(-1, 2, 2)
+        turned = Rotation.from_rotvec(field.rotation_rad.reshape(-1, 3)[index]).as_matrix()
+        moved = turned @ tangent_frames(normals)[..., :2] @ stretched
+    return match_gain(pair, points, normals, displaced, moved)

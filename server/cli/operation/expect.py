@@ -1,0 +1,161 @@
+"""``stereorig expect``: what a rig, a calibration and a measurement will leave uncertain, before anything moves."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from core.errors import InputError
+from core.names import BUDGET
+from core.plan.settings import PlannedMeasurement, PlannedRig
+
+#: options that other commands have by these names
+_NAMES = {"subset_px": "--subset", "spacing_px": "--step", "strain_window": "--strain"}
+_M = TypeVar("_M", bound=BaseModel)
+_NEEDED = ("image_size_px", "standoff_mm", "angle_deg", "pitch_mm", "lines")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.description = (
+        "Predict the standard uncertainties of a measurement, with their budget by cause, from nominal values alone: "
+        "of a rig file, or of a rig that is only thought about."
+    )
+    # "-2,4" after --positions is a list of numbers, not an option
+    parser._negative_number_matcher = re.compile(r"^-[\d.][\d.,+\- ]*$")
+    parser.add_argument(
+        "--rig", metavar="RIG.toml", type=Path, help="rig file; without one the options below state all"
+    )
+    parser.add_argument(
+        "--positions", metavar="-4,0,4", help="dZ of the calibration's fitted positions, mm; left out: the rig file's"
+    )
+    parser.add_argument(
+        "--noise-px", type=float, metavar="PX", help="noise of an intersection's coordinate (default: 0.005 px)"
+    )
+    parser.add_argument("--roll-deg", type=float, default=0.0, metavar="DEG", help="turn of the target in the images")
+    parser.add_argument("--json", action="store_true", help="print the whole document in place of a table")
+    for title, model in (("the rig, where it differs from the file", PlannedRig), ("measurement", PlannedMeasurement)):
+        group = parser.add_argument_group(title)
+        for name, field in model.model_fields.items():
+            default = "" if field.default is None else f" (default: {_shown(field.default)})"
+            text = f"{field.description or name}{default}".replace("%", "%%").replace("`", "")
+            group.add_argument(_option(name), dest=name, metavar=name.rsplit("_", 1)[-1].upper(), help=text)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Predict and print; 1 where such a calibration would be refused."""
+    from server.compute.expectation import PlannedCalibration, expectation_document, rig_as_planned
+    from server.formats.results.summary import to_json
+    from server.workflows.calibration.sequence import CalibrationPlan, check_plan
+
+    planned = _model(PlannedRig, args)
+    measured = _model(PlannedMeasurement, args)
+    rig, positions, localiser = _base(args.rig, planned)
+    if args.positions is not None:
+        positions = tuple(_numbers("--positions", args.positions))
+    if args.noise_px is not None and not 1e-6 <= args.noise_px <= 10.0:
+        raise InputError(f"--noise-px {args.noise_px:g} is not between 1e-6 and 10 px.")
+    check_plan(CalibrationPlan(positions_mm=positions, held_out_mm=(), frames=1, localiser=localiser))
+    plan = PlannedCalibration(
+        positions_mm=positions, localiser=localiser, noise_px=args.noise_px, roll_deg=args.roll_deg
+    )
+    document = expectation_document(rig_as_planned(rig, planned), plan, measured)
+    print(to_json(document).decode().rstrip() if args.json else table(document))
+    return 1 if document["refused"] else 0
+
+
+def table(document: Mapping[str, Any]) -> str:
+    """Write an expectation as a table: micrometres and microstrain."""
+    head = ["quantity", "after, mm", "u (k = 1)", *BUDGET]
+    rows = [head]
+    for one in document["quantities"]:
+        unit = "ue" if one["unit"] == "1" else "um"
+        scale = 1e6 if one["unit"] == "1" else 1e3
+        size = "" if one["size_mm"] is None else f", {one['size_mm']:.3g} mm"
+        name = one["name"] if one["of"] in ("point", "length") else f"{one['of']} {one['name']}"
+        moved = "" if one["translation_mm"] is None else ", ".join(f"{v:g}" for v in one["translation_mm"])
+        row = [name.removeprefix("strain ") + size, moved]
+        if one["sigma"] is None:
+            row += [f"- ({one['missing']})"]
+        else:
+            row += [f"{scale * one['sigma']:.3g} {unit}", *(f"{scale * one['budget'][c]:.3g}" for c in BUDGET)]
+        rows.append(row)
+    widths = [max(len(r[k]) for r in rows if len(r) == len(head)) for k in range(len(head))]
+    lines = [
+        "  ".join(
+            cell.ljust(w) if k < 2 else cell.rjust(w) for k, (cell, w) in enumerate(zip(row, widths, strict=False))
+        )
+        for row in rows
+    ]
+    lines += ["", document["assumed"]["text"], document["measurement"]["text"]]
+    lines += [f"would be refused: {reason}" for reason in document["reasons"]]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _base(path: Path | None, planned: PlannedRig) -> tuple[dict[str, Any], tuple[float, ...], Any]:
+    """Rig, positions and localiser of the rig file; without one those that everything must be stated beside."""
+    if path is not None:
+        from server.config.rig_file import load_config
+        from server.workflows.calibration.sequence import rig_metadata
+
+        config = load_config(path)
+        return rig_metadata(config), tuple(config.calibration.positions_mm), config.calibration.localiser
+    missing = [_option(name) for name in _NEEDED if getattr(planned, name) is None]
+    if planned.pinhole_px is None:
+        missing.append("--phd-px (or --focal-mm and --pixel-um)")
+    if missing:
+        raise InputError(f"Without --rig {', '.join(missing)} must be given.", remedy="Give them, or a rig file.")
+    camera = {"aspect": 1.0, "standoff_mm": None, "angle_deg": None, "phd_px": None, "image_size_px": None}
+    # a line's width has no part in a prediction
+    target = {"line_width_mm": 0.05 * (planned.pitch_mm or 1.0)}
+    rig = {"target": target, "cam1": camera, "cam2": camera, "axis_tilt_sigma_rad": 1e-3}
+    return rig, (), "profile"
+
+
+def _option(name: str) -> str:
+    return _NAMES.get(name, "--" + name.replace("_", "-"))
+
+
+def _shown(value: Any) -> str:
+    return ",".join(f"{v:g}" for v in value) if isinstance(value, list | tuple) else f"{value}"
+
+
+def _model(model: type[_M], args: argparse.Namespace) -> _M:
+    """Return a model of the options given.
+
+    Raises
+    ------
+    InputError
+        Where one is no number of its range, or two disagree.
+    """
+    given: dict[str, Any] = {}
+    for name in model.model_fields:
+        text = getattr(args, name)
+        if text is not None:
+            numbers = _numbers(_option(name), text)
+            given[name] = numbers if _takes_list(model, name) else numbers[0]
+    try:
+        return model.model_validate(given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = _option(str(first["loc"][0])) + ": " if first["loc"] else ""
+        raise InputError(f"{where}{first['msg']}.", remedy="See stereorig expect --help.") from error
+
+
+def _takes_list(model: type[BaseModel], name: str) -> bool:
+    return re.search(r"list\[|tuple\[", str(model.model_fields[name].annotation)) is not None
+
+
+def _numbers(option: str, text: str) -> Sequence[float]:
+    try:
+        numbers = [float(part) for part in text.split(",") if part.strip()]
+    except ValueError:
+        numbers = []
+    if not numbers:
+        raise InputError(f"{option} {text!r} holds no numbers.", remedy="Write it as 0,5,10.")
+    return [int(v) if v.is_integer() else v for v in numbers]
