@@ -15,6 +15,8 @@ from server.workflows.calibration.sequence import CalibrationPlan, check_plan, r
 from server.workflows.service import Service
 
 Decision = Literal["accepted", "discarded"]
+#: names of the newest accepted calibration; the second is the earlier one
+LATEST = ("latest", "accepted")
 
 
 def expectation(service: Service, plan: CalibrationPlan, noise_px: float | None, roll_deg: float) -> dict[str, object]:
