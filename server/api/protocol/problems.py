@@ -135,18 +135,19 @@ def install(app: FastAPI) -> None:
     async def _invalid(request: Request, error: RequestValidationError) -> JSONResponse:
         found = _field_problems(request, error.errors())
         fields = [{"field": one.field or where, "in": where, "problem": one.problem} for where, one in found]
-        text = " ".join(str(one) for _, one in found[:3])
-        if len(found) > 3:
-            text += f" {len(found) - 3} more values are wrong; `fields` has all of them."
+        wrong = " ".join(str(one) for _, one in found[:3])
+        more = f" {len(found) - 3} more values are wrong; `fields` has them." if len(found) > 3 else ""
         if all(item["type"] == "values_disagree" for item in error.errors()):
             return problem_response(
                 422,
                 "values_disagree",
-                text,
+                f"{wrong}{more}",
                 "Each value is right by itself; change one of them so that they fit each other.",
                 fields=fields,
             )
-        return problem_response(422, "invalid_request", text, "Correct the values named above.", fields=fields)
+        return problem_response(
+            422, "invalid_request", f"{wrong}{more}", "Correct the values named above.", fields=fields
+        )
 
     @app.exception_handler(HTTPException)
     async def _http(request: Request, error: HTTPException) -> JSONResponse:

@@ -157,7 +157,7 @@ def _request(args: argparse.Namespace) -> GaugeRequest:
         return GaugeRequest.model_validate(body)
     except ValidationError as error:
         first = problems_in(error, GaugeRequest)[0]
-        raise InputError(str(first), code="gauge_unusable", remedy="See stereorig gauge --help.") from error
+        raise InputError(f"{first}", code="gauge_unusable", remedy="See stereorig gauge --help.") from error
 
 
 def _align(args: argparse.Namespace) -> dict[str, object]:
