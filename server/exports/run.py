@@ -14,12 +14,14 @@ from core.errors import InputError
 from server.exports.matlab import write_mat
 from server.exports.pictures import check_fps, frames, image_of, picture_of, write_figure, write_gif, write_mp4
 from server.exports.request import ExportRequest
-from server.exports.stacked import write_stacked
+from server.exports.stacked import scalars_of, write_stacked
 from server.exports.table import write_table
 from server.exports.vtu import NEEDS, write_pvd, write_vtu
 from server.formats.files import written_temporary
 from server.formats.images import read_mask
 from server.formats.results.folder import number_of
+from server.formats.results.netcdf import add_scalars
+from server.results.channels import rising
 from server.results.provenance import provenance
 from server.results.steps import Source, chosen, columns_of, each, read_step, require_known, variables_of
 
@@ -93,8 +95,11 @@ def _as_stored(source: Source, files: Sequence[Path], request: ExportRequest, ou
         )
     for path in files:
         copy = _path(out, source, number_of(path), "nc")
+        recorded = read_step(path, []).recorded
         with written_temporary(copy) as temporary:
             shutil.copyfile(path, temporary)
+            if recorded.channels or recorded.load_n is not None:
+                add_scalars(temporary, scalars_of(recorded))
         yield copy
 
 
@@ -103,15 +108,17 @@ def _as_vtu(source: Source, files: Sequence[Path], request: ExportRequest, out: 
     there = {path: variables_of(path) for path in source.files}
     moves = any("u_mm" in names for names in there.values())
     require_known(files, request.variables)
+    heads = [read_step(path, []) for path in files]
+    times = rising(head.recorded.time_s for head in heads) or [float(head.n) for head in heads]
     written = []
-    for path in files:
+    for path, time in zip(files, times, strict=True):
         names = request.variables
         if names is not None:
             names = [name for name in (*names, *NEEDS) if name in there[path]]
         step = read_step(path, names)
         target = _path(out, source, step.n, "vtu")
-        write_vtu(target, step, source, mask=mask, at_rest=moves and "u_mm" not in there[path])
-        written.append((step.n, target.name))
+        write_vtu(target, step, source, mask=mask, at_rest=moves and "u_mm" not in there[path], time=time)
+        written.append((time, target.name))
         yield target
     series = out / f"{source.name}.pvd"
     write_pvd(series, written)

@@ -18,6 +18,7 @@ from server.base.errors import NotFoundError
 from server.formats.results.folder import number_of
 from server.formats.results.netcdf import opened
 from server.formats.results.settings import current_inputs, current_settings
+from server.results.channels import Recorded, recorded_with
 from server.results.reader import Variable
 from server.store.durable import known_json
 
@@ -39,12 +40,15 @@ class StepResult:
         The file's own, as text and numbers.
     cuts
         Cracks and borders of holes.
+    recorded
+        Channels and time, where the step is one of a test.
     """
 
     n: int
     variables: dict[str, Variable]
     attributes: dict[str, object]
     cuts: Cuts | None
+    recorded: Recorded = field(default_factory=Recorded)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -60,6 +64,8 @@ class StepResult:
     @property
     def load_n(self) -> float | None:
         """Load in newtons; None where it is not known."""
+        if self.recorded.load_n is not None:
+            return self.recorded.load_n
         text = self.attributes.get("load_n")
         return None if text is None else float(str(text))
 
@@ -180,7 +186,10 @@ def _read(path: Path, data: Any, names: Sequence[str] | None, always: Sequence[s
     attributes = {name: _plain(data.getncattr(name)) for name in data.ncattrs()}
     for name, current in (("settings", current_settings), ("inputs_sha256", current_inputs)):
         attributes[name] = json.dumps(current(json.loads(str(attributes.get(name, "{}")))))
-    return StepResult(int(str(attributes.get("step", number_of(path)))), variables, attributes, cuts)
+    n = int(str(attributes.get("step", number_of(path))))
+    reference = attributes.get("reference_step")
+    recorded = recorded_with(path, n, None if reference is None else int(str(reference)))
+    return StepResult(n, variables, attributes, cuts, recorded)
 
 
 def _plain(value: object) -> object:

@@ -8,6 +8,8 @@ from typing import Annotated
 
 from pydantic import Field
 
+from server.formats.channel_units import unit_of
+
 
 @dataclass(frozen=True)
 class Number:
@@ -155,6 +157,8 @@ class StepReadings:
     kind: str
     label: str
     load_n: float | None
+    time_s: float | None = None
+    channels: Mapping[str, float] = field(default_factory=dict)
     problem: Problem | None = None
     rigid_motion: RigidMotionReading | None = None
     points: Sequence[PointReading] = ()
@@ -166,7 +170,7 @@ class StepReadings:
         """Return it as plain values."""
         whole = asdict(self)
         if self.problem is not None:
-            return {name: whole[name] for name in ("n", "kind", "label", "load_n", "problem")}
+            return {name: whole[name] for name in ("n", "kind", "label", "load_n", "time_s", "channels", "problem")}
         return {k: v for k, v in whole.items() if k != "problem" and (k != "rigid_motion" or v is not None)}
 
 
@@ -202,6 +206,11 @@ class GaugeReadings:
     steps: Sequence[StepReadings] = field(repr=False)
 
     @property
+    def channel_units(self) -> dict[str, str]:
+        """The unit of each channel that any step has."""
+        return {name: unit_of(name) for name in sorted({name for step in self.steps for name in step.channels})}
+
+    @property
     def read(self) -> list[StepReadings]:
         """The steps that could be read."""
         return [step for step in self.steps if step.problem is None]
@@ -217,9 +226,11 @@ class GaugeReadings:
             "settings": self.settings,
             "inputs_sha256": self.inputs_sha256,
             "alignment": None if self.alignment is None else asdict(self.alignment),
+            **({"channel_units": self.channel_units} if self.channel_units else {}),
         }
 
     def document(self) -> dict[str, object]:
         """Return it as plain values."""
         whole = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        whole["channel_units"] = self.channel_units
         return whole | {"alignment": self.about()["alignment"], "steps": [step.document() for step in self.steps]}
