@@ -9,6 +9,8 @@
 
 Lengths are mm in the system frame of the calibration, image coordinates px with pixel centres at integers. A point that
 failed has NaN and a `status`; every value has a standard uncertainty beside it (`sigma_*`).
+
+:class:`stereorig.Client` and :class:`stereorig.AsyncClient` drive a running service instead: rig, tests, results.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from server.formats.noise_json import LoadedNoise as Noise
     from server.formats.noise_json import load_noise as read_noise
     from stereorig.calibration import calibrate, read_calibration
+    from stereorig.client import AsyncClient, Client
     from stereorig.measurement import Measurement
     from stereorig.result import Result, read_result
 
@@ -38,7 +41,9 @@ if TYPE_CHECKING:
 _LIES_IN = {
     "AnalysisSettings": "core.settings",
     "AreaStatistics": "core.gauge.area",
+    "AsyncClient": "stereorig.client",
     "Calibration": "server.formats.calibrations.recognise:LoadedCalibration",
+    "Client": "stereorig.client",
     "Extensometer": "core.gauge.extensometer",
     "Measurement": "stereorig.measurement",
     "Noise": "server.formats.noise_json:LoadedNoise",
@@ -59,7 +64,9 @@ _LIES_IN = {
 __all__ = [
     "AnalysisSettings",
     "AreaStatistics",
+    "AsyncClient",
     "Calibration",
+    "Client",
     "Extensometer",
     "Measurement",
     "Noise",

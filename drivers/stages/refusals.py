@@ -14,7 +14,7 @@ def configuration_state(axis: int) -> StageError:
         f"Axis {axis} is in CONFIGURATION state, in which a program left it (PW1): it refuses every motion.",
         code="configuration_state",
         remedy="Finish what that program began, or leave the state on purpose, which writes the controller's flash "
-        "memory (it bears about a hundred writes): POST /stage/axes/N/leave-configuration.",
+        "memory (it bears about a hundred writes): POST /stage/axes/N:leave-configuration.",
         axis=axis,
     )
 

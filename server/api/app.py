@@ -17,13 +17,14 @@ from server.api.protocol.audit import AuditLog, Recorder
 from server.api.protocol.auth import AccessRules, Door, Sessions
 from server.api.protocol.delivery import Delivery
 from server.api.protocol.guard import LOOPBACK_NAMES, Guard
+from server.api.protocol.old_addresses import OldAddresses
 from server.api.routes.analyses import analyses, exports, gauges, picking, previews, region, report, results
 from server.api.routes.calibrations import calibrations, guide, noise, repair, review
 from server.api.routes.calibrations import checks as calibration_checks
 from server.api.routes.calibrations import exports as calibration_exports
 from server.api.routes.rig import cameras, devices, stage
 from server.api.routes.service import jobs, session, system
-from server.api.routes.tests import metadata, tests, watch
+from server.api.routes.tests import channels, metadata, tests, watch
 from server.api.routes.tests.trash import router as trash_router
 from server.http.access import KeyFile
 from server.workflows.calibration.guided import Guides
@@ -33,12 +34,14 @@ from server.workflows.watch import Watches
 PREFIX = "/api/v1"
 _DESCRIPTION = """Stereo measurement of shape and 3-D displacement.
 
-Anything that takes long answers 202 with a job; follow it at `/jobs/{id}` or `/jobs/{id}/events`. Errors are
-problem+json (RFC 9457) with a stable `code`, the cause in `detail` and a `remedy`. POSTs that make something take an
-`Idempotency-Key`. What GET answers, HEAD does without a body. Answers have an ETag; asked with it in `If-None-Match`,
-they come as 304 while nothing has changed, and changes with `If-Match` are refused where something has. Lists come in
-pages: `next_cursor` leads to the next one. Answers are compressed for those who accept gzip. Lengths are in
-millimetres in the calibration target's frame unless a name states another one."""
+Anything that takes long answers 202 with a job; with `?wait=30` once the job has ended, or after so many seconds; so
+does `GET /jobs/{id}?wait=30`, and `/jobs/{id}/events` follows it. Errors are problem+json (RFC 9457) with a stable
+`code`, the cause in `detail` and a `remedy`; so is the `problem` of a job. What is no plain reading or changing of a
+thing is `thing:verb`; addresses of earlier versions still answer, with a `Deprecation` header. POSTs that make
+something take an `Idempotency-Key`. What GET answers, HEAD does without a body. Answers have an ETag; asked with it in
+`If-None-Match`, they come as 304 while nothing has changed, and changes with `If-Match` are refused where something
+has. Lists come in pages: `next_cursor` leads to the next one. Answers are compressed for those who accept gzip.
+Lengths are in millimetres in the calibration target's frame unless a name states another one."""
 
 
 def create_app(
@@ -93,6 +96,7 @@ def create_app(
     app.add_middleware(Door, rules=rules, sessions=sessions)
     app.add_middleware(Guard, allowed=hosts | frozenset(section.allowed_hosts))
     app.add_middleware(Recorder, log=audit, metrics=service.metrics)
+    app.add_middleware(OldAddresses, prefix=PREFIX)
     return app
 
 
@@ -125,6 +129,7 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         tests,
         metadata,
         watch,
+        channels,
         analyses,
         picking,
         region,

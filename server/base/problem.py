@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import Field, model_validator
 
 from core.errors import StateError, StereorigError
 from server.base.json_values import without_nan
@@ -13,9 +16,21 @@ class JobProblem(Document):
     """Reason why a job has no result."""
 
     code: str = Field(description="Stable code.")
-    cause: str = Field(description="The cause, with the values that disagree.")
+    detail: str = Field(
+        "", description="The cause, with the values that disagree; the same word as in an answer's problem."
+    )
+    cause: str = Field(description="Earlier name of `detail`, the same text.", json_schema_extra={"deprecated": True})
     remedy: str = Field(description="Remedy.")
     context: dict[str, object] = Field(default_factory=dict, description="Values that a program may want.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_text_by_both_names(cls, value: Any) -> Any:
+        # documents of earlier versions have the cause alone
+        if isinstance(value, Mapping):
+            texts = {name: value[name] for name in ("detail", "cause") if name in value}
+            return {**{name: text for text in texts.values() for name in ("detail", "cause")}, **value}
+        return value
 
 
 RESTART = StateError(

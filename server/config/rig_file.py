@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from core.errors import FileFormatError
 from core.names import CameraName
 from server.config.camera_metadata import Above, CameraMetadata, LensMetadata, Text
+from server.wording import problems_in
 
 _log = logging.getLogger("stereorig.config")
 
@@ -461,10 +462,10 @@ def parse_config(text: str, *, name: str = "the rig file") -> RigConfig:
     try:
         return RigConfig.model_validate(data)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "file"
-        more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-        cause = f"{name}: {where}: {first['msg']}{more}."
+        found = problems_in(error, RigConfig)
+        where = found[0].field or "file"
+        more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+        cause = f"{name}: {where}: {found[0].problem}{more}."
         raise FileFormatError(cause, code="config_invalid", remedy=remedy, field=where) from error
 
 

@@ -79,9 +79,9 @@ def _check_axis(book: Notebook, stage: Stage, config: RigConfig, axis: int) -> N
         status = stage.state(axis)
         limits = stage.limits(axis)
         remedies = {
-            AxisState.NOT_HOMED: "POST /stage/home before it is used, or give --home here.",
-            AxisState.MOTOR_OFF: "POST /stage/home, or /stage/enable if it was homed; or give --home here.",
-            AxisState.CONFIGURATION: f"POST /stage/axes/{axis}/leave-configuration, after a look at "
+            AxisState.NOT_HOMED: "POST /stage:home before it is used, or give --home here.",
+            AxisState.MOTOR_OFF: "POST /stage:home, or /stage:enable if it was homed; or give --home here.",
+            AxisState.CONFIGURATION: f"POST /stage/axes/{axis}:leave-configuration, after a look at "
             "docs/how_to/stages.md.",
         }
         state: State = "warning"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -13,50 +12,19 @@ import scipy.io
 
 from core.errors import InputError
 from server.formats.files import written_temporary
+from server.formats.matlab_names import matlab_name
 from server.results.provenance import provenance
 from server.results.steps import Source, StepResult
 
-_MAX_NAME = 63  # namelengthmax
-_KEYWORDS = frozenset(
-    {
-        "break",
-        "case",
-        "catch",
-        "classdef",
-        "continue",
-        "else",
-        "elseif",
-        "end",
-        "for",
-        "function",
-        "global",
-        "if",
-        "otherwise",
-        "parfor",
-        "persistent",
-        "return",
-        "spmd",
-        "switch",
-        "try",
-        "while",
-    }
-)
 _MAX_BYTES = (1 << 31) - (1 << 20)  # of one variable in this version of the format
-
-
-def matlab_name(name: str) -> str:
-    """Return a name as MATLAB takes it for a variable or field: letters, digits, underscores, a letter first."""
-    name = re.sub(r"[^A-Za-z0-9_]", "_", name)
-    if not name or not name[0].isalpha() or name in _KEYWORDS:
-        name = f"v_{name}"
-    return name[:_MAX_NAME]
 
 
 def write_mat(path: Path, steps: Iterable[StepResult], source: Source) -> None:
     """Write ``step_<nnnn>``, a struct for each step, and one ``about_<nnnn>`` that describes it.
 
-    A step's struct has ``n``, ``load_n`` (NaN where not known), ``label`` and each variable as a double array: rows
-    and columns of the grid, NaN where a point has no number. ``about_<nnnn>`` has ``units`` and ``meaning`` by
+    A step's struct has ``n``, ``load_n``, ``time_s`` (since the reference; NaN where not known), ``label``, the struct
+    ``channels`` if any were recorded, and each variable as a double array: rows and columns of the grid, NaN where a
+    point has no number. ``about_<nnnn>`` has ``units`` and ``meaning`` by
     variable, and the provenance; settings are JSON text, for ``jsondecode``. Steps are written one after the other.
 
     Raises
@@ -78,7 +46,10 @@ def write_mat(path: Path, steps: Iterable[StepResult], source: Source) -> None:
                 "n": float(step.n),
                 "load_n": np.nan if step.load_n is None else step.load_n,
                 "label": step.label,
+                "time_s": np.nan if step.recorded.time_s is None else step.recorded.time_s,
             }
+            if step.recorded.channels:
+                held["channels"] = {matlab_name(name): value for name, value in step.recorded.channels.items()}
             held |= {names[name]: v.values.astype(np.float64) for name, v in step.variables.items()}
             about = {matlab_name(k): _plain(v) for k, v in provenance(step, source).items()}
             about["units"] = {names[name]: v.units for name, v in step.variables.items()}

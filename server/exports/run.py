@@ -15,12 +15,14 @@ from core.errors import InputError
 from server.exports.matlab import write_mat
 from server.exports.pictures import check_fps, frames, image_of, picture_of, write_figure, write_gif, write_mp4
 from server.exports.request import ExportRequest
-from server.exports.stacked import write_stacked
+from server.exports.stacked import scalars_of, write_stacked
 from server.exports.table import write_table
 from server.exports.vtu import NEEDS, write_pvd, write_vtu
 from server.formats.files import written_temporary
 from server.formats.images import read_mask
 from server.formats.results.folder import number_of
+from server.formats.results.netcdf import add_scalars
+from server.results.channels import rising
 from server.results.provenance import provenance
 from server.results.steps import Source, chosen, columns_of, each, read_step, require_known, variables_of, with_coverage
 from server.results.uncertainty import in_file
@@ -102,8 +104,11 @@ def _as_stored(source: Source, files: Sequence[Path], request: ExportRequest, ou
         )
     for path in files:
         copy = _path(out, source, number_of(path), "nc")
+        recorded = read_step(path, []).recorded
         with written_temporary(copy) as temporary:
             shutil.copyfile(path, temporary)
+            if recorded.channels or recorded.load_n is not None:
+                add_scalars(temporary, scalars_of(recorded))
         yield copy
 
 
@@ -113,15 +118,17 @@ def _as_vtu(source: Source, files: Sequence[Path], request: ExportRequest, out: 
     moves = any("u_mm" in names for names in there.values())
     asked = None if request.variables is None else [in_file(name, source.coverage) for name in request.variables]
     require_known(files, asked)
+    heads = [read_step(path, []) for path in files]
+    times = rising(head.recorded.time_s for head in heads) or [float(head.n) for head in heads]
     written = []
-    for path in files:
+    for path, time in zip(files, times, strict=True):
         names = asked
         if names is not None:
             names = [name for name in (*names, *NEEDS) if name in there[path]]
         step = with_coverage(read_step(path, names), source)
         target = _path(out, source, step.n, "vtu")
-        write_vtu(target, step, source, mask=mask, at_rest=moves and "u_mm" not in there[path])
-        written.append((step.n, target.name))
+        write_vtu(target, step, source, mask=mask, at_rest=moves and "u_mm" not in there[path], time=time)
+        written.append((time, target.name))
         yield target
     series = out / f"{source.name}.pvd"
     write_pvd(series, written)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,23 +12,27 @@ from typing import Any
 import numpy as np
 
 from core.common.factor import Causes, joined
+from server.formats.channel_units import unit_of
 from server.formats.results.netcdf import opened, written_dataset
+from server.results.channels import Recorded
 from server.results.provenance import provenance
 from server.results.steps import Source, StepResult, causes_in, chosen, each, require_same_grid
 from server.results.uncertainty import COMMON_FACTOR
 
+LOAD_MEANS = "load, where it is known"
 _NO_STATE = -1  # of an integer variable in a step that does not have it
 _COMMON = ("x_px", "y_px")
+_OF_A_STEP = ("step", "label", "load_n", "kind", "time_s", "channels")
 
 
 def write_stacked(path: Path, source: Source, steps: Sequence[int] | None, names: Sequence[str] | None) -> None:
     """Write one file of all steps, one step in memory at a time.
 
     Datasets have the axes step, row, col (MATLAB, which counts from the other end, has col, row, step); ``x_px`` and
-    ``y_px`` are the same in every step and have row, col. ``step``, ``load_n``, ``label`` and ``provenance`` (JSON
-    text) have one entry a step. A variable that a step lacks is NaN there, or -1 if it counts. Units and meanings are
-    attributes. A column of a common factor is the same cause in all steps (attribute ``parts``), zero where a step
-    does without it. The file is netCDF-4, which is HDF5.
+    ``y_px`` are the same in every step and have row, col. ``step``, ``load_n``, ``time_s`` (since the reference),
+    ``channel_...`` as recorded, ``label`` and ``provenance`` (JSON text) have one entry a step. A variable that a step
+    lacks is NaN there, or -1 if it counts. Units and meanings are attributes. A column of a common factor is the same
+    cause in all steps (attribute ``parts``), zero where a step does without it. The file is netCDF-4, which is HDF5.
 
     Raises
     ------
@@ -74,12 +78,22 @@ def _aligned(step: StepResult, causes: Causes | None) -> StepResult:
     return replace(step, variables=variables)
 
 
+def scalars_of(recorded: Recorded) -> Iterator[tuple[str, float, str, str]]:
+    """Yield what was recorded with a step as name, value, unit and meaning; what is not known is left out."""
+    if recorded.load_n is not None:
+        yield "load_n", recorded.load_n, "N", LOAD_MEANS
+    if recorded.time_s is not None:
+        yield "time_s", recorded.time_s, "s", "time since the reference"
+    for name, value in recorded.channels.items():
+        yield f"channel_{name}", value, unit_of(name), f"channel {name}, as recorded with the step"
+
+
 def _begin(data: Any, step: StepResult, count: int) -> None:
     rows, cols = step.shape
     for name, size in (("step", count), ("row", rows), ("col", cols)):
         data.createDimension(name, size)
     _describe(data.createVariable("step", "i4", ("step",)), "1", "number of the step")
-    _describe(data.createVariable("load_n", "f8", ("step",), fill_value=np.nan), "N", "load, where it is known")
+    _describe(data.createVariable("load_n", "f8", ("step",), fill_value=np.nan), "N", LOAD_MEANS)
     for name, meaning in (
         ("label", "the step's label, given by the user"),
         ("provenance", "where it comes from, JSON"),
@@ -90,10 +104,13 @@ def _begin(data: Any, step: StepResult, count: int) -> None:
 def _put(data: Any, k: int, step: StepResult, source: Source) -> None:
     document = provenance(step, source)
     if k == 0:
-        of_all = {n: v for n, v in document.items() if n not in ("step", "label", "load_n", "kind")}
+        of_all = {n: v for n, v in document.items() if n not in _OF_A_STEP}
         data.setncatts({n: v if isinstance(v, str) else json.dumps(v, sort_keys=True) for n, v in of_all.items()})
     data.variables["step"][k] = step.n
-    data.variables["load_n"][k] = np.nan if step.load_n is None else step.load_n
+    for name, value, units, meaning in scalars_of(replace(step.recorded, load_n=step.load_n)):
+        if name not in data.variables:
+            _describe(data.createVariable(name, "f8", ("step",), fill_value=np.nan), units, meaning)
+        data.variables[name][k] = value
     data.variables["label"][k] = step.label
     data.variables["provenance"][k] = json.dumps(document, ensure_ascii=False, sort_keys=True)
     for name, variable in step.variables.items():

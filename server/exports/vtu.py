@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.exports.mesh import triangles_of, turned_as
+from server.formats.channel_units import unit_of
 from server.formats.files import write_bytes, written_temporary
 from server.results.provenance import provenance
 from server.results.reader import Variable
@@ -27,7 +28,13 @@ _TYPES = {"f8": "Float64", "f4": "Float32", "i8": "Int64", "i4": "Int32", "i2": 
 
 
 def write_vtu(
-    path: Path, step: StepResult, source: Source, *, mask: NDArray[np.bool_] | None = None, at_rest: bool = False
+    path: Path,
+    step: StepResult,
+    source: Source,
+    *,
+    mask: NDArray[np.bool_] | None = None,
+    at_rest: bool = False,
+    time: float | None = None,
 ) -> None:
     """Write one step: points where the surface was at the reference, triangles between neighbours, all variables.
 
@@ -41,6 +48,8 @@ def write_vtu(
         Its provenance.
     mask
         Camera 1's image, False where no triangle may lie.
+    time
+        Of the step in the time series; its number if left out.
     at_rest
         Displacements are relative to this step: its own is zero, which a time series needs to warp all its steps.
 
@@ -72,7 +81,7 @@ def write_vtu(
             'version="1.0" byte_order="LittleEndian" header_type="UInt64">\n<UnstructuredGrid>\n'
             "<FieldData>\n"
         )
-        _field_data(out, step, source, about)
+        _field_data(out, step, source, about, float(step.n) if time is None else time)
         out.write(f'</FieldData>\n<Piece NumberOfPoints="{keep.size}" NumberOfCells="{kinds.size}">\n<Points>\n')
         _array(out, "Points", xyz[keep], units="mm")
         out.write("</Points>\n<Cells>\n")
@@ -97,9 +106,9 @@ def write_vtu(
         out.write("</PointData>\n</Piece>\n</UnstructuredGrid>\n</VTKFile>\n")
 
 
-def write_pvd(path: Path, files: Iterable[tuple[int, str]]) -> None:
-    """Write the time series: number of each step, as its time, and the file's name beside this one."""
-    lines = [f'<DataSet timestep="{n}" group="" part="0" file={quoteattr(name)}/>' for n, name in files]
+def write_pvd(path: Path, files: Iterable[tuple[float, str]]) -> None:
+    """Write the time series: time of each step, in seconds since the reference or its number, and the file's name."""
+    lines = [f'<DataSet timestep="{n:.12g}" group="" part="0" file={quoteattr(name)}/>' for n, name in files]
     text = [
         '<?xml version="1.0" encoding="utf-8"?>',
         '<VTKFile type="Collection" version="1.0" byte_order="LittleEndian">',
@@ -118,8 +127,10 @@ def _vector(columns: dict[str, Variable], parts: tuple[str, ...]) -> NDArray[np.
     return np.stack([columns[name].values.ravel().astype(np.float64) for name in parts], axis=1)
 
 
-def _field_data(out: TextIO, step: StepResult, source: Source, about: str) -> None:
-    _array(out, "TimeValue", np.array([float(step.n)]), tuples=1)
+def _field_data(out: TextIO, step: StepResult, source: Source, about: str, time: float) -> None:
+    _array(out, "TimeValue", np.array([time]), tuples=1)
+    for name, value in step.recorded.channels.items():
+        _array(out, name, np.array([value]), tuples=1, units=unit_of(name))
     if step.load_n is not None:
         _array(out, "load_n", np.array([step.load_n]), tuples=1)
     # as bytes: readers other than VTK's own do not take its arrays of text

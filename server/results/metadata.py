@@ -17,6 +17,7 @@ from core.errors import FileFormatError
 from server.base.models import StepNumber
 from server.config.camera_metadata import Above, CameraMetadata, ClosedMetadata, Text
 from server.results.gauges.request import GaugeRequest
+from server.wording import problems_in
 
 
 class TestMetadata(ClosedMetadata):
@@ -81,10 +82,10 @@ def parse_metadata(document: Mapping[str, object], *, name: str) -> TestMetadata
     try:
         return TestMetadata.model_validate(dict(document))
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "file"
+        first = problems_in(error, TestMetadata)[0]
+        where = first.field or "file"
         raise FileFormatError(
-            f"{name}: {where}: {first['msg']}.",
+            f"{name}: {where}: {first.problem}.",
             code="metadata_invalid",
             field=where,
             remedy="Correct it; docs/how_to/report.md lists the entries.",

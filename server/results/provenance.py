@@ -8,6 +8,7 @@ from typing import Any
 
 from server.formats.files import sha256_of
 from server.formats.version import software_version
+from server.results.channels import units_of
 from server.results.steps import Source, StepResult, statement_of
 
 
@@ -42,6 +43,11 @@ def provenance(step: StepResult, source: Source, *, path: Path | None = None) ->
             document[name] = recorded[name]
     document["step"] = step.n
     document["label"], document["load_n"] = step.label, step.load_n
+    if step.recorded.time_s is not None:
+        document["time_s"] = step.recorded.time_s
+    if step.recorded.channels:
+        document["channels"] = dict(step.recorded.channels)
+        document["channel_units"] = units_of(step.recorded.channels)
     if path is not None:
         document["result_file"] = path.name
         document["result_sha256"] = sha256_of(path)

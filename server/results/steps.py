@@ -22,6 +22,7 @@ from server.formats.results.netcdf import opened
 from server.formats.results.reading import causes_of
 from server.formats.results.settings import current_inputs, current_settings
 from server.formats.results.uncertainty import Included, Statement
+from server.results.channels import Recorded, recorded_with
 from server.results.reader import Variable
 from server.results.uncertainty import COMMON_FACTOR, in_file, matrix_columns, with_intervals
 from server.store.durable import known_json
@@ -48,6 +49,8 @@ class StepResult:
         What its uncertainties include.
     causes
         Of the columns of its common factors; None without any.
+    recorded
+        Channels and time, where the step is one of a test.
     """
 
     n: int
@@ -56,6 +59,7 @@ class StepResult:
     cuts: Cuts | None
     included: Included
     causes: Causes | None = None
+    recorded: Recorded = field(default_factory=Recorded)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -71,6 +75,8 @@ class StepResult:
     @property
     def load_n(self) -> float | None:
         """Load in newtons; None where it is not known."""
+        if self.recorded.load_n is not None:
+            return self.recorded.load_n
         text = self.attributes.get("load_n")
         return None if text is None else float(str(text))
 
@@ -200,7 +206,9 @@ def _read(path: Path, data: Any, names: Sequence[str] | None, always: Sequence[s
         variables |= {
             name: replace(v, parts=causes.columns) for name, v in variables.items() if name.startswith(COMMON_FACTOR)
         }
-    return StepResult(n, variables, attributes, cuts, Included.of(data), causes)
+    reference = attributes.get("reference_step")
+    recorded = recorded_with(path, n, None if reference is None else int(str(reference)))
+    return StepResult(n, variables, attributes, cuts, Included.of(data), causes, recorded)
 
 
 def causes_in(data: Any) -> Causes | None:

@@ -161,7 +161,7 @@ class Rig:
             raise DeviceError(
                 f"The rig is not connected: {cause}",
                 code="not_connected",
-                remedy="Put the fault right, then POST /rig/reconnect.",
+                remedy="Put the fault right, then POST /rig:reconnect.",
             )
         return devices
 
@@ -350,13 +350,13 @@ class Rig:
                     status.state.value, status.state.value
                 )
                 remedies = {
-                    "motor_off": "POST /stage/enable; POST /stage/home where it was not homed either.",
-                    "configuration_state": "POST /stage/axes/N/leave-configuration, which writes the flash memory.",
+                    "motor_off": "POST /stage:enable; POST /stage:home where it was not homed either.",
+                    "configuration_state": "POST /stage/axes/N:leave-configuration, which writes the flash memory.",
                 }
                 raise StateError(
                     f"Axis {axis} cannot move: it is {status.state.value}. {status.detail}".strip(),
                     code=code,
-                    remedy=remedies.get(code, "POST /stage/home first."),
+                    remedy=remedies.get(code, "POST /stage:home first."),
                     axis=axis,
                 )
             self._check_room_to_arrive(axis, status.position_mm, target)

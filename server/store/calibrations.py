@@ -14,7 +14,7 @@ from server.base.errors import NotFoundError
 from server.formats.calibrations.kept_checks import checks_file, keep_check, read_checks, with_checks
 from server.formats.files import known_sha256, mismatch, require_recorded, sha256_of
 from server.formats.images import GrayImage, encode_tiff
-from server.store.documents import CalibrationRecord
+from server.store.documents import CalibrationRecord, failure_state
 from server.store.durable import make_folder, read_json, record_of, write_bytes, write_json
 from server.store.folder import DataFolder, is_id, now_utc
 
@@ -109,7 +109,7 @@ class CalibrationStore:
         keep_check(self.path(calibration_id) / "calibration.json", self.checksum(calibration_id), name, finding)
 
     def read(self, calibration_id: str) -> CalibrationRecord:
-        """Return plan, views taken, result and state (``unfinished``, ``failed``, ``complete``).
+        """Return plan, views taken, result and state (``unfinished``, ``cancelled``, ``failed``, ``complete``).
 
         One that failed its verdict has the rejected result.
         """
@@ -128,7 +128,8 @@ class CalibrationStore:
             made = with_checks(read_json(path / "calibration.json"), self.checks(calibration_id))
             document = {**made, **document, "state": "complete", "problem": None}
         elif (path / "failure.json").exists():
-            document |= {"state": "failed", "problem": read_json(path / "failure.json")}
+            problem = read_json(path / "failure.json")
+            document |= {"state": failure_state(problem), "problem": problem}
             if (path / REJECTED).exists():  # a rejected calibration is kept for inspection
                 document = {**read_json(path / REJECTED), **document}
         kept = next((path / name for name in _REVIEWS if (path / name).exists()), None)

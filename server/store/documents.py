@@ -6,6 +6,7 @@ these.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal
 
 from pydantic import AliasChoices, Field
@@ -217,11 +218,20 @@ class Failure(JobProblem):
     job_state: JobState = "interrupted"
 
 
+#: state of a calibration or noise measurement; `cancelled` and `failed` ones have no result to measure with
+MadeState = Literal["unfinished", "cancelled", "failed", "complete"]
+
+
+def failure_state(failure: Mapping[str, object]) -> MadeState:
+    """Return the state of what ended with this ``failure.json``: who cancelled it knows that nothing went wrong."""
+    return "cancelled" if failure.get("job_state") == "cancelled" else "failed"
+
+
 class MadeRecord(Document):
     """A calibration or noise measurement as its folder has it: results are beside these fields."""
 
     id: str
-    state: Literal["unfinished", "failed", "complete"]
+    state: MadeState
     plan: Plan
     problem: Failure | None = None
 

@@ -19,6 +19,7 @@ from server.base.models import Document
 from server.formats import disk as _disk
 from server.formats import files
 from server.formats.files import fsync_path, storage_error
+from server.wording import problems_in
 
 Record = TypeVar("Record", bound=Document)
 
@@ -80,9 +81,8 @@ def record_of(kind: type[Record], document: object, path: Path) -> Record:
     try:
         return kind.model_validate(document)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        raise FileFormatError(f"{path.name} holds a wrong {key}: {first['msg']}.", file=path.name) from error
+        first = problems_in(error, kind)[0]
+        raise FileFormatError(f"{path.name} holds a wrong {first.field}: {first.problem}.", file=path.name) from error
 
 
 def read_record(kind: type[Record], path: Path) -> Record:

@@ -15,7 +15,7 @@ from server.base.errors import NotFoundError
 from server.base.problem import RESTART, problem_of
 from server.formats.files import require_recorded
 from server.formats.images import GrayImage, encode_tiff
-from server.store.documents import MadeRecord
+from server.store.documents import MadeRecord, failure_state
 from server.store.durable import make_folder, read_json, record_of, write_bytes, write_json
 from server.store.folder import DataFolder, is_id, now_utc
 
@@ -83,14 +83,15 @@ class NoiseStore:
         write_json(self.path(noise_id) / "failure.json", problem)
 
     def read(self, noise_id: str) -> MadeRecord:
-        """Return plan, models and state (``unfinished``, ``failed``, ``complete``)."""
+        """Return plan, models and state (``unfinished``, ``cancelled``, ``failed``, ``complete``)."""
         path = self.path(noise_id)
         document: dict[str, object] = {"id": noise_id, "state": "unfinished", "plan": read_json(path / "plan.json")}
         if (path / "noise.json").exists():
             require_recorded(path / "noise.json", f"noise measurement {noise_id}", f"noise/{noise_id}")
             document = {**read_json(path / "noise.json"), **document, "state": "complete", "problem": None}
         elif (path / "failure.json").exists():
-            document |= {"state": "failed", "problem": read_json(path / "failure.json")}
+            problem = read_json(path / "failure.json")
+            document |= {"state": failure_state(problem), "problem": problem}
         return record_of(MadeRecord, document, path / "plan.json")
 
     def file(self, noise_id: str) -> Path:

@@ -8,7 +8,7 @@ from core.errors import StateError
 from server.base.models import Ids
 from server.jobs.idempotency import RequestMark
 from server.store.index import test_entry
-from server.workflows.calibration.review import check_not_discarded, newest_accepted
+from server.workflows.calibration.review import LATEST, check_not_discarded, newest_accepted
 from server.workflows.service import Service
 
 
@@ -18,7 +18,7 @@ def create(service: Service, wanted: Mapping[str, object], request: RequestMark)
     Parameters
     ----------
     wanted
-        Name, specimen, notes and ``calibration_id`` (``accepted``: the newest that was accepted; None: none).
+        Name, specimen, notes and ``calibration_id`` (``latest``: the newest that was accepted; None: none).
 
     Returns
     -------
@@ -31,7 +31,7 @@ def create(service: Service, wanted: Mapping[str, object], request: RequestMark)
         ``calibration_not_complete``, ``calibration_discarded`` or ``no_calibration_accepted``.
     """
     path, asked = None, wanted["calibration_id"]
-    calibration_id = newest_accepted(service) if asked == "accepted" else asked
+    calibration_id = newest_accepted(service) if asked in LATEST else asked
     if calibration_id is not None:
         path = service.calibrations.path(str(calibration_id)) / "calibration.json"
         state = service.calibrations.read(str(calibration_id)).state

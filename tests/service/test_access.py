@@ -100,7 +100,7 @@ def test_each_role_may_do_its_part(asks: httpx.Client, keys: dict[str, str]) -> 
         assert asks.get(f"{API}/rig", headers=bearer(keys[role])).status_code == 200
         assert asks.get(f"{API}/session", headers=bearer(keys[role])).json() == {"name": f"{role}-key", "role": role}
         # any user who sees that something goes wrong may stop it
-        assert asks.post(f"{API}/stage/stop", headers=bearer(keys[role])).status_code == 200
+        assert asks.post(f"{API}/stage:stop", headers=bearer(keys[role])).status_code == 200
     refused = asks.post(f"{API}/tests", json={"name": "x"}, headers=bearer(keys["viewer"]))
     assert refused.status_code == 403
     assert refused.json()["code"] == "role_too_low"
@@ -119,7 +119,7 @@ def test_the_pages_cookie_stands_for_its_key(asks: httpx.Client, keys: dict[str,
     assert asks.get(f"{API}/rig").status_code == 200  # the client keeps the cookie
     assert asks.post(f"{API}/tests", json={"name": "x"}).status_code == 403
     # a page of another site cannot use it
-    assert asks.post(f"{API}/stage/stop", headers={"Origin": "http://elsewhere.example"}).status_code == 403
+    assert asks.post(f"{API}/stage:stop", headers={"Origin": "http://elsewhere.example"}).status_code == 403
     token = asks.cookies["stereorig_session"]
     assert asks.delete(f"{API}/session").status_code == 204
     for ended in (token, "guessed", "a=b; c"):
@@ -193,13 +193,13 @@ def test_every_change_leaves_a_line_in_the_audit_log(
 ) -> None:
     log = service.folder.root / "audit.log"
     before = len(log.read_text().splitlines())
-    asks.post(f"{API}/stage/stop", headers={**bearer(keys["viewer"]), "X-Request-Id": "stop-1"})
+    asks.post(f"{API}/stage:stop", headers={**bearer(keys["viewer"]), "X-Request-Id": "stop-1"})
     asks.post(f"{API}/stage/moves", json={"positions_mm": {"1": 99.0}}, headers=bearer(keys["operator"]))
     asks.post(f"{API}/tests", json={"name": "x"})
     asks.get(f"{API}/rig", headers=bearer(keys["viewer"]))
     lines = [json.loads(line) for line in log.read_text().splitlines()[before:]]
     assert [(line["who"], line["path"], line["status"]) for line in lines] == [
-        ("viewer-key", f"{API}/stage/stop", 200),
+        ("viewer-key", f"{API}/stage:stop", 200),
         ("operator-key", f"{API}/stage/moves", 422),
         (None, f"{API}/tests", 401),
     ]
@@ -221,7 +221,7 @@ def test_a_client_that_asks_without_end_is_slowed_and_a_stop_never(tmp_path: Pat
             assert len(slowed) >= 10
             assert slowed[0].json()["code"] == "too_many_requests"
             assert int(slowed[0].headers["retry-after"]) >= 1
-            assert client.post(f"{API}/stage/stop", headers=bearer(key)).status_code == 200
+            assert client.post(f"{API}/stage:stop", headers=bearer(key)).status_code == 200
     finally:
         made.close()
 

@@ -53,8 +53,8 @@ def test_a_step_is_the_second_number_before_1_0_and_the_first_one_after() -> Non
 
 def test_a_breaking_change_without_a_step_is_told(described: Json) -> None:
     changed = copy.deepcopy(described)
-    del changed["paths"]["/api/v1/stage/stop"]
-    assert missing_step(described, changed) == ["POST /api/v1/stage/stop is gone"]
+    del changed["paths"]["/api/v1/stage:stop"]
+    assert missing_step(described, changed) == ["POST /api/v1/stage:stop is gone"]
     changed["info"]["version"] = "99.0.0"
     assert missing_step(described, changed) == []
 

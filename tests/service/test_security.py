@@ -363,7 +363,7 @@ def test_no_operation_falls_over_any_of_these_bodies(client: httpx.Client) -> No
         filled = path.replace("{test_id}", test_id).replace("{cam}", "cam1").replace("{axis}", "1").replace("{n}", "0")
         filled = re.sub(r"\{[^}]*\}", "a000001-abcdef", filled)
         for method in set(operations) & {"post", "put", "patch"}:
-            if path.endswith(("/reconnect", "/home", "/session", "/noise", ":guide")):
+            if path.endswith((":reconnect", ":home", "/session", "/noise", ":guide")):
                 continue  # they need no body, and work for long
             for body in bodies:
                 answer = client.request(method, filled, content=body, headers={"Content-Type": "application/json"})

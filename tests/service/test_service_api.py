@@ -35,7 +35,7 @@ def test_health_and_metrics_answer(client: httpx.Client) -> None:
 
 def test_documentation_page_asks_nothing_of_other_hosts(client: httpx.Client) -> None:
     page = client.get("/docs/operations").text
-    assert "/api/v1/stage/stop" in page
+    assert "/api/v1/stage:stop" in page
     assert "http://" not in page
     assert "https://" not in page
 

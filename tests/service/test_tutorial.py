@@ -42,7 +42,10 @@ def at(client: httpx.Client, text: str) -> str:
 
 @pytest.fixture(scope="module")
 def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """A service of its own process, with a calibration: the simulated cameras' own parameters."""
+    """A service of its own process, with a calibration: the simulated cameras' own parameters.
+
+    The newest calibration is another one, cancelled: nothing that the pages print may take it for the one in force.
+    """
     folder = tmp_path_factory.mktemp("tutorial")
     with (
         running_service(RIG, folder / "data", folder / "service.log") as url,
@@ -52,6 +55,10 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
         cameras = json.dumps(true_cameras(RIG.read_text(encoding="utf-8")))
         sent = made.post(f"{API}/calibrations:import", files={"file": ("true.json", cameras)})
         assert sent.status_code == 201, sent.text
+        accepted = made.put(f"{API}/calibrations/{sent.json()['id']}/review", json={"decision": "accepted"})
+        assert accepted.status_code == 200, accepted.text
+        begun = made.post(f"{API}/calibrations").json()["job"]["id"]
+        assert made.post(f"{API}/jobs/{begun}:cancel", params={"wait": 30}).json()["state"] == "cancelled"
         yield made
 
 

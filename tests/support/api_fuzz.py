@@ -151,7 +151,7 @@ class Known:
         if response.status_code == 404:
             assert path not in self.made or method != "GET", f"made, and not deleted: {path}"
         elif response.status_code < 300 and method in ("PUT", "POST"):
-            self.deleted = set() if path.endswith("/restore") else self.deleted - {path}
+            self.deleted = set() if path.endswith(":restore") else self.deleted - {path}
             answer = json.loads(response.content or b"null") if response.status_code == 201 else None
             made = answer.get("id", answer.get("n")) if isinstance(answer, dict) else None
             if made is not None:

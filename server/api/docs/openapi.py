@@ -11,8 +11,9 @@ from pydantic.json_schema import JsonSchemaValue
 
 from server.api.protocol import problems
 
-#: Version of the API, apart from the program's own. While it begins with 0, the second number grows with what breaks
-#: clients; what they need not heed is free until the next release (docs/explanation/decisions/0019-api-description.md).
+#: Version of the API, and of the program (pyproject.toml): one number. While it begins with 0, the second number grows
+#: with what breaks clients; what they need not heed is free until the next release
+#: (docs/explanation/decisions/0019-api-description.md).
 API_VERSION = "0.2.0"
 
 _BODY_METHODS = ("post", "put", "patch")

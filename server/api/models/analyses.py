@@ -246,6 +246,8 @@ class GaugeStep(Reply):
     kind: str = Field(description="`shape` or `displacement`.")
     label: str = Field(description="The step's label.")
     load_n: float | None = Field(None, description="The step's load in newton.")
+    time_s: float | None = Field(None, description="Seconds since the reference; null where a time is not known.")
+    channels: dict[str, float] = Field(default_factory=dict, description="The step's channels, by name.")
     rigid_motion: RigidMotionReading | None = Field(
         None, description="The motion that was taken out, with its covariance."
     )
@@ -269,4 +271,5 @@ class GaugesReply(Reply):
     smoothing_window: int | None = Field(None, description="Points over which displacements were smoothed.")
     alignment: FrameReading | None = Field(None, description="The frame that was laid, and its uncertainty.")
     uncertainty: Uncertainty = Field(description="What the uncertainties are, and what they include in all steps.")
+    channel_units: dict[str, str] = Field(default_factory=dict, description="Unit of each channel, from its name.")
     steps: list[GaugeStep] = Field(description="Readings of each step.")

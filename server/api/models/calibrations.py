@@ -14,6 +14,7 @@ from server.api.models.calibration_checks import KeptCheck
 from server.api.models.jobs import Accepted, JobProblem
 from server.base.json_values import Nested
 from server.base.models import Label, Listing, Number, Reply, Request, StepNumber
+from server.store.documents import MadeState
 
 
 class CalibrationRequest(Request):
@@ -260,7 +261,7 @@ class CalibrationReply(Reply):
     """A calibration: its plan, and once complete everything in calibration.json; what a verdict refused, too."""
 
     id: str = Field(description="Id.")
-    state: Literal["unfinished", "failed", "complete"] = Field(description="Only `complete` ones can be measured with.")
+    state: MadeState = Field(description="Only `complete` ones can be measured with.")
     plan: PlanReply = Field(description="Positions, frames and localiser asked for.")
     taken: list[ViewReply] | None = Field(None, description="Views taken, each as in GET /calibrations/{id}/views.")
     problem: JobProblem | None = Field(None, description="Problem that left no calibration.")
@@ -292,7 +293,7 @@ class CalibrationEntry(Reply):
     """Entry of a calibration in a list."""
 
     id: str = Field(description="Id.", examples=["c000001-5b02aa"])
-    state: str = Field(description="`unfinished`, `failed` or `complete`.")
+    state: MadeState = Field(description="Only `complete` ones can be measured with.")
     label: str = Field(description="Free text.")
     created_utc: str = Field(description="Time at which it was begun or imported.")
     verdict: VerdictReply | None = Field(description="Its verdict; null: none, as of most imported ones.")

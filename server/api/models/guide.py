@@ -122,7 +122,9 @@ class GuideReply(Reply):
 
     calibration_id: str = Field(description="Its calibration.")
     job_id: str | None = Field(description="Its job: DELETE it to end without a fit; the views are kept.")
-    state: Literal["acquiring", "fitting", "unfinished", "failed", "complete"] = Field(description="State.")
+    state: Literal["acquiring", "fitting", "unfinished", "cancelled", "failed", "complete"] = Field(
+        description="State."
+    )
     quantity: Literal["z", "shape"] = Field(description="Uncertainty that the goal is about.")
     goal_um: float | None = Field(description="The goal; null: none.")
     automatic: bool = Field(description="True if views are taken by themselves.")

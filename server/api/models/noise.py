@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field, with_config
 from typing_extensions import TypedDict
@@ -10,6 +10,7 @@ from typing_extensions import TypedDict
 from core.settings import Whole
 from server.api.models.jobs import Accepted, JobProblem
 from server.base.models import Label, Listing, Reply, Request
+from server.store.documents import MadeState
 
 
 class NoiseRequest(Request):
@@ -59,7 +60,7 @@ class NoiseReply(Reply):
     """A noise measurement."""
 
     id: str = Field(description="Id.")
-    state: Literal["unfinished", "failed", "complete"] = Field(description="State of the measurement.")
+    state: MadeState = Field(description="State of the measurement.")
     plan: NoisePlanReply = Field(description="Plan.")
     problem: JobProblem | None = Field(None, description="Problem that left no models.")
     cam1: NoiseModelReply | None = Field(None, description="Camera 1's model.")

@@ -19,7 +19,7 @@ class TestRequest(Request):
     name: Annotated[str, StringConstraints(min_length=1, max_length=300)] = Field(description="Name, any characters.")
     calibration_id: str | None = Field(
         None,
-        description="Calibration to measure with, copied into the test; `accepted`: the newest one accepted.",
+        description="Calibration to measure with, copied into the test; `latest`: the newest one accepted.",
         max_length=40,
     )
     specimen: Label = Field("", description="The specimen, free text.")

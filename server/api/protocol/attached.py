@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from typing import Annotated
 
 from fastapi import Query, Request
@@ -19,11 +20,38 @@ Attached = Annotated[
         "stopped (a handle that must be held)."
     ),
 ]
+#: longest wait; proxies give up on an answer after a minute, mostly
+MAX_WAIT_S = 60
+Wait = Annotated[
+    float,
+    Query(
+        ge=0,
+        le=MAX_WAIT_S,
+        allow_inf_nan=False,
+        description="Seconds to wait, at most, for the job's end; the answer shows the job as it is then. It goes on "
+        "whether the client stays or not.",
+    ),
+]
 _ATTEND_S = 0.05
 
 
-async def job_reply(request: Request, service: Service, job_id: str, attached: bool) -> dict[str, object]:
-    """Answer at once, or stay with the job to its end and stop it when the client goes away."""
+async def waited(request: Request, service: Service, job_id: str, wait_s: float) -> None:
+    """Return when the job has ended, the time is over or the client has gone."""
+    until = time.monotonic() + wait_s
+    while (
+        service.jobs.document(job_id).state not in FINAL
+        and (left := until - time.monotonic()) > 0.0
+        and not await request.is_disconnected()
+    ):
+        await asyncio.sleep(min(_ATTEND_S, left))
+
+
+async def job_reply(
+    request: Request, service: Service, job_id: str, attached: bool = False, wait_s: float = 0.0
+) -> dict[str, object]:
+    """Answer at once or after a wait; or stay with the job to its end and stop it when the client goes away."""
+    if not attached:
+        await waited(request, service, job_id, wait_s)
     while attached and service.jobs.document(job_id).state not in FINAL:
         if await request.is_disconnected():
             with contextlib.suppress(StateError):  # it ended just now

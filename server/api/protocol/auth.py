@@ -27,10 +27,10 @@ _OPEN = frozenset({"/", "/docs", "/healthz", "/readyz", "/api/v1/healthz", "/api
 # the page's own files and what is public in the program's source; without them no operator could log in
 _PAGES = ("/static/", "/docs/", "/problems")
 _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
-_STOP = "/api/v1/stage/stop"
+_STOP = "/api/v1/stage:stop"
 # stopping must never fail for a right that is lacking; every client may log in and out
 _FOR_EVERYBODY = frozenset({_STOP, "/api/v1/session"})
-_HALTS = frozenset({_STOP, "/api/v1/stage/abort"})
+_HALTS = frozenset({_STOP, "/api/v1/stage:abort"})
 _MAX_CLIENTS = 10_000
 
 

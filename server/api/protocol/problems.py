@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+from collections.abc import Sequence
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from core.errors import (
 )
 from server.base.errors import NotFoundError, QueueFullError, TooLargeError
 from server.base.problem import problem_of
+from server.wording import FieldProblem, in_words
 
 _log = logging.getLogger("stereorig.api")
 _PARAMETER = re.compile(r"\{[^}]*\}")
@@ -130,29 +132,21 @@ def install(app: FastAPI) -> None:
         return _response_of(error)
 
     @app.exception_handler(RequestValidationError)
-    async def _invalid(_request: Request, error: RequestValidationError) -> JSONResponse:
-        fields = []
-        for item in error.errors()[:20]:
-            location = [str(part) for part in item["loc"]]
-            field = ".".join(location[1:] or location)[:200]
-            fields.append(
-                {"field": field, "in": location[0], "problem": str(item["msg"]).removeprefix("Value error, ")[:300]}
-            )
-        first = fields[0]
+    async def _invalid(request: Request, error: RequestValidationError) -> JSONResponse:
+        found = _field_problems(request, error.errors())
+        fields = [{"field": one.field or where, "in": where, "problem": one.problem} for where, one in found]
+        wrong = " ".join(str(one) for _, one in found[:3])
+        more = f" {len(found) - 3} more values are wrong; `fields` has them." if len(found) > 3 else ""
         if all(item["type"] == "values_disagree" for item in error.errors()):
             return problem_response(
                 422,
                 "values_disagree",
-                f"{first['field']}: {first['problem']}.",
+                f"{wrong}{more}",
                 "Each value is right by itself; change one of them so that they fit each other.",
                 fields=fields,
             )
         return problem_response(
-            422,
-            "invalid_request",
-            f"{first['field']}: {first['problem']}.",
-            "Correct the fields named in `fields`.",
-            fields=fields,
+            422, "invalid_request", f"{wrong}{more}", "Correct the values named above.", fields=fields
         )
 
     @app.exception_handler(HTTPException)
@@ -179,6 +173,20 @@ def install(app: FastAPI) -> None:
         _log.exception("unexpected error")
         cause = f"{type(error).__name__} inside the service."
         return problem_response(500, "internal_error", cause, "Report this with the service's log.")
+
+
+def _field_problems(request: Request, errors: Sequence[Any]) -> list[tuple[str, FieldProblem]]:
+    """Return what is wrong in a request, with the part of it (``body``, ``query`` ...), as its sender would say it."""
+    field = getattr(request.scope.get("route"), "body_field", None)
+    body = None if field is None else field.field_info.annotation
+    parts = list(dict.fromkeys(str(error["loc"][0]) for error in errors))
+    return [
+        (part, problem)
+        for part in parts
+        for problem in in_words(
+            [e for e in errors if str(e["loc"][0]) == part], body if part == "body" else None, skip=1
+        )
+    ][:20]
 
 
 def _methods_of(app: FastAPI, path: str) -> list[str]:

@@ -20,6 +20,7 @@ from server.formats.results.summary import to_json
 from server.results.gauges.fields import FieldWriter
 from server.results.gauges.readings import read_gauges
 from server.results.gauges.request import GaugeRequest
+from server.wording import problems_in
 
 _FORMS = {".csv": gauges_csv, ".json": lambda readings: to_json(readings.document()), ".mat": gauges_mat}
 
@@ -158,12 +159,8 @@ def _request(args: argparse.Namespace) -> GaugeRequest:
     try:
         return GaugeRequest.model_validate(body)
     except ValidationError as error:
-        first = error.errors()[0]
-        location = ".".join(str(part) for part in first["loc"] if part != "function-after")
-        text = str(first["msg"]).removeprefix("Value error, ")
-        raise InputError(
-            f"{location + ': ' if location else ''}{text}.", code="gauge_unusable", remedy="See stereorig gauge --help."
-        ) from error
+        first = problems_in(error, GaugeRequest)[0]
+        raise InputError(f"{first}", code="gauge_unusable", remedy="See stereorig gauge --help.") from error
 
 
 def _align(args: argparse.Namespace) -> dict[str, object]:

@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
             session.acquire()
         except BaseException:
             with contextlib.suppress(StateError):
-                client.call("POST", f"/jobs/{session.job_id}/cancel")
+                client.call("POST", f"/jobs/{session.job_id}:cancel")
             raise
         return session.result(args.out)
 

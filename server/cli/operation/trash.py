@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.description = (
         "Deleting moves things into the trash of the data folder. 'list' shows them, 'restore ID ...' moves them back "
-        "(with no service running; a running one does it by POST /trash/ID/restore), 'empty' removes them for good: "
+        "(with no service running; a running one does it by POST /trash/ID:restore), 'empty' removes them for good: "
         "all, or those that were deleted more than --older-than days ago, or those that are named."
     )
     parser.add_argument("action", choices=["list", "restore", "empty"])

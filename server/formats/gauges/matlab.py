@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.formats.gauges.readings import GaugeReadings
-from server.formats.gauges.table import COLUMNS, table_rows
+from server.formats.gauges.table import columns, table_rows
+from server.formats.matlab_names import matlab_name
 
 _TEXTS = frozenset({"label", "gauge", "kind", "quantity", "units", "missing", "not_included"})
 
@@ -25,7 +26,7 @@ def gauges_mat(readings: GaugeReadings) -> bytes:
     from scipy.io import savemat  # loaded where it is used
 
     rows = list(table_rows(readings))
-    held = {name: _column(name, [getattr(row, name) for row in rows]) for name in COLUMNS}
+    held = {matlab_name(name): _column(name, [value(row) for row in rows]) for name, value in columns(readings).items()}
     about = {k: v if isinstance(v, str) else json.dumps(v, sort_keys=True) for k, v in readings.about().items()}
     out = io.BytesIO()
     save: Any = savemat

@@ -8,12 +8,13 @@ from typing import Annotated
 
 from pydantic import Field
 
+from server.formats.channel_units import unit_of
 from server.formats.results.uncertainty import Statement
 
 EXPANDED = "k times the standard uncertainty, where another k than 1 was asked for."
 LACKING = "`calibration not included` where that is so."
 _BUDGET = (
-    "Standard uncertainties by where they come from, whose squares add up to the whole's: `matching` (noise that is new "
+    "Standard uncertainties by where they come from; their squares add up to the whole's: `matching` (new noise "
     "at each step), `reference` (noise of the reference pair, the same in all steps of a test), `calibration` (noise "
     "of the calibration's views), `stage`, `target`. What is not known is not among them, see `not_told` of the step; "
     "null where nothing is."
@@ -193,6 +194,8 @@ class StepReadings:
     kind: str
     label: str
     load_n: float | None
+    time_s: float | None = None
+    channels: Mapping[str, float] = field(default_factory=dict)
     problem: Problem | None = None
     rigid_motion: RigidMotionReading | None = None
     points: Sequence[PointReading] = ()
@@ -205,7 +208,7 @@ class StepReadings:
         """Return it as plain values."""
         whole = asdict(self)
         if self.problem is not None:
-            return {name: whole[name] for name in ("n", "kind", "label", "load_n", "problem")}
+            return {name: whole[name] for name in ("n", "kind", "label", "load_n", "time_s", "channels", "problem")}
         return {k: v for k, v in whole.items() if k != "problem" and (k != "rigid_motion" or v is not None)}
 
 
@@ -244,6 +247,11 @@ class GaugeReadings:
     steps: Sequence[StepReadings] = field(repr=False)
 
     @property
+    def channel_units(self) -> dict[str, str]:
+        """The unit of each channel that any step has."""
+        return {name: unit_of(name) for name in sorted({name for step in self.steps for name in step.channels})}
+
+    @property
     def read(self) -> list[StepReadings]:
         """The steps that could be read."""
         return [step for step in self.steps if step.problem is None]
@@ -260,11 +268,13 @@ class GaugeReadings:
             "inputs_sha256": self.inputs_sha256,
             "alignment": None if self.alignment is None else asdict(self.alignment),
             "uncertainty": self.statement.document(),
+            **({"channel_units": self.channel_units} if self.channel_units else {}),
         }
 
     def document(self) -> dict[str, object]:
         """Return it as plain values."""
         whole = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "statement"}
+        whole["channel_units"] = self.channel_units
         about = self.about()
         steps = [step.document() for step in self.steps]
         return whole | {"alignment": about["alignment"], "uncertainty": about["uncertainty"], "steps": steps}

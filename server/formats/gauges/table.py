@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from operator import attrgetter
 
 from server.formats.gauges.readings import GaugeReadings, Number, StepReadings
 
@@ -38,9 +39,20 @@ class Row:
     u_calibration: float | None = None
     u_stage: float | None = None
     u_target: float | None = None
+    time_s: float | None = None
+    channels: Mapping[str, float] = field(default_factory=dict)
 
 
-COLUMNS = tuple(f.name for f in fields(Row))
+_OWN = tuple(f.name for f in fields(Row) if f.name != "channels")
+
+
+def columns(readings: GaugeReadings) -> dict[str, Callable[[Row], str | float | None]]:
+    """Return the table's columns by name; each channel that was recorded has one, after those of every table."""
+    found: dict[str, Callable[[Row], str | float | None]] = {name: attrgetter(name) for name in _OWN}
+    for name in readings.channel_units:
+        # a channel may have the name of another column
+        found[name if name not in found else f"channel_{name}"] = lambda row, name=name: row.channels.get(name)  # type: ignore[misc]
+    return found
 
 
 def gauges_csv(readings: GaugeReadings) -> bytes:
@@ -53,9 +65,10 @@ def gauges_csv(readings: GaugeReadings) -> bytes:
     for name, value in readings.about().items():
         text.write(f"# {name}: {json.dumps(value, ensure_ascii=False, sort_keys=True)}\n")
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    wanted = columns(readings)
+    writer.writerow(wanted)
     for row in table_rows(readings):
-        writer.writerow(_cell(getattr(row, name)) for name in COLUMNS)
+        writer.writerow(_cell(value(row)) for value in wanted.values())
     return text.getvalue().encode()
 
 
@@ -66,7 +79,7 @@ def table_rows(readings: GaugeReadings) -> Iterator[Row]:
 
 
 def _of_step(step: StepReadings) -> Iterator[Row]:
-    head = Row(step.n, step.label, step.load_n)
+    head = Row(step.n, step.label, step.load_n, time_s=step.time_s, channels=step.channels)
     if step.problem is not None:
         yield replace(head, kind="step", missing=step.problem.cause)
     if step.rigid_motion is not None:

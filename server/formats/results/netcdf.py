@@ -6,7 +6,7 @@ import contextlib
 import errno
 import shutil
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +66,15 @@ def written_dataset(path: Path, *, classic: bool = True, checksum: bool = False)
         except RuntimeError as error:  # the HDF5 library's failed writes come without an errno
             full = shutil.disk_usage(temporary.parent).free < _NEARLY_FULL_BYTES
             raise OSError(errno.ENOSPC if full else errno.EIO, str(error)) from error
+
+
+def add_scalars(path: Path, scalars: Iterable[tuple[str, float, str, str]]) -> None:
+    """Add numbers without dimensions to a NetCDF-4 file: name, value, unit, meaning."""
+    with library, netCDF4.Dataset(str(path), "a") as dataset:
+        for name, value, units, meaning in scalars:
+            made = dataset.createVariable(name, "f8", ())
+            made.setncatts({"units": units, "long_name": meaning})
+            made[...] = value
 
 
 def dataset_bytes(fill: Callable[[Any], None]) -> bytes:

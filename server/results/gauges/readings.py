@@ -47,6 +47,7 @@ from server.formats.results.layout import COVARIANCE_NAMES
 from server.formats.results.reading import ResultHead, read_field, read_head
 from server.formats.results.uncertainty import Included, Statement, read_included
 from server.formats.version import software_version
+from server.results.channels import recorded_with
 from server.results.gauges.fields import FieldWriter
 from server.results.gauges.request import ExtensometerGauge, GaugeRequest, LineGauge, PlaneAlignment, PointGauge
 from server.results.gauges.variables import STRAIN_NAMES, Variables, component_of
@@ -73,7 +74,16 @@ class _Step:
 
     def reading(self, **found: Any) -> StepReadings:
         head = self.head
-        return StepReadings(n=head.step, kind=head.kind, label=head.label, load_n=head.load_n, **found)
+        recorded = recorded_with(self.path, head.step, head.reference_step)
+        return StepReadings(
+            n=head.step,
+            kind=head.kind,
+            label=head.label,
+            load_n=head.load_n if recorded.load_n is None else recorded.load_n,
+            time_s=recorded.time_s,
+            channels=recorded.channels,
+            **found,
+        )
 
 
 def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWriter | None = None) -> GaugeReadings:

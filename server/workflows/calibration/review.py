@@ -13,6 +13,8 @@ from server.workflows.calibration.sequence import CalibrationPlan, check_plan, r
 from server.workflows.service import Service
 
 Decision = Literal["accepted", "discarded"]
+#: names of the newest accepted calibration; the second is the earlier one
+LATEST = ("latest", "accepted")
 
 
 def expectation(

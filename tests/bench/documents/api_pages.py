@@ -30,7 +30,7 @@ All paths begin with `/api/v1`. Bodies and replies are JSON unless said otherwis
 is `null`, never zero.
 
 - A long operation answers 202 with a `job`: poll `/jobs/{job_id}`, or follow `/jobs/{job_id}/events` (server-sent events).
-- The hardware is exclusive: a second client gets 409 with the holder. `POST /stage/stop` works always.
+- The hardware is exclusive: a second client gets 409 with the holder. `POST /stage:stop` works always.
 - `Idempotency-Key` on a request that makes something: sent again after a lost reply, the request has one effect.
 - `ETag` and `If-Match` on what is read and changed; lists come in pages (`limit`, `cursor`, `next_cursor`).
 - `Authorization: Bearer KEY` where keys are asked for ([keys and roles](../how_to/operate.md#keys-and-roles)).

@@ -156,11 +156,21 @@ class Found:
 
     def __init__(self) -> None:
         self.statuses: set[int] = set()
+        self.kinds: set[type[core.errors.StereorigError]] = set()
         self.causes: list[str] = []
         self.remedies: list[str] = []
 
-    def add(self, status: int | None, cause: str | None, remedy: str | None) -> None:
+    @property
+    def kind(self) -> str:
+        """The class of the tree that its errors have in common: what a client raises."""
+        lines = [kind.__mro__ for kind in sorted(self.kinds, key=lambda kind: kind.__name__)]
+        common = [c for c in lines[0] if all(c in line for line in lines)] if lines else [core.errors.StereorigError]
+        return next(c.__name__ for c in common if c.__module__ == core.errors.__name__)
+
+    def add(self, status: int | None, cause: str | None, remedy: str | None, *, kind: Kind | None = None) -> None:
         """Note one call that raises it."""
+        if kind is not None:
+            self.kinds.add(kind.known)
         if status is not None:
             self.statuses.add(status)
         for text, texts in ((cause, self.causes), (remedy, self.remedies)):
@@ -189,7 +199,7 @@ def scan() -> dict[str, dict[str, Any]]:
     classes = tree(parsed)
     found: dict[str, Found] = {}
     for cls in classes.values():
-        found.setdefault(cls.code, Found()).add(cls.status(cls.code), cls.about, cls.remedy)
+        found.setdefault(cls.code, Found()).add(cls.status(cls.code), cls.about, cls.remedy, kind=cls)
     for path, module in parsed.items():
         for call, names in _makers_called(module):
             name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
@@ -201,7 +211,9 @@ def scan() -> dict[str, dict[str, Any]]:
             target = node.targets[0] if isinstance(node, ast.Assign) else None
             if isinstance(target, ast.Name) and target.id.endswith("_CODES") and isinstance(node.value, ast.Dict):  # type: ignore[union-attr]
                 for code in _words(node.value, {}):  # type: ignore[union-attr]
-                    found.setdefault(code, Found()).add(classes["StageError"].status(code), None, None)
+                    found.setdefault(code, Found()).add(
+                        classes["StageError"].status(code), None, None, kind=classes["StageError"]
+                    )
     for code, (status, cause) in _MORE.items():
         found[code].causes = [c for c in found[code].causes if c != "{...}."]
         found[code].add(status, cause, None)
@@ -210,7 +222,7 @@ def scan() -> dict[str, dict[str, Any]]:
         found[code].causes = [c for c in found[code].causes if c.strip("{.}")] or found[code].causes
     found.pop("error", None)  # the tree's root is never raised
     return {
-        code: {"status": sorted(f.statuses), "causes": f.causes, "remedies": f.remedies}
+        code: {"status": sorted(f.statuses), "kind": f.kind, "causes": f.causes, "remedies": f.remedies}
         for code, f in sorted(found.items())
     }
 
@@ -226,7 +238,7 @@ def _error(found: dict[str, Found], cls: Kind, call: ast.Call, names: dict[str, 
     for code in codes:
         # a remedy that is put together of several is named by its class
         remedy = (_text(given["remedy"], names) if "remedy" in given else None) or cls.remedy
-        found.setdefault(code, Found()).add(cls.status(code), cause, remedy)
+        found.setdefault(code, Found()).add(cls.status(code), cause, remedy, kind=cls)
 
 
 def _answer(found: dict[str, Found], name: str, call: ast.Call, names: dict[str, list[ast.expr]]) -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import base64
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Request
+from fastapi.concurrency import run_in_threadpool
 
 from core.errors import RegionError
 from server.api.models import AnalysisAccepted, AnalysisList, AnalysisReply, AnalysisRequest, ContinueRequest, Region
+from server.api.protocol.attached import Wait, job_reply
 from server.api.protocol.dependencies import AnalysisId, KeyHeader, ServiceDep, TestId, mark
 from server.api.protocol.paging import PageDep
 from server.api.protocol.problems import errors
@@ -22,15 +24,28 @@ router = APIRouter(prefix="/tests/{test_id}/analyses", tags=["analyses"])
 
 
 @router.post("", summary="Measure a test's steps", status_code=202, responses=errors(404, 409, 422, 503, 507))
-def create_analysis(
-    service: ServiceDep, test_id: TestId, body: AnalysisRequest, key: KeyHeader = None
+async def create_analysis(
+    request: Request,
+    service: ServiceDep,
+    test_id: TestId,
+    body: AnalysisRequest,
+    wait: Wait = 0.0,
+    key: KeyHeader = None,
 ) -> AnalysisAccepted:
     """Compute shape and displacement over a region; results can be read step by step as they are finished."""
+    made = await run_in_threadpool(_start, service, test_id, body, key)
+    return await _accepted(request, service, made, wait)
+
+
+def _start(service: Service, test_id: str, body: AnalysisRequest, key: str | None) -> Ids:
     request = mark(f"tests/{test_id}/analyses", key, body)
     made, _ = service.once(request.scope, key, request.body_sha256, lambda: _begin(service, test_id, body, request))
-    return AnalysisAccepted.model_validate(
-        {"job": service.jobs.document(str(made["job_id"])).plain(), "analysis_id": made["analysis_id"]}
-    )
+    return made
+
+
+async def _accepted(request: Request, service: Service, made: Ids, wait_s: float) -> AnalysisAccepted:
+    reply = await job_reply(request, service, str(made["job_id"]), wait_s=wait_s)
+    return AnalysisAccepted.model_validate({**reply, "analysis_id": made["analysis_id"]})
 
 
 def _begin(service: Service, test_id: str, body: AnalysisRequest, request: RequestMark) -> Ids:
@@ -124,11 +139,13 @@ def get_analysis(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId) 
     status_code=202,
     responses=errors(404, 409, 422, 503, 507),
 )
-def continue_analysis(
+async def continue_analysis(
+    request: Request,
     service: ServiceDep,
     test_id: TestId,
     analysis_id: AnalysisId,
     body: ContinueRequest | None = None,
+    wait: Wait = 0.0,
     key: KeyHeader = None,
 ) -> AnalysisAccepted:
     """Measure what an interrupted, cancelled or failed analysis, or one with failed steps, has not measured yet.
@@ -136,6 +153,11 @@ def continue_analysis(
     Finished steps are kept, and the others are measured from them as they would have been: the results are the same as
     without the interruption. Steps that failed are tried again.
     """
+    made = await run_in_threadpool(_go_on, service, test_id, analysis_id, body, key)
+    return await _accepted(request, service, made, wait)
+
+
+def _go_on(service: Service, test_id: str, analysis_id: str, body: ContinueRequest | None, key: str | None) -> Ids:
     body = body or ContinueRequest.model_validate({})
     service.tests.analysis_path(test_id, analysis_id)
     request = mark(f"tests/{test_id}/analyses/{analysis_id}:continue", key, body)
@@ -146,20 +168,25 @@ def continue_analysis(
         return {"analysis_id": analysis_id, "job_id": job.id}
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return AnalysisAccepted.model_validate(
-        {"job": service.jobs.document(str(made["job_id"])).plain(), "analysis_id": analysis_id}
-    )
+    return {**made, "analysis_id": analysis_id}
 
 
 @router.post(
     "/{analysis_id}:finish",
     summary="Let an analysis that follows its test come to its end",
     status_code=202,
-    responses=errors(404, 409),
+    responses=errors(404, 409, 422),
 )
-def finish_analysis(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId) -> AnalysisAccepted:
+async def finish_analysis(
+    request: Request, service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, wait: Wait = 0.0
+) -> AnalysisAccepted:
     """Measure the steps committed so far, then end the job; cancelling it instead ends it at once."""
+    made = await run_in_threadpool(_finish, service, test_id, analysis_id)
+    return await _accepted(request, service, made, wait)
+
+
+def _finish(service: Service, test_id: str, analysis_id: str) -> Ids:
     service.tests.analysis_path(test_id, analysis_id)
     runs = service.tests.analysis_jobs(test_id, analysis_id)
-    job_id = runs[-1].job_id if runs else ""
-    return AnalysisAccepted.model_validate({"job": service.jobs.finish(job_id).plain(), "analysis_id": analysis_id})
+    job = service.jobs.finish(runs[-1].job_id if runs else "")
+    return {"job_id": job.id, "analysis_id": analysis_id}

@@ -7,7 +7,8 @@ from pathlib import Path as FilePath
 from typing import Annotated, Literal
 
 import cv2
-from fastapi import APIRouter, File, Form, Path, Query, UploadFile
+from fastapi import APIRouter, File, Form, Path, Query, Request, UploadFile
+from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse, Response
 
 from core.errors import StateError
@@ -21,6 +22,7 @@ from server.api.models import (
     ViewList,
 )
 from server.api.models.calibrations import CalibrationFile
+from server.api.protocol.attached import Wait, job_reply
 from server.api.protocol.conditional import tagged
 from server.api.protocol.dependencies import CalibrationId, Camera, KeyHeader, ServiceDep, mark
 from server.api.protocol.paging import PageDep
@@ -33,17 +35,29 @@ from server.formats.calibrations.recognise import imported_content, parse_calibr
 from server.formats.images import read_image
 from server.results.reader import read_residuals
 from server.store.calibrations import REJECTED
+from server.store.documents import MadeState
 from server.store.index import calibration_entry
 from server.workflows.calibration.sequence import CalibrationPlan, begin
+from server.workflows.service import Service
 
 router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 
 
 @router.post("", summary="Calibrate the pair", status_code=202, responses=errors(409, 422, 503, 507))
-def create_calibration(
-    service: ServiceDep, body: CalibrationRequest | None = None, key: KeyHeader = None
+async def create_calibration(
+    request: Request,
+    service: ServiceDep,
+    body: CalibrationRequest | None = None,
+    wait: Wait = 0.0,
+    key: KeyHeader = None,
 ) -> CalibrationAccepted:
     """Move both cameras through the plan before the grid, then fit; the rig file gives what the body leaves out."""
+    made = await run_in_threadpool(_start, service, body, key)
+    reply = await job_reply(request, service, str(made["job_id"]), wait_s=wait)
+    return CalibrationAccepted.model_validate({**reply, "calibration_id": made["calibration_id"]})
+
+
+def _start(service: Service, body: CalibrationRequest | None, key: str | None) -> Ids:
     body = body or CalibrationRequest.model_validate({})
     usual = service.config.calibration
     plan = CalibrationPlan(
@@ -56,15 +70,29 @@ def create_calibration(
     request = mark("calibrations", key, body)
 
     made, _ = service.once(request.scope, key, request.body_sha256, lambda: begin(service, plan, request))
-    return CalibrationAccepted.model_validate(
-        {"job": service.jobs.document(str(made["job_id"])).plain(), "calibration_id": made["calibration_id"]}
-    )
+    return made
 
 
 @router.get("", summary="Calibrations, oldest first", responses=errors(422))
-def list_calibrations(service: ServiceDep, page: PageDep) -> CalibrationList:
-    """Return every calibration that was begun, with its state and verdict."""
-    calibrations = page.of(service.catalog.entries("calibration"), lambda c: str(c["id"]))
+def list_calibrations(
+    service: ServiceDep,
+    page: PageDep,
+    accepted: Annotated[
+        bool | None, Query(description="True: those that were accepted; false: those that were not, or not yet.")
+    ] = None,
+    state: Annotated[MadeState | None, Query(description="Those in this state.")] = None,
+) -> CalibrationList:
+    """Return every calibration that was begun, with its state and verdict; or those asked for.
+
+    The calibration in force is the last of `?accepted=true`; requests name it `latest`.
+    """
+    found = [
+        entry
+        for entry in service.catalog.entries("calibration")
+        if (state is None or entry["state"] == state)
+        and (accepted is None or (entry.get("decision") == "accepted") is accepted)
+    ]
+    calibrations = page.of(found, lambda c: str(c["id"]))
     return CalibrationList.model_validate({"calibrations": calibrations, "next_cursor": page.next_cursor})
 
 

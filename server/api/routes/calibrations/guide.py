@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Request
+from fastapi.concurrency import run_in_threadpool
 
 from server.api.models import Accepted, CalibrationAccepted
 from server.api.models.guide import GuideReply, GuideRequest
+from server.api.protocol.attached import Wait, job_reply
 from server.api.protocol.dependencies import CalibrationId, KeyHeader, ServiceDep, mark
 from server.api.protocol.problems import errors
 from server.workflows.calibration.guided import GuidePlan, Guides
@@ -70,9 +72,11 @@ def take_view(guides: GuidesDep, calibration_id: CalibrationId) -> GuideReply:
     "/{calibration_id}/guide:finish",
     summary="Finish a guided acquisition",
     status_code=202,
-    responses=errors(404, 409, 503, 507),
+    responses=errors(404, 409, 422, 503, 507),
 )
-def finish_guide(service: ServiceDep, guides: GuidesDep, calibration_id: CalibrationId) -> Accepted:
+async def finish_guide(
+    request: Request, service: ServiceDep, guides: GuidesDep, calibration_id: CalibrationId, wait: Wait = 0.0
+) -> Accepted:
     """Let the cameras go and fit the views; the views of an interrupted acquisition are fitted, too."""
-    job_id = guides.finish(calibration_id)
-    return Accepted.model_validate({"job": service.jobs.document(job_id).plain()})
+    job_id = await run_in_threadpool(guides.finish, calibration_id)
+    return Accepted.model_validate(await job_reply(request, service, job_id, wait_s=wait))

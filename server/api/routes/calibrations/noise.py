@@ -5,26 +5,37 @@ from __future__ import annotations
 import contextlib
 from typing import Annotated
 
-from fastapi import APIRouter, Path
+from fastapi import APIRouter, Path, Request
+from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse
 
 from core.errors import FileFormatError
 from server.api.models import NoiseAccepted, NoiseList, NoiseReply, NoiseRequest
 from server.api.models.noise import NoiseFile
+from server.api.protocol.attached import Wait, job_reply
 from server.api.protocol.dependencies import KeyHeader, ServiceDep, mark
 from server.api.protocol.paging import PageDep
 from server.api.protocol.problems import errors
 from server.base.models import Ids
 from server.store.documents import MadeRecord
 from server.workflows import noise_sequence
+from server.workflows.service import Service
 
 router = APIRouter(prefix="/noise", tags=["noise"])
 NoiseId = Annotated[str, Path(max_length=40, description="Id of a noise measurement.")]
 
 
 @router.post("", summary="Measure both cameras' noise", status_code=202, responses=errors(409, 422, 503, 507))
-def create_noise(service: ServiceDep, body: NoiseRequest | None = None, key: KeyHeader = None) -> NoiseAccepted:
+async def create_noise(
+    request: Request, service: ServiceDep, body: NoiseRequest | None = None, wait: Wait = 0.0, key: KeyHeader = None
+) -> NoiseAccepted:
     """Take frames of a scene at rest with the present settings; fit variance against grey level."""
+    made = await run_in_threadpool(_start, service, body, key)
+    reply = await job_reply(request, service, str(made["job_id"]), wait_s=wait)
+    return NoiseAccepted.model_validate({**reply, "noise_id": made["noise_id"]})
+
+
+def _start(service: Service, body: NoiseRequest | None, key: str | None) -> Ids:
     body = body or NoiseRequest.model_validate({})
     request = mark("noise", key, body)
 
@@ -32,9 +43,7 @@ def create_noise(service: ServiceDep, body: NoiseRequest | None = None, key: Key
         return noise_sequence.begin(service, body.frames, body.label, request)
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return NoiseAccepted.model_validate(
-        {"job": service.jobs.document(str(made["job_id"])).plain(), "noise_id": made["noise_id"]}
-    )
+    return made
 
 
 @router.get("", summary="Noise measurements, oldest first", responses=errors(422))

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Request
+from fastapi.concurrency import run_in_threadpool
 
 from server.api.models import CalibrationAccepted, RepairRequest
+from server.api.protocol.attached import Wait, job_reply
 from server.api.protocol.dependencies import CalibrationId, KeyHeader, ServiceDep, mark
 from server.api.protocol.problems import errors
 from server.api.routes.analyses.analyses import mask_of
 from server.base.models import Ids
 from server.workflows.calibration.repair import begin
+from server.workflows.service import Service
 
 router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 
@@ -20,14 +23,25 @@ router = APIRouter(prefix="/calibrations", tags=["calibrations"])
     status_code=202,
     responses=errors(404, 409, 422, 503, 507),
 )
-def repair_calibration(
-    service: ServiceDep, calibration_id: CalibrationId, body: RepairRequest, key: KeyHeader = None
+async def repair_calibration(
+    request: Request,
+    service: ServiceDep,
+    calibration_id: CalibrationId,
+    body: RepairRequest,
+    wait: Wait = 0.0,
+    key: KeyHeader = None,
 ) -> CalibrationAccepted:
     """Make a new calibration: the cameras' relative orientation is estimated from the speckle of steps after the bump.
 
     The old one is kept as it is; `plan.repaired_from` of the new one names it, `repair` has the finding. The length of
     the baseline is kept, the covariance widened. The job fails with a `repair_...` code where it does not hold.
     """
+    made = await run_in_threadpool(_start, service, calibration_id, body, key)
+    reply = await job_reply(request, service, str(made["job_id"]), wait_s=wait)
+    return CalibrationAccepted.model_validate({**reply, "calibration_id": made["calibration_id"]})
+
+
+def _start(service: Service, calibration_id: str, body: RepairRequest, key: str | None) -> Ids:
     request = mark(f"calibrations/{calibration_id}:repair", key, body)
     region = body.region
 
@@ -47,6 +61,4 @@ def repair_calibration(
         )
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return CalibrationAccepted.model_validate(
-        {"job": service.jobs.document(str(made["job_id"])).plain(), "calibration_id": made["calibration_id"]}
-    )
+    return made

@@ -42,7 +42,6 @@ def expect_calibration(service: ServiceDep, body: ExpectRequest | None = None) -
     return ExpectReply.model_validate(found)
 
 
-@router.put("/{calibration_id}/judgement", include_in_schema=False)  # its earlier address
 @router.put(
     "/{calibration_id}/review", summary="Accept or discard a calibration", responses=errors(404, 409, 412, 422, 507)
 )
@@ -54,7 +53,7 @@ def put_review(
     response: Response,
     if_match: IfMatch = None,
 ) -> CalibrationReply:
-    """Keep a decision: tests that name `accepted` take the newest accepted; none can be made with a discarded one.
+    """Keep a decision: tests that name `latest` take the newest accepted; none can be made with a discarded one.
 
     If-Match, with the ETag of the calibration, is refused (412) if another client decided meanwhile.
     """

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from anyio import CapacityLimiter
 from fastapi import APIRouter, Query, Request
+from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response, StreamingResponse
 
 from core.errors import StereorigError
@@ -28,6 +29,7 @@ from server.api.models import (
     SceneRequest,
     SettingsPatch,
 )
+from server.api.protocol.attached import Wait, job_reply
 from server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
 from server.api.protocol.dependencies import Camera, KeyHeader, ServiceDep, get_service, mark
 from server.api.protocol.problems import errors
@@ -36,6 +38,7 @@ from server.formats.images import encode_tiff
 from server.jobs.job import Job, Phase
 from server.results.quality import image_quality
 from server.workflows.calibration.guided import GUIDED_PURPOSE
+from server.workflows.service import Service
 
 router = APIRouter(tags=["rig"])
 _BOUNDARY = "frame"
@@ -47,9 +50,16 @@ def get_rig(service: ServiceDep) -> RigReply:
     return service.rig.describe()
 
 
-@router.post("/rig/reconnect", summary="Open cameras and stage again", status_code=202, responses=errors(409, 503, 507))
-def reconnect(service: ServiceDep, key: KeyHeader = None) -> Accepted:
+@router.post(
+    "/rig:reconnect", summary="Open cameras and stage again", status_code=202, responses=errors(409, 422, 503, 507)
+)
+async def reconnect(request: Request, service: ServiceDep, wait: Wait = 0.0, key: KeyHeader = None) -> Accepted:
     """Close and open every device; settings are pushed and read back."""
+    job_id = await run_in_threadpool(_start_reconnection, service, key)
+    return Accepted.model_validate(await job_reply(request, service, job_id, wait_s=wait))
+
+
+def _start_reconnection(service: Service, key: str | None) -> str:
 
     def run(job: Job) -> Mapping[str, object]:
         job.progress("reconnecting", 0, 1)
@@ -64,7 +74,7 @@ def reconnect(service: ServiceDep, key: KeyHeader = None) -> Accepted:
 
     request = mark("reconnect", key, None)
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return Accepted.model_validate({"job": service.jobs.document(str(made["job_id"])).plain()})
+    return str(made["job_id"])
 
 
 @router.put(

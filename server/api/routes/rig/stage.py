@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Annotated
 
@@ -24,7 +24,7 @@ from server.api.models import (
     StageReply,
     StopReply,
 )
-from server.api.protocol.attached import Attached, job_reply
+from server.api.protocol.attached import Attached, Wait, job_reply
 from server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
 from server.api.protocol.dependencies import KeyHeader, ServiceDep, get_service, mark
 from server.api.protocol.problems import errors
@@ -47,11 +47,13 @@ def get_stage(service: ServiceDep) -> StageReply:
 
 
 @router.post("/moves", summary="Move axes", status_code=202, responses=errors(409, 422, 503, 507))
-async def move(request: Request, body: MoveRequest, attached: Attached = False, key: KeyHeader = None) -> Accepted:
+async def move(
+    request: Request, body: MoveRequest, attached: Attached = False, wait: Wait = 0.0, key: KeyHeader = None
+) -> Accepted:
     """Start a move; its job's result holds positions read back. Targets are checked before any byte goes out."""
     service = get_service(request)
     job_id = await run_in_threadpool(_start_move, service, body, key)
-    return Accepted.model_validate(await job_reply(request, service, job_id, attached))
+    return Accepted.model_validate(await job_reply(request, service, job_id, attached, wait))
 
 
 def _start_move(service: Service, body: MoveRequest, key: str | None) -> str:
@@ -81,21 +83,30 @@ def _start_move(service: Service, body: MoveRequest, key: str | None) -> str:
             }
 
         subject = {"targets_mm": {str(a): t for a, t in wanted.items()}}
-        return {"job_id": _motion(service, sent, "move", f"a move to {wanted}", subject, run)}
+        return {"job_id": _motion(service, sent, "move", _move_in_words(wanted), subject, run)}
 
     sent = mark("moves", key, body)
     made, _ = service.once(sent.scope, key, sent.body_sha256, make)
     return str(made["job_id"])
 
 
-@router.post("/home", summary="Home axes", status_code=202, responses=errors(409, 422, 503, 507))
+def _move_in_words(targets_mm: Mapping[int, float]) -> str:
+    """Say where axes go, as the holder of the hardware reads to those who wait."""
+    return "a move of " + " and ".join(f"axis {axis} to {target:.12g} mm" for axis, target in targets_mm.items())
+
+
+@router.post(":home", summary="Home axes", status_code=202, responses=errors(409, 422, 503, 507))
 async def home(
-    request: Request, body: HomeRequest | None = None, attached: Attached = False, key: KeyHeader = None
+    request: Request,
+    body: HomeRequest | None = None,
+    attached: Attached = False,
+    wait: Wait = 0.0,
+    key: KeyHeader = None,
 ) -> Accepted:
     """Switch motors on and search home."""
     service = get_service(request)
     job_id = await run_in_threadpool(_start_home, service, body, key)
-    return Accepted.model_validate(await job_reply(request, service, job_id, attached))
+    return Accepted.model_validate(await job_reply(request, service, job_id, attached, wait))
 
 
 def _start_home(service: Service, body: HomeRequest | None, key: str | None) -> str:
@@ -114,11 +125,17 @@ def _start_home(service: Service, body: HomeRequest | None, key: str | None) -> 
                 found.update(service.rig.home((axis,)))
             return {"axes": {str(a): {"position_mm": p} for a, p in found.items()}}
 
-        return {"job_id": _motion(service, sent, "home", f"homing of axes {list(axes)}", {"axes": list(axes)}, run)}
+        return {
+            "job_id": _motion(service, sent, "home", f"homing of {_axes_in_words(axes)}", {"axes": list(axes)}, run)
+        }
 
     sent = mark("home", key, body)
     made, _ = service.once(sent.scope, key, sent.body_sha256, make)
     return str(made["job_id"])
+
+
+def _axes_in_words(axes: Sequence[int]) -> str:
+    return f"{'axis' if len(axes) == 1 else 'axes'} {' and '.join(map(str, axes))}"
 
 
 def _motion(
@@ -130,7 +147,7 @@ def _motion(
     return job.id
 
 
-@router.post("/stop", summary="Stop every axis, always", responses=errors(503))
+@router.post(":stop", summary="Stop every axis, always", responses=errors(503))
 async def stop(request: Request) -> StopReply:
     """Stop at once: waits for no job and no lock, and cancels the hardware job if one runs."""
     service = get_service(request)
@@ -139,9 +156,9 @@ async def stop(request: Request) -> StopReply:
     return answer
 
 
-@router.post("/abort", summary="Stop every axis and switch the motors off, always", responses=errors(503))
+@router.post(":abort", summary="Stop every axis and switch the motors off, always", responses=errors(503))
 async def abort(request: Request) -> StopReply:
-    """Stop as in an emergency: as `/stage/stop`, with the controller's emergency stop, and without power afterwards."""
+    """Stop as in an emergency: as `/stage:stop`, with the controller's emergency stop, and without power afterwards."""
     service = get_service(request)
     # it waits until the motors are off, behind which no stop must wait
     return await _halt(service, service.abort_thread, service.rig.controls.abort)
@@ -158,14 +175,14 @@ async def _halt(service: Service, thread: ThreadPoolExecutor, halt: Callable[[],
     return StopReply(stopped=True, elapsed_ms=round(elapsed_ms, 3), cancelled_job=cancelled)
 
 
-@router.post("/enable", summary="Switch motors on", response_model_exclude_unset=True, responses=errors(409, 422, 503))
+@router.post(":enable", summary="Switch motors on", response_model_exclude_unset=True, responses=errors(409, 422, 503))
 def enable(service: ServiceDep, body: AxesRequest | None = None) -> StageReply:
     """Switch motors on, and return the stage as it is then. An SMC100's are switched on by homing the first time."""
     return _switch(service, body, on=True)
 
 
 @router.post(
-    "/disable", summary="Switch motors off", response_model_exclude_unset=True, responses=errors(409, 422, 503)
+    ":disable", summary="Switch motors off", response_model_exclude_unset=True, responses=errors(409, 422, 503)
 )
 def disable(service: ServiceDep, body: AxesRequest | None = None) -> StageReply:
     """Switch motors off, and return the stage as it is then; refused while a job uses it."""
@@ -175,19 +192,21 @@ def disable(service: ServiceDep, body: AxesRequest | None = None) -> StageReply:
 def _switch(service: Service, body: AxesRequest | None, *, on: bool) -> StageReply:
     axes = tuple(body.axes) if body is not None and body.axes else service.config.axes
     service.rig.check_axes(axes)
-    with service.hardware.hold(f"the switching of motors {list(axes)}"):
+    with service.hardware.hold(f"the switching of the motors of {_axes_in_words(axes)}"):
         service.hardware.call(lambda: service.rig.controls.switch(axes, on=on))
     return service.rig.describe_stage()
 
 
-@router.get("/axes/{axis}", summary="An axis' velocity and acceleration", responses=errors(422, 503))
+@router.get("/axes/{axis:plain_id}", summary="An axis' velocity and acceleration", responses=errors(422, 503))
 def get_axis(service: ServiceDep, axis: AxisNumber, response: Response) -> DynamicsReply:
     """Read both back from the controller; the header ETag names this state of them."""
     service.rig.check_axes((axis,))
     return tagged(response, service.rig.controls.read_dynamics(axis))
 
 
-@router.patch("/axes/{axis}", summary="Set an axis' velocity and acceleration", responses=errors(409, 412, 422, 503))
+@router.patch(
+    "/axes/{axis:plain_id}", summary="Set an axis' velocity and acceleration", responses=errors(409, 412, 422, 503)
+)
 def patch_axis(
     service: ServiceDep, axis: AxisNumber, body: DynamicsPatch, response: Response, if_match: IfMatch = None
 ) -> DynamicsReply:
@@ -206,13 +225,20 @@ def patch_axis(
 
 
 @router.post(
-    "/axes/{axis}/leave-configuration",
+    "/axes/{axis}:leave-configuration",
     summary="Leave an SMC100's configuration state",
     status_code=202,
     responses=errors(409, 422, 503, 507),
 )
-def leave_configuration(service: ServiceDep, axis: AxisNumber, body: FlashConsent, key: KeyHeader = None) -> Accepted:
+async def leave_configuration(
+    request: Request, service: ServiceDep, axis: AxisNumber, body: FlashConsent, wait: Wait = 0.0, key: KeyHeader = None
+) -> Accepted:
     """Leave the state in which it refuses every motion. This writes its flash memory, and `write_flash` consents."""
+    job_id = await run_in_threadpool(_start_leaving, service, axis, body, key)
+    return Accepted.model_validate(await job_reply(request, service, job_id, wait_s=wait))
+
+
+def _start_leaving(service: Service, axis: int, body: FlashConsent, key: str | None) -> str:
 
     def run(job: Job) -> Mapping[str, object]:
         job.progress("leaving the configuration state", 0, 1)
@@ -226,7 +252,7 @@ def leave_configuration(service: ServiceDep, axis: AxisNumber, body: FlashConsen
 
     request = mark(f"leave-configuration/{axis}", key, body)
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return Accepted.model_validate({"job": service.jobs.document(str(made["job_id"])).plain()})
+    return str(made["job_id"])
 
 
 @router.get("/messages", summary="Messages of the controller")

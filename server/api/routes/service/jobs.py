@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from typing import Annotated
 
-from fastapi import APIRouter, Depends
+from fastapi import APIRouter, Depends, Request
+from fastapi.concurrency import run_in_threadpool
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from server.api.models import JobList, JobReply
+from server.api.protocol.attached import Wait, waited
 from server.api.protocol.dependencies import JobId, ServiceDep
 from server.api.protocol.paging import ShortPageDep
 from server.api.protocol.problems import errors
@@ -32,16 +34,21 @@ def list_jobs(service: ServiceDep, page: ShortPageDep) -> JobList:
     return JobList.model_validate({"jobs": [job.plain() for job in jobs], "next_cursor": page.next_cursor})
 
 
-@router.get("/{job_id}", summary="One job", responses=errors(404))
-def get_job(service: ServiceDep, job_id: JobId) -> JobReply:
-    """Return state, progress, and result or problem."""
-    return JobReply.model_validate(service.jobs.document(job_id).plain())
+@router.get("/{job_id:plain_id}", summary="One job", responses=errors(404, 422))
+async def get_job(request: Request, service: ServiceDep, job_id: JobId, wait: Wait = 0.0) -> JobReply:
+    """Return state, progress, and result or problem; with `wait`, once the job has ended or that time is over."""
+    await waited(request, service, job_id, wait)
+    return JobReply.model_validate((await run_in_threadpool(service.jobs.document, job_id)).plain())
 
 
-@router.post("/{job_id}/cancel", summary="Cancel a job", status_code=202, responses=errors(404, 409))
-def cancel_job(service: ServiceDep, job_id: JobId) -> JobReply:
+@router.post("/{job_id}:cancel", summary="Cancel a job", status_code=202, responses=errors(404, 409, 422))
+async def cancel_job(request: Request, service: ServiceDep, job_id: JobId, wait: Wait = 0.0) -> JobReply:
     """Ask the job to stop; it does within a second, and keeps what was finished."""
-    return JobReply.model_validate(service.jobs.cancel(job_id).plain())
+    cancelled = await run_in_threadpool(service.jobs.cancel, job_id)
+    if wait:
+        await waited(request, service, job_id, wait)
+        cancelled = service.jobs.document(job_id)
+    return JobReply.model_validate(cancelled.plain())
 
 
 @router.get(

@@ -27,7 +27,7 @@ from server.api.models import (
     Timestamp,
     utc_text,
 )
-from server.api.protocol.attached import Attached, job_reply
+from server.api.protocol.attached import Attached, Wait, job_reply
 from server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
 from server.api.protocol.dependencies import Camera, KeyHeader, ServiceDep, StepNumber, TestId, get_service, mark
 from server.api.protocol.paging import PageDep
@@ -37,6 +37,7 @@ from server.formats.images import read_image
 from server.jobs.idempotency import RequestMark
 from server.store.documents import StepMetadata
 from server.store.index import step_entry, test_entry
+from server.wording import problems_in
 from server.workflows.burst import start_burst
 from server.workflows.capture import capture_step, import_step
 from server.workflows.service import Service
@@ -75,14 +76,14 @@ def list_tests(service: ServiceDep, page: PageDep) -> TestList:
     )
 
 
-@router.get("/{test_id}", summary="One test", responses=errors(404))
+@router.get("/{test_id:plain_id}", summary="One test", responses=errors(404))
 def get_test(service: ServiceDep, test_id: TestId, response: Response) -> TestReply:
     """Return a test with its steps and analyses; the header ETag names this state of it."""
     return TestReply.model_validate(tagged(response, _reply(service, test_id)))
 
 
 @router.patch(
-    "/{test_id}", summary="Change a test's name, specimen or notes", responses=errors(404, 412, 422, 428, 507)
+    "/{test_id:plain_id}", summary="Change a test's name, specimen or notes", responses=errors(404, 412, 422, 428, 507)
 )
 def patch_test(
     service: ServiceDep, test_id: TestId, body: TestPatch, response: Response, if_match: IfMatch = None
@@ -109,7 +110,12 @@ def patch_test(
     },
 )
 async def create_step(
-    request: Request, test_id: TestId, body: StepRequest, attached: Attached = False, key: KeyHeader = None
+    request: Request,
+    test_id: TestId,
+    body: StepRequest,
+    attached: Attached = False,
+    wait: Wait = 0.0,
+    key: KeyHeader = None,
 ) -> Any:
     """Capture a synchronised pair. When this answers, both images and `step.json` are durable on disk.
 
@@ -120,7 +126,7 @@ async def create_step(
     service = get_service(request)
     if body.count > 1:
         job_id = await run_in_threadpool(_start_burst, service, test_id, body, key)
-        reply = await job_reply(request, service, job_id, attached)
+        reply = await job_reply(request, service, job_id, attached, wait)
         return JSONResponse(BurstAccepted.model_validate(reply).model_dump(mode="json"), status_code=202)
     return await run_in_threadpool(_capture, service, test_id, body, key)
 
@@ -168,10 +174,9 @@ def _readings(text: str | None) -> dict[str, float] | None:
     try:
         return None if text is None else _CHANNELS.validate_json(text)
     except ValidationError as error:
-        first = error.errors()[0]
-        location = ".".join(str(part) for part in first["loc"])
+        first = problems_in(error, Channels)[0]
         raise InputError(
-            f"channels{location and '.'}{location}: {first['msg']}.",
+            f"channels{first.field and '.'}{first.field}: {first.problem}.",
             code="channels_unreadable",
             remedy='Send a JSON object of numbers, as in {"stroke_mm": 0.42}.',
         ) from error

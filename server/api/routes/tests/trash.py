@@ -26,7 +26,7 @@ def _delete(service: Service, request: Request, kind: Kind, **ids: str | int | f
     return delete(service, kind, ids, by=person_name(request))
 
 
-@router.delete("/tests/{test_id}", summary="Delete a test", responses=_ERRORS)
+@router.delete("/tests/{test_id:plain_id}", summary="Delete a test", responses=_ERRORS)
 def delete_test(service: ServiceDep, request: Request, test_id: TestId) -> TrashEntry:
     """Move a test with its steps and analyses into the trash; refused while a job or a capture uses it."""
     return _delete(service, request, "test", test_id=test_id)
@@ -63,14 +63,18 @@ def list_trash(service: ServiceDep, page: PageDep) -> TrashList:
     return TrashList(trash=trash, next_cursor=page.next_cursor)
 
 
-@router.post("/trash/{trash_id}/restore", summary="Restore from the trash", responses=_ERRORS)
+@router.post("/trash/{trash_id}:restore", summary="Restore from the trash", responses=_ERRORS)
 def restore_trash(service: ServiceDep, trash_id: TrashId) -> TrashEntry:
     """Move it back to where it was; refused if something lies there by now, or its test is in the trash too."""
     return restore(service, trash_id)
 
 
 @router.delete(
-    "/trash/{trash_id}", summary="Remove for good", status_code=204, response_class=Response, responses=errors(404, 507)
+    "/trash/{trash_id:plain_id}",
+    summary="Remove for good",
+    status_code=204,
+    response_class=Response,
+    responses=errors(404, 507),
 )
 def remove_trash(service: ServiceDep, trash_id: TrashId) -> None:
     """Remove an entry of the trash from the disk; nothing brings it back."""
@@ -78,7 +82,9 @@ def remove_trash(service: ServiceDep, trash_id: TrashId) -> None:
 
 
 @router.post(
-    "/tests/{test_id}/exported", summary="Acknowledge that a copy lies elsewhere", responses=errors(404, 409, 422, 507)
+    "/tests/{test_id}:acknowledge-export",
+    summary="Acknowledge that a copy lies elsewhere",
+    responses=errors(404, 409, 422, 507),
 )
 def acknowledge_exported(
     service: ServiceDep, request: Request, test_id: TestId, body: ExportedRequest

@@ -1,0 +1,26 @@
+"""A load frame's record, aligned with the steps, as it travels."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from server.base.models import Reply
+
+
+class StepAligned(Reply):
+    """A step, and what the record says of it."""
+
+    n: int = Field(description="Number of the step.")
+    time_s: float | None = Field(None, description="Time of the record's clock that the step was taken at.")
+    channels: dict[str, float] = Field(default_factory=dict, description="Channels that the step has now from it.")
+    missing: str = Field("", description="Reason why it has none, or not all.")
+
+
+class ChannelsImported(Reply):
+    """What came of a record."""
+
+    channels: dict[str, str] = Field(description="Unit of each channel of the record, by its name.")
+    readings: int = Field(description="Readings over time in the record.")
+    interval_s: float = Field(description="Median time between them.")
+    max_gap_s: float = Field(description="Readings further apart than this were not joined.")
+    steps: list[StepAligned] = Field(description="Each step of the test.")

@@ -1,0 +1,79 @@
+"""What was recorded with a step: channels, load, and its time since the reference."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+
+from server.formats.channel_units import unit_of
+from server.store.durable import known_json
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What a step's record says beside its images.
+
+    Attributes
+    ----------
+    channels
+        Scalar readings by name.
+    load_n
+        Load in newtons; None where none was recorded.
+    time_s
+        Seconds since the reference; None where either time is not known, as of imported images without their own.
+    """
+
+    channels: Mapping[str, float] = field(default_factory=dict)
+    load_n: float | None = None
+    time_s: float | None = None
+
+
+def recorded_with(result: Path, n: int, reference: int | None) -> Recorded:
+    """Return what was recorded with the step of a result file; nothing for a result of no test.
+
+    Parameters
+    ----------
+    result
+        ``<test>/analyses/<id>/step_<nnnn>.nc``, or one in ``<test>/exports/measure``.
+    n
+        Number of the step.
+    reference
+        Of its reference; None: it is the reference.
+    """
+    steps = result.absolute().parents[2] / "steps"
+    one = known_json(steps / f"{n:04d}" / "step.json") if steps.is_dir() else {}
+    if not one:
+        return Recorded()
+    first = one if reference in (None, n) else known_json(steps / f"{reference:04d}" / "step.json")
+    begin, end = step_time(first), step_time(one)
+    channels = one.get("channels")
+    return Recorded(
+        {str(k): float(v) for k, v in channels.items()} if isinstance(channels, dict) else {},
+        float(one["load_n"]) if isinstance(one.get("load_n"), int | float) else None,
+        None if begin is None or end is None else (end - begin).total_seconds(),
+    )
+
+
+def step_time(step: Mapping[str, object]) -> datetime | None:
+    """Return when a step's images were taken: by the client's clock, else the service's; an import's is not known."""
+    text = step.get("timestamp_utc") or (step.get("captured_utc") if step.get("source") != "import" else None)
+    try:
+        return datetime.fromisoformat(str(text)) if text else None
+    except ValueError:
+        return None
+
+
+def units_of(names: Iterable[str]) -> dict[str, str]:
+    """Return the unit of each channel, by its name."""
+    return {name: unit_of(name) for name in sorted(names)}
+
+
+def rising(times: Iterable[float | None]) -> list[float] | None:
+    """Return times that are all known and rise from step to step; None otherwise."""
+    held = list(times)
+    known = [t for t in held if t is not None]
+    ordered = len(known) == len(held) and all(a < b for a, b in itertools.pairwise(known))
+    return known if ordered else None

@@ -1,0 +1,297 @@
+"""The service from a program with an event loop; each method does what the one of :class:`Client` does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+import httpx
+
+from server.api.models import (
+    AnalysisReply,
+    AnalysisRequest,
+    CalibrationReply,
+    CalibrationRequest,
+    GaugesReply,
+    JobReply,
+    MoveRequest,
+    RigReply,
+    SceneReply,
+    SceneRequest,
+    StepReply,
+    StepRequest,
+    TestReply,
+    TestRequest,
+)
+from server.api.models.calibrations import CalibrationEntry
+from server.api.models.channels import ChannelsImported
+from server.api.models.tests import TestEntry
+from server.results.gauges.request import GaugeRequest
+from stereorig.client import datasets, operations
+from stereorig.client.errors import checked, no_answer
+from stereorig.client.operations import Ask, Operation, Result, request_of
+from stereorig.client.progress import Progress, shown
+from stereorig.client.settings import options_of
+
+if TYPE_CHECKING:
+    import xarray
+
+
+class AsyncClient:
+    """A service, and what can be asked of it; a context manager that closes its connections.
+
+    Parameters
+    ----------
+    url
+        Address of the service.
+    key
+        A key that ``stereorig keys add`` made; none is needed on the loopback address.
+    progress
+        Bars while jobs run: True, False; None: in a terminal or a notebook, where rich is installed; or a function,
+        called with the job.
+    timeout_s
+        Seconds after which a service that does not answer is given up.
+    transport
+        Carries the requests; the network when left out.
+    """
+
+    def __init__(
+        self,
+        url: str = "http://127.0.0.1:8000",
+        *,
+        key: str | None = None,
+        progress: Progress = None,
+        timeout_s: float = 60.0,
+        transport: httpx.AsyncBaseTransport | None = None,
+    ) -> None:
+        self.url, self.progress = url, progress
+        self._http = httpx.AsyncClient(**options_of(url, key, timeout_s), transport=transport)
+
+    async def close(self) -> None:
+        """Close the connections."""
+        await self._http.aclose()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+        """Do as :meth:`Client.ask`."""
+        try:
+            return checked(await self._http.request(method, path.lstrip("/"), **options))
+        except httpx.TransportError as error:
+            raise no_answer(self.url, error) from error
+
+    # the rig ---------------------------------------------------------------------------------------------------------
+
+    async def rig(self) -> RigReply:
+        """Do as :meth:`Client.rig`."""
+        return await self._run(operations.get("/rig", RigReply))
+
+    async def move(self, request: MoveRequest | None = None, **targets: Any) -> JobReply:
+        """Do as :meth:`Client.move`."""
+        body = request_of(MoveRequest, request, targets)
+        return await self._watched("Moving", lambda on: operations.move(body, on))
+
+    async def set_scene(self, scene: str, load: float = 0.0, **params: Any) -> SceneReply:
+        """Do as :meth:`Client.set_scene`."""
+        body = request_of(SceneRequest, None, {"scene": scene, "load": load, **({"params": params} if params else {})})
+        return await self._run(operations.set_scene(body))
+
+    # calibrations ----------------------------------------------------------------------------------------------------
+
+    async def calibrate(
+        self, request: CalibrationRequest | None = None, *, accept: bool = True, **plan: Any
+    ) -> CalibrationReply:
+        """Do as :meth:`Client.calibrate`."""
+        body = request_of(CalibrationRequest, request, plan)
+        return await self._watched("Calibration", lambda on: operations.calibrate(body, accept, on))
+
+    async def import_calibration(self, path: str | Path, *, label: str = "", accept: bool = False) -> CalibrationReply:
+        """Do as :meth:`Client.import_calibration`."""
+        file = Path(path)
+        return await self._run(operations.import_calibration(file.name, file.read_bytes(), label, accept))
+
+    async def calibrations(self, *, accepted: bool | None = None, state: str | None = None) -> list[CalibrationEntry]:
+        """Do as :meth:`Client.calibrations`."""
+        return await self._run(operations.calibrations(accepted, state))
+
+    async def calibration(self, calibration_id: str) -> CalibrationReply:
+        """Do as :meth:`Client.calibration`."""
+        return await self._run(operations.review(calibration_id, None))
+
+    # tests -----------------------------------------------------------------------------------------------------------
+
+    async def new_test(self, name: str, *, calibration_id: str | None = "latest", **fields: Any) -> AsyncTest:
+        """Do as :meth:`Client.new_test`."""
+        body = request_of(TestRequest, None, {"name": name, "calibration_id": calibration_id, **fields})
+        return AsyncTest(self, (await self._run(operations.new_test(body))).id)
+
+    def test(self, test_id: str) -> AsyncTest:
+        """Return a test by its id; nothing is asked of the service."""
+        return AsyncTest(self, test_id)
+
+    async def tests(self) -> list[TestEntry]:
+        """Do as :meth:`Client.tests`."""
+        return await self._run(operations.tests())
+
+    # jobs ------------------------------------------------------------------------------------------------------------
+
+    async def job(self, job_id: str) -> JobReply:
+        """Do as :meth:`Client.job`."""
+        return await self._run(operations.get(f"/jobs/{job_id}", JobReply))
+
+    async def wait(self, job: JobReply | str) -> JobReply:
+        """Do as :meth:`Client.wait`."""
+        found = await self.job(job) if isinstance(job, str) else job
+        return await self._watched(found.kind.capitalize(), lambda on: operations.ended(found, on))
+
+    async def cancel(self, job_id: str) -> JobReply:
+        """Do as :meth:`Client.cancel`."""
+        return await self._run(operations.cancel(job_id))
+
+    # running ---------------------------------------------------------------------------------------------------------
+
+    async def _watched(self, title: str, operation: operations.Watched[Result]) -> Result:
+        with shown(self.progress, title) as on_progress:
+            return await self._run(operation(on_progress))
+
+    async def _run(self, operation: Operation[Result]) -> Result:
+        try:
+            wanted = next(operation)
+            while True:
+                try:
+                    answer = await self._answer(wanted)
+                except Exception as error:  # noqa: BLE001 - the operation may know what to do
+                    wanted = operation.throw(error)
+                else:
+                    wanted = operation.send(answer)
+        except StopIteration as end:
+            return end.value  # type: ignore[no-any-return]
+
+    async def _answer(self, wanted: Ask) -> httpx.Response:
+        if wanted.into is None:
+            return await self.ask(wanted.method, wanted.path, **wanted.options)
+        try:
+            async with self._http.stream(
+                wanted.method, wanted.path.lstrip("/"), params=dict(wanted.params)
+            ) as response:
+                if not response.is_success:
+                    await response.aread()
+                checked(response)
+                with wanted.into.open("wb") as file:
+                    async for part in response.aiter_bytes():
+                        file.write(part)
+                return response
+        except httpx.TransportError as error:
+            raise no_answer(self.url, error) from error
+
+
+class AsyncTest:
+    """A test of a service: its steps, and what is measured of them.
+
+    Attributes
+    ----------
+    id
+        Its id.
+    """
+
+    __test__ = False  # not one of pytest's
+
+    def __init__(self, client: AsyncClient, test_id: str) -> None:
+        self._client, self.id = client, test_id
+
+    async def document(self) -> TestReply:
+        """Do as :meth:`Test.document`."""
+        return await self._client._run(operations.get(f"/tests/{self.id}", TestReply))
+
+    async def step(self, n: int) -> StepReply:
+        """Do as :meth:`Test.step`."""
+        return await self._client._run(operations.get(f"/tests/{self.id}/steps/{n}", StepReply))
+
+    async def capture(self, request: StepRequest | None = None, **fields: Any) -> StepReply:
+        """Do as :meth:`Test.capture`."""
+        body = request_of(StepRequest, request, {"count": 1, **fields} if request is None else {})
+        return (await self._client._run(operations.capture(self.id, body, None)))[-1]
+
+    async def capture_burst(self, request: StepRequest | None = None, **fields: Any) -> list[StepReply]:
+        """Do as :meth:`Test.capture_burst`."""
+        body = request_of(StepRequest, request, fields)
+        return await self._client._watched("Burst", lambda on: operations.capture(self.id, body, on))
+
+    async def import_step(self, cam1: str | Path, cam2: str | Path, **fields: Any) -> StepReply:
+        """Do as :meth:`Test.import_step`."""
+        images = Path(cam1).read_bytes(), Path(cam2).read_bytes()
+        return await self._client._run(operations.import_step(self.id, images, operations.step_form(fields)))
+
+    async def import_channels(self, path: str | Path, **options: Any) -> ChannelsImported:
+        """Do as :meth:`Test.import_channels`."""
+        file = Path(path)
+        return await self._client._run(operations.import_channels(self.id, file.name, file.read_bytes(), options))
+
+    async def measure(self, request: AnalysisRequest | None = None, **settings: Any) -> AsyncAnalysis:
+        """Do as :meth:`Test.measure`."""
+        body = request_of(AnalysisRequest, request, settings)
+        analysis = await self._client._watched("Measurement", lambda on: operations.measure(self.id, body, on))
+        return AsyncAnalysis(self._client, self.id, analysis)
+
+    def analysis(self, analysis_id: str) -> AsyncAnalysis:
+        """Return an analysis by its id; nothing is asked of the service."""
+        return AsyncAnalysis(self._client, self.id, analysis_id)
+
+    async def analyses(self) -> list[AsyncAnalysis]:
+        """Do as :meth:`Test.analyses`."""
+        return [self.analysis(one.id) for one in (await self.document()).analyses]
+
+
+class AsyncAnalysis:
+    """What was measured of a test's steps.
+
+    Attributes
+    ----------
+    id, test_id
+        Its id, and its test's.
+    """
+
+    def __init__(self, client: AsyncClient, test_id: str, analysis_id: str) -> None:
+        self._client, self.test_id, self.id = client, test_id, analysis_id
+        self._path = f"/tests/{test_id}/analyses/{analysis_id}"
+
+    async def document(self) -> AnalysisReply:
+        """Do as :meth:`Analysis.document`."""
+        return await self._client._run(operations.get(self._path, AnalysisReply))
+
+    async def finish(self) -> JobReply:
+        """Do as :meth:`Analysis.finish`."""
+        return await self._client._watched("Measurement", lambda on: operations.finish(self._path, on))
+
+    async def dataset(self, step: int | None = None) -> xarray.Dataset:
+        """Do as :meth:`Analysis.dataset`."""
+        return datasets.stacked(await self._client._run(operations.netcdf_of(self._path, None, step)))
+
+    async def field(self, name: str, step: int | None = None) -> xarray.DataArray:
+        """Do as :meth:`Analysis.field`."""
+        return datasets.stacked(await self._client._run(operations.netcdf_of(self._path, name, step)))[name]
+
+    async def gauges(self, request: GaugeRequest | None = None, **gauges: Any) -> GaugesReply:
+        """Do as :meth:`Analysis.gauges`."""
+        return await self._client._run(operations.gauges(self._path, request_of(GaugeRequest, request, gauges)))
+
+    async def extensometer(self, a_px: tuple[float, float], b_px: tuple[float, float], **more: Any) -> xarray.Dataset:
+        """Do as :meth:`Analysis.extensometer`."""
+        ends = [{"a_px": list(a_px), "b_px": list(b_px)}]
+        return datasets.extensometers(await self.gauges(extensometers=ends, **more))
+
+    async def export(self, path: str | Path, format: str = "nc", **options: Any) -> Path:  # noqa: A002
+        """Do as :meth:`Analysis.export`."""
+        params = {"format": format, **options}
+        return await self._client._run(operations.saved(f"{self._path}/export", Path(path), params))
+
+    async def report(self, path: str | Path) -> Path:
+        """Do as :meth:`Analysis.report`."""
+        return await self._client._run(operations.saved(f"{self._path}/report", Path(path), {}))

@@ -1,0 +1,310 @@
+"""Each thing that a client does, as the requests that it takes: one text for :class:`Client` and :class:`AsyncClient`.
+
+An operation is a generator: it yields an :class:`Ask`, is sent the answer, and returns the result. Who runs it decides
+whether a thread or an event loop waits.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+from uuid import uuid4
+
+import httpx
+from pydantic import BaseModel, ValidationError
+
+from core.errors import InputError, StorageError
+from server.api.models import (
+    AnalysisAccepted,
+    AnalysisReply,
+    AnalysisRequest,
+    CalibrationAccepted,
+    CalibrationReply,
+    CalibrationRequest,
+    GaugesReply,
+    JobReply,
+    MoveRequest,
+    SceneReply,
+    SceneRequest,
+    StepReply,
+    StepRequest,
+    TestReply,
+    TestRequest,
+)
+from server.api.models.calibrations import CalibrationEntry, CalibrationList
+from server.api.models.channels import ChannelsImported
+from server.api.models.tests import TestEntry, TestList
+from server.results.gauges.request import GaugeRequest
+from server.wording import problems_in
+from stereorig.client.errors import error_of
+from stereorig.client.progress import OnProgress
+
+Model = TypeVar("Model", bound=BaseModel)
+Result = TypeVar("Result")
+#: seconds that one request waits for a job; shorter where somebody looks at its progress
+_WAIT_S, _LOOK_S = 30.0, 0.5
+_FINAL = ("succeeded", "failed", "cancelled", "interrupted")
+
+
+@dataclass(frozen=True)
+class Ask:
+    """A request that an operation wants answered."""
+
+    method: str
+    path: str
+    params: Mapping[str, Any] = field(default_factory=dict)
+    json: Any = None
+    files: Mapping[str, Any] | None = None
+    data: Mapping[str, Any] | None = None
+    #: the answer is sent into this file
+    into: Path | None = None
+    #: names the request, so that it has one effect if it must be sent again
+    key: str | None = None
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What httpx sends with it."""
+        headers = {} if self.key is None else {"Idempotency-Key": self.key}
+        whole = {"params": dict(self.params), "json": self.json, "files": self.files, "data": self.data}
+        return {name: value for name, value in whole.items() if value is not None} | {"headers": headers}
+
+
+Operation = Generator[Ask, httpx.Response, Result]
+#: an operation with a job in it, told of the job's progress
+Watched = Callable[[OnProgress | None], Operation[Result]]
+
+
+def request_of(model: type[Model], given: Model | None, named: Mapping[str, Any]) -> Model:
+    """Return a request that is given as a whole or by its parameters' names.
+
+    Raises
+    ------
+    InputError
+        ``invalid_request`` in the sender's words, before anything is sent.
+    """
+    if given is not None:
+        if named:
+            raise InputError("The request is given twice.", remedy="Give it as a whole, or by its parameters' names.")
+        return given
+    try:
+        return model.model_validate(dict(named))
+    except ValidationError as error:
+        text = " ".join(str(one) for one in problems_in(error, model)[:3])
+        raise InputError(text, code="invalid_request", remedy="Correct the values named above.") from error
+
+
+def _body(request: BaseModel) -> Any:
+    return request.model_dump(mode="json", exclude_unset=True)
+
+
+def _posted(path: str, request: BaseModel, answer: type[Model]) -> Operation[Model]:
+    return _read((yield Ask("POST", path, json=_body(request), key=uuid4().hex)), answer)
+
+
+def _read(response: httpx.Response, answer: type[Model]) -> Model:
+    return answer.model_validate(response.json())
+
+
+def get(path: str, answer: type[Model], **params: Any) -> Operation[Model]:
+    """Read one document."""
+    return _read((yield Ask("GET", path, params=params)), answer)
+
+
+# jobs ----------------------------------------------------------------------------------------------------------------
+
+
+def ended(job: JobReply, on_progress: OnProgress | None = None) -> Operation[JobReply]:
+    """Wait for a job's end.
+
+    Raises
+    ------
+    StereorigError
+        The job's problem, if it did not succeed.
+    """
+    wait = _WAIT_S if on_progress is None else _LOOK_S
+    while job.state not in _FINAL:
+        if on_progress is not None:
+            on_progress(job)
+        job = yield from get(f"/jobs/{job.id}", JobReply, wait=wait)
+    if on_progress is not None:
+        on_progress(job)
+    if job.state == "succeeded":
+        return job
+    problem = {} if job.problem is None else job.problem.model_dump()
+    raise error_of({"code": f"job_{job.state}", "detail": f"The {job.kind} is {job.state}.", **problem})
+
+
+def cancel(job_id: str) -> Operation[JobReply]:
+    """Cancel a job, and wait for its end."""
+    return _read((yield Ask("POST", f"/jobs/{job_id}:cancel", params={"wait": _WAIT_S})), JobReply)
+
+
+# rig -----------------------------------------------------------------------------------------------------------------
+
+
+def move(request: MoveRequest, on_progress: OnProgress | None) -> Operation[JobReply]:
+    """Move axes to their end."""
+    answer = yield Ask("POST", "/stage/moves", json=_body(request), key=uuid4().hex)
+    return (yield from ended(JobReply.model_validate(answer.json()["job"]), on_progress))
+
+
+def set_scene(request: SceneRequest) -> Operation[SceneReply]:
+    """Put a scene before a simulated rig's cameras."""
+    return _read((yield Ask("PUT", "/sim/scene", json=_body(request))), SceneReply)
+
+
+# calibrations --------------------------------------------------------------------------------------------------------
+
+
+def calibrate(request: CalibrationRequest, accept: bool, on_progress: OnProgress | None) -> Operation[CalibrationReply]:
+    """Calibrate, wait, and accept the result."""
+    begun = yield from _posted("/calibrations", request, CalibrationAccepted)
+    yield from ended(begun.job, on_progress)
+    return (yield from review(begun.calibration_id, "accepted" if accept else None))
+
+
+def import_calibration(name: str, content: bytes, label: str, accept: bool) -> Operation[CalibrationReply]:
+    """Import another program's calibration."""
+    sent = Ask("POST", "/calibrations:import", files={"file": (name, content)}, data={"label": label}, key=uuid4().hex)
+    made = _read((yield sent), CalibrationReply)
+    return (yield from review(made.id, "accepted" if accept else None))
+
+
+def review(calibration_id: str, decision: str | None) -> Operation[CalibrationReply]:
+    """Decide on a calibration; without a decision, read it."""
+    if decision is None:
+        return (yield from get(f"/calibrations/{calibration_id}", CalibrationReply))
+    answer = yield Ask("PUT", f"/calibrations/{calibration_id}/review", json={"decision": decision})
+    return _read(answer, CalibrationReply)
+
+
+def calibrations(accepted: bool | None, state: str | None) -> Operation[list[CalibrationEntry]]:
+    """List calibrations, oldest first."""
+    asked: dict[str, Any] = {"accepted": accepted, "state": state}
+    asked = {name: value for name, value in asked.items() if value is not None}
+    found: list[CalibrationEntry] = []
+    while True:
+        page = yield from get("/calibrations", CalibrationList, **asked)
+        found += page.calibrations
+        if page.next_cursor is None:
+            return found
+        asked["cursor"] = page.next_cursor
+
+
+# tests ---------------------------------------------------------------------------------------------------------------
+
+
+def new_test(request: TestRequest) -> Operation[TestReply]:
+    """Make a test."""
+    return (yield from _posted("/tests", request, TestReply))
+
+
+def tests() -> Operation[list[TestEntry]]:
+    """List tests, oldest first."""
+    found: list[TestEntry] = []
+    asked: dict[str, Any] = {}
+    while True:
+        page = yield from get("/tests", TestList, **asked)
+        found += page.tests
+        if page.next_cursor is None:
+            return found
+        asked["cursor"] = page.next_cursor
+
+
+def capture(test_id: str, request: StepRequest, on_progress: OnProgress | None) -> Operation[list[StepReply]]:
+    """Capture a step, or a burst of them, to its end."""
+    answer = yield Ask("POST", f"/tests/{test_id}/steps", json=_body(request), key=uuid4().hex)
+    if request.count == 1:
+        return [_read(answer, StepReply)]
+    job = yield from ended(JobReply.model_validate(answer.json()["job"]), on_progress)
+    taken: Any = (job.result or {}).get("steps", [])
+    steps = []
+    for one in taken:
+        steps.append((yield from get(f"/tests/{test_id}/steps/{one['n']}", StepReply)))
+    return steps
+
+
+def step_form(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a step's entries as a form sends them.
+
+    Raises
+    ------
+    InputError
+        ``invalid_request`` in the sender's words.
+    """
+    form = _body(request_of(StepRequest, None, fields))
+    if "channels" in form:
+        form["channels"] = json.dumps(form["channels"])
+    return {name: value for name, value in form.items() if value is not None}
+
+
+def import_step(test_id: str, images: tuple[bytes, bytes], form: Mapping[str, Any]) -> Operation[StepReply]:
+    """Import a pair of image files as a step."""
+    files = {cam: (f"{cam}.img", data) for cam, data in zip(("cam1", "cam2"), images, strict=True)}
+    sent = Ask("POST", f"/tests/{test_id}/steps:import", files=files, data=form, key=uuid4().hex)
+    return _read((yield sent), StepReply)
+
+
+def import_channels(test_id: str, name: str, content: bytes, options: Mapping[str, Any]) -> Operation[ChannelsImported]:
+    """Import a load frame's CSV and align it with the steps."""
+    sent = {option: str(value) for option, value in options.items() if value is not None}
+    files = {"file": (name, content)}
+    answer = yield Ask("POST", f"/tests/{test_id}/channels:import", files=files, data=sent, key=uuid4().hex)
+    return _read(answer, ChannelsImported)
+
+
+def measure(test_id: str, request: AnalysisRequest, on_progress: OnProgress | None) -> Operation[str]:
+    """Measure a test's steps; return the analysis' id once it has ended, of one that follows at once."""
+    begun = yield from _posted(f"/tests/{test_id}/analyses", request, AnalysisAccepted)
+    if not request.follow:
+        yield from ended(begun.job, on_progress)
+    return begun.analysis_id
+
+
+# results -------------------------------------------------------------------------------------------------------------
+
+
+def finish(path: str, on_progress: OnProgress | None) -> Operation[JobReply]:
+    """Let an analysis that follows its test come to its end."""
+    answer = yield Ask("POST", f"{path}:finish")
+    return (yield from ended(JobReply.model_validate(answer.json()["job"]), on_progress))
+
+
+def finished_steps(path: str) -> Operation[list[int]]:
+    """Return the numbers of the steps whose results can be read."""
+    return (yield from get(path, AnalysisReply)).steps_finished
+
+
+def netcdf_of(path: str, name: str | None, step: int | None) -> Operation[dict[int, bytes]]:
+    """Return NetCDF files of one step or of all that are finished: of all variables, or of one."""
+    steps = (yield from finished_steps(path)) if step is None else [step]
+    found: dict[int, bytes] = {}
+    for n in steps:
+        if name is None:
+            found[n] = (yield Ask("GET", f"{path}/export", params={"format": "nc", "step": n})).content
+            continue
+        try:
+            found[n] = (yield Ask("GET", f"{path}/steps/{n}/fields/{name}", params={"format": "nc"})).content
+        except InputError as error:
+            # the reference has a shape and no displacement
+            if error.code != "field_missing" or len(steps) == 1 or n == steps[-1]:
+                raise
+    return found
+
+
+def gauges(path: str, request: GaugeRequest) -> Operation[GaugesReply]:
+    """Read gauges in every step."""
+    return (yield from _posted(f"{path}/gauges", request, GaugesReply))
+
+
+def saved(path: str, into: Path, params: Mapping[str, Any]) -> Operation[Path]:
+    """Write what a GET answers into a file."""
+    try:
+        into.parent.mkdir(parents=True, exist_ok=True)
+        yield Ask("GET", path, params=params, into=into)
+    except OSError as error:
+        raise StorageError(f"{into} cannot be written ({error.strerror}).") from error
+    return into
