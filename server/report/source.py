@@ -31,6 +31,7 @@ from server.report.records import (
 from server.results.metadata import TestMetadata, parse_metadata
 from server.results.staleness import stale_results
 from server.results.steps import failed_steps
+from server.results.warnings.analysis import ResultWarning, analysis_warnings
 from server.store.durable import known_json
 
 
@@ -58,6 +59,8 @@ class Source:
         Inputs that are gone or were replaced since the results were written.
     doubts
         Warnings about inputs that were not found, and steps that failed.
+    warnings
+        Failed checks and what else must be known before the results are used.
     camera_motion
         Findings about the cameras, of the steps that have one.
     """
@@ -73,6 +76,7 @@ class Source:
     metadata: TestMetadata
     stale: list[str]
     doubts: list[str] = field(default_factory=list)
+    warnings: list[ResultWarning] = field(default_factory=list)
     camera_motion: dict[int, CameraMotionRecord] = field(default_factory=dict)
 
     @property
@@ -188,6 +192,7 @@ def find_source(
         else metadata,
         stale=stale_results(list(files.values()), list(heads.values())),
         doubts=doubts,
+        warnings=[one for one in analysis_warnings(folder) if one.code != "steps_failed"],  # they are among the doubts
         camera_motion=_camera_motion(folder, list(heads)),
     )
 

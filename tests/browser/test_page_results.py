@@ -14,10 +14,12 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 from core.cameras.camera import Camera
+from server.exports.mesh import triangles_of
 from server.formats.calibrations.recognise import load_calibration
+from server.formats.results.reading import read_field
 from tests.support import results_page
 from tests.support.page_bench import UNREACHED, Watched, tabbed, watched
-from tests.support.results_page import API, ENDS, LINE, Bench, drawn, given, shown
+from tests.support.results_page import API, ENDS, LINE, Bench, drawn, given, shown, with_a_cut
 
 bench, page = results_page.bench, results_page.page  # fixtures
 
@@ -369,17 +371,30 @@ def test_an_areas_statistics_are_the_gauges(page: Watched, bench: Bench) -> None
     page.sound()
 
 
+def exported_triangles(bench: Bench, analysis_id: str) -> int:
+    """Number of triangles of step 2 in the mesh that is exported."""
+    field = read_field(bench.service.tests.result_file(bench.test_id, analysis_id, 2))
+    return len(triangles_of(field.x_px, field.y_px, field.valid, field.cuts))
+
+
+def test_a_slanting_crack_opens_the_surface_along_its_line_alone(page: Watched, bench: Bench) -> None:
+    slant = with_a_cut(bench.service, bench.test_id, bench.analysis_id, [(73.0, 74.0), (166.0, 158.0)])
+    at = shown(page, bench, analysis_id=slant)
+    at.get_by_role("button", name="3-D surface").click()
+    space = at.locator(".space")
+    expect(space).to_have_attribute("data-drawn", "2 w_mm")
+    drawn_ = int(space.get_attribute("data-triangles") or 0)
+    assert drawn_ == exported_triangles(bench, slant)
+    assert drawn_ > 0.75 * exported_triangles(bench, bench.analysis_id)  # its bounding box is two thirds of the region
+    page.sound()
+
+
 def test_the_surface_stands_in_space_without_what_was_not_measured(page: Watched, bench: Bench) -> None:
     at = shown(page, bench, analysis_id=bench.cut_id)
     at.get_by_role("button", name="3-D surface").click()
     space = at.locator(".space")
     expect(space).to_have_attribute("data-drawn", "2 w_mm")
-    status, x, y = (bench.field(2, name, bench.cut_id) for name in ("status", "x_px", "y_px"))
-    good = np.isin(status, (0, 10))
-    corners = good[:-1, :-1].astype(int) + good[:-1, 1:] + good[1:, :-1] + good[1:, 1:]
-    # cells that the cut goes through have none
-    corners[(x[:-1, :-1] <= 155) & (x[:-1, 1:] >= 155) & (y[:-1, :-1] <= 120)] = 0
-    assert int(space.get_attribute("data-triangles") or 0) == 2 * (corners == 4).sum() + (corners == 3).sum()
+    assert int(space.get_attribute("data-triangles") or 0) == exported_triangles(bench, bench.cut_id)
     before = picture(space.screenshot())
     box = space.bounding_box()
     assert box is not None
@@ -491,3 +506,36 @@ def test_on_a_tablet_and_in_the_dark(chromium: Browser, bench: Bench) -> None:
         at.keyboard.press("ArrowLeft")
         drawn(at, "1 exx reference")
         page.sound()
+
+
+def test_a_failed_check_stands_at_the_head_of_the_results_and_in_the_lists(page: Watched, bench: Bench) -> None:
+    doubtful = with_a_cut(bench.service, bench.test_id, bench.analysis_id)
+    folder = bench.service.tests.analysis_path(bench.test_id, doubtful)
+    check = {"level": "failed", "offset_px": 0.115, "reason": "camera 2 sees the points 0.115 px off"}
+    found = {"n": 2, "points": 900, "valid": 371, "valid_fraction": 371 / 900, "epipolar_check": check, "status": {}}
+    (folder / "step_0002.json").write_text(json.dumps(found))
+    at = shown(page, bench, analysis_id=doubtful)
+    head = at.locator('[data-role="warnings"]')
+    expect(head.locator("[data-warning]")).to_have_count(2)
+    expect(head.locator('[data-warning="epipolar_check_failed"].bad')).to_contain_text("0.115 px off")
+    expect(head.locator('[data-warning="epipolar_check_failed"].bad')).to_contain_text("calibrate again")
+    expect(head.locator('[data-warning="low_coverage"].bad')).to_contain_text("371 of 900 (41 %)")
+    box = head.bounding_box()
+    picture_ = at.locator(".view .frame").first.bounding_box()
+    assert box is not None
+    assert picture_ is not None
+    assert box["y"] + box["height"] < picture_["y"]  # above the picture, in the first window
+    for address in (f"#/results/{bench.test_id}", f"#/test/{bench.test_id}"):
+        page.open(address)
+        row = at.get_by_role("row").filter(has=at.locator(f'a[href$="{doubtful}"]'))
+        expect(row).to_contain_text("epipolar check failed")
+        expect(row).to_contain_text("few points have values")
+    entry = next(
+        one
+        for one in bench.client.get(f"{API}/tests/{bench.test_id}/analyses").json()["analyses"]
+        if one["id"] == doubtful
+    )
+    assert [one["code"] for one in entry["warnings"]] == ["epipolar_check_failed", "low_coverage"]
+    report = bench.client.get(f"{bench.path(doubtful)}/report").text
+    assert report.index('data-warning="epipolar_check_failed"') < report.index('class="boxes"')
+    page.sound()

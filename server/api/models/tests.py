@@ -8,6 +8,7 @@ from pydantic import Field, StringConstraints
 
 from core.settings import Real, Whole
 from server.api.models.jobs import Accepted
+from server.api.models.warnings import AnalysisWarning
 from server.base.models import Channels, Label, Listing, Number, Reply, Request, Timestamp
 
 
@@ -70,6 +71,9 @@ class AnalysisEntry(Reply):
     created_utc: str | None = Field(None, description="Time at which it was begun.")
     job_id: str | None = Field(None, description="Its job.")
     steps_failed: list[int] = Field(default_factory=list, description="Steps that could not be measured.")
+    warnings: list[AnalysisWarning] = Field(
+        default_factory=list, description="What must be known before its results are used, failed checks first."
+    )
 
 
 class TestReply(Reply):

@@ -8,7 +8,8 @@ import { about, files } from "./results/about.js";
 import { camerasNote } from "./results/cameras.js";
 import { gauges } from "./results/gauges.js";
 import { mark, pinned } from "./results/probe.js";
-import { h, replace, table, badge, when, num, count, quantity, field, select, definitions, notify, problemText, STATE_KIND } from "../lib/dom.js";
+import { stateBadge, warningsBox, warningsCell } from "./results/warnings.js";
+import { h, replace, table, when, num, count, quantity, field, select, definitions, notify, problemText } from "../lib/dom.js";
 
 /** @import { Here } from "../main.js" */
 /** @import { Ends } from "#dom" */
@@ -51,7 +52,7 @@ async function list(root, testId) {
         table([
           ["Analysis", (one) => h("a", { href: `#/results/${test.id}/${one.id}` }, one.label || one.id)],
           ["Kind", (one) => one.kind],
-          ["Failed steps", (one) => one.steps_failed?.join(", ") ?? ""],
+          ["Checks", warningsCell],
           ["Begun", (one) => when(one.created_utc)],
         ], (whole.analyses ?? []).toReversed(), { caption: "Analyses of this test, newest first", empty: "This test has not been measured yet.",
           onrow: (one) => { location.hash = `#/results/${test.id}/${one.id}`; } }));
@@ -96,6 +97,7 @@ async function show(root, testId, analysisId, query) {
   const slider = h("input", { type: "range", min: 0, max: Math.max(result.steps.length - 1, 0), step: 1, "aria-label": "Step" });
   const stepText = h("output", { "data-role": "step" });
   const status = h("div");
+  const warned = h("div");
   const statistics = h("dl.definitions", { "data-role": "statistics" });
   const probe = h("div", { "data-role": "probe" }, h("p.quiet", "Click a point to see all its values."));
   const message = h("p.quiet", { role: "status" });
@@ -262,14 +264,12 @@ async function show(root, testId, analysisId, query) {
 
   function drawStatus() {
     const { analysis } = result;
-    const failed = Object.keys(analysis.steps_failed ?? {});
-    replace(status, h("span.row", badge(analysis.state, STATE_KIND[analysis.state]),
-      failed.length ? h("span", { title: `Steps ${failed.join(", ")}: see Settings, checks and warnings` }, badge(`${failed.length} ${failed.length === 1 ? "step" : "steps"} failed`, "warn")) : null, analysis.stale ? badge("out of date", "warn") : null),
-      analysis.stale ? h("p", h("strong", "Out of date: "), (analysis.stale_reasons ?? []).join("; ")) : null, analysis.problem ? problemText(api.problemOf(analysis.problem)) : null);
+    replace(status, h("span.row", stateBadge(analysis.state, analysis.warnings)), analysis.problem ? problemText(api.problemOf(analysis.problem)) : null);
+    replace(warned, warningsBox(analysis.warnings));
   }
 
   replace(root,
-    h("div.spread", h("h1", "Results: ", h("a", { href: `#/results/${testId}` }, result.test.name || testId), ` · ${result.analysis.label || analysisId}`), status, modes),
+    h("div.spread", h("h1", "Results: ", h("a", { href: `#/results/${testId}` }, result.test.name || testId), ` · ${result.analysis.label || analysisId}`), status, modes), warned,
     h("div.row.controls", h("div.field", h("label", { for: "resultfield" }, "Field"), Object.assign(fieldChoice, { id: "resultfield" })),
       field("Image", imageChoice), field("Opacity", opacity, "%"),
       h("div.field.grow", h("label", { for: "resultstep" }, "Step "), h("span.control",
