@@ -149,8 +149,11 @@ class CameraQuality(Reply):
     texture_grey_per_px: float = Field(
         description="Median over tiles of the rms gradient, counts per pixel.", examples=[12.7]
     )
-    focus: float = Field(
-        description="Share of the gradient that remains at the scale of a pixel; below 0.12 blurred.", examples=[0.31]
+    focus: float | None = Field(
+        None,
+        description="Share of the gradient that remains at the scale of a pixel, noise taken out; below 0.12 "
+        "blurred; null where little but noise is seen.",
+        examples=[0.31],
     )
     exposure_ms: float | None = Field(None, description="Exposure as read back; null for files.", examples=[10.0])
     gain_db: float | None = Field(None, description="Gain as read back; null where there is none.", examples=[0.0])
