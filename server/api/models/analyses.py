@@ -187,6 +187,7 @@ class FieldList(Reply):
     cuts_px: list[tuple[float, float, float, float]] = Field(
         description="Straight pieces x0, y0, x1, y1 of the cuts, px of camera 1's reference image; empty: none."
     )
+    frame: str = Field("", description="Frame of positions, displacements and strain.")
 
 
 class FieldReply(Reply):

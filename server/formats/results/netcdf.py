@@ -68,6 +68,16 @@ def written_dataset(path: Path, *, classic: bool = True, checksum: bool = False)
             raise OSError(errno.ENOSPC if full else errno.EIO, str(error)) from error
 
 
+def rename_axes(path: Path, old: str, new: str) -> None:
+    """Replace the name of the axes in every text of a file that speaks of them."""
+    with library, netCDF4.Dataset(path, "a") as dataset:
+        for variable in dataset.variables.values():
+            if old in getattr(variable, "long_name", ""):
+                variable.long_name = variable.long_name.replace(old, new)
+        if "strain_axes" in dataset.ncattrs():
+            dataset.strain_axes = dataset.strain_axes.replace(old, new)
+
+
 def dataset_bytes(fill: Callable[[Any], None]) -> bytes:
     """Return the bytes of a NetCDF-4 file that ``fill`` puts into an empty data set."""
     with library:

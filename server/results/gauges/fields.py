@@ -11,12 +11,15 @@ from core.field.points.result import Field
 from core.strain import surface_strain
 from server.formats.files import make_folder
 from server.formats.gauges.readings import FrameReading, RigidMotionReading
+from server.formats.results.netcdf import rename_axes
 from server.formats.results.reading import ResultHead
 from server.formats.results.strain import read_strain
 from server.formats.results.writing import Provenance, write_field
 from server.formats.version import software_version
+from server.results.gauges.frames import text_of
 from server.results.gauges.request import GaugeRequest
 
+_AXES = "_frame"  # as X_sys is of the system
 _CARRIED = ("label", "load_n", "test_step", "reference_step", "cam1_file", "cam2_file")
 
 
@@ -81,7 +84,7 @@ class FieldWriter:
         )
         described = head.frame
         if self._request.align is not None:
-            described = f"aligned by {self._request.align.kind}; before: {described}"
+            described = f"{text_of(self._request.align)}; before: {described}"
         provenance = Provenance(
             settings=head.settings,
             inputs=head.inputs_sha256,
@@ -92,4 +95,6 @@ class FieldWriter:
         )
         to = self._folder / path.name
         write_field(to, field, provenance, strain)
+        if self._request.align is not None:
+            rename_axes(to, "_sys", _AXES)
         self.written.append(to)

@@ -13,12 +13,14 @@ from pydantic_core import to_json
 
 from server.api.models import FieldList, FieldReply, ProbeReply
 from server.api.protocol.conditional import etag_of, tags_in
-from server.api.protocol.dependencies import AnalysisId, Camera, ServiceDep, StepNumber, TestId
+from server.api.protocol.dependencies import AnalysisId, Camera, FrameText, ServiceDep, StepNumber, TestId
 from server.api.protocol.problems import errors
 from server.formats.files import known_sha256
+from server.formats.results.reading import read_head
 from server.results.field_forms import MEDIA_TYPES, RANGE_PATTERN, FieldForm, Part, encode, nested, take
 from server.results.positions import image_positions
 from server.results.reader import list_variables, probe_result, read_cut_pieces, read_variable
+from server.workflows.framed import result_in
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
 FieldName = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,63}$", description="Variable of the result file.")]
@@ -61,12 +63,13 @@ def get_field(
             "a colour map with its bar."
         ),
     ] = "json",
+    frame: FrameText = None,
     rows: RangeText = None,
     cols: RangeText = None,
     stride: Annotated[int, Query(ge=1, le=10000, description="Each so many-th row and column.")] = 1,
 ) -> Response:
     """Return values over the grid of points, or a part of it; null, NaN or nothing where a point failed."""
-    path = service.tests.result_file(test_id, analysis_id, n)
+    path = result_in(service, test_id, analysis_id, n, frame)
     # a result never changes: what was asked for, and of which file, name the answer
     etag = etag_of([known_sha256(path), name, format, rows, cols, stride])
     headers = {"ETag": etag, "Cache-Control": "private, no-cache"}
@@ -99,11 +102,17 @@ def _json(document: dict[str, Any], headers: dict[str, str] | None = None) -> Re
     response_model_exclude_none=True,
     responses=errors(404, 422),
 )
-def list_fields(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, n: StepNumber) -> FieldList:
+def list_fields(
+    service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, n: StepNumber, frame: FrameText = None
+) -> FieldList:
     """Return name, unit, meaning and dimensions of every variable; what the values of a status mean; the cuts."""
-    path = service.tests.result_file(test_id, analysis_id, n)
+    path = result_in(service, test_id, analysis_id, n, frame)
     return FieldList.model_validate(
-        {"fields": [asdict(v) for v in list_variables(path)], "cuts_px": read_cut_pieces(path)}
+        {
+            "fields": [asdict(v) for v in list_variables(path)],
+            "cuts_px": read_cut_pieces(path),
+            "frame": read_head(path).frame,
+        }
     )
 
 
@@ -148,8 +157,9 @@ def get_probe(
     x_px: Annotated[float, Query(ge=0.0, le=32767.0, allow_inf_nan=False, description="Column in camera 1's image.")],
     y_px: Annotated[float, Query(ge=0.0, le=32767.0, allow_inf_nan=False, description="Row in camera 1's image.")],
     step: Annotated[int, Query(ge=0, le=9999, description="Number of the step.")] = 0,
+    frame: FrameText = None,
 ) -> ProbeReply:
     """Return every number of the nearest point."""
     return ProbeReply.model_validate(
-        {"step": step, **asdict(probe_result(service.tests.result_file(test_id, analysis_id, step), x_px, y_px))}
+        {"step": step, **asdict(probe_result(result_in(service, test_id, analysis_id, step, frame), x_px, y_px))}
     )
