@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from core.errors import MeasurementError
 from server.formats.files import known_sha256
 from server.results.gauges.fields import FieldWriter
-from server.results.gauges.frames import frame_asked, frame_of_test
+from server.results.gauges.frames import frame_asked, frame_of_test, part_of
 from server.results.gauges.readings import read_gauges
 from server.results.gauges.request import Alignment, GaugeRequest
 
@@ -37,7 +37,7 @@ class FramedResults:
         self._lock = threading.Lock()
         self._kept: OrderedDict[str, Path] = OrderedDict()
 
-    def file(self, files: Sequence[Path], asked: Alignment) -> Path:
+    def file(self, files: Sequence[Path], asked: Alignment, *, strain: bool = True) -> Path:
         """Return the last of some result files in a frame that is laid through the first of them.
 
         Raises
@@ -45,14 +45,14 @@ class FramedResults:
         StereorigError
             As :func:`read_gauges`.
         """
-        text = "\n".join([asked.model_dump_json(), *(known_sha256(path) for path in files)])
+        text = "\n".join([f"{strain}", asked.model_dump_json(), *(known_sha256(path) for path in files)])
         key = hashlib.sha256(text.encode()).hexdigest()
         with self._lock:  # one at a time: several requests ask for one step at once
             known = self._kept.get(key)
             if known is not None and known.is_file():
                 self._kept.move_to_end(key)
                 return known
-            made = self._kept[key] = write_framed(files, asked, self._folder / key)[-1]
+            made = self._kept[key] = write_framed(files, asked, self._folder / key, strain=strain)[-1]
             self._forget()
             return made
 
@@ -63,7 +63,7 @@ class FramedResults:
             shutil.rmtree(path.parent, ignore_errors=True)
 
 
-def write_framed(files: Sequence[Path], asked: Alignment, folder: Path) -> list[Path]:
+def write_framed(files: Sequence[Path], asked: Alignment, folder: Path, *, strain: bool = True) -> list[Path]:
     """Write result files in a frame that is laid through the first of them; return their paths.
 
     Raises
@@ -72,7 +72,7 @@ def write_framed(files: Sequence[Path], asked: Alignment, folder: Path) -> list[
         As :func:`read_gauges`.
     """
     request = GaugeRequest(align=asked)
-    writer = FieldWriter(folder, files[0].parent, request)
+    writer = FieldWriter(folder, files[0].parent, request, strain=strain)
     readings = read_gauges(files, request, writer)
     problem = next((s.problem for s in readings.steps if s.problem is not None), None)
     if problem is not None:
@@ -88,13 +88,24 @@ def asked_of(service: Service, test_id: str, frame: str | None) -> Alignment | N
     return frame_asked(frame, frame_of_test(kept if isinstance(kept, dict) else None))
 
 
-def result_in(service: Service, test_id: str, analysis_id: str, n: int, frame: str | None) -> Path:
-    """Return the result file of a step in a frame; the stored one for the system frame."""
+def result_in(
+    service: Service, test_id: str, analysis_id: str, n: int, frame: str | None, name: str | None = None
+) -> Path:
+    """Return the result file of a step in a frame; the stored one for the system frame.
+
+    Parameters
+    ----------
+    name
+        Variable that will be read of it: one that is the same in every frame is read where it is stored, and strain is
+        made anew for its own components alone.
+    """
     source = service.tests.result_file(test_id, analysis_id, n)
     asked = asked_of(service, test_id, frame)
-    if asked is None:
+    part = "strain" if name is None else part_of(name)
+    if asked is None or part == "none":
         return source
-    return service.framed.file([*_reference(service, test_id, analysis_id, [n]), source], asked)
+    before = _reference(service, test_id, analysis_id, [n])
+    return service.framed.file([*before, source], asked, strain=part == "strain")
 
 
 def results_in_frame(

@@ -19,7 +19,8 @@ from server.formats.version import software_version
 from server.results.gauges.frames import text_of
 from server.results.gauges.request import GaugeRequest
 
-_AXES = "_frame"  # as X_sys is of the system
+#: ending of the axes' names in another frame, as X_sys is of the system
+AXES = "_frame"
 _CARRIED = ("label", "load_n", "test_step", "reference_step", "cam1_file", "cam2_file")
 
 
@@ -34,6 +35,8 @@ class FieldWriter:
         Where the results come from.
     request
         The request.
+    strain
+        False leaves the strain out, which takes most of the time.
 
     Raises
     ------
@@ -41,7 +44,7 @@ class FieldWriter:
         ``output_unusable`` if both folders are one; ``option_conflict`` where the request leaves fields as they are.
     """
 
-    def __init__(self, folder: Path, source: Path, request: GaugeRequest) -> None:
+    def __init__(self, folder: Path, source: Path, request: GaugeRequest, *, strain: bool = True) -> None:
         if request.align is None and request.remove_rigid is None:
             raise InputError(
                 "The fields are asked for as they were measured: they lie there already.",
@@ -53,7 +56,7 @@ class FieldWriter:
                 f"{folder} holds the results that are read.", code="output_unusable", remedy="Give another folder."
             )
         make_folder(folder)
-        self._folder, self._request = folder, request
+        self._folder, self._request, self._with_strain = folder, request, strain
         self.written: list[Path] = []
 
     def __call__(
@@ -66,7 +69,7 @@ class FieldWriter:
         motion: RigidMotionReading | None,
     ) -> None:
         """Write one step; strain, where the result has it, is made anew along the new axes."""
-        strain = read_strain(path)
+        strain = read_strain(path) if self._with_strain else None
         if strain is not None:
             strain = surface_strain(field, strain.options, subset_px=strain.subset_px)
         extra = {name: str(head.attributes[name]) for name in _CARRIED if name in head.attributes}
@@ -96,5 +99,5 @@ class FieldWriter:
         to = self._folder / path.name
         write_field(to, field, provenance, strain)
         if self._request.align is not None:
-            rename_axes(to, "_sys", _AXES)
+            rename_axes(to, "_sys", AXES)
         self.written.append(to)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from typing import Literal
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -20,6 +22,30 @@ from server.results.gauges.request import GivenAlignment, PlaneAlignment
 SPECIMEN = PlaneAlignment(kind="plane", x_direction="image_rows")
 #: longest text of a frame that is written out
 MAX_TEXT = 2000
+#: variables that are the same in every frame
+_INVARIANT = frozenset(
+    [
+        "x_px",
+        "y_px",
+        "status",
+        "zncc",
+        "iterations",
+        "epipolar_px",
+        "noise_grey",
+        "reference_step",
+        "theta_rad",
+        "phi_rad",
+        "zp_mm",
+        "strain_status",
+        "e1",
+        "e2",
+        "sigma_e1",
+        "sigma_e2",
+        "max_shear",
+        "von_mises",
+    ]
+)
+_STRAIN = re.compile(r"(sigma_)?(exx|eyy|exy)(_patch)?$|strain_")
 _ASKED: TypeAdapter[Asked] = TypeAdapter(Asked)
 
 
@@ -101,6 +127,13 @@ def lay(asked: Asked, field: Field, shared: SharedPixels) -> Alignment:
         first, second = ends.of(field.xyz_mm)
         direction = second - first
     return align_plane(field, shared=shared, chosen=points_within(field, asked.corners()), x_direction=direction)
+
+
+def part_of(name: str) -> Literal["none", "field", "strain"]:
+    """Return which part of a result holds a variable, of those that depend on the frame."""
+    if name in _INVARIANT:
+        return "none"
+    return "strain" if _STRAIN.match(name) else "field"
 
 
 def text_of(asked: Asked) -> str:

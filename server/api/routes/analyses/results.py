@@ -18,9 +18,11 @@ from server.api.protocol.problems import errors
 from server.formats.files import known_sha256
 from server.formats.results.reading import read_head
 from server.results.field_forms import MEDIA_TYPES, RANGE_PATTERN, FieldForm, Part, encode, nested, take
+from server.results.gauges.fields import AXES
+from server.results.gauges.frames import text_of
 from server.results.positions import image_positions
 from server.results.reader import list_variables, probe_result, read_cut_pieces, read_variable
-from server.workflows.framed import result_in
+from server.workflows.framed import asked_of, result_in
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
 FieldName = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,63}$", description="Variable of the result file.")]
@@ -69,7 +71,7 @@ def get_field(
     stride: Annotated[int, Query(ge=1, le=10000, description="Each so many-th row and column.")] = 1,
 ) -> Response:
     """Return values over the grid of points, or a part of it; null, NaN or nothing where a point failed."""
-    path = result_in(service, test_id, analysis_id, n, frame)
+    path = result_in(service, test_id, analysis_id, n, frame, name)
     # a result never changes: what was asked for, and of which file, name the answer
     etag = etag_of([known_sha256(path), name, format, rows, cols, stride])
     headers = {"ETag": etag, "Cache-Control": "private, no-cache"}
@@ -106,14 +108,13 @@ def list_fields(
     service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, n: StepNumber, frame: FrameText = None
 ) -> FieldList:
     """Return name, unit, meaning and dimensions of every variable; what the values of a status mean; the cuts."""
-    path = result_in(service, test_id, analysis_id, n, frame)
-    return FieldList.model_validate(
-        {
-            "fields": [asdict(v) for v in list_variables(path)],
-            "cuts_px": read_cut_pieces(path),
-            "frame": read_head(path).frame,
-        }
-    )
+    path = service.tests.result_file(test_id, analysis_id, n)
+    fields, described = [asdict(v) for v in list_variables(path)], read_head(path).frame
+    asked = asked_of(service, test_id, frame)
+    if asked is not None:
+        described = f"{text_of(asked)}; before: {described}"
+        fields = [one | {"long_name": one["long_name"].replace("_sys", AXES)} for one in fields]
+    return FieldList.model_validate({"fields": fields, "cuts_px": read_cut_pieces(path), "frame": described})
 
 
 @router.get("/steps/{n}/places/{cam}", include_in_schema=False, response_model=FieldReply)  # its earlier address
