@@ -63,6 +63,8 @@ class Source:
         Failed checks and what else must be known before the results are used.
     camera_motion
         Findings about the cameras, of the steps that have one.
+    stored
+        Result files in the system frame, by step, where ``files`` are in another one.
     """
 
     files: dict[int, Path]
@@ -78,6 +80,12 @@ class Source:
     doubts: list[str] = field(default_factory=list)
     warnings: list[ResultWarning] = field(default_factory=list)
     camera_motion: dict[int, CameraMotionRecord] = field(default_factory=dict)
+    stored: Mapping[int, Path] = field(default_factory=dict)
+
+    def in_frame(self, files: Mapping[int, Path]) -> Source:
+        """Return the source with its result files in another frame, by step."""
+        heads = {n: read_head(path) for n, path in sorted(files.items())}
+        return replace(self, files=dict(sorted(files.items())), heads=heads, stored=self.files)
 
     @property
     def reference(self) -> int:

@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 NAME = "report.html"
 
 
-def report_task(results: str, out: str) -> tuple[str, int]:
-    """Make an analysis' report; return its Content-Security-Policy and the number of items that are not stated."""
+def report_task(results: str, out: str, framed: Sequence[str] = ()) -> tuple[str, int]:
+    """Make an analysis' report; return its Content-Security-Policy and the number of items that are not stated.
+
+    Parameters
+    ----------
+    framed
+        Its result files in the frame of the report; those stored if left out.
+    """
     # matplotlib is loaded here alone
+    from server.formats.results.folder import number_of
     from server.report.build import make_report
     from server.report.source import find_source
 
-    made = make_report(find_source(Path(results)))
+    source = find_source(Path(results))
+    if framed:
+        source = source.in_frame({number_of(path): path for path in map(Path, framed)})
+    made = make_report(source)
     (Path(out) / NAME).write_bytes(made.page)
     return made.policy, len(made.missing)

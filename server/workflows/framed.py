@@ -10,12 +10,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from core.errors import MeasurementError
 from server.formats.files import known_sha256
-from server.results.gauges.fields import FieldWriter
+from server.results.gauges.framed import in_frame, write_framed
 from server.results.gauges.frames import frame_asked, frame_of_test, part_of
-from server.results.gauges.readings import read_gauges
-from server.results.gauges.request import Alignment, GaugeRequest
+from server.results.gauges.request import Alignment
 
 if TYPE_CHECKING:
     from server.workflows.service import Service
@@ -63,23 +61,6 @@ class FramedResults:
             shutil.rmtree(path.parent, ignore_errors=True)
 
 
-def write_framed(files: Sequence[Path], asked: Alignment, folder: Path, *, strain: bool = True) -> list[Path]:
-    """Write result files in a frame that is laid through the first of them; return their paths.
-
-    Raises
-    ------
-    StereorigError
-        As :func:`read_gauges`.
-    """
-    request = GaugeRequest(align=asked)
-    writer = FieldWriter(folder, files[0].parent, request, strain=strain)
-    readings = read_gauges(files, request, writer)
-    problem = next((s.problem for s in readings.steps if s.problem is not None), None)
-    if problem is not None:
-        raise MeasurementError(problem.cause, code=problem.code, remedy=problem.remedy)
-    return writer.written
-
-
 def asked_of(service: Service, test_id: str, frame: str | None) -> Alignment | None:
     """Return the frame that a request names, None for the system frame; see :func:`frame_asked`."""
     if frame in (None, "system"):
@@ -109,15 +90,13 @@ def result_in(
 
 
 def results_in_frame(
-    service: Service, test_id: str, analysis_id: str, files: Sequence[Path], frame: str | None, folder: Path
+    service: Service, test_id: str, files: Sequence[Path], frame: str | None, folder: Path
 ) -> list[Path]:
     """Return result files in a frame, written into a folder; the stored ones for the system frame."""
     asked = asked_of(service, test_id, frame)
     if asked is None:
         return list(files)
-    numbers = [int(path.stem[5:]) for path in files]
-    before = _reference(service, test_id, analysis_id, numbers)
-    return write_framed([*before, *files], asked, folder)[len(before) :]
+    return in_frame(files, asked, folder)
 
 
 def _reference(service: Service, test_id: str, analysis_id: str, numbers: Sequence[int]) -> list[Path]:

@@ -117,7 +117,9 @@ def test_what_is_under_the_mouse_is_the_probes(page: Watched, bench: Bench) -> N
     at = shown(page, bench)
     readout = at.locator(".view .readout").first
     for spot in ((103.4, 98.2), (141.0, 131.0)):
-        reply = bench.client.get(f"{bench.path()}/probe", params={"x_px": spot[0], "y_px": spot[1], "step": 2}).json()
+        reply = bench.client.get(
+            f"{bench.path()}/probe", params={"x_px": spot[0], "y_px": spot[1], "step": 2, "frame": "specimen"}
+        ).json()
         at.mouse.move(*point_on_screen(at, *spot))
         w = reply["values"]["w_mm"]["value"]
         expect(readout).to_have_attribute("data-value", repr(w))
@@ -125,7 +127,9 @@ def test_what_is_under_the_mouse_is_the_probes(page: Watched, bench: Bench) -> N
         expect(readout).to_contain_text(text)
         expect(readout).to_contain_text("±")
     at.mouse.click(*point_on_screen(at, 103.4, 98.2))
-    reply = bench.client.get(f"{bench.path()}/probe", params={"x_px": 103.4, "y_px": 98.2, "step": 2}).json()
+    reply = bench.client.get(
+        f"{bench.path()}/probe", params={"x_px": 103.4, "y_px": 98.2, "step": 2, "frame": "specimen"}
+    ).json()
     pinned = at.locator('[data-role="probe"]')
     expect(pinned).to_contain_text(f"row {reply['row']}, column {reply['col']}, step 2")
     row = pinned.locator("tr", has=at.get_by_role("cell", name="w_mm", exact=True))
@@ -234,7 +238,9 @@ def test_a_line_reads_what_the_gauges_read(page: Watched, bench: Bench) -> None:
         "variables": ["w_mm", "x_mm", "y_mm", "z_mm"],
         "steps": [2],
     }
-    reply = bench.client.post(f"{bench.path()}/gauges", json=body).json()["steps"][0]["lines"][0]["values"]
+    reply = bench.client.post(f"{bench.path()}/gauges?frame=specimen", json=body).json()["steps"][0]["lines"][0][
+        "values"
+    ]
     assert got["value"] == reply["w_mm"]["value"]
     assert got["sigma"] == reply["w_mm"]["sigma"]
     xyz = np.array([reply[f"{a}_mm"]["value"] for a in "xyz"], dtype=float)
@@ -244,7 +250,9 @@ def test_a_line_reads_what_the_gauges_read(page: Watched, bench: Bench) -> None:
     # another step: the same line
     at.get_by_role("button", name="Step before").click()
     drawn(at, "1 w_mm reference")
-    reply = bench.client.post(f"{bench.path()}/gauges", json=body | {"steps": [1]}).json()["steps"][0]["lines"][0]
+    reply = bench.client.post(f"{bench.path()}/gauges?frame=specimen", json=body | {"steps": [1]}).json()["steps"][0][
+        "lines"
+    ][0]
     first = reply["values"]["w_mm"]["value"][0]
     wait_for_chart(at, "line-chart", "a.value[0] === arg", first)
     page.sound()
@@ -264,7 +272,7 @@ def test_extensometers_by_two_clicks_and_by_keyboard_against_load_and_channels(p
     wait_for_chart(at, "extensometer-chart", "a.x[1] === 689 && a.value[1].length === 2")
     got = answer_of(at, "extensometer-chart")
     body = {"extensometers": [{"a_px": [120, 70], "b_px": [120, 160]}]}
-    steps = bench.client.post(f"{bench.path()}/gauges", json=body).json()["steps"]
+    steps = bench.client.post(f"{bench.path()}/gauges?frame=specimen", json=body).json()["steps"]
     listed = [one["extensometers"][0]["values"]["elongation_mm"] for one in steps]
     assert [v[1] for v in got["value"]] == [one["value"] for one in listed]
     assert [v[1] for v in got["sigma"]] == [one["sigma"] for one in listed]
@@ -363,7 +371,9 @@ def test_an_areas_statistics_are_the_gauges(page: Watched, bench: Bench) -> None
     got = answer_of(at, "area")[2]
     corners = [float(at.get_by_label(f"Area {side}").input_value()) for side in ("left", "top", "right", "bottom")]
     body = {"areas": [{"rectangle_px": corners}], "variables": ["w_mm"]}
-    expected = bench.client.post(f"{bench.path()}/gauges", json=body).json()["steps"][2]["areas"][0]["values"]["w_mm"]
+    expected = bench.client.post(f"{bench.path()}/gauges?frame=specimen", json=body).json()["steps"][2]["areas"][0][
+        "values"
+    ]["w_mm"]
     assert got == expected
     w, x, y = (bench.field(2, name) for name in ("w_mm", "x_px", "y_px"))
     inside = (x >= corners[0]) & (x <= corners[2]) & (y >= corners[1]) & (y <= corners[3])

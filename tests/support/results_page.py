@@ -36,8 +36,9 @@ class Bench:
     def path(self, analysis_id: str | None = None) -> str:
         return f"{API}/tests/{self.test_id}/analyses/{analysis_id or self.analysis_id}"
 
-    def field(self, step: int, name: str, analysis_id: str | None = None) -> Any:
-        answer = self.client.get(f"{self.path(analysis_id)}/steps/{step}/fields/{name}")
+    def field(self, step: int, name: str, analysis_id: str | None = None, frame: str = "specimen") -> Any:
+        """A variable in the axes that the page shows by default."""
+        answer = self.client.get(f"{self.path(analysis_id)}/steps/{step}/fields/{name}", params={"frame": frame})
         assert answer.status_code == 200, answer.text
         return np.array(answer.json()["values"], dtype=float)
 

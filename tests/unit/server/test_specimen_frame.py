@@ -16,10 +16,11 @@ from core.strain import StrainOptions, surface_strain
 from server.formats.results.reading import read_field, read_head
 from server.formats.results.strain import read_strain
 from server.formats.results.writing import Provenance, write_field
+from server.results.gauges.framed import write_framed
 from server.results.gauges.frames import SPECIMEN, frame_asked, frame_of_test
 from server.results.gauges.readings import read_gauges
 from server.results.gauges.request import Alignment, AreaGauge, GaugeRequest, PlaneAlignment, PointGauge
-from server.workflows.framed import FramedResults, write_framed
+from server.workflows.framed import FramedResults
 from tests.support.gauge_field import SUBSET, make_field
 
 TENSION, LATERAL = 2000e-6, -661e-6

@@ -136,7 +136,7 @@ async def export(
     folder = await run_in_threadpool(service.exports.new_folder)
     try:
         home = files[0].parent
-        files = await run_in_threadpool(results_in_frame, service, test_id, analysis_id, files, frame, folder / "frame")
+        files = await run_in_threadpool(results_in_frame, service, test_id, files, frame, folder / "frame")
         made = Path(await _made(request, service, home, files, export_request, folder))
         file = made.open("rb")
     finally:
