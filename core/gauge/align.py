@@ -122,6 +122,57 @@ def align_plane(
     return Alignment(R, origin, full, rms, len(x), budgets)
 
 
+def image_rows(field: Field) -> Float:
+    """Return the direction (3,), of length 1, in which the reference shape runs along camera 1's image rows.
+
+    That of the plane that the reference positions follow over the image; of a curved surface a mean.
+
+    Raises
+    ------
+    MeasurementError
+        ``too_few_points`` for fewer than three valid points, or points on one line of the image.
+    """
+    used = field.valid
+    at = np.stack([field.x_px[used], field.y_px[used]], axis=-1)
+    arm = at - at.mean(axis=0) if len(at) else at
+    if len(at) < 3 or np.linalg.matrix_rank(arm) < 2:
+        raise MeasurementError(
+            f"{len(at)} points are left, or they lie on one line: the direction of the image's rows is not known.",
+            code="too_few_points",
+            remedy="Choose three or more valid points that span an area.",
+        )
+    x = field.xyz_mm[used]
+    along = np.linalg.lstsq(arm, x - x.mean(axis=0), rcond=None)[0][0]
+    return np.asarray(along / np.linalg.norm(along))
+
+
+def align_given(rotation: ArrayLike, origin_mm: ArrayLike) -> Alignment:
+    """Return a frame that is written out: its axes as rows, its origin, both in the old frame.
+
+    Parameters
+    ----------
+    rotation
+        (3, 3), right-handed and orthonormal to 1e-6.
+    origin_mm
+        (3,).
+
+    Raises
+    ------
+    RegionError
+        ``gauge_unusable`` for anything else than a rotation.
+    """
+    R, origin = np.asarray(rotation, dtype=np.float64), np.asarray(origin_mm, dtype=np.float64)
+    if R.shape != (3, 3) or np.abs(R @ R.T - np.eye(3)).max() > _STRAIGHT or np.linalg.det(R) < 0.0:
+        raise RegionError(
+            "The rotation is no rotation: its rows must be three perpendicular axes of length 1, right-handed.",
+            code="gauge_unusable",
+            remedy="Give the new X, Y and Z as rows, in the system frame.",
+        )
+    # what is left of the six digits that were written goes
+    u, _, vt = np.linalg.svd(R)
+    return Alignment(u @ vt, origin, np.zeros((6, 6)), 0.0, 0)
+
+
 def align_3_2_1(field: Field, positions_px: ArrayLike, *, shared: SharedPixels) -> Alignment:
     """Lay the frame through six positions of the reference: three on the plane, two on the X axis, one at its origin.
 

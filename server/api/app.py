@@ -24,7 +24,7 @@ from server.api.routes.calibrations import checks as calibration_checks
 from server.api.routes.calibrations import exports as calibration_exports
 from server.api.routes.rig import cameras, devices, stage
 from server.api.routes.service import jobs, session, system
-from server.api.routes.tests import channels, metadata, tests, watch
+from server.api.routes.tests import channels, frame, metadata, tests, watch
 from server.api.routes.tests.trash import router as trash_router
 from server.http.access import KeyFile
 from server.workflows.calibration.guided import Guides
@@ -128,6 +128,7 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         guide,
         tests,
         metadata,
+        frame,
         watch,
         channels,
         analyses,

@@ -41,7 +41,7 @@ def find_source(folder: Path, analysis: str | None = None) -> Source:
 def source_of(folder: Path, files: list[Path]) -> Source:
     """Return the source of an analysis' folder, or of a folder of ``stereorig measure``."""
     heads = [read_head(path) for path in files]
-    stale, mask = stale_results(files, heads), _mask(folder, heads[0].settings)
+    stale, mask = stale_results(files, heads, folder), _mask(folder, heads[0].settings)
     about: dict[str, object] = {}
     failed = failed_steps(folder)
     if failed:

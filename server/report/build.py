@@ -88,7 +88,7 @@ def make_report(source: Source, coverage: CoverageFields | None = None) -> Repor
     measured = read_steps(source, coverage)
     found = None
     if source.calibration is not None:
-        found = geometry(source.calibration.pair, measured.reference, image_sizes(source))
+        found = geometry(source.calibration.pair, measured.reference_sys, image_sizes(source))
     test, rig, settings = (
         the_test(source, measured),
         hardware(source, measured, found),
@@ -218,7 +218,7 @@ def _floor_gaps(source: Source, measured: Measured) -> list[Missing]:
 
 def _reference(source: Source, measured: Measured) -> tuple[list[Picture], list[Missing]]:
     """Both cameras' reference images with the measured points, and those that are not there."""
-    field = measured.reference
+    field = measured.reference_sys
     drawn, missing = [], []
     valid = field.valid.ravel()
     for cam in CAMERAS:

@@ -31,6 +31,7 @@ from server.report.records import (
 from server.results.metadata import TestMetadata, parse_metadata
 from server.results.staleness import stale_results
 from server.results.steps import failed_steps
+from server.results.warnings.analysis import ResultWarning, analysis_warnings
 from server.store.durable import known_json
 
 
@@ -58,8 +59,12 @@ class Source:
         Inputs that are gone or were replaced since the results were written.
     doubts
         Warnings about inputs that were not found, and steps that failed.
+    warnings
+        Failed checks and what else must be known before the results are used.
     camera_motion
         Findings about the cameras, of the steps that have one.
+    stored
+        Result files in the system frame, by step, where ``files`` are in another one.
     """
 
     files: dict[int, Path]
@@ -73,7 +78,14 @@ class Source:
     metadata: TestMetadata
     stale: list[str]
     doubts: list[str] = field(default_factory=list)
+    warnings: list[ResultWarning] = field(default_factory=list)
     camera_motion: dict[int, CameraMotionRecord] = field(default_factory=dict)
+    stored: Mapping[int, Path] = field(default_factory=dict)
+
+    def in_frame(self, files: Mapping[int, Path]) -> Source:
+        """Return the source with its result files in another frame, by step."""
+        heads = {n: read_head(path) for n, path in sorted(files.items())}
+        return replace(self, files=dict(sorted(files.items())), heads=heads, stored=self.files)
 
     @property
     def reference(self) -> int:
@@ -188,6 +200,7 @@ def find_source(
         else metadata,
         stale=stale_results(list(files.values()), list(heads.values())),
         doubts=doubts,
+        warnings=[one for one in analysis_warnings(folder) if one.code != "steps_failed"],  # they are among the doubts
         camera_motion=_camera_motion(folder, list(heads)),
     )
 

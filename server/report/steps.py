@@ -99,8 +99,8 @@ class Measured:
     ----------
     steps
         Ascending.
-    reference
-        The shape that everything is relative to.
+    reference, reference_sys
+        The shape that everything is relative to, in the report's frame, and in the system frame of the calibration.
     shown
         Steps that are drawn: the peak and the last; of shapes, the last.
     floor
@@ -117,6 +117,7 @@ class Measured:
 
     steps: list[StepFigures]
     reference: Field
+    reference_sys: Field
     shown: list[Shown]
     floor: dict[str, Floor]
     static: list[int]
@@ -215,6 +216,7 @@ def read_steps(source: Source, coverage: CoverageFields | None = None) -> Measur
     return Measured(
         steps=figures,
         reference=reference,
+        reference_sys=read_field(source.stored[source.reference]) if source.reference in source.stored else reference,
         shown=shown,
         floor=keeper.result(),
         static=keeper.steps,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from core.settings import Coverage
@@ -9,12 +10,22 @@ from core.settings import Coverage
 NAME = "report.html"
 
 
-def report_task(results: str, out: str, coverage: Coverage) -> tuple[str, int]:
-    """Make an analysis' report; return its Content-Security-Policy and the number of items that are not stated."""
+def report_task(results: str, out: str, coverage: Coverage, framed: Sequence[str] = ()) -> tuple[str, int]:
+    """Make an analysis' report; return its Content-Security-Policy and the number of items that are not stated.
+
+    Parameters
+    ----------
+    framed
+        Its result files in the frame of the report; those stored if left out.
+    """
     # matplotlib is loaded here alone
+    from server.formats.results.folder import number_of
     from server.report.build import make_report
     from server.report.source import find_source
 
-    made = make_report(find_source(Path(results)), coverage)
+    source = find_source(Path(results))
+    if framed:
+        source = source.in_frame({number_of(path): path for path in map(Path, framed)})
+    made = make_report(source, coverage)
     (Path(out) / NAME).write_bytes(made.page)
     return made.policy, len(made.missing)

@@ -20,14 +20,23 @@ DARK_SHARE = 0.02
 BLANK_SHARE = 0.012
 #: median over tiles of the rms gradient, as a share of full scale per px, below which matching will fail
 LOW_TEXTURE_SHARE = 0.004
-#: rms second difference over rms first difference; white noise on nothing has sqrt(3), blurred speckle far below this
+#: rms second difference over rms first difference, noise taken out of both; speckles in focus have twice this and more
 BLURRED_RATIO = 0.12
+#: share of the squared gradient that must be more than noise for a figure of focus
+_SEEN_SHARE = 0.2
+#: differences over 1 ... 4 px extrapolated to 0 px, by an even polynomial through them
+_TO_ZERO = (1.6, -0.8, 8.0 / 35.0, -1.0 / 35.0)
+_NOISE_PIXELS = 1_000_000  # that suffice for the noise
 _TILE_PX = 32
 
 
 @dataclass(frozen=True)
 class ImageQuality:
-    """Figures of one image; grey levels in counts, ``mean_share`` of full scale."""
+    """Figures of one image; grey levels in counts, ``mean_share`` of full scale.
+
+    ``focus`` is the rms second difference over the rms first one, both without the noise of the pixels; None where
+    little but noise is seen.
+    """
 
     code: str
     mean_grey: float
@@ -35,9 +44,9 @@ class ImageQuality:
     saturated_share: float
     contrast_grey: float
     texture_grey_per_px: float
-    focus: float
+    focus: float | None
 
-    def as_dict(self) -> dict[str, str | float]:
+    def as_dict(self) -> dict[str, str | float | None]:
         """Names and rounded numbers."""
         return {
             "code": self.code,
@@ -46,7 +55,7 @@ class ImageQuality:
             "saturated_share": round(self.saturated_share, 5),
             "contrast_grey": round(self.contrast_grey, 2),
             "texture_grey_per_px": round(self.texture_grey_per_px, 3),
-            "focus": round(self.focus, 4),
+            "focus": None if self.focus is None else round(self.focus, 4),
         }
 
 
@@ -55,6 +64,29 @@ def gradients(pixels: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.flo
     a = pixels.astype(np.float32)
     # neighbouring pixels' independent noise does not cancel in them, but is halved
     return 0.5 * (a[1:-1, 2:] - a[1:-1, :-2]), 0.5 * (a[2:, 1:-1] - a[:-2, 1:-1])
+
+
+def _noise_variance(a: NDArray[np.float32]) -> float:
+    """Return the variance of the pixels' own noise, grey levels squared.
+
+    Half the mean squared difference of pixels h apart is that of the picture, which vanishes with h, and that of the
+    noise, which is the same at any h.
+    """
+    every = max(a.size // _NOISE_PIXELS, 1)
+    along, down = a[::every], a[:, ::every]
+    total = 0.0
+    for h, weight in enumerate(_TO_ZERO, 1):
+        across = float(np.mean((along[:, h:] - along[:, :-h]) ** 2)) + float(np.mean((down[h:] - down[:-h]) ** 2))
+        total += weight * 0.25 * across
+    return max(total, 0.0)
+
+
+def _focus(first2: float, second2: float, noise2: float) -> float | None:
+    """Return the figure of focus from mean squares of first and second differences, which hold 1 and 5/4 of noise."""
+    seen = first2 - noise2
+    if seen <= _SEEN_SHARE * first2:
+        return None
+    return float(np.sqrt(max(second2 - 1.25 * noise2, 0.0) / seen))
 
 
 def image_quality(pixels: NDArray[Any], bit_depth: int) -> ImageQuality:
@@ -70,15 +102,14 @@ def image_quality(pixels: NDArray[Any], bit_depth: int) -> ImageQuality:
     tiles = tiles.reshape(rows, tiles.shape[0] // rows, cols, tiles.shape[1] // cols)
     texture = float(np.sqrt(np.median(tiles.mean(axis=(1, 3)))))
     second = 0.25 * (a[1:-1, 2:] + a[1:-1, :-2] + a[2:, 1:-1] + a[:-2, 1:-1]) - a[1:-1, 1:-1]
-    strongest = float(np.sqrt(g2.mean()))
-    focus = float(np.sqrt(np.mean(second * second))) / strongest if strongest > 0.0 else 0.0
+    focus = _focus(float(g2.mean()), float(np.mean(second * second)), _noise_variance(a))
     if saturated > SATURATED_SHARE:
         code = "saturated"
     elif mean < DARK_SHARE * full:
         code = "dark"
     elif contrast < BLANK_SHARE * full:
         code = "blank"
-    elif texture < LOW_TEXTURE_SHARE * full:
+    elif texture < LOW_TEXTURE_SHARE * full or focus is None:
         code = "low_texture"
     elif focus < BLURRED_RATIO:
         code = "blurred"

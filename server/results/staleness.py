@@ -59,7 +59,7 @@ def stale_inputs(
     return found
 
 
-def stale_results(files: Sequence[Path], heads: Sequence[ResultHead]) -> list[str]:
+def stale_results(files: Sequence[Path], heads: Sequence[ResultHead], folder: Path | None = None) -> list[str]:
     """Return the inputs that are gone or were replaced since result files were written.
 
     Parameters
@@ -68,8 +68,10 @@ def stale_results(files: Sequence[Path], heads: Sequence[ResultHead]) -> list[st
         Result files of one measurement.
     heads
         Attributes of each.
+    folder
+        Of the measurement, where the files do not lie in it.
     """
-    folder = files[0].absolute().parent
+    folder = files[0].absolute().parent if folder is None else folder.absolute()
     summary = current_summary(known_json(folder / "summary.json"))
     test = folder.parent.parent if (folder.parent.parent / "steps").is_dir() else None
     steps = {head.step: _images(head.inputs_sha256) for head in heads}

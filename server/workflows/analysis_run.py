@@ -20,6 +20,7 @@ from server.formats.results.settings import stored_settings
 from server.formats.results.summary import SequenceSummary
 from server.formats.version import software_version
 from server.jobs.job import Job, Waiting
+from server.results.warnings.analysis import analysis_warnings
 from server.store.documents import AnalysisRecord, Finished, StepOutcome
 from server.store.folder import now_utc
 from server.store.index import analysis_entry
@@ -258,6 +259,9 @@ class AnalysisRun:
                 remedy=self._failed[first].remedy,
                 steps_failed=sorted(self._failed),
             )
+        folder = self._service.tests.analysis_path(self._test_id, self._document.id)
+        problems = {str(n): problem_of(error).plain() for n, error in self._failed.items()}
+        found["warnings"] = [one.plain() for one in analysis_warnings(folder, failed=problems)]
         return found
 
 

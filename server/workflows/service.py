@@ -37,6 +37,7 @@ from server.store.trash import Trash
 from server.worker.dask_cluster import ClusterExecutor
 from server.worker.embedded import ComputeWorker, make_worker
 from server.worker.executor import TaskExecutor
+from server.workflows.framed import FramedResults
 
 _log = logging.getLogger("stereorig.service")
 _OPEN_WAIT_S = 5.0
@@ -90,6 +91,7 @@ class Service:
         self.rig = Rig(config, self.hardware, self.hub.publish, record=record)
         self.finder = DeviceFinder()
         self.exports = ExportProcess(self.folder.root)
+        self.framed = FramedResults(self.folder.root / ".exports" / "frames")  # removed with the exports
         # stopping must not wait behind forty slow requests
         self.stop_thread = ThreadPoolExecutor(max_workers=2, thread_name_prefix="stop")
         self.abort_thread = ThreadPoolExecutor(max_workers=4, thread_name_prefix="abort")

@@ -14,10 +14,12 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 from core.cameras.camera import Camera
+from server.exports.mesh import triangles_of
 from server.formats.calibrations.recognise import load_calibration
+from server.formats.results.reading import read_field
 from tests.support import results_page
 from tests.support.page_bench import UNREACHED, Watched, tabbed, watched
-from tests.support.results_page import API, ENDS, LINE, Bench, drawn, given, shown
+from tests.support.results_page import API, ENDS, LINE, Bench, drawn, given, shown, with_a_cut
 
 bench, page = results_page.bench, results_page.page  # fixtures
 
@@ -115,7 +117,9 @@ def test_what_is_under_the_mouse_is_the_probes(page: Watched, bench: Bench) -> N
     at = shown(page, bench)
     readout = at.locator(".view .readout").first
     for spot in ((103.4, 98.2), (141.0, 131.0)):
-        reply = bench.client.get(f"{bench.path()}/probe", params={"x_px": spot[0], "y_px": spot[1], "step": 2}).json()
+        reply = bench.client.get(
+            f"{bench.path()}/probe", params={"x_px": spot[0], "y_px": spot[1], "step": 2, "frame": "specimen"}
+        ).json()
         at.mouse.move(*point_on_screen(at, *spot))
         w = reply["values"]["w_mm"]["value"]
         expect(readout).to_have_attribute("data-value", repr(w))
@@ -123,7 +127,9 @@ def test_what_is_under_the_mouse_is_the_probes(page: Watched, bench: Bench) -> N
         expect(readout).to_contain_text(text)
         expect(readout).to_contain_text("±")
     at.mouse.click(*point_on_screen(at, 103.4, 98.2))
-    reply = bench.client.get(f"{bench.path()}/probe", params={"x_px": 103.4, "y_px": 98.2, "step": 2}).json()
+    reply = bench.client.get(
+        f"{bench.path()}/probe", params={"x_px": 103.4, "y_px": 98.2, "step": 2, "frame": "specimen"}
+    ).json()
     pinned = at.locator('[data-role="probe"]')
     expect(pinned).to_contain_text(f"row {reply['row']}, column {reply['col']}, step 2")
     row = pinned.locator("tr", has=at.get_by_role("cell", name="w_mm", exact=True))
@@ -232,7 +238,9 @@ def test_a_line_reads_what_the_gauges_read(page: Watched, bench: Bench) -> None:
         "variables": ["w_mm", "x_mm", "y_mm", "z_mm"],
         "steps": [2],
     }
-    reply = bench.client.post(f"{bench.path()}/gauges", json=body).json()["steps"][0]["lines"][0]["values"]
+    reply = bench.client.post(f"{bench.path()}/gauges?frame=specimen", json=body).json()["steps"][0]["lines"][0][
+        "values"
+    ]
     assert got["value"] == reply["w_mm"]["value"]
     assert got["sigma"] == reply["w_mm"]["sigma"]
     xyz = np.array([reply[f"{a}_mm"]["value"] for a in "xyz"], dtype=float)
@@ -242,7 +250,9 @@ def test_a_line_reads_what_the_gauges_read(page: Watched, bench: Bench) -> None:
     # another step: the same line
     at.get_by_role("button", name="Step before").click()
     drawn(at, "1 w_mm reference")
-    reply = bench.client.post(f"{bench.path()}/gauges", json=body | {"steps": [1]}).json()["steps"][0]["lines"][0]
+    reply = bench.client.post(f"{bench.path()}/gauges?frame=specimen", json=body | {"steps": [1]}).json()["steps"][0][
+        "lines"
+    ][0]
     first = reply["values"]["w_mm"]["value"][0]
     wait_for_chart(at, "line-chart", "a.value[0] === arg", first)
     page.sound()
@@ -262,7 +272,7 @@ def test_extensometers_by_two_clicks_and_by_keyboard_against_load_and_channels(p
     wait_for_chart(at, "extensometer-chart", "a.x[1] === 689 && a.value[1].length === 2")
     got = answer_of(at, "extensometer-chart")
     body = {"extensometers": [{"a_px": [120, 70], "b_px": [120, 160]}]}
-    steps = bench.client.post(f"{bench.path()}/gauges", json=body).json()["steps"]
+    steps = bench.client.post(f"{bench.path()}/gauges?frame=specimen", json=body).json()["steps"]
     listed = [one["extensometers"][0]["values"]["elongation_mm"] for one in steps]
     assert [v[1] for v in got["value"]] == [one["value"] for one in listed]
     assert [v[1] for v in got["sigma"]] == [one["sigma"] for one in listed]
@@ -361,11 +371,31 @@ def test_an_areas_statistics_are_the_gauges(page: Watched, bench: Bench) -> None
     got = answer_of(at, "area")[2]
     corners = [float(at.get_by_label(f"Area {side}").input_value()) for side in ("left", "top", "right", "bottom")]
     body = {"areas": [{"rectangle_px": corners}], "variables": ["w_mm"]}
-    expected = bench.client.post(f"{bench.path()}/gauges", json=body).json()["steps"][2]["areas"][0]["values"]["w_mm"]
+    expected = bench.client.post(f"{bench.path()}/gauges?frame=specimen", json=body).json()["steps"][2]["areas"][0][
+        "values"
+    ]["w_mm"]
     assert got == expected
     w, x, y = (bench.field(2, name) for name in ("w_mm", "x_px", "y_px"))
     inside = (x >= corners[0]) & (x <= corners[2]) & (y >= corners[1]) & (y <= corners[3])
     assert got["mean"] == pytest.approx(float(w[inside].mean()), abs=1e-12)
+    page.sound()
+
+
+def exported_triangles(bench: Bench, analysis_id: str) -> int:
+    """Number of triangles of step 2 in the mesh that is exported."""
+    field = read_field(bench.service.tests.result_file(bench.test_id, analysis_id, 2))
+    return len(triangles_of(field.x_px, field.y_px, field.valid, field.cuts))
+
+
+def test_a_slanting_crack_opens_the_surface_along_its_line_alone(page: Watched, bench: Bench) -> None:
+    slant = with_a_cut(bench.service, bench.test_id, bench.analysis_id, [(73.0, 74.0), (166.0, 158.0)])
+    at = shown(page, bench, analysis_id=slant)
+    at.get_by_role("button", name="3-D surface").click()
+    space = at.locator(".space")
+    expect(space).to_have_attribute("data-drawn", "2 w_mm")
+    left = exported_triangles(bench, slant)
+    expect(space).to_have_attribute("data-triangles", str(left))
+    assert left > 0.75 * exported_triangles(bench, bench.analysis_id)  # its bounding box is two thirds of the region
     page.sound()
 
 
@@ -374,12 +404,7 @@ def test_the_surface_stands_in_space_without_what_was_not_measured(page: Watched
     at.get_by_role("button", name="3-D surface").click()
     space = at.locator(".space")
     expect(space).to_have_attribute("data-drawn", "2 w_mm")
-    status, x, y = (bench.field(2, name, bench.cut_id) for name in ("status", "x_px", "y_px"))
-    good = np.isin(status, (0, 10))
-    corners = good[:-1, :-1].astype(int) + good[:-1, 1:] + good[1:, :-1] + good[1:, 1:]
-    # cells that the cut goes through have none
-    corners[(x[:-1, :-1] <= 155) & (x[:-1, 1:] >= 155) & (y[:-1, :-1] <= 120)] = 0
-    assert int(space.get_attribute("data-triangles") or 0) == 2 * (corners == 4).sum() + (corners == 3).sum()
+    expect(space).to_have_attribute("data-triangles", str(exported_triangles(bench, bench.cut_id)))
     before = picture(space.screenshot())
     box = space.bounding_box()
     assert box is not None
@@ -491,3 +516,36 @@ def test_on_a_tablet_and_in_the_dark(chromium: Browser, bench: Bench) -> None:
         at.keyboard.press("ArrowLeft")
         drawn(at, "1 exx reference")
         page.sound()
+
+
+def test_a_failed_check_stands_at_the_head_of_the_results_and_in_the_lists(page: Watched, bench: Bench) -> None:
+    doubtful = with_a_cut(bench.service, bench.test_id, bench.analysis_id)
+    folder = bench.service.tests.analysis_path(bench.test_id, doubtful)
+    check = {"level": "failed", "offset_px": 0.115, "reason": "camera 2 sees the points 0.115 px off"}
+    found = {"n": 2, "points": 900, "valid": 371, "valid_fraction": 371 / 900, "epipolar_check": check, "status": {}}
+    (folder / "step_0002.json").write_text(json.dumps(found))
+    at = shown(page, bench, analysis_id=doubtful)
+    head = at.locator('[data-role="warnings"]')
+    expect(head.locator("[data-warning]")).to_have_count(2)
+    expect(head.locator('[data-warning="epipolar_check_failed"].bad')).to_contain_text("0.115 px off")
+    expect(head.locator('[data-warning="epipolar_check_failed"].bad')).to_contain_text("calibrate again")
+    expect(head.locator('[data-warning="low_coverage"].bad')).to_contain_text("371 of 900 (41 %)")
+    box = head.bounding_box()
+    picture_ = at.locator(".view .frame").first.bounding_box()
+    assert box is not None
+    assert picture_ is not None
+    assert box["y"] + box["height"] < picture_["y"]  # above the picture, in the first window
+    for address in (f"#/results/{bench.test_id}", f"#/test/{bench.test_id}"):
+        page.open(address)
+        row = at.get_by_role("row").filter(has=at.locator(f'a[href$="{doubtful}"]'))
+        expect(row).to_contain_text("epipolar check failed")
+        expect(row).to_contain_text("few points have values")
+    entry = next(
+        one
+        for one in bench.client.get(f"{API}/tests/{bench.test_id}/analyses").json()["analyses"]
+        if one["id"] == doubtful
+    )
+    assert [one["code"] for one in entry["warnings"]] == ["epipolar_check_failed", "low_coverage"]
+    report = bench.client.get(f"{bench.path(doubtful)}/report").text
+    assert report.index('data-warning="epipolar_check_failed"') < report.index('class="boxes"')
+    page.sound()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,8 +36,9 @@ class Bench:
     def path(self, analysis_id: str | None = None) -> str:
         return f"{API}/tests/{self.test_id}/analyses/{analysis_id or self.analysis_id}"
 
-    def field(self, step: int, name: str, analysis_id: str | None = None) -> Any:
-        answer = self.client.get(f"{self.path(analysis_id)}/steps/{step}/fields/{name}")
+    def field(self, step: int, name: str, analysis_id: str | None = None, frame: str = "specimen") -> Any:
+        """A variable in the axes that the page shows by default."""
+        answer = self.client.get(f"{self.path(analysis_id)}/steps/{step}/fields/{name}", params={"frame": frame})
         assert answer.status_code == 200, answer.text
         return np.array(answer.json()["values"], dtype=float)
 
@@ -68,8 +69,11 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
         service.close()
 
 
-def with_a_cut(service: Service, test_id: str, analysis_id: str) -> str:
-    """The plate's results with three points missing, a cut between two columns, and 1 um more deflection."""
+VERTICAL = ((155.0, 50.0), (155.0, 120.0))
+
+
+def with_a_cut(service: Service, test_id: str, analysis_id: str, line: Sequence[tuple[float, float]] = VERTICAL) -> str:
+    """The plate's results with three points missing, a cut (between two columns), and 1 um more deflection."""
     whole = service.tests.analysis_path(test_id, analysis_id)
     stored = service.tests.analysis(test_id, analysis_id).plain()
     kept = {k: stored[k] for k in ("kind", "settings", "steps", "inputs", "software")}
@@ -79,7 +83,7 @@ def with_a_cut(service: Service, test_id: str, analysis_id: str) -> str:
     for n in stored["steps"]:
         field = read_field(whole / f"step_{n:04d}.nc")
         field.status[4, 5] = field.status[4, 6] = field.status[8, 2] = 6
-        object.__setattr__(field, "cuts", Cuts([[(155.0, 50.0), (155.0, 120.0)]]))
+        object.__setattr__(field, "cuts", Cuts([line]))
         if field.uvw_mm is not None:
             field.uvw_mm[..., 2] += 1e-3
         provenance = Provenance({"subset_px": 25, "spacing_px": 10}, {"a": "b"}, "0.1.0", step=n)

@@ -11,6 +11,7 @@ from core.settings import StoredSettings, disagreement
 from server.api.models.cameras_moved import CameraMotion
 from server.api.models.jobs import Accepted, JobProblem
 from server.api.models.tests import AnalysisEntry
+from server.api.models.warnings import AnalysisWarning
 from server.base.json_values import Nested
 from server.base.models import JobState, Label, Listing, Reply, Request, StepNumber, Switch, any_of, not_both
 from server.formats.gauges.readings import (
@@ -155,6 +156,10 @@ class AnalysisReply(Reply):
         False, description="True if steps, the reference or the calibration are gone or were replaced since."
     )
     stale_reasons: list[str] = Field(default_factory=list, description="Inputs that are gone or were replaced.")
+    warnings: list[AnalysisWarning] = Field(
+        default_factory=list,
+        description="What must be known before the results are used: failed checks first, each with its remedy.",
+    )
 
 
 class AnalysisList(Listing):
@@ -199,6 +204,7 @@ class FieldList(Reply):
         description="Straight pieces x0, y0, x1, y1 of the cuts, px of camera 1's reference image; empty: none."
     )
     uncertainty: Uncertainty = Field(description="What the step's uncertainties include.")
+    frame: str = Field("", description="Frame of positions, displacements and strain.")
 
 
 class FieldReply(Reply):

@@ -168,7 +168,11 @@ class FrameQuality(Reply):
     saturated_share: float = Field(description="Share of pixels at full scale.")
     contrast_grey: float = Field(description="Standard deviation of the grey levels, counts.")
     texture_grey_per_px: float = Field(description="Median over tiles of the rms gradient, counts per pixel.")
-    focus: float = Field(description="Share of the gradient that remains at the scale of a pixel; below 0.12 blurred.")
+    focus: float | None = Field(
+        None,
+        description="Share of the gradient that remains at the scale of a pixel, noise taken out; below 0.12 "
+        "blurred; null where little but noise is seen.",
+    )
 
 
 class CameraStats(Reply):

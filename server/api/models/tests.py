@@ -8,6 +8,7 @@ from pydantic import Field, StringConstraints
 
 from core.settings import Real, Whole
 from server.api.models.jobs import Accepted
+from server.api.models.warnings import AnalysisWarning
 from server.base.models import Channels, Label, Listing, Number, Reply, Request, Timestamp
 
 
@@ -70,6 +71,9 @@ class AnalysisEntry(Reply):
     created_utc: str | None = Field(None, description="Time at which it was begun.")
     job_id: str | None = Field(None, description="Its job.")
     steps_failed: list[int] = Field(default_factory=list, description="Steps that could not be measured.")
+    warnings: list[AnalysisWarning] = Field(
+        default_factory=list, description="What must be known before its results are used, failed checks first."
+    )
 
 
 class TestReply(Reply):
@@ -145,8 +149,11 @@ class CameraQuality(Reply):
     texture_grey_per_px: float = Field(
         description="Median over tiles of the rms gradient, counts per pixel.", examples=[12.7]
     )
-    focus: float = Field(
-        description="Share of the gradient that remains at the scale of a pixel; below 0.12 blurred.", examples=[0.31]
+    focus: float | None = Field(
+        None,
+        description="Share of the gradient that remains at the scale of a pixel, noise taken out; below 0.12 "
+        "blurred; null where little but noise is seen.",
+        examples=[0.31],
     )
     exposure_ms: float | None = Field(None, description="Exposure as read back; null for files.", examples=[10.0])
     gain_db: float | None = Field(None, description="Gain as read back; null where there is none.", examples=[0.0])

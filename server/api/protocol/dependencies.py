@@ -54,6 +54,15 @@ AnalysisId = Annotated[str, Path(max_length=40, description="Id of an analysis."
 CalibrationId = Annotated[str, Path(max_length=40, description="Id of a calibration.")]
 JobId = Annotated[str, Path(max_length=40, description="Id of a job.")]
 Camera = Annotated[CameraName, Path(description="Which camera.")]
+FrameText = Annotated[
+    str | None,
+    Query(
+        max_length=2000,
+        description="Frame of positions, displacements and strain: `system`, as stored (the default); `specimen`, the "
+        "test's; or one written out in JSON, as a gauge's `align`.",
+        examples=["specimen"],
+    ),
+]
 StepNumber = Annotated[int, Path(ge=0, le=9999, description="Number of a step.")]
 _ABOUT_COVERAGE = {name: field.description for name, field in CoverageFields.model_fields.items()}
 

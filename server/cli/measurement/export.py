@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from server.exports.run import export
 from server.exports.source import find_source
 from server.formats.figure_options import COLOURS, FigureStyle
 from server.formats.files import make_folder
+from server.results.gauges.framed import FRAME_HELP, asked_at, in_frame
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME[,...]",
         help="these variables only; repeatable (all; of figures and films w_mm, or z_mm of a shape)",
     )
+    add("--frame", metavar="FRAME", help=FRAME_HELP)
     add("--limits", metavar="LOW,HIGH", help="ends of the colour scale, in the variable's unit")
     add("--percentiles", metavar="LOW,HIGH", default="1,99", help="else of the values, where the scale ends (1,99)")
     add("--colours", choices=COLOURS, default="viridis", help="colour map (viridis)")
@@ -76,9 +79,12 @@ def run(args: argparse.Namespace) -> int:
         print(f"STALE: {reason} since this was measured; measure again")
     make_folder(args.out)
     count = 0
-    for path in export(source, request, args.out):
-        print(path)
-        count += 1
+    with tempfile.TemporaryDirectory() as folder:
+        files = [Path(path) for path in source.files]
+        framed = in_frame(files, asked_at(args.frame, files[0].parent), Path(folder) / "frame")
+        for path in export(replace(source, files=framed), request, args.out):
+            print(path)
+            count += 1
     print(f"written: {count} file{'s' if count != 1 else ''} in {args.out}")
     return 0
 

@@ -18,8 +18,9 @@ from server.formats.gauges.table import gauges_csv
 from server.formats.results.folder import first_results
 from server.formats.results.summary import to_json
 from server.results.gauges.fields import FieldWriter
+from server.results.gauges.framed import FRAME_HELP, asked_at
 from server.results.gauges.readings import read_gauges
-from server.results.gauges.request import GaugeRequest
+from server.results.gauges.request import Alignment, GaugeRequest
 from server.wording import problems_in
 
 _FORMS = {".csv": gauges_csv, ".json": lambda readings: to_json(readings.document()), ".mat": gauges_mat}
@@ -85,6 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="frame: best-fit plane of the reference, or six positions: three "
         "on the plane, two on the X axis, one at X = 0",
     )
+    add("--frame", metavar="FRAME", help=f"instead of --align: {FRAME_HELP}")
     add("--x-direction", metavar="X,Y,Z", help="of --align plane, system frame (1,0,0)")
     add(
         "--remove-rigid",
@@ -118,8 +120,9 @@ def run(args: argparse.Namespace) -> int:
             code="output_unusable",
             remedy="Give file.csv, file.json or file.mat.",
         )
-    request = _request(args)
     files = first_results(args.folder, (args.folder, args.folder / "exports" / "measure"))
+    asked = asked_at(args.frame, files[0].parent)
+    request = _request(args, asked)
     fields = None if args.field_out is None else FieldWriter(args.field_out, files[0].parent, request)
     readings = read_gauges(files, request, fields)
     print("\n".join(report(readings)))
@@ -132,7 +135,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _request(args: argparse.Namespace) -> GaugeRequest:
+def _request(args: argparse.Namespace, frame: Alignment | None) -> GaugeRequest:
     body: dict[str, object] = {
         "points": [
             *(_named("--point", t, lambda v: {"xy_px": v}, (2,)) for t in args.point),
@@ -154,8 +157,12 @@ def _request(args: argparse.Namespace) -> GaugeRequest:
         raise InputError("--robust is given without --remove-rigid.", code="option_conflict", remedy="Give both.")
     if args.x_direction is not None and args.align != "plane":
         raise InputError("--x-direction is given without --align plane.", code="option_conflict", remedy="Give both.")
+    if args.align is not None and args.frame is not None:
+        raise InputError("--align and --frame both name a frame.", code="option_conflict", remedy="Give one of them.")
     if args.align is not None:
         body["align"] = _align(args)
+    elif frame is not None:
+        body["align"] = frame.model_dump()
     try:
         return GaugeRequest.model_validate(body)
     except ValidationError as error:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import tempfile
 from pathlib import Path
 
 from core.errors import InputError
 from server.cli.measurement.coverage import add_coverage, coverage_from
 from server.formats.files import make_folder, write_bytes
+from server.results.gauges.framed import FRAME_HELP, asked_at, in_frame
 from server.results.metadata import load_metadata
 
 
@@ -30,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="lenses, light, pattern, specimen, static steps ...; what is kept with the test if left out",
     )
+    add("--frame", metavar="FRAME", help=FRAME_HELP)
     add("--out", metavar="FILE", type=Path, default=Path("report.html"), help="the report (report.html)")
     add_coverage(parser)
 
@@ -50,7 +53,13 @@ def run(args: argparse.Namespace) -> int:
     source = find_source(
         args.folder, test=args.test, analysis=args.analysis, calibration=args.calibration, metadata=metadata
     )
-    made = make_report(source, coverage_from(args))
+    with tempfile.TemporaryDirectory() as folder:
+        first = source.files[min(source.files)]
+        asked = asked_at(args.frame, first.parent)
+        if asked is not None:
+            framed = in_frame(list(source.files.values()), asked, Path(folder) / "frame")
+            source = source.in_frame(dict(zip(source.files, framed, strict=True)))
+        made = make_report(source, coverage_from(args))
     make_folder(args.out.absolute().parent)
     write_bytes(args.out, made.page)
     for doubt in (*(f"{reason} since this was measured" for reason in source.stale), *source.doubts):

@@ -77,6 +77,16 @@ def add_scalars(path: Path, scalars: Iterable[tuple[str, float, str, str]]) -> N
             made[...] = value
 
 
+def rename_axes(path: Path, old: str, new: str) -> None:
+    """Replace the name of the axes in every text of a file that speaks of them."""
+    with library, netCDF4.Dataset(path, "a") as dataset:
+        for variable in dataset.variables.values():
+            if old in getattr(variable, "long_name", ""):
+                variable.long_name = variable.long_name.replace(old, new)
+        if "strain_axes" in dataset.ncattrs():
+            dataset.strain_axes = dataset.strain_axes.replace(old, new)
+
+
 def dataset_bytes(fill: Callable[[Any], None]) -> bytes:
     """Return the bytes of a NetCDF-4 file that ``fill`` puts into an empty data set."""
     with library:

@@ -11,12 +11,16 @@ from core.field.points.result import Field
 from core.strain import surface_strain
 from server.formats.files import make_folder
 from server.formats.gauges.readings import FrameReading, RigidMotionReading
+from server.formats.results.netcdf import rename_axes
 from server.formats.results.reading import ResultHead
 from server.formats.results.strain import read_strain
 from server.formats.results.writing import Provenance, write_field
 from server.formats.version import software_version
+from server.results.gauges.frames import text_of
 from server.results.gauges.request import GaugeRequest
 
+#: ending of the axes' names in another frame, as X_sys is of the system
+AXES = "_frame"
 _CARRIED = ("label", "load_n", "test_step", "reference_step", "cam1_file", "cam2_file")
 
 
@@ -31,6 +35,8 @@ class FieldWriter:
         Where the results come from.
     request
         The request.
+    strain
+        False leaves the strain out, which takes most of the time.
 
     Raises
     ------
@@ -38,7 +44,7 @@ class FieldWriter:
         ``output_unusable`` if both folders are one; ``option_conflict`` where the request leaves fields as they are.
     """
 
-    def __init__(self, folder: Path, source: Path, request: GaugeRequest) -> None:
+    def __init__(self, folder: Path, source: Path, request: GaugeRequest, *, strain: bool = True) -> None:
         if request.align is None and request.remove_rigid is None:
             raise InputError(
                 "The fields are asked for as they were measured: they lie there already.",
@@ -50,7 +56,7 @@ class FieldWriter:
                 f"{folder} holds the results that are read.", code="output_unusable", remedy="Give another folder."
             )
         make_folder(folder)
-        self._folder, self._request = folder, request
+        self._folder, self._request, self._with_strain = folder, request, strain
         self.written: list[Path] = []
 
     def __call__(
@@ -63,7 +69,7 @@ class FieldWriter:
         motion: RigidMotionReading | None,
     ) -> None:
         """Write one step; strain, where the result has it, is made anew along the new axes."""
-        strain = read_strain(path)
+        strain = read_strain(path) if self._with_strain else None
         if strain is not None:
             strain = surface_strain(field, strain.options, subset_px=strain.subset_px)
         extra = {name: str(head.attributes[name]) for name in _CARRIED if name in head.attributes}
@@ -81,7 +87,7 @@ class FieldWriter:
         )
         described = head.frame
         if self._request.align is not None:
-            described = f"aligned by {self._request.align.kind}; before: {described}"
+            described = f"{text_of(self._request.align)}; before: {described}"
         provenance = Provenance(
             settings=head.settings,
             inputs=head.inputs_sha256,
@@ -92,4 +98,6 @@ class FieldWriter:
         )
         to = self._folder / path.name
         write_field(to, field, provenance, strain)
+        if self._request.align is not None:
+            rename_axes(to, "_sys", AXES)
         self.written.append(to)

@@ -15,7 +15,7 @@ from core.errors import InputError, MeasurementError, StateError
 from core.field.common import notes_of
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
-from core.gauge.align import Alignment, align_3_2_1, align_plane, aligned
+from core.gauge.align import Alignment, aligned
 from core.gauge.area import area_statistics, points_within
 from core.gauge.extensometer import extensometer
 from core.gauge.line import positions_along
@@ -49,7 +49,8 @@ from server.formats.results.uncertainty import Included, Statement, read_include
 from server.formats.version import software_version
 from server.results.channels import recorded_with
 from server.results.gauges.fields import FieldWriter
-from server.results.gauges.request import ExtensometerGauge, GaugeRequest, LineGauge, PlaneAlignment, PointGauge
+from server.results.gauges.frames import lay, text_of
+from server.results.gauges.request import ExtensometerGauge, GaugeRequest, LineGauge, PointGauge
 from server.results.gauges.variables import STRAIN_NAMES, Variables, component_of
 from server.results.projected_pattern import check_gauges
 from server.results.reader import read_variable
@@ -126,7 +127,7 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
         _check_same(step, first, grid, path, moved_by)
         hashes[path.name] = step.sha256
         if request.align is not None and alignment is None:
-            alignment = _alignment(step, request)
+            alignment = lay(request.align, step.field, step.shared)
         if first is step.head:
             positions = _positions_of(step.field if alignment is None else aligned(step.field, alignment), request)
         numbers += _count(step.field, request.lines, len(request.variables or COVARIANCE_NAMES))
@@ -147,7 +148,7 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
     stale = stale_results(chosen, heads)
     frame = first.frame
     if request.align is not None:
-        frame = f"aligned by {request.align.kind}; before: {frame}"
+        frame = f"{text_of(request.align)}; before: {frame}"
     return GaugeReadings(
         software_version=software_version(),
         settings=request.model_dump(mode="json"),
@@ -229,15 +230,6 @@ def _count(field: Field, lines: Sequence[LineGauge], variables: int) -> int:
     return variables * sum(len(positions_along(field, line.vertices_px, line.count)[1]) for line in lines)
 
 
-def _alignment(step: _Step, request: GaugeRequest) -> Alignment:
-    asked = request.align
-    if isinstance(asked, PlaneAlignment):
-        inside = points_within(step.field, asked.corners())
-        return align_plane(step.field, shared=step.shared, chosen=inside, x_direction=asked.x_direction)
-    assert asked is not None
-    return align_3_2_1(step.field, asked.positions_px, shared=step.shared)
-
-
 def _positions_of(field: Field, request: GaugeRequest) -> _Positions:
     """Return the pixels of each named point and extensometer; those given in mm are found on the first step's shape."""
     positions: _Positions = {}
@@ -257,7 +249,7 @@ def _read_step(
     found: set[str],
     fields: FieldWriter | None,
 ) -> StepReadings:
-    field = step.field if alignment is None else aligned(step.field, alignment)
+    field = measured = step.field if alignment is None else aligned(step.field, alignment)
     taken_out: RigidMotionReading | None = None
     if request.remove_rigid is not None and field.has_motion:
         removal = request.remove_rigid
@@ -271,7 +263,7 @@ def _read_step(
     if fields is not None:
         frame = None if alignment is None else _frame_reading(alignment)
         fields(step.path, step.sha256, step.head, field, frame, taken_out)
-    variables = Variables(step.path, field, step.shared, measured=step.field)
+    variables = Variables(step.path, field, step.shared, measured=measured, turned=alignment is not None)
     names = variables.known(request.variables or COVARIANCE_NAMES)
     found.update(names)
     return step.reading(

@@ -12,6 +12,7 @@ from server.base.models import Number, Request, StepNumber, Switch, any_of, give
 
 PositionPx = tuple[Pixel, Pixel]
 PositionMm = tuple[Number, Number]
+PositionXyz = tuple[Number, Number, Number]
 Name = Annotated[str, StringConstraints(min_length=1, max_length=60, pattern=r"^[^\x00-\x1f,;\"]+$")]
 Variable = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
 _MAX_GAUGES = 200
@@ -127,8 +128,13 @@ class PlaneAlignment(_Area):
     """Z = 0 in the best-fit plane of the reference's points in an area or the whole field."""
 
     kind: Literal["plane"] = Field(description="Best-fit plane.")
-    x_direction: tuple[Number, Number, Number] = Field(
-        (1.0, 0.0, 0.0), description="Direction in the system frame whose part along the plane becomes X."
+    x_direction: tuple[Number, Number, Number] | Literal["image_rows"] = Field(
+        (1.0, 0.0, 0.0),
+        description="Direction in the system frame whose part along the plane becomes X; `image_rows`: that of camera "
+        "1's image rows.",
+    )
+    x_line_px: tuple[PositionPx, PositionPx] | None = Field(
+        None, description="X runs from the first to the second of these positions; instead of x_direction."
     )
 
 
@@ -142,7 +148,17 @@ class ThreeTwoOneAlignment(Request):
     )
 
 
-Alignment = Annotated[PlaneAlignment | ThreeTwoOneAlignment, Field(discriminator="kind")]
+class GivenAlignment(Request):
+    """A frame that is written out."""
+
+    kind: Literal["given"] = Field(description="Written out.")
+    rotation: tuple[PositionXyz, PositionXyz, PositionXyz] = Field(
+        description="Its axes X, Y, Z as rows, in the system frame.", examples=[[[0, 1, 0], [-1, 0, 0], [0, 0, 1]]]
+    )
+    origin_mm: PositionXyz = Field((0.0, 0.0, 0.0), description="Its origin in the system frame.")
+
+
+Alignment = Annotated[PlaneAlignment | ThreeTwoOneAlignment | GivenAlignment, Field(discriminator="kind")]
 
 
 class GaugeRequest(CoverageFields, Request):

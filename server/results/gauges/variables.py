@@ -15,6 +15,7 @@ from core.arrays import Float
 from core.errors import InputError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
+from core.strain import surface_strain
 from core.strain.mean import MeanStrainVariance, mean_strain_variance
 from core.strain.result import StrainField
 from server.base.errors import NotFoundError
@@ -35,10 +36,20 @@ class OwnSigma:
 
 
 class Variables:
-    """Variables by name: of the field as it is now, else of the file as it was written."""
+    """Variables by name: of the field as it is now, else of the file as it was written.
 
-    def __init__(self, path: Path, field: Field, shared: SharedPixels, *, measured: Field) -> None:
-        self.path, self.field, self.shared, self.measured = path, field, shared, measured
+    Parameters
+    ----------
+    measured
+        The field as measured, in the frame that is read in.
+    turned
+        True if its axes are not the file's: components of strain are then made anew along them.
+    """
+
+    def __init__(
+        self, path: Path, field: Field, shared: SharedPixels, *, measured: Field, turned: bool = False
+    ) -> None:
+        self.path, self.field, self.shared, self.measured, self._turned = path, field, shared, measured, turned
         self._read: dict[str, tuple[Variable, Float | None]] = {}
 
     def get(self, name: str) -> tuple[Variable, Float | None]:
@@ -49,15 +60,17 @@ class Variables:
 
     @cached_property
     def strain(self) -> StrainField | None:
-        """Strain of the file; None where it has none."""
-        return read_strain(self.path)
+        """Strain along the axes that are read in; None where the file has none."""
+        strain = read_strain(self.path)
+        if strain is None or not self._turned or not self.measured.has_motion:
+            return strain
+        return surface_strain(self.measured, strain.options, subset_px=strain.subset_px)
 
     def mean_strain_variance(self, inside: NDArray[np.bool_]) -> MeanStrainVariance | None:
         """Return the uncertainty of the means of exx, eyy, exy over an area; None without strain."""
         strain = self.strain
         if strain is None:
             return None
-        # the file's strain is that of the field as it was measured, along the file's axes
         return mean_strain_variance(self.measured, strain.options, inside, subset_px=strain.subset_px)
 
     def own_sigma(self, name: str) -> OwnSigma | None:
@@ -91,7 +104,7 @@ class Variables:
         if of_field is not None:
             return Variable(*of_field), sigma
         variable = read_variable(self.path, name)
-        values = variable.values
+        values = self._along_axes.get(name, variable.values)
         if values.shape != self.field.shape or not np.issubdtype(values.dtype, np.number):
             raise InputError(
                 f"{name} of {self.path.name} is no scalar over the points.",
@@ -101,12 +114,25 @@ class Variables:
         held = np.where(self.field.valid, values.astype(np.float64), np.nan)
         return Variable(held, variable.units, variable.long_name), sigma
 
+    @cached_property
+    def _along_axes(self) -> dict[str, Float]:
+        """Components of strain along the axes that are read in; empty where the file has them so."""
+        made = self.strain if self._turned and self.measured.has_motion else None
+        if made is None:
+            return {}
+        found = {name: made.strain[..., k] for k, name in enumerate(STRAIN_NAMES)}
+        found |= {f"sigma_{name}": made.sigma[..., k] for k, name in enumerate(STRAIN_NAMES)}
+        if made.patch is not None:
+            found |= {f"{name}_patch": made.patch[..., k] for k, name in enumerate(STRAIN_NAMES)}
+        return found | {"strain_angle_rad": made.angle_rad}
+
     def _sigma(self, name: str) -> Float | None:
         k = component_of(name)
         if k is not None:
             return self.field.sigma_mm[..., k] if k < self.field.covariance.shape[-1] else None
         try:
-            values = read_variable(self.path, f"sigma_{name}").values
+            own = f"sigma_{name}"
+            values = self._along_axes[own] if own in self._along_axes else read_variable(self.path, own).values
         except NotFoundError:
             return None
         return np.asarray(values, dtype=np.float64) if values.shape == self.field.shape else None

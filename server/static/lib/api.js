@@ -139,9 +139,10 @@ export const get = async (path, query, signal) => json(await send("GET", path, {
  * @template {string} const P
  * @param {P & Address<"post", P>} path
  * @param {Body<"post", P>} [body]
+ * @param {Query<"post", P>} [query]
  * @returns {Promise<Reply<"post", P>>}
  */
-export const post = async (path, body) => json(await send("POST", path, { body, making: true }));
+export const post = async (path, body, query) => json(await send("POST", path, { body, query: /** @type {Asked | undefined} */ (query), making: true }));
 
 /**
  * @template {string} const P

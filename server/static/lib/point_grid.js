@@ -59,7 +59,7 @@ export class Grid {
     this.cutCells = this.#cutCells();
   }
 
-  /** Cell number -> the pieces of cuts that touch it. */
+  /** Cell number -> the pieces of cuts that meet it, its border included. */
   #cutCells() {
     /** @type {Map<number, Piece[]>} */
     const cells = new Map();
@@ -70,11 +70,55 @@ export class Grid {
       for (let r = Math.max(row(Math.min(y0, y1) - NEAR), 0); r <= Math.min(row(Math.max(y0, y1) + NEAR), this.rows - 2); r += 1) {
         for (let c = Math.max(column(Math.min(x0, x1) - NEAR), 0); c <= Math.min(column(Math.max(x0, x1) + NEAR), this.cols - 2); c += 1) {
           const cell = r * this.cols + c;
-          cells.set(cell, [...(cells.get(cell) ?? []), piece]);
+          if (this.#meets(cell, piece)) cells.set(cell, [...(cells.get(cell) ?? []), piece]);
         }
       }
     }
     return cells;
+  }
+
+  /**
+   * @param {number} cell
+   * @param {Piece} piece
+   */
+  #meets(cell, piece) {
+    const left = this.x[cell] - NEAR;
+    const top = this.y[cell] - NEAR;
+    const right = this.x[cell] + this.dx + NEAR;
+    const bottom = this.y[cell] + this.dy + NEAR;
+    const [x0, y0] = piece;
+    const within = x0 >= left && x0 <= right && y0 >= top && y0 <= bottom;
+    // a line that enters and leaves a rectangle meets one of its diagonals; one that ends in it has an end within, or meets a side
+    return within || meet(left, top, right, bottom, ...piece) || meet(right, top, left, bottom, ...piece) || (piece[2] >= left && piece[2] <= right && piece[3] >= top && piece[3] <= bottom);
+  }
+
+  /**
+   * Return true if no cut meets a side of the triangle of three points, and none lies inside it.
+   * @param {number} cell that the three are corners of
+   * @param {number[]} three numbers of points
+   */
+  whole(cell, three) {
+    const pieces = this.cutCells.get(cell);
+    if (!pieces) return true;
+    const inside = (/** @type {number} */ px, /** @type {number} */ py) => {
+      const turns = three.map((a, k) => {
+        const b = three[(k + 1) % 3];
+        return (this.x[b] - this.x[a]) * (py - this.y[a]) - (this.y[b] - this.y[a]) * (px - this.x[a]);
+      });
+      return turns.every((turn) => turn >= 0) || turns.every((turn) => turn <= 0);
+    };
+    return pieces.every((piece) => !inside(piece[0], piece[1]) || !inside(piece[2], piece[3]))
+      && three.every((a, k) => !this.parted(cell, a, three[(k + 1) % 3]));
+  }
+
+  /**
+   * Return true if a cut meets the side between two corners of a cell.
+   * @param {number} cell
+   * @param {number} a
+   * @param {number} b
+   */
+  parted(cell, a, b) {
+    return (this.cutCells.get(cell) ?? []).some((piece) => meet(this.x[a], this.y[a], this.x[b], this.y[b], ...piece));
   }
 
   /**

@@ -1,6 +1,7 @@
 // Running and ended jobs, and the state of the system.
 import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
+import { stateBadge, warningsBox } from "./results/warnings.js";
 import { h, replace, action, badge, definitions, num, quantity, table, when, problemText, STATE_KIND } from "../lib/dom.js";
 
 /** @import { Model } from "#routes" */
@@ -33,12 +34,16 @@ export async function open(root) {
     replace(list, table([
       ["Job", (job) => h("button.plain", { type: "button", onclick: () => { chosen = job.id; show(); } }, h("code", job.id))],
       ["Kind", (job) => job.kind],
-      ["State", (job) => badge(job.state, STATE_KIND[job.state])],
+      ["State", state],
       ["Progress", (job) => progress(job)],
       ["Begun", (job) => when(job.started_utc ?? job.created_utc)],
       ["Cancel", (job) => (["queued", "running"].includes(job.state) ? cancel(job) : null), { unseen: true }],
     ], rows, { caption: "Jobs, newest first", onrow: (job) => { chosen = job.id; show(); }, empty: "No job has run yet." }));
   }
+
+  /** @param {Job} job */
+  const state = (job) => stateBadge(job.state, warningsOf(job));
+  const warningsOf = (/** @type {Job} */ job) => /** @type {import("./results/warnings.js").Warning[] | undefined} */ (job.result?.warnings);
 
   /** @param {Job} job */
   function progress(job) {
@@ -55,7 +60,7 @@ export async function open(root) {
     const job = jobs.get(chosen);
     if (!job) return;
     replace(detail,
-      h("div.spread", h("h2", `${job.kind} `, h("code", job.id)), badge(job.state, STATE_KIND[job.state])),
+      h("div.spread", h("h2", `${job.kind} `, h("code", job.id)), state(job)), warningsBox(warningsOf(job)),
       definitions([["created", when(job.created_utc)], ["started", when(job.started_utc)], ["finished", when(job.finished_utc)],
         ...Object.entries(job.subject ?? {}).map(([name, value]) => /** @type {const} */ ([name, link(name, value, job.subject)]))]),
       job.problem ? problemText(api.problemOf(job.problem)) : null,

@@ -7,9 +7,11 @@ import { Scale } from "../widgets/scale.js";
 import { about, files } from "./results/about.js";
 import { camerasNote } from "./results/cameras.js";
 import { gauges } from "./results/gauges.js";
+import { frames } from "./results/frame.js";
 import { mark, pinned } from "./results/probe.js";
 import { interval } from "./results/uncertainty.js";
-import { h, replace, table, badge, when, num, count, quantity, field, select, definitions, notify, problemText, STATE_KIND } from "../lib/dom.js";
+import { stateBadge, warningsBox, warningsCell } from "./results/warnings.js";
+import { h, replace, table, when, num, count, quantity, field, select, definitions, notify, problemText } from "../lib/dom.js";
 
 /** @import { Here } from "../main.js" */
 /** @import { Ends } from "#dom" */
@@ -21,6 +23,12 @@ import { h, replace, table, badge, when, num, count, quantity, field, select, de
 /** @typedef {{ result: Result, state: State, map: FieldMap, scale: Scale, interval: Interval, ends: Ends, probe: HTMLElement, message: HTMLElement, readonly step: number | null,
  *   readonly info: Shown | null, onpick: (x: number, y: number, event: Event) => unknown, drawn: Set<() => unknown> }} Viewer shared by the parts of the screen; `drawn` is called after each change of step, field or scale */
 /** @typedef {{ root: HTMLElement, update: () => Promise<void>, close: () => void, attach?: () => void }} OtherView shown instead of the map */
+
+/**
+ * Which axes a step's frame has, in a few words.
+ * @param {string | undefined} frame
+ */
+const axesText = (frame) => (frame?.startsWith("aligned") ? `the specimen's (${frame.split("; before:")[0].replace(/^aligned by /, "").replace(/^plane/, "best plane")})` : "the calibration's (system frame)");
 
 /** @type {[Mode, string][]} */
 const MODES = [["image", "Image"], ["surface", "3-D surface"], ["compare", "Side by side"]];
@@ -53,7 +61,7 @@ async function list(root, testId) {
         table([
           ["Analysis", (one) => h("a", { href: `#/results/${test.id}/${one.id}` }, one.label || one.id)],
           ["Kind", (one) => one.kind],
-          ["Failed steps", (one) => one.steps_failed?.join(", ") ?? ""],
+          ["Checks", warningsCell],
           ["Begun", (one) => when(one.created_utc)],
         ], (whole.analyses ?? []).toReversed(), { caption: "Analyses of this test, newest first", empty: "This test has not been measured yet.",
           onrow: (one) => { location.hash = `#/results/${test.id}/${one.id}`; } }));
@@ -84,6 +92,7 @@ async function show(root, testId, analysisId, query) {
   /** @type {Ends} */
   const ends = [];
   const asked = Number(query.get("step") ?? NaN);
+  if (query.get("frame") === "system") result.use("system");
   /** @type {State} */
   const state = {
     step: result.steps.includes(asked) ? asked : result.steps.at(-1) ?? null, field: query.get("field"), image: "reference", mode: "image", info: null, playing: null,
@@ -98,6 +107,7 @@ async function show(root, testId, analysisId, query) {
   const slider = h("input", { type: "range", min: 0, max: Math.max(result.steps.length - 1, 0), step: 1, "aria-label": "Step" });
   const stepText = h("output", { "data-role": "step" });
   const status = h("div");
+  const warned = h("div");
   const statistics = h("dl.definitions", { "data-role": "statistics" });
   const probe = h("div", { "data-role": "probe" }, h("p.quiet", "Click a point to see all its values."));
   const message = h("p.quiet", { role: "status" });
@@ -106,6 +116,7 @@ async function show(root, testId, analysisId, query) {
     h("button", { type: "button", "data-mode": name, "aria-pressed": String(name === "image"), onclick: () => setMode(name).catch(notify) }, text)));
   const stage = h("div", map.view.root);
   const below = h("div");
+  const axesField = h("div.field");
   const play = h("button", { type: "button", "aria-pressed": "false", title: "Play through the steps", onclick: () => playing(!state.playing) }, "▶ Play");
   /** @type {Viewer} */
   const screen = {
@@ -145,7 +156,7 @@ async function show(root, testId, analysisId, query) {
     slider.setAttribute("aria-valuetext", result.stepText(state.step));
     stepText.textContent = `${result.stepText(state.step)} · ${result.steps.indexOf(state.step ?? NaN) + 1} of ${result.steps.length}`;
     await drawFields();
-    const address = `#/results/${testId}/${analysisId}?step=${state.step}&field=${encodeURIComponent(state.field ?? "")}`;
+    const address = `#/results/${testId}/${analysisId}?step=${state.step}&field=${encodeURIComponent(state.field ?? "")}${result.frame === "system" ? "&frame=system" : ""}`;
     if (location.hash !== address && location.hash.startsWith(`#/results/${testId}/${analysisId}`)) history.replaceState(null, "", address);
     if (!state.info) {
       message.textContent = `Step ${state.step} has no ${state.field}: ${state.step === result.reference ? "it is the reference of the displacements." : "choose another field."}`;
@@ -156,7 +167,7 @@ async function show(root, testId, analysisId, query) {
       await redraw();
       return;
     }
-    message.textContent = state.info.about;
+    message.textContent = `${state.info.about.replace(/([XYZ])_(frame|sys)/, "$1").replace("axis 1", "X").replace("axis 2", "Y")} · axes: ${axesText((await result.fields(state.step)).frame)}`;
     if (!(await map.load(result, state.step, state.info, state.image))) return;
     await redraw();
   }
@@ -184,6 +195,20 @@ async function show(root, testId, analysisId, query) {
       ["valid", `${count(s.count)} of ${count(s.within)} points (${num(s.within ? (100 * s.count) / s.within : null, 4)} %)`],
     ]).children]);
     for (const listener of screen.drawn) await listener();
+    await principal();
+  }
+
+  /** Principal strains beside a component of strain: no axes matter to them. */
+  async function principal() {
+    const { step, info } = state;
+    if (step === null || info?.group !== "Strain" || !map.now) return;
+    const { all } = await result.fields(step);
+    if (!all.has("e1") || !all.has("e2")) return;
+    const [e1, e2] = await Promise.all(["e1", "e2"].map((name) => result.values(step, name)));
+    if (state.step !== step || state.info !== info || !map.now) return;
+    const { grid } = map.now;
+    const mean = (/** @type {ArrayLike<number>} */ of) => { const known = measured(grid, of); return known.length ? known.reduce((sum, v) => sum + v, 0) / known.length : null; };
+    statistics.append(...definitions([["principal strains, mean", `${num(mean(e1), 4)} and ${quantity(mean(e2), info.unit || "µm/m", 4)}`]]).children);
   }
 
   /** @param {number | null} n */
@@ -221,7 +246,7 @@ async function show(root, testId, analysisId, query) {
     if (i < 0 || !map.now || state.step === null) return;
     const { grid } = map.now;
     state.pinned = i;
-    const answer = await api.get(`${result.path}/probe`, { x_px: Math.max(grid.x[i], 0), y_px: Math.max(grid.y[i], 0), step: state.step });
+    const answer = await api.get(`${result.path}/probe`, { x_px: Math.max(grid.x[i], 0), y_px: Math.max(grid.y[i], 0), step: state.step, frame: result.frame });
     pinned(screen, answer);
   }
 
@@ -265,16 +290,14 @@ async function show(root, testId, analysisId, query) {
 
   function drawStatus() {
     const { analysis } = result;
-    const failed = Object.keys(analysis.steps_failed ?? {});
-    replace(status, h("span.row", badge(analysis.state, STATE_KIND[analysis.state]),
-      failed.length ? h("span", { title: `Steps ${failed.join(", ")}: see Settings, checks and warnings` }, badge(`${failed.length} ${failed.length === 1 ? "step" : "steps"} failed`, "warn")) : null, analysis.stale ? badge("out of date", "warn") : null),
-      analysis.stale ? h("p", h("strong", "Out of date: "), (analysis.stale_reasons ?? []).join("; ")) : null, analysis.problem ? problemText(api.problemOf(analysis.problem)) : null);
+    replace(status, h("span.row", stateBadge(analysis.state, analysis.warnings)), analysis.problem ? problemText(api.problemOf(analysis.problem)) : null);
+    replace(warned, warningsBox(analysis.warnings));
   }
 
   replace(root,
-    h("div.spread", h("h1", "Results: ", h("a", { href: `#/results/${testId}` }, result.test.name || testId), ` · ${result.analysis.label || analysisId}`), status, modes),
+    h("div.spread", h("h1", "Results: ", h("a", { href: `#/results/${testId}` }, result.test.name || testId), ` · ${result.analysis.label || analysisId}`), status, modes), warned,
     h("div.row.controls", h("div.field", h("label", { for: "resultfield" }, "Field"), Object.assign(fieldChoice, { id: "resultfield" })),
-      field("Image", imageChoice), field("Opacity", opacity, "%"),
+      axesField, field("Image", imageChoice), field("Opacity", opacity, "%"),
       h("div.field.grow", h("label", { for: "resultstep" }, "Step "), h("span.control",
         h("button", { type: "button", "aria-label": "Step before", onclick: () => move(-1) }, "◂"), Object.assign(slider, { id: "resultstep" }),
         h("button", { type: "button", "aria-label": "Next step", onclick: () => move(1) }, "▸"), play, stepText))),
@@ -284,7 +307,10 @@ async function show(root, testId, analysisId, query) {
   drawStatus();
   screen.drawn.add(() => mark(screen));
   const aboutPanel = about(screen);
-  below.append(gauges(screen), files(screen), aboutPanel.root);
+  const gaugePanels = gauges(screen);
+  const axes = frames(screen, async () => { scale.forget(); state.pinned = undefined; replace(probe, h("p.quiet", "Click a point to see all its values.")); await refresh(); });
+  axesField.append(h("label", { for: "resultframe" }, "Axes"), axes.choice);
+  below.append(gaugePanels, axes.root, files(screen), aboutPanel.root);
   await refresh();
   ends.push(events.on("result", async (event) => {
     if (event.analysis_id !== analysisId) return;

@@ -137,7 +137,7 @@ function camera(cam, first, ends) {
   const trouble = h("div", { role: "alert" });
   const histogramBox = h("div");
   const focusBox = h("div");
-  /** @type {[number, number][]} time and focus */
+  /** @type {[number, number | null][]} time and focus */
   const course = [];
   /** @type {Chart | null} */
   let histogram = null;
@@ -193,25 +193,26 @@ function camera(cam, first, ends) {
     const q = stats.quality;
     began ??= performance.now();
     const at = (performance.now() - began) / 1000;
-    course.push([at, q.focus]);
+    course.push([at, q.focus ?? null]);
     if (course.length > COURSE) course.shift();
+    const highest = Math.max(...course.map((p) => p[1] ?? 0));
     replace(quality, badge(q.code, STATE_KIND[q.code] ?? "warn"));
     // after a change of settings a camera counts from zero
     const rate = counted && stats.frames.delivered >= counted.delivered ? (stats.frames.delivered - counted.delivered) / ((performance.now() - counted.at) / 1000) : null;
     counted = { delivered: stats.frames.delivered, at: performance.now() };
     replace(figures, [...definitions([
       ["frame rate", quantity(rate, "Hz", 3)], ["mean grey", num(q.mean_grey, 4)], ["saturated", quantity(100 * q.saturated_share, "%", 3)],
-      ["texture", quantity(q.texture_grey_per_px, "grey/px", 3)], ["focus figure", num(q.focus, 3)],
+      ["texture", quantity(q.texture_grey_per_px, "grey/px", 3)], ["focus figure", q.focus === null || q.focus === undefined ? "– (little but noise is seen)" : `${num(q.focus, 3)} (highest ${num(highest, 3)})`],
       ["dropped", count(stats.frames.dropped)], ["incomplete", count(stats.frames.incomplete)],
     ]).children]);
     const bins = stats.histogram.map((_, i) => i);
     if (!histogram && histogramBox.clientWidth) {
       histogram = await chart(histogramBox, { x: "grey level (8 bit)", y: "pixels", height: 130, bars: true, series: [{ label: "pixels" }], data: [bins, stats.histogram], label: `Histogram of ${cam}` });
     } else histogram?.set([bins, stats.histogram]);
-    /** @type {[number[], number[]]} */
-    const courseData = [course.map((p) => p[0]), course.map((p) => p[1])];
+    /** @type {[number[], (number | null)[], (number | null)[]]} */
+    const courseData = [course.map((p) => p[0]), course.map((p) => p[1]), course.map((p) => (p[1] !== null && p[1] === highest ? p[1] : null))];
     if (!focus && focusBox.clientWidth && course.length > 1) {
-      focus = await chart(focusBox, { x: "time (s)", y: "focus", height: 130, series: [{ label: "focus" }], data: courseData, label: `Recent history of the focus figure of ${cam}` });
+      focus = await chart(focusBox, { x: "time (s)", y: "focus", height: 130, series: [{ label: "focus" }, { label: "highest", edge: true, dots: true }], data: courseData, label: `Recent history of the focus figure of ${cam}` });
     } else focus?.set(courseData);
     rounds += 1;
     if (overlayChoice.value && rounds % 2 === 0) layOver().catch(() => {});

@@ -4,6 +4,7 @@ import * as events from "../lib/events.js";
 import { stepsPanel } from "./test/steps.js";
 import { metadataPanel } from "./test/metadata.js";
 import { measurePanel } from "./test/measure.js";
+import { warningsCell } from "./results/warnings.js";
 import { h, replace, field, select, action, table, when, notify } from "../lib/dom.js";
 
 /** @import { Here } from "../main.js" */
@@ -78,7 +79,7 @@ async function one(root, id) {
   }
   function drawAnalyses() {
     replace(analyses, h("h2", "Analyses"), table([
-      ["Analysis", (a) => h("a", { href: `#/results/${id}/${a.id}` }, a.label || a.id)], ["Kind", (a) => a.kind], ["Made", (a) => when(a.created_utc)],
+      ["Analysis", (a) => h("a", { href: `#/results/${id}/${a.id}` }, a.label || a.id)], ["Kind", (a) => a.kind], ["Checks", warningsCell], ["Made", (a) => when(a.created_utc)],
     ], (test.analyses ?? []).toReversed(), { caption: "Newest first", empty: "None yet." }));
   }
   const title = h("h1", test.name);

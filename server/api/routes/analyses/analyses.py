@@ -18,6 +18,7 @@ from server.base.models import Ids, JobState
 from server.jobs.idempotency import RequestMark
 from server.store.documents import Finished
 from server.workflows import analysis_start
+from server.workflows.analysis_warnings import warnings_of, with_warnings
 from server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}/analyses", tags=["analyses"])
@@ -115,6 +116,7 @@ def analysis_reply(service: Service, test_id: str, analysis_id: str) -> Analysis
         "summary": shown,
         "stale": bool(stale),
         "stale_reasons": stale,
+        "warnings": warnings_of(service, test_id, analysis_id, stale=stale, failed=failed),
     }
     return AnalysisReply.model_validate(reply)
 
@@ -124,7 +126,8 @@ def list_analyses(service: ServiceDep, test_id: TestId, page: PageDep) -> Analys
     """Return the analyses of a test."""
     service.tests.path(test_id)
     analyses_page = page.of(service.catalog.entries("analysis", test_id), lambda a: str(a["id"]))
-    return AnalysisList.model_validate({"analyses": analyses_page, "next_cursor": page.next_cursor})
+    shown = with_warnings(service, test_id, analyses_page)
+    return AnalysisList.model_validate({"analyses": shown, "next_cursor": page.next_cursor})
 
 
 @router.get("/{analysis_id:plain_id}", summary="One analysis", responses=errors(404))

@@ -14,13 +14,14 @@ from fastapi.responses import FileResponse, Response, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
 from core.errors import Cancelled
-from server.api.protocol.dependencies import AnalysisId, CoverageDep, ServiceDep, TestId
+from server.api.protocol.dependencies import AnalysisId, CoverageDep, FrameText, ServiceDep, TestId
 from server.api.protocol.problems import errors
 from server.base.errors import NotFoundError
 from server.exports.request import MEDIA_TYPES, ExportFormat, ExportRequest, steps_in
 from server.formats.figure_options import COLOURS, WIDTHS_PX, FigureStyle
 from server.worker.executor import TaskFuture
 from server.workflows import analysis_start
+from server.workflows.framed import results_in_frame
 from server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
@@ -118,6 +119,7 @@ async def export(
             description="Variables of the result files; all if left out, of figures and films w_mm or z_mm.",
         ),
     ] = None,
+    frame: FrameText = None,
 ) -> Response:
     """Answer with the file once it is made; several files are one ZIP archive.
 
@@ -127,7 +129,8 @@ async def export(
     """
     wanted = [step] if step is not None else None if steps is None else steps_in(steps)
     files, headers = await run_in_threadpool(_prepared, service, test_id, analysis_id, wanted)
-    if format == "nc" and len(files) == 1 and variables is None and coverage.factor == 1.0:
+    as_stored = variables is None and coverage.factor == 1.0 and frame in (None, "system")
+    if format == "nc" and len(files) == 1 and as_stored:
         return FileResponse(
             files[0], media_type=MEDIA_TYPES["nc"], headers=headers, filename=f"{test_id}_{analysis_id}_{files[0].name}"
         )
@@ -135,7 +138,9 @@ async def export(
     export_request = ExportRequest(format, None, names, drawn.style, drawn.over_image, drawn.fps, coverage)
     folder = await run_in_threadpool(service.exports.new_folder)
     try:
-        made = Path(await _made(request, service, files, export_request, folder))
+        home = files[0].parent
+        files = await run_in_threadpool(results_in_frame, service, test_id, files, frame, folder / "frame")
+        made = Path(await _made(request, service, home, files, export_request, folder))
         file = made.open("rb")
     finally:
         # the opened file stays until it is sent, whatever becomes of the client or the service
@@ -162,10 +167,10 @@ def _prepared(
 
 
 async def _made(
-    request: Request, service: Service, files: list[Path], export_request: ExportRequest, folder: Path
+    request: Request, service: Service, home: Path, files: list[Path], export_request: ExportRequest, folder: Path
 ) -> str:
     service.require_room()
-    return str(await finished(request, service.exports.submit(files[0].parent, files, export_request, folder)))
+    return str(await finished(request, service.exports.submit(home, files, export_request, folder)))
 
 
 async def finished(request: Request, future: TaskFuture) -> Any:

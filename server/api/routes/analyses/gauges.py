@@ -9,15 +9,16 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Query
 from fastapi.responses import Response
 
-from core.errors import MeasurementError
+from core.errors import InputError, MeasurementError
 from server.api.models import GaugesReply
-from server.api.protocol.dependencies import AnalysisId, ServiceDep, TestId
+from server.api.protocol.dependencies import AnalysisId, FrameText, ServiceDep, TestId
 from server.api.protocol.problems import errors
 from server.formats.gauges.matlab import gauges_mat
 from server.formats.gauges.table import gauges_csv
 from server.results.gauges.fields import FieldWriter
 from server.results.gauges.readings import read_gauges
 from server.results.gauges.request import GaugeRequest
+from server.workflows.framed import asked_of
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
 _MATLAB = "application/x-matlab-data"
@@ -70,9 +71,16 @@ def read(
     format: Annotated[  # noqa: A002
         Literal["json", "csv", "mat"], Query(description="mat: a MATLAB file; its columns are those of the CSV table.")
     ] = "json",
+    frame: FrameText = None,
 ) -> dict[str, object] | Response:
     """Answer at once with what points, extensometers, lines and areas read in the finished steps; nothing is stored."""
     steps = service.tests.finished_steps(test_id, analysis_id)
+    asked = asked_of(service, test_id, frame)
+    if asked is not None and body.align is not None:
+        raise InputError(
+            "The frame is given twice, in `align` and in frame=.", code="option_conflict", remedy="Give one of them."
+        )
+    body = body if asked is None else body.model_copy(update={"align": asked})
     readings = read_gauges([service.tests.result_file(test_id, analysis_id, n) for n in steps], body)
     if format == "json":
         return readings.document()

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import shutil
+from pathlib import Path
 
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, Response
 from starlette.concurrency import run_in_threadpool
 
-from server.api.protocol.dependencies import AnalysisId, CoverageDep, ServiceDep, TestId
+from server.api.protocol.dependencies import AnalysisId, CoverageDep, FrameText, ServiceDep, TestId
 from server.api.protocol.problems import errors
 from server.api.routes.analyses.exports import finished
 from server.base.errors import NotFoundError
 from server.report.task import NAME, report_task
 from server.workflows import analysis_start
+from server.workflows.framed import asked_of, results_in_frame
 from server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
@@ -32,7 +34,12 @@ router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["resu
     },
 )
 async def get_report(
-    request: Request, service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, coverage: CoverageDep
+    request: Request,
+    service: ServiceDep,
+    test_id: TestId,
+    analysis_id: AnalysisId,
+    coverage: CoverageDep,
+    frame: FrameText = None,
 ) -> Response:
     """Answer with the report of the finished steps: rig, settings, noise floor, calibration, pictures, tables, courses.
 
@@ -42,12 +49,22 @@ async def get_report(
     service.require_room()
     folder = await run_in_threadpool(service.exports.new_folder)
     try:
-        policy, missing = await finished(request, service.exports.run(report_task, results, str(folder), coverage))
+        framed = await run_in_threadpool(_framed, service, test_id, analysis_id, frame, folder / "frame")
+        task = service.exports.run(report_task, results, str(folder), coverage, framed)
+        policy, missing = await finished(request, task)
         page = await run_in_threadpool((folder / NAME).read_bytes)
     finally:
         await run_in_threadpool(shutil.rmtree, folder, ignore_errors=True)
     headers = {"Content-Security-Policy": policy, "X-Not-Stated": str(missing)}
     return HTMLResponse(page, headers=headers | ({"X-Stale": "; ".join(stale)} if stale else {}))
+
+
+def _framed(service: Service, test_id: str, analysis_id: str, frame: str | None, folder: Path) -> list[str]:
+    if asked_of(service, test_id, frame) is None:
+        return []
+    steps = service.tests.finished_steps(test_id, analysis_id)
+    files = [service.tests.result_file(test_id, analysis_id, n) for n in steps]
+    return [str(path) for path in results_in_frame(service, test_id, files, frame, folder)]
 
 
 def _prepared(service: Service, test_id: str, analysis_id: str) -> tuple[str, list[str]]:

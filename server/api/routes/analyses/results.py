@@ -13,14 +13,18 @@ from pydantic_core import to_json
 
 from server.api.models import FieldList, FieldReply, ProbeReply
 from server.api.protocol.conditional import etag_of, tags_in
-from server.api.protocol.dependencies import AnalysisId, Camera, CoverageDep, ServiceDep, StepNumber, TestId
+from server.api.protocol.dependencies import AnalysisId, Camera, CoverageDep, FrameText, ServiceDep, StepNumber, TestId
 from server.api.protocol.problems import errors
 from server.formats.files import known_sha256
+from server.formats.results.reading import read_head
 from server.formats.results.uncertainty import Statement, read_included
 from server.results.field_forms import MEDIA_TYPES, RANGE_PATTERN, FieldForm, Part, encode, nested, take
+from server.results.gauges.fields import AXES
+from server.results.gauges.frames import text_of
 from server.results.positions import image_positions
 from server.results.reader import list_variables, probe_result, read_cut_pieces
 from server.results.uncertainty import read_interval
+from server.workflows.framed import asked_of, result_in
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
 FieldName = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,63}$", description="Variable of the result file.")]
@@ -64,6 +68,7 @@ def get_field(
             "a colour map with its bar."
         ),
     ] = "json",
+    frame: FrameText = None,
     rows: RangeText = None,
     cols: RangeText = None,
     stride: Annotated[int, Query(ge=1, le=10000, description="Each so many-th row and column.")] = 1,
@@ -73,7 +78,7 @@ def get_field(
     `sigma_NAME` is the standard uncertainty; with k or coverage there is `expanded_NAME` too. The header X-Uncertainty
     says what they include.
     """
-    path = service.tests.result_file(test_id, analysis_id, n)
+    path = result_in(service, test_id, analysis_id, n, frame, name)
     # a result never changes: what was asked for, and of which file, name the answer
     etag = etag_of([known_sha256(path), name, format, rows, cols, stride, coverage.factor])
     headers = {"ETag": etag, "Cache-Control": "private, no-cache"}
@@ -109,14 +114,25 @@ def _json(document: dict[str, Any], headers: dict[str, str] | None = None) -> Re
     responses=errors(404, 422),
 )
 def list_fields(
-    service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, n: StepNumber, coverage: CoverageDep
+    service: ServiceDep,
+    test_id: TestId,
+    analysis_id: AnalysisId,
+    n: StepNumber,
+    coverage: CoverageDep,
+    frame: FrameText = None,
 ) -> FieldList:
     """Return name, unit, meaning and dimensions of every variable; what the values of a status mean; the cuts."""
     path = service.tests.result_file(test_id, analysis_id, n)
+    fields, described = [asdict(v) for v in list_variables(path)], read_head(path).frame
+    asked = asked_of(service, test_id, frame)
+    if asked is not None:
+        described = f"{text_of(asked)}; before: {described}"
+        fields = [one | {"long_name": one["long_name"].replace("_sys", AXES)} for one in fields]
     return FieldList.model_validate(
         {
-            "fields": [asdict(v) for v in list_variables(path)],
+            "fields": fields,
             "cuts_px": read_cut_pieces(path),
+            "frame": described,
             "uncertainty": Statement(read_included(path), coverage).document(),
         }
     )
@@ -164,7 +180,8 @@ def get_probe(
     y_px: Annotated[float, Query(ge=0.0, le=32767.0, allow_inf_nan=False, description="Row in camera 1's image.")],
     coverage: CoverageDep,
     step: Annotated[int, Query(ge=0, le=9999, description="Number of the step.")] = 0,
+    frame: FrameText = None,
 ) -> ProbeReply:
     """Return every number of the nearest point, with its uncertainty."""
-    path = service.tests.result_file(test_id, analysis_id, step)
+    path = result_in(service, test_id, analysis_id, step, frame)
     return ProbeReply.model_validate({"step": step, **asdict(probe_result(path, x_px, y_px, coverage))})

@@ -38,6 +38,7 @@ from server.jobs.idempotency import RequestMark
 from server.store.documents import StepMetadata
 from server.store.index import step_entry, test_entry
 from server.wording import problems_in
+from server.workflows.analysis_warnings import with_warnings
 from server.workflows.burst import start_burst
 from server.workflows.capture import capture_step, import_step
 from server.workflows.service import Service
@@ -56,6 +57,11 @@ def _reply(service: Service, test_id: str) -> dict[str, object]:
     }
 
 
+def _shown(service: Service, test_id: str, reply: dict[str, object]) -> TestReply:
+    entries = with_warnings(service, test_id, service.catalog.entries("analysis", test_id))
+    return TestReply.model_validate({**reply, "analyses": entries})
+
+
 @router.post("", summary="Make a test", status_code=201, responses=errors(404, 409, 422, 507))
 def create_test(service: ServiceDep, body: TestRequest, key: KeyHeader = None) -> TestReply:
     """Make a test; it gets its own copy of the calibration."""
@@ -65,7 +71,7 @@ def create_test(service: ServiceDep, body: TestRequest, key: KeyHeader = None) -
         return create(service, body.model_dump(), request)
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
-    return TestReply.model_validate(_reply(service, str(made["test_id"])))
+    return _shown(service, str(made["test_id"]), _reply(service, str(made["test_id"])))
 
 
 @router.get("", summary="Tests, oldest first", responses=errors(422))
@@ -79,7 +85,7 @@ def list_tests(service: ServiceDep, page: PageDep) -> TestList:
 @router.get("/{test_id:plain_id}", summary="One test", responses=errors(404))
 def get_test(service: ServiceDep, test_id: TestId, response: Response) -> TestReply:
     """Return a test with its steps and analyses; the header ETag names this state of it."""
-    return TestReply.model_validate(tagged(response, _reply(service, test_id)))
+    return _shown(service, test_id, tagged(response, _reply(service, test_id)))
 
 
 @router.patch(
@@ -95,7 +101,7 @@ def patch_test(
         require_match(if_match, etag_of(_reply(service, test_id)), f"test {test_id}")
         document = service.tests.update(test_id, changes)
         service.catalog.put_entry("test", "", test_id, test_entry(document))
-        return TestReply.model_validate(tagged(response, _reply(service, test_id)))
+        return _shown(service, test_id, tagged(response, _reply(service, test_id)))
 
 
 @router.post(

@@ -127,13 +127,15 @@ export function files(screen) {
     const film = ["gif", "mp4"].includes(form_ ?? "");
     const step = inputs.get("step");
     const variables = inputs.get("variables");
+    const frame = inputs.get("frame");
+    if (frame) frame.value = result.frame;
     if (step) step.value = film || screen.step === null ? "" : String(screen.step);
     if (variables) variables.value = (film || ["png", "svg"].includes(form_ ?? "")) && screen.info ? screen.info.name : "";
   }
 
   /** The report in a tab of its own. It is computed on request, which takes a while: a message states so. */
   function report() {
-    const address = api.address(`${result.path}/report`);
+    const address = api.address(`${result.path}/report`, { frame: result.frame });
     const note = h("p.quiet", { role: "status" }, "One HTML page with all results, to file or print.");
     const announce = () => { note.textContent = "The report is computed from the steps' files: some seconds, longer for many steps. It is shown when it is complete."; };
     return h("div", h("div.row", h("a.button", { href: address, target: "_blank", rel: "noopener", onclick: announce }, "Open the report"),

@@ -1,6 +1,7 @@
 // One analysis' results: answers are cached, so that stepping and playing request each once.
 import * as api from "../../lib/api.js";
 import { Grid } from "../../lib/point_grid.js";
+import { axesOf } from "../../widgets/triad.js";
 
 /** @import { Model, Reply } from "#routes" */
 /** @typedef {{ key: string, name: string, component: number | null, group: string, text: string, unit: string, about: string,
@@ -46,6 +47,29 @@ export class Result {
     /** @type {Map<string, { bytes: number, promise: Promise<any> }>} by key */
     this.kept = new Map();
     this.bytes = 0;
+    /** Axes that the numbers are read in: "specimen", "system", or written out. */
+    this.frame = "specimen";
+    /** @type {string | null} axes of another result that these are the same as */
+    this.follows = null;
+  }
+
+  /**
+   * Read everything in other axes from now on; also where the same axes were laid anew.
+   * @param {string} frame
+   */
+  use(frame) {
+    this.frame = frame;
+    this.kept.clear();
+    this.bytes = 0;
+  }
+
+  /** Directions of the axes in the reference image. */
+  axes() {
+    return this.#keep("axes", async () => {
+      const n = this.steps.includes(this.reference) ? this.reference : this.steps[0];
+      const [px, py, x, y] = await Promise.all(["x_px", "y_px", "x_mm", "y_mm"].map((name) => this.array(n, name)));
+      return { axes: axesOf(px.data, py.data, x.data, y.data) };
+    }).then((found) => found.axes);
   }
 
   /**
@@ -125,7 +149,7 @@ export class Result {
    */
   fields(n) {
     return this.#keep(`${n}`, async () => {
-      const { fields, cuts_px: cuts, uncertainty } = await api.get(`${this.path}/steps/${n}/fields`);
+      const { fields, cuts_px: cuts, frame, uncertainty } = await api.get(`${this.path}/steps/${n}/fields`, { frame: this.frame });
       /** @type {Shown[]} */
       const shown = [];
       for (const one of fields) {
@@ -142,7 +166,7 @@ export class Result {
       }
       const order = GROUPS.map(([name]) => name);
       shown.sort((a, b) => order.indexOf(a.group) - order.indexOf(b.group));
-      return { shown, cuts, uncertainty, all: new Set(fields.map((one) => one.name)) };
+      return { shown, cuts, frame, uncertainty, all: new Set(fields.map((one) => one.name)) };
     });
   }
 
@@ -152,7 +176,7 @@ export class Result {
    */
   array(n, name) {
     return this.#keep(`${n}/${name}`, async () => {
-      const got = await api.npy(`${this.path}/steps/${n}/fields/${name}`, { format: "npy" });
+      const got = await api.npy(`${this.path}/steps/${n}/fields/${name}`, { format: "npy", frame: this.frame });
       return { ...got, bytes: got.data.byteLength };
     });
   }

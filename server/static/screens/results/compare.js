@@ -2,6 +2,7 @@
 import * as api from "../../lib/api.js";
 import { FieldMap } from "../../widgets/field_map.js";
 import { Result, allTests } from "./analysis.js";
+import { drawTriad } from "../../widgets/triad.js";
 import { Scale } from "../../widgets/scale.js";
 import { chart } from "../../widgets/plots.js";
 import { h, replace, select, field, definitions, count, quantity, notify } from "../../lib/dom.js";
@@ -78,8 +79,22 @@ export async function compare(screen) {
   async function choose() {
     other = choice.value ? await Result.open(testChoice.value, choice.value) : null;
     const of = other;
+    await sameAxes();
     replace(stepChoice, h("option", { value: "same" }, "the same step"), of ? of.steps.map((n) => h("option", { value: n }, of.stepText(n))) : null);
     await update();
+  }
+  /** Both in the same axes: those of this analysis, written out, since the best plane of the other one is its own. */
+  async function sameAxes() {
+    if (other?.follows === result.frame) return;
+    let frame = "system";
+    if (result.frame === "specimen") {
+      const { alignment } = await api.post(`${result.path}/gauges`, { areas: [{}], variables: ["z_mm"], steps: [result.steps[0]] }, { frame: "specimen" });
+      if (alignment) frame = JSON.stringify({ kind: "given", rotation: alignment.rotation, origin_mm: alignment.origin_mm });
+    }
+    if (other) {
+      other.use(frame);
+      other.follows = result.frame;
+    }
   }
   testChoice.addEventListener("change", () => fillAnalyses().catch(notify));
   choice.addEventListener("change", () => choose().catch(notify));
@@ -119,6 +134,7 @@ export async function compare(screen) {
       panel.hidden = true;
       return;
     }
+    if (other.follows !== result.frame) await sameAxes();
     const n = stepChoice.value === "same" ? map.now.n : Number(stepChoice.value);
     const key = screen.state.field;
     const found = other.steps.includes(n) ? (await other.fields(n)).shown.find((one) => one.key === key) : null;
@@ -131,6 +147,7 @@ export async function compare(screen) {
     }
     if (!(await right.load(other, n, found, map.now.image)) || mine !== asked) return;
     right.view.empty.hidden = true;
+    result.axes().then((axes) => drawTriad(right.view.frame, axes, "as on the left"), () => {});
     const differ = show.value === "difference";
     const named = `${other.analysis.label || other.analysisId}, step ${n}`;
     rightName.textContent = differ ? `This less ${named}` : named;

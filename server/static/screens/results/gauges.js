@@ -264,7 +264,7 @@ export function gauges(screen) {
     if (screen.info.component !== null) return void replace(lineText, h("p.quiet", "A line needs a scalar field; choose another field."));
     const name = screen.info.name;
     replace(lineText, h("p.quiet", "Reading …"));
-    const answer = await api.post(`${result.path}/gauges`, body({ lines: [{ vertices_px: from }], variables: [name, "x_mm", "y_mm", "z_mm"].filter((v, k, each) => each.indexOf(v) === k), steps: [screen.step] }));
+    const answer = await api.post(`${result.path}/gauges`, body({ lines: [{ vertices_px: from }], variables: [name, "x_mm", "y_mm", "z_mm"].filter((v, k, each) => each.indexOf(v) === k), steps: [screen.step] }), { frame: result.frame });
     const [step] = answer.steps;
     if (step.problem) return void replace(lineText, problemText(api.problemOf(step.problem)));
     const [line] = step.lines ?? [];
@@ -323,7 +323,7 @@ export function gauges(screen) {
       return;
     }
     if (!answers.extensometer) replace(extTable, h("p.quiet", "Reading …"));
-    answers.extensometer = (await api.post(`${result.path}/gauges`, body({ extensometers: state.extensometers.map((one) => ({ name: one.name, a_px: one.a, b_px: one.b })) }))).steps;
+    answers.extensometer = (await api.post(`${result.path}/gauges`, body({ extensometers: state.extensometers.map((one) => ({ name: one.name, a_px: one.a, b_px: one.b })) }), { frame: result.frame })).steps;
     await abscissas();
     await drawExtensometers();
   }
@@ -405,7 +405,7 @@ export function gauges(screen) {
     if (screen.info.component !== null) return void replace(areaBox, h("p.quiet", "An area needs a scalar field; choose another field."));
     const { name } = screen.info;
     if (!areaBox.firstChild) replace(areaBox, h("p.quiet", "Reading …"));
-    const answer = await api.post(`${result.path}/gauges`, body({ areas: [{ rectangle_px: state.area }], variables: [name] }));
+    const answer = await api.post(`${result.path}/gauges`, body({ areas: [{ rectangle_px: state.area }], variables: [name] }), { frame: result.frame });
     drawArea(name, answer.steps);
   }
   /**
@@ -443,7 +443,7 @@ export function gauges(screen) {
   let last = "";
   screen.drawn.add(async () => {
     draw();
-    const now = `${screen.step} ${screen.info?.key}`;
+    const now = `${screen.step} ${screen.info?.key} ${result.frame}`;
     if (now === last) return;
     last = now;
     if (state.line) await readLine().catch(notify);

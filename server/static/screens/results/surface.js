@@ -152,15 +152,14 @@ export async function surface(screen) {
     for (let r = 0; r < g.rows - 1; r += 1) {
       for (let c = 0; c < g.cols - 1; c += 1) {
         const cell = r * g.cols + c;
-        if (g.cutCells.has(cell)) continue;
         const [p, q, s, t] = g.corners(cell);
         const good = [whole(p), whole(q), whole(s), whole(t)];
         const number_ = good.filter(Boolean).length;
-        if (number_ === 4) triangles.push(p, s, q, q, s, t);
-        else if (number_ === 3) triangles.push(...[p, s, t, q].filter((_, k) => good[[0, 2, 3, 1][k]]));
-        else continue;
-        if (good[0] && good[1]) lines.push(p, q);
-        if (good[0] && good[2]) lines.push(p, s);
+        const each = number_ === 4 ? [[p, s, q], [q, s, t]] : number_ === 3 ? [[p, s, t, q].filter((_, k) => good[[0, 2, 3, 1][k]])] : [];
+        for (const three_ of each) if (g.whole(cell, three_)) triangles.push(...three_);
+        if (!each.length) continue;
+        if (good[0] && good[1] && !g.parted(cell, p, q)) lines.push(p, q);
+        if (good[0] && good[2] && !g.parted(cell, p, s)) lines.push(p, s);
       }
     }
     const attribute = new THREE.BufferAttribute(at, 3);

@@ -2,8 +2,9 @@
 import * as api from "../../lib/api.js";
 import { View, stroke } from "../../widgets/view.js";
 import { greyOf } from "../../widgets/grey.js";
+import { stateBadge, warningsBox } from "../results/warnings.js";
 import { RegionEditor } from "../../widgets/region_editor.js";
-import { h, replace, svg, field, number, select, action, table, badge, num, count, quantity, notify, problemText, STATE_KIND } from "../../lib/dom.js";
+import { h, replace, svg, field, number, select, action, table, badge, num, count, quantity, notify, problemText } from "../../lib/dom.js";
 
 /** @import { Ends } from "#dom" */
 /** @import { Model } from "#routes" */
@@ -224,7 +225,8 @@ export async function measurePanel(id, test, ends, done) {
         text.textContent = now.state === "queued" ? "waiting" : `${stage ?? ""}${eta ? `, ${num(eta, 2)} s left` : ""}`;
       } });
       const problem = ["succeeded", "cancelled"].includes(ended.state) ? null : problemText(api.jobProblem(ended));
-      replace(progress, h("div.row", badge(ended.state, STATE_KIND[ended.state]), link), problem);
+      const warnings = /** @type {import("../results/warnings.js").Warning[] | undefined} */ (ended.result?.warnings);
+      replace(progress, h("div.row", stateBadge(ended.state, warnings), link), problem, warningsBox(warnings));
       await done();
     }
 

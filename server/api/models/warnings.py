@@ -1,0 +1,24 @@
+"""Warnings of results, as they travel."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from server.base.models import Reply
+
+
+class AnalysisWarning(Reply):
+    """A reason for which a result is not to be used as it is."""
+
+    code: str = Field(
+        description="Stable name: `epipolar_check_failed`, `low_coverage`, `cameras_off_zero`, `steps_failed` ...",
+        examples=["epipolar_check_failed"],
+    )
+    level: Literal["failed", "warning"] = Field(
+        description="`failed`: no number of it should be reported; `warning`: with care."
+    )
+    text: str = Field(description="The finding, with its figures.")
+    remedy: str = Field(description="What to do.")
+    steps: list[int] = Field(default_factory=list, description="Steps that it holds for; empty: all of it.")

@@ -1,0 +1,63 @@
+"""Result files in another frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from core.errors import MeasurementError
+from server.formats.results.reading import read_head
+from server.results.gauges.fields import FieldWriter
+from server.results.gauges.frames import frame_asked, frame_of_test
+from server.results.gauges.readings import read_gauges
+from server.results.gauges.request import Alignment, GaugeRequest
+from server.store.durable import known_json
+
+FRAME_HELP = "axes of positions, displacements and strain: system, specimen, or JSON as of a gauge's align (system)"
+
+
+def write_framed(files: Sequence[Path], asked: Alignment, folder: Path, *, strain: bool = True) -> list[Path]:
+    """Write result files in a frame that is laid through the first of them; return their paths.
+
+    Raises
+    ------
+    StereorigError
+        As :func:`read_gauges`.
+    """
+    request = GaugeRequest(align=asked)
+    writer = FieldWriter(folder, files[0].parent, request, strain=strain)
+    readings = read_gauges(files, request, writer)
+    problem = next((s.problem for s in readings.steps if s.problem is not None), None)
+    if problem is not None:
+        raise MeasurementError(problem.cause, code=problem.code, remedy=problem.remedy)
+    return writer.written
+
+
+def asked_at(text: str | None, folder: Path) -> Alignment | None:
+    """Return the frame that a command names for the results of a folder, None for the system frame.
+
+    Raises
+    ------
+    InputError
+        ``frame_invalid``.
+    """
+    kept = known_json(folder.absolute().parent.parent / "test.json").get("frame")
+    return frame_asked(text, frame_of_test(kept if isinstance(kept, dict) else None))
+
+
+def in_frame(files: Sequence[Path], asked: Alignment | None, out: Path) -> list[Path]:
+    """Return result files in a frame, written into a folder; they themselves for the system frame.
+
+    The frame is laid through the reference of the measurement, where its result lies beside them.
+
+    Raises
+    ------
+    StereorigError
+        As :func:`write_framed`.
+    """
+    if asked is None:
+        return list(files)
+    n = read_head(files[-1]).reference_step
+    reference = None if n is None else files[-1].parent / f"step_{n:04d}.nc"
+    before = [reference] if reference is not None and reference.is_file() and reference not in files else []
+    return write_framed([*before, *files], asked, out)[len(before) :]

@@ -1,0 +1,152 @@
+"""The specimen's frame: a tension along the image's vertical, the system frame at 45 degrees in the image."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import netCDF4
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from core.arrays import Float
+from core.errors import InputError, RegionError
+from core.strain import StrainOptions, surface_strain
+from server.formats.results.reading import read_field, read_head
+from server.formats.results.strain import read_strain
+from server.formats.results.writing import Provenance, write_field
+from server.results.gauges.framed import write_framed
+from server.results.gauges.frames import SPECIMEN, frame_asked, frame_of_test
+from server.results.gauges.readings import read_gauges
+from server.results.gauges.request import Alignment, AreaGauge, GaugeRequest, PlaneAlignment, PointGauge
+from server.workflows.framed import FramedResults
+from tests.support.gauge_field import SUBSET, make_field
+
+TENSION, LATERAL = 2000e-6, -661e-6
+# the system frame in the image: 45 degrees about the line of sight, as a grid on its corner makes it, and a tilt
+SYS_FROM_IMAGE = Rotation.from_euler("xz", [4.0, 45.0], degrees=True).as_matrix()
+SHIFT = np.array([3.0, -1.0, 40.0])
+# the file holds positions and displacements as float32: 3e-6 of 2 um between neighbours 0.14 mm apart
+TOLERANCE = 3e-6
+
+
+def shape(x_px: Float, y_px: Float) -> Float:
+    flat = np.stack([0.02 * (x_px - 90.0), 0.02 * (y_px - 100.0), np.zeros_like(x_px)], axis=-1)
+    return np.asarray(flat @ SYS_FROM_IMAGE.T + SHIFT)
+
+
+def pulled(x: Float) -> Float:
+    E = SYS_FROM_IMAGE @ np.diag([LATERAL, TENSION, 0.0]) @ SYS_FROM_IMAGE.T
+    # Green-Lagrange of a symmetric stretch U: (U^2 - 1) / 2
+    values, vectors = np.linalg.eigh(np.eye(3) + 2.0 * E)
+    U = vectors @ np.diag(np.sqrt(values)) @ vectors.T
+    return np.asarray((x - SHIFT) @ U.T + SHIFT + [0.05, 0.02, -0.03])
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("strip")
+    made = []
+    for n, motion in enumerate((None, pulled)):
+        field = make_field(motion, shape=shape)
+        strain = None if motion is None else surface_strain(field, StrainOptions(window=5), subset_px=SUBSET)
+        given = Provenance({"subset_px": SUBSET}, {"calibration": "aa", "reference_cam1": "bb"}, "1", step=n)
+        write_field(folder / f"step_{n:04d}.nc", field, given, strain)
+        made.append(folder / f"step_{n:04d}.nc")
+    return made
+
+
+def mean_strain(path: Path) -> Float:
+    strain = read_strain(path)
+    assert strain is not None
+    return np.asarray(np.nanmean(strain.strain, axis=(0, 1)))
+
+
+def test_the_files_stay_in_the_system_frame_and_the_specimens_reads_the_tension_along_y(
+    files: list[Path], tmp_path: Path
+) -> None:
+    before = files[1].read_bytes()
+    made = write_framed(files, SPECIMEN, tmp_path / "out")
+    assert files[1].read_bytes() == before
+    turned = 0.5 * (TENSION + LATERAL)
+    # the tilt of 4 degrees turns X_sys, laid into the surface, by 0.07 degrees: 2.4e-3 of the shear of 1.3e-3
+    assert mean_strain(files[1]) == pytest.approx([turned, turned, 0.5 * (TENSION - LATERAL)], abs=5e-6)
+    assert mean_strain(made[1]) == pytest.approx([LATERAL, TENSION, 0.0], abs=TOLERANCE)
+    field = read_field(made[0])
+    # X runs to the right and Y down the image; the origin is the middle of the points
+    assert np.diff(field.xyz_mm[..., 0], axis=1) == pytest.approx(0.14, abs=1e-5)
+    assert np.diff(field.xyz_mm[..., 1], axis=0) == pytest.approx(0.14, abs=1e-5)
+    assert np.abs(field.xyz_mm[..., 2]).max() < 1e-5
+
+
+def test_a_file_in_the_specimens_frame_says_so_and_names_no_axis_of_the_system(
+    files: list[Path], tmp_path: Path
+) -> None:
+    made = write_framed(files, SPECIMEN, tmp_path / "out")
+    assert read_head(made[1]).frame.startswith("aligned by plane, X along camera 1's image rows; before: sys")
+    with netCDF4.Dataset(made[1]) as data:
+        assert data["w_mm"].long_name.endswith("Z_frame component")
+        assert not [v.long_name for v in data.variables.values() if "_sys" in getattr(v, "long_name", "")]
+        assert "_sys" not in data.strain_axes
+
+
+def test_gauges_read_strain_along_the_frames_axes(files: list[Path]) -> None:
+    names = ["exx", "eyy", "exy", "e1", "sigma_eyy"]
+    whole, point = AreaGauge(name="all"), PointGauge(name="p", xy_px=(90.0, 100.0))
+    request = GaugeRequest(areas=[whole], points=[point], variables=names, align=SPECIMEN)
+    step = read_gauges(files, request).steps[1]
+    area, at = step.areas[0].values, step.points[0].values
+    for name, value in (("exx", LATERAL), ("eyy", TENSION), ("exy", 0.0), ("e1", TENSION)):
+        assert area[name].mean == pytest.approx(value, abs=TOLERANCE)
+        assert at[name].value == pytest.approx(value, abs=TOLERANCE)
+    assert at["eyy"].sigma is not None
+    assert at["eyy"].sigma > 0.0
+
+
+RIGHT = SYS_FROM_IMAGE[:, 0]
+FRAMES: list[dict[str, object]] = [
+    {"kind": "plane", "x_direction": RIGHT.tolist()},
+    {"kind": "plane", "x_line_px": [[47.0, 100.0], [130.0, 100.0]]},
+    {"kind": "3-2-1", "positions_px": [[50, 70], [130, 70], [90, 140], [50, 100], [130, 100], [90, 100]]},
+    {"kind": "given", "rotation": SYS_FROM_IMAGE.T.tolist(), "origin_mm": SHIFT.tolist()},
+]
+
+
+@pytest.mark.parametrize("frame", FRAMES, ids=["direction", "line", "3-2-1", "given"])
+def test_every_way_to_lay_the_frame_gives_the_same_strain(
+    files: list[Path], tmp_path: Path, frame: dict[str, object]
+) -> None:
+    asked = frame_asked(json.dumps(frame), SPECIMEN)
+    assert asked is not None
+    made = write_framed(files, asked, tmp_path / "out")
+    assert mean_strain(made[1]) == pytest.approx([LATERAL, TENSION, 0.0], abs=TOLERANCE)
+
+
+def test_a_frame_is_named_system_specimen_or_written_out() -> None:
+    of_test: Alignment = PlaneAlignment(kind="plane", x_direction=(0.0, 1.0, 0.0))
+    assert frame_asked(None, of_test) is None
+    assert frame_asked("system", of_test) is None
+    assert frame_asked("specimen", of_test) == of_test
+    assert frame_of_test(None) == SPECIMEN
+    assert frame_of_test({"kind": "plane", "x_direction": [0, 1, 0]}) == of_test
+    with pytest.raises(InputError, match="names no frame") as refused:
+        frame_asked('{"kind": "cube"}', of_test)
+    assert refused.value.code == "frame_invalid"
+
+
+def test_a_rotation_that_is_none_is_refused(files: list[Path], tmp_path: Path) -> None:
+    mirrored = np.diag([1.0, 1.0, -1.0]).tolist()
+    asked = frame_asked(json.dumps({"kind": "given", "rotation": mirrored}), SPECIMEN)
+    assert asked is not None
+    with pytest.raises(RegionError, match="right-handed"):
+        write_framed(files, asked, tmp_path / "out")
+
+
+def test_a_step_in_a_frame_is_made_once(files: list[Path], tmp_path: Path) -> None:
+    kept = FramedResults(tmp_path / "kept")
+    first = kept.file(files, SPECIMEN)
+    assert kept.file(files, SPECIMEN) == first
+    assert mean_strain(first) == pytest.approx([LATERAL, TENSION, 0.0], abs=TOLERANCE)
+    other = kept.file(files, PlaneAlignment(kind="plane"))
+    assert other != first
