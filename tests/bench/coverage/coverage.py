@@ -104,7 +104,7 @@ def main() -> int:
     if not args.page:
         words = [word for word in args.strata.split(",") if word]
         chosen = [s for s in STRATA if not words or any(word in s.name for word in words)]
-        for name in _THREAD_SETTINGS:
+        for name in _THREAD_SETTINGS:  # a process each: their kernels share nothing
             os.environ[name] = "1"
         todo = list(wanted(chosen, args.replicates, args.others))
         with ProcessPoolExecutor(args.threads, mp_context=get_context("spawn")) as pool:

@@ -20,7 +20,7 @@ LINES, PITCH_MM, WIDTH_MM = (7, 7), 1.55, 0.14
 CORNERS, SQUARE_MM = (7, 6), 1.4
 POSITIONS_MM = (0.0, 5.0, 10.0)
 POSES = 9
-KNOT_MM = {"soft": 0.12, "discs": 0.4}
+KNOT_MM = {"soft": 0.18, "discs": 0.4}
 
 
 @dataclass(frozen=True)
