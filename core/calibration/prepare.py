@@ -9,6 +9,7 @@ import numpy as np
 
 from core.arrays import Float
 from core.calibration.checks.positions import PositionCheck, check_positions
+from core.calibration.fit.adjust import parts_of_priors
 from core.calibration.fit.layout import Layout, State, camera_of
 from core.calibration.fit.named import named_covariance, parameter_names
 from core.calibration.fit.normal import assemble, covariance
@@ -28,7 +29,7 @@ from core.calibration.inputs import (
 from core.calibration.uncertainty import VolumeUncertainty, volume_uncertainty
 from core.cameras.stereo import StereoPair
 from core.errors import CalibrationError, CalibrationInputError
-from core.names import CAMERAS
+from core.names import CAMERAS, Cause
 
 EXPECTED_NOISE_PX = 0.005  # of a localiser, for predictions before any residual is known
 _SAME_POSITION_MM = 1e-6
@@ -180,9 +181,23 @@ def covariance_at(problem: Problem, layout: Layout, state: State, *, noise_px: f
     CalibrationError
         Code ``calibration_singular``.
     """
+    return covariance_parts_at(problem, layout, state, noise_px=noise_px)[0]
+
+
+def covariance_parts_at(
+    problem: Problem, layout: Layout, state: State, *, noise_px: float
+) -> tuple[Float, dict[Cause, Float]]:
+    """Covariance as :func:`covariance_at`, and its parts by what is known before of stage and target.
+
+    Raises
+    ------
+    CalibrationError
+        Code ``calibration_singular``.
+    """
     noise = np.full(2, noise_px)
     normal = assemble(layout, state, problem.rows, problem.flat_nodes_mm, problem.priors(layout), noise)
-    return covariance(normal).unknowns
+    found = covariance(normal)
+    return found.unknowns, parts_of_priors(layout, normal, found)
 
 
 def compare_positions(

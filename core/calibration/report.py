@@ -15,7 +15,7 @@ from core.calibration.choice.lens import Chosen
 from core.calibration.choice.screening import points_mm
 from core.calibration.fit.adjust import Adjustment
 from core.calibration.fit.layout import camera_of, camera_seeing
-from core.calibration.fit.named import named_covariance, parameter_names
+from core.calibration.fit.named import named_by_cause, named_covariance, parameter_names
 from core.calibration.fit.unit_vector import direction
 from core.calibration.inputs import AnyTarget, CalibrationOptions, NominalCamera, flatness_mm
 from core.calibration.result import CalibrationResult, LensChosen, StageFound, ViewResult
@@ -95,6 +95,9 @@ def build_result(
         pair=pair,
         names=names,
         covariance=covariance,
+        covariance_by_cause=named_by_cause(
+            layout, adjustment.priors, state.x, adjustment.covariance, adjustment.by_prior
+        ),
         lens=LensChosen(chosen.model, chosen.reasons, chosen.structure),
         stage=_stage(adjustment),
         pitch_scale=float(state.x[layout.pitch_scale]),

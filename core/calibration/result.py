@@ -17,7 +17,7 @@ from core.calibration.inputs import CalibrationOptions, Moves, NominalCamera
 from core.calibration.uncertainty import VolumeUncertainty
 from core.cameras.camera import TEN_PARAMETER_NAMES, RigidTransform
 from core.cameras.stereo import StereoPair
-from core.names import CAMERAS, CameraName
+from core.names import CAMERAS, CameraName, Cause
 
 #: parameters of a pair with the paper's lens and a given aspect ratio, the usual order of a covariance
 COVARIANCE_NAMES = tuple(f"{camera}.{name}" for camera in CAMERAS for name in TEN_PARAMETER_NAMES)
@@ -124,6 +124,9 @@ class CalibrationResult:
     names, covariance
         Estimated parameters of camera 1, then of camera 2, and their covariance (n, n); with the paper's lens and a
         given aspect ratio :data:`COVARIANCE_NAMES`. Priors are included.
+    covariance_by_cause
+        (n, n) parts of it, which add up to it: ``calibration`` of the views' noise, ``stage`` of what was known of
+        steps, scale and tilt, ``target`` of the pitch and the nodes.
     lens
         Lens model and why.
     stage
@@ -160,6 +163,7 @@ class CalibrationResult:
     pair: StereoPair
     names: tuple[str, ...]
     covariance: Float
+    covariance_by_cause: dict[Cause, Float]
     lens: LensChosen
     stage: StageFound
     pitch_scale: float

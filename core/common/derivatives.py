@@ -18,6 +18,7 @@ from core.cameras.stereo import StereoPair
 
 #: of the comparisons camera 2 at t0, camera 1 and camera 2 at t: the inverse of noise I plus the reference's in all
 _WEIGHTS = np.eye(3) - 0.25
+_NOISE = np.kron(np.eye(3) + 1.0, np.eye(2))
 
 
 def measured_derivatives(
@@ -51,26 +52,69 @@ def measured_derivatives(
     alone = -np.linalg.solve(first, B)
     if displaced_mm is None:
         return np.asarray(alone[:, :3])
-    # unknowns depth along camera 1's ray, offset, current X Y Z; equations camera 2 at t0, camera 1 and 2 at t. What
-    # camera 1's equations at t0 say is put in: the point moves by ray d + given
-    ray = points_mm - pair.cam1.centre_sys_mm
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    # what camera 1's equations at t0 say is put in: the point moves by ray d + given
     given = -np.linalg.pinv(A1) @ B[:, :2]
-    now1, now2 = pair.cam1.point_jacobian(displaced_mm), pair.cam2.point_jacobian(displaced_mm)
+    ray, A = _equations(pair, points_mm, displaced_mm)
     B_now = image_derivatives(pair, displaced_mm, names)
-    across_now = _carried(pair, points_mm, displaced_mm, across)
-    A = np.zeros((n, 6, 5))
-    A[:, :2, 0], A[:, :2, 1] = (A2 @ ray[..., None])[..., 0], across
-    A[:, 2:4, 2:], A[:, 4:, 2:], A[:, 4:, 1] = now1, now2, across_now
     known = np.concatenate([B[:, 2:] + A2 @ given, B_now], axis=1)
-    W = np.kron(_WEIGHTS, np.eye(2))
-    At = np.swapaxes(A, 1, 2) @ W
-    solved = -np.linalg.solve(At @ A, At @ known)
+    solved = -_gain(A) @ known
     at_reference = ray[..., None] * solved[:, :1] + given
     out = np.empty((n, 6, p))
     out[:, :3] = alone[:, :3]
     out[:, 3:] = solved[:, 2:] - at_reference
     return out
+
+
+def new_noise_share(pair: StereoPair, points_mm: Float, displaced_mm: Float) -> Float:
+    """Return the share of the noise of U, V, W that is new at t; all else is the reference pair's, in all steps alike.
+
+    The reference subset's noise is in all three comparisons, that of camera 2's match at t0 in the first.
+
+    Parameters
+    ----------
+    pair
+        The cameras.
+    points_mm, displaced_mm
+        (n, 3) points at the reference and at t, system frame.
+
+    Returns
+    -------
+    Float
+        (n, 3, 3) symmetric S, eigenvalues 0 to 1: of a covariance C with symmetric root R the part R S R is new.
+    """
+    ray, A = _equations(pair, points_mm, displaced_mm)
+    to_uvw = np.zeros((len(points_mm), 3, 5))
+    to_uvw[:, :, 0], to_uvw[:, :, 2:] = -ray, np.eye(3)
+    gain = to_uvw @ _gain(A)
+    new = gain[:, :, 2:]
+    every = gain @ _NOISE @ np.swapaxes(gain, 1, 2)
+    value, vector = np.linalg.eigh(every)
+    half = (vector / np.sqrt(value)[:, None, :]) @ np.swapaxes(vector, 1, 2)
+    part = half @ new
+    return np.asarray(part @ np.swapaxes(part, 1, 2))
+
+
+def _equations(pair: StereoPair, points_mm: Float, displaced_mm: Float) -> tuple[Float, Float]:
+    """(n, 3) unit rays of camera 1, and (n, 6, 5) the comparisons' derivatives.
+
+    Unknowns depth along camera 1's ray, offset, current X Y Z; equations camera 2 at t0, camera 1 and 2 at t.
+    """
+    A2 = pair.cam2.point_jacobian(points_mm)
+    ray = points_mm - pair.cam1.centre_sys_mm
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    across = _across(pair, points_mm)
+    now1, now2 = pair.cam1.point_jacobian(displaced_mm), pair.cam2.point_jacobian(displaced_mm)
+    across_now = _carried(pair, points_mm, displaced_mm, across)
+    A = np.zeros((len(points_mm), 6, 5))
+    A[:, :2, 0], A[:, :2, 1] = (A2 @ ray[..., None])[..., 0], across
+    A[:, 2:4, 2:], A[:, 4:, 2:], A[:, 4:, 1] = now1, now2, across_now
+    return ray, A
+
+
+def _gain(A: Float) -> Float:
+    """(n, 5, 6) of the unknowns over what the comparisons show."""
+    At = np.swapaxes(A, 1, 2) @ np.kron(_WEIGHTS, np.eye(2))
+    return np.asarray(np.linalg.solve(At @ A, At))
 
 
 def _across(pair: StereoPair, points_mm: Float) -> Float:

@@ -1,4 +1,4 @@
-"""The calibration's part of a field's uncertainty."""
+"""What is common in a field's uncertainty: the calibration's part to all points, the reference's noise to all steps."""
 
 from __future__ import annotations
 
@@ -6,8 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from core.common.factor import ParameterCovariance, common_factor
+from core.cameras.stereo import StereoPair
+from core.common.budget import budget_of
+from core.common.derivatives import new_noise_share
+from core.common.factor import ParameterCovariance, factor_of
 from core.field.points.result import Field
+from core.field.points.shared_pixels import roots_of
 
 
 def with_common_factor(field: Field, source: ParameterCovariance | None) -> Field:
@@ -26,11 +30,39 @@ def with_common_factor(field: Field, source: ParameterCovariance | None) -> Fiel
         ``covariance_not_positive``.
     """
     if source is None:
-        return replace(field, common=None)
+        return replace(field, common=None, causes=None)
     valid = field.valid
     points = field.xyz_mm[valid]
     now = None if field.uvw_mm is None else points + field.uvw_mm[valid]
-    found = common_factor(source, points, now)
-    out = np.full((*field.shape, *found.shape[1:]), np.nan)
-    out[valid] = found
-    return replace(field, common=out)
+    found = factor_of(source, points, now)
+    out = np.full((*field.shape, *found.values.shape[1:]), np.nan)
+    out[valid] = found.values
+    return replace(field, common=out, causes=found.causes)
+
+
+def notes_of(field: Field) -> tuple[str, ...]:
+    """Return what budgets of a field's quantities do not tell apart, and what they do not include."""
+    at_reference = None if field.frozen_covariance is None else 0.0
+    row = None if field.common is None else np.zeros(field.common.shape[-1])
+    return budget_of(0.0, at_reference, row, field.causes).notes
+
+
+def with_frozen_noise(field: Field, pair: StereoPair) -> Field:
+    """Return the field with the part of its displacement's noise that is the reference pair's, in all steps alike.
+
+    Parameters
+    ----------
+    field
+        In the system frame, as it is shown: smoothed or not.
+    pair
+        The cameras.
+    """
+    if field.uvw_mm is None or field.references is not None:
+        return replace(field, frozen=None)
+    valid = field.valid
+    points = field.xyz_mm[valid]
+    own = field.covariance[valid][:, 3:, 3:]
+    root = roots_of(own)
+    out = np.full((*field.shape, 3, 3), np.nan)
+    out[valid] = own - root @ new_noise_share(pair, points, points + field.uvw_mm[valid]) @ root
+    return replace(field, frozen=out)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from core.arrays import Bool, Float
+from core.common.budget import UNKNOWN, Budget, budgets_through
 from core.errors import MeasurementError, RegionError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels, roots_of
@@ -42,6 +43,8 @@ class Alignment:
     covariance: Float
     residual_rms_mm: float
     points: int
+    budgets: tuple[Budget, ...] = (UNKNOWN,) * 6
+    """Of the six errors."""
 
 
 def align_plane(
@@ -103,14 +106,20 @@ def align_plane(
     roots = roots_of(np.where(field.valid[..., None, None], field.covariance[..., :3, :3], 0.0))
     each = gain @ roots
     three = np.einsum("rcij,rckj->ik", each, shared.positions.summed(field, each))
+    own = np.zeros((6, 6))
+    full, position = np.zeros((6, 6)), np.ix_([0, 1, 5], [0, 1, 5])
+    own[position] = 0.5 * (three + three.T)
+    row = None
     if field.common is not None:
         shift = np.einsum("rcij,rcjk->ik", gain, np.where(field.valid[..., None, None], field.common[..., :3, :], 0.0))
         three = three + shift @ shift.T
-    full = np.zeros((6, 6))
-    position = np.ix_([0, 1, 5], [0, 1, 5])
+        row = np.zeros((6, shift.shape[1]))
+        row[[0, 1, 5]] = shift
     full[position] = 0.5 * (three + three.T)
+    # positions have the reference pair's noise alone
+    budgets = budgets_through(np.eye(6), own, own, row, field.causes)
     rms = float(np.sqrt(np.mean(((x - origin) @ normal) ** 2)))
-    return Alignment(R, origin, full, rms, len(x))
+    return Alignment(R, origin, full, rms, len(x), budgets)
 
 
 def align_3_2_1(field: Field, positions_px: ArrayLike, *, shared: SharedPixels) -> Alignment:
@@ -155,8 +164,8 @@ def align_3_2_1(field: Field, positions_px: ArrayLike, *, shared: SharedPixels) 
     R, origin = _three_two_one(x)
     first, second = (i.ravel() for i in np.meshgrid(np.arange(6), np.arange(6), indexing="ij"))
     blocks = positions.covariance(shared, first, second)[:, :3, :3].reshape(6, 6, 3, 3)
-    joint = np.swapaxes(blocks, 1, 2).reshape(18, 18)
-    common = positions.common()
+    joint = own = np.swapaxes(blocks, 1, 2).reshape(18, 18)
+    common, shift = positions.common(), None
     if common is not None:
         shift = common[:, :3].reshape(18, -1)
         joint = joint + shift @ shift.T
@@ -171,7 +180,8 @@ def align_3_2_1(field: Field, positions_px: ArrayLike, *, shared: SharedPixels) 
             turn = R @ R2.T  # of the new axes, along the new axes
             ends.append(np.concatenate([[turn[2, 1], turn[0, 2], turn[1, 0]], R @ (o2 - origin)]))
         slope[:, k] = (ends[0] - ends[1]) / (2.0 * step)
-    return Alignment(R, origin, slope @ joint @ slope.T, 0.0, 6)
+    budgets = budgets_through(slope, own, own, shift, field.causes)
+    return Alignment(R, origin, slope @ joint @ slope.T, 0.0, 6, budgets)
 
 
 def _three_two_one(x: Float) -> tuple[Float, Float]:
@@ -219,5 +229,6 @@ def aligned(field: Field, alignment: Alignment) -> Field:
         rotation_rad=None if field.rotation_rad is None else field.rotation_rad @ R.T,
         covariance=J @ field.covariance @ J.T,
         common=None if field.common is None else J @ field.common,
+        frozen=None if field.frozen is None else R @ field.frozen @ R.T,
         starts=None,
     )

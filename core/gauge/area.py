@@ -12,6 +12,7 @@ from core.errors import RegionError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels, steps_px
 from core.field.region.region import PointGrid
+from core.gauge.reading import MISSING, Reading, reading_of
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,8 @@ class AreaStatistics:
         it is unknown.
     mean_sigma_calibration
         The common factor's part of it; NaN where that is not known, and then not included.
+    mean_reading
+        The mean with its budget.
     """
 
     count: int
@@ -42,6 +45,7 @@ class AreaStatistics:
     rms: float
     mean_sigma: float
     mean_sigma_calibration: float = float("nan")
+    mean_reading: Reading = MISSING
 
 
 def points_within(field: Field, polygon_px: ArrayLike | None) -> Bool:
@@ -75,7 +79,14 @@ def points_within(field: Field, polygon_px: ArrayLike | None) -> Bool:
 
 
 def area_statistics(
-    field: Field, values: Float, sigma: Float | None, inside: Bool, *, shared: SharedPixels, common: Float | None = None
+    field: Field,
+    values: Float,
+    sigma: Float | None,
+    inside: Bool,
+    *,
+    shared: SharedPixels,
+    common: Float | None = None,
+    sigma_reference: Float | None = None,
 ) -> AreaStatistics:
     """Return the statistics of values over an area.
 
@@ -93,28 +104,36 @@ def area_statistics(
         The correlation of neighbouring points.
     common
         (r, c, k) the variable's common factor, which a mean does not reduce.
+    sigma_reference
+        (r, c) the reference pair's part of the own standard deviations; None where it is not told apart.
     """
     used = inside & field.valid & np.isfinite(values)
     v = values[used]
     n = int(v.size)
-    mean_sigma = of_calibration = float("nan")
+    mean = MISSING
+
+    def variance(own: Float) -> float:
+        s = np.where(used, own, 0.0)
+        return float(np.sum(s * shared.summed(field, s))) / n**2
+
+    if n:
+        mean = Reading(float(v.mean()), float("nan"))
     if n and sigma is not None and np.isfinite(sigma[used]).all():
-        s = np.where(used, sigma, 0.0)
-        mean_sigma = float(np.sqrt(max(float(np.sum(s * shared.summed(field, s))), 0.0)) / n)
-        if common is not None:
-            of_calibration = float(np.linalg.norm(common[used].mean(axis=0)))
-            mean_sigma = float(np.hypot(mean_sigma, of_calibration))
+        frozen = None if sigma_reference is None else variance(sigma_reference)
+        row = None if common is None else np.asarray(common[used].mean(axis=0))
+        mean = reading_of(mean.value, variance(sigma), frozen, row, field.causes)
     if not n:
         nan = float("nan")
         return AreaStatistics(0, int(inside.sum()), nan, nan, nan, nan, nan, nan)
     return AreaStatistics(
         count=n,
         points=int(inside.sum()),
-        mean=float(v.mean()),
+        mean=mean.value,
         sd=float(v.std(ddof=1)) if n > 1 else float("nan"),
         minimum=float(v.min()),
         maximum=float(v.max()),
         rms=float(np.sqrt(np.mean(v**2))),
-        mean_sigma=mean_sigma,
-        mean_sigma_calibration=of_calibration,
+        mean_sigma=mean.sigma,
+        mean_sigma_calibration=mean.sigma_calibration,
+        mean_reading=mean,
     )

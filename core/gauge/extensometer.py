@@ -11,7 +11,7 @@ from core.arrays import Float
 from core.errors import RegionError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
-from core.gauge.reading import MISSING, Reading
+from core.gauge.reading import MISSING, Reading, reading_of
 from core.gauge.sampling import Samples, sample
 
 
@@ -74,6 +74,8 @@ def extensometer(field: Field, a_px: ArrayLike, b_px: ArrayLike, *, shared: Shar
     if why:
         return Extensometer(missing=", ".join(why))
     cov = _both_ends(samples, shared)
+    at_reference = samples.reference_alone()
+    frozen = None if at_reference is None else _both_ends(at_reference, shared)
     common = samples.common()
     ends_common = None if common is None else common.reshape(cov.shape[0], -1)
     n = cov.shape[0] // 2
@@ -87,11 +89,9 @@ def extensometer(field: Field, a_px: ArrayLike, b_px: ArrayLike, *, shared: Shar
     d = np.concatenate([moving, -moving]) / length
 
     def reading(value: float, slope: Float) -> Reading:
-        own = float(np.sqrt(max(float(slope @ cov @ slope), 0.0)))
-        if ends_common is None:
-            return Reading(value, own)
-        shared_part = float(np.linalg.norm(slope @ ends_common))
-        return Reading(value, float(np.hypot(own, shared_part)), shared_part)
+        of_reference = None if frozen is None else float(slope @ frozen @ slope)
+        row = None if ends_common is None else slope @ ends_common
+        return reading_of(value, float(slope @ cov @ slope), of_reference, row, field.causes)
 
     if field.uvw_mm is None:
         return Extensometer(length0_mm=reading(length0, d0), length_mm=reading(length0, d0))

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from core.arrays import Bool, Float
+from core.common.budget import Budget, budgets_through
 from core.errors import InputError, MeasurementError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels, roots_of
@@ -68,6 +69,10 @@ class RigidMotion:
     """(6, k) common factor of the small rotation and the translation; None where the field has none."""
     sigma_common: Float
     """(6,) the common part's standard deviations, as ``covariance``; NaN where the field has none."""
+    budgets: tuple[Budget, ...]
+    """Of the rotation vector's three components (rad) and the translation's (mm)."""
+    reference_covariance: Float | None
+    """(6, 6) part of ``own_covariance`` that is the reference pair's noise; None where it is not told apart."""
 
 
 def skew(v: Float) -> Float:
@@ -136,6 +141,8 @@ def rigid_motion(
     gain = np.zeros((*field.shape, 6, 3))
     gain[used] = np.linalg.solve(H, np.swapaxes(weight[:, None, None] * (W @ A), 1, 2))
     own = _fit_covariance(field, shared, gain, R)
+    at_reference = field.reference_alone
+    frozen = None if at_reference is None else _fit_covariance(at_reference, shared, gain, R)
     common = _fit_common(field, gain, R)
     small = own if common is None else own + common @ common.T
     vector = Rotation.from_matrix(R).as_rotvec()
@@ -154,6 +161,8 @@ def rigid_motion(
         own_covariance=own,
         common=common,
         sigma_common=np.full(6, np.nan) if common is None else np.linalg.norm(to_vector @ common, axis=1),
+        budgets=budgets_through(to_vector, own, frozen, common, field.causes),
+        reference_covariance=frozen,
     )
 
 
@@ -200,15 +209,22 @@ def without_rigid_motion(field: Field, motion: RigidMotion, *, shared: SharedPix
     P = np.zeros((*field.shape, 6, 6))
     P[..., 3:, :3] = R.T @ skew(arm)
     P[..., 3:, 3:] = -R.T
-    roots = roots_of(np.where(valid[..., None, None], field.covariance, 0.0))
     M = np.concatenate([np.eye(3) - R, np.eye(3)], axis=1)
-    common = shared.summed(field, motion.gain @ (M @ roots)) @ roots  # (r, c, 6, 6) of dp with dX, dU of the point
-    mixed = P @ common @ J.T
-    cov = J @ field.covariance @ J.T + mixed + np.swapaxes(mixed, -1, -2)
-    cov = cov + P @ motion.own_covariance @ np.swapaxes(P, -1, -2)
-    cov[~valid] = np.nan
+
+    def moved_back(covariance: Float, of_fit: Float) -> Float:
+        roots = roots_of(np.where(valid[..., None, None], covariance, 0.0))
+        common = shared.summed(field, motion.gain @ (M @ roots)) @ roots  # (r, c, 6, 6) of dp with dX, dU of the point
+        mixed = P @ common @ J.T
+        cov = J @ covariance @ J.T + mixed + np.swapaxes(mixed, -1, -2)
+        cov = cov + P @ of_fit @ np.swapaxes(P, -1, -2)
+        cov[~valid] = np.nan
+        return np.asarray(cov)
+
+    cov, at_reference, frozen = moved_back(field.covariance, motion.own_covariance), field.frozen_covariance, None
+    if at_reference is not None and motion.reference_covariance is not None:
+        frozen = moved_back(at_reference, motion.reference_covariance)[..., 3:, 3:]
     left = None if field.common is None or motion.common is None else J @ field.common + P @ motion.common
-    return replace(field, uvw_mm=uvw, rotation_rad=rotation, covariance=cov, common=left, starts=None)
+    return replace(field, uvw_mm=uvw, rotation_rad=rotation, covariance=cov, common=left, frozen=frozen, starts=None)
 
 
 def _fit_covariance(field: Field, shared: SharedPixels, gain: Float, R: Float) -> Float:

@@ -8,7 +8,7 @@ squared spacing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -66,6 +66,11 @@ class Samples:
     def common(self) -> Float | None:
         """Return the positions' common factor (m, n, k); None where the field has none."""
         return None if self.field.common is None else self.of(self.field.common)
+
+    def reference_alone(self) -> Samples | None:
+        """Return the samples with the reference pair's noise alone; None where it is not told apart."""
+        field = self.field.reference_alone
+        return None if field is None else replace(self, field=field)
 
     def covariance(self, shared: SharedPixels, first: ArrayLike, second: ArrayLike) -> Float:
         """Return the own covariance between pairs of positions: from the points' and their subsets' common pixels.

@@ -47,11 +47,7 @@ def repaired_covariance(
     pose_index
         Which parameters are camera 2's pose, in the order of :data:`core.cameras.camera.POSE_NAMES`.
     """
-    k = len(covariance)
-    whole = np.eye(k)
-    pose = list(pose_index)
-    for j, (ahead, back) in enumerate(stepped):
-        whole[pose, j] = _pose_slope(repair, ahead, back) / (2.0 * steps[j])
+    whole, pose = carried_parameters(repair, stepped, steps, pose_index), list(pose_index)
     out = whole @ covariance @ whole.T
     own = np.stack(
         [
@@ -67,6 +63,16 @@ def repaired_covariance(
     )
     out[np.ix_(pose, pose)] += repair.length_sigma**2 * np.outer(length, length)
     return np.asarray(0.5 * (out + out.T))
+
+
+def carried_parameters(
+    repair: Repair, stepped: Sequence[tuple[StereoPair, StereoPair]], steps: Float, pose_index: Sequence[int]
+) -> Float:
+    """Return the derivatives (k, k) of the parameters after a repair over the old ones; see the arguments above."""
+    whole, pose = np.eye(len(steps)), list(pose_index)
+    for j, (ahead, back) in enumerate(stepped):
+        whole[pose, j] = _pose_slope(repair, ahead, back) / (2.0 * steps[j])
+    return whole
 
 
 def _pose_slope(repair: Repair, ahead: StereoPair, back: StereoPair) -> Float:

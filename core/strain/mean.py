@@ -6,9 +6,13 @@ sum over the points: each point's weight is the sum over all windows of the area
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from core.arrays import Bool, Float
+from core.common.budget import Budget, budget_of
+from core.common.factor import Causes
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels, roots_of
 from core.field.region.window import window_offsets
@@ -19,10 +23,56 @@ from core.strain.tensors import strain_slopes
 from core.strain.window import plane_weights
 
 
+@dataclass(frozen=True)
+class MeanStrainVariance:
+    """Of the means of exx, eyy, exy over an area.
+
+    Attributes
+    ----------
+    own
+        (3,) variance from the points' own noise; NaN without strain.
+    reference
+        (3,) the reference pair's part of it; None where it is not told apart.
+    common
+        (3, k) common factor; None where it is not known.
+    causes
+        Of its columns.
+    """
+
+    own: Float
+    reference: Float | None = None
+    common: Float | None = None
+    causes: Causes | None = None
+
+    @property
+    def budgets(self) -> tuple[Budget, ...]:
+        """The budgets of the three means."""
+        return tuple(
+            budget_of(
+                float(self.own[k]),
+                None if self.reference is None else float(self.reference[k]),
+                None if self.common is None else self.common[k],
+                self.causes,
+            )
+            for k in range(3)
+        )
+
+
 def mean_strain_sigma(field: Field, options: StrainOptions, inside: Bool, *, subset_px: float) -> tuple[Float, Float]:
     """Return the standard uncertainties (3,) of the means of exx, eyy, exy over an area, and the calibration's part.
 
-    NaN without strain; the part alone where the field has no common factor.
+    NaN without strain; the part alone where the field has no common factor. Takes what :func:`mean_strain_variance`
+    does.
+    """
+    found = mean_strain_variance(field, options, inside, subset_px=subset_px)
+    if found.common is None:
+        return np.sqrt(found.own), np.full(3, np.nan)
+    part = np.linalg.norm(found.common, axis=1)
+    return np.asarray(np.hypot(np.sqrt(found.own), part)), np.asarray(part)
+
+
+def mean_strain_variance(field: Field, options: StrainOptions, inside: Bool, *, subset_px: float) -> MeanStrainVariance:
+    """Return the uncertainty of the means of exx, eyy, exy over an area, by where it comes from.
 
     Parameters
     ----------
@@ -52,7 +102,7 @@ def mean_strain_sigma(field: Field, options: StrainOptions, inside: Bool, *, sub
     used = good & inside
     n = int(used.sum())
     if n == 0:
-        return np.full(3, np.nan), np.full(3, np.nan)
+        return MeanStrainVariance(np.full(3, np.nan))
     D = np.zeros((*field.shape, 3, 2, 6))
     D[used] = strain_slopes(frame, gradient, options.tensor, per_mm, strain)[used[good]] / n
     half = options.window // 2
@@ -68,12 +118,19 @@ def mean_strain_sigma(field: Field, options: StrainOptions, inside: Bool, *, sub
         kernel[offsets[:, 0] + half, offsets[:, 1] + half] = along
         v += oaconvolve(D[..., a, :], kernel[:, :, None, None], mode="full", axes=(0, 1))
     v = v[half : half + field.shape[0], half : half + field.shape[1]]
-    roots = roots_of(np.where(field.valid[..., None, None], field.covariance, 0.0))
-    each = np.where(field.valid[..., None, None], v, 0.0) @ roots
-    noise = np.maximum(np.einsum("rcij,rcij->i", each, shared.summed(field, each)), 0.0)
-    variance = noise + np.sqrt(left[used]).mean(axis=0) ** 2
-    if field.common is None:
-        return np.asarray(np.sqrt(variance)), np.full(3, np.nan)
-    held = np.where(field.valid[..., None, None], field.common, 0.0)
-    part = np.linalg.norm(np.einsum("rcij,rcjk->ik", v, held), axis=1)
-    return np.asarray(np.hypot(np.sqrt(variance), part)), np.asarray(part)
+
+    def noise(covariance: Float) -> Float:
+        roots = roots_of(np.where(field.valid[..., None, None], covariance, 0.0))
+        each = np.where(field.valid[..., None, None], v, 0.0) @ roots
+        return np.asarray(np.maximum(np.einsum("rcij,rcij->i", each, shared.summed(field, each)), 0.0))
+
+    frozen = field.frozen_covariance
+    common = None
+    if field.common is not None:
+        common = np.einsum("rcij,rcjk->ik", v, np.where(field.valid[..., None, None], field.common, 0.0))
+    return MeanStrainVariance(
+        noise(field.covariance) + np.sqrt(left[used]).mean(axis=0) ** 2,
+        None if frozen is None else noise(frozen),
+        common,
+        field.causes,
+    )

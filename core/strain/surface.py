@@ -6,6 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from core.arrays import Bool, Float
+from core.common.factor import rounded
 from core.errors import InputError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
@@ -70,7 +71,7 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
     common = None
     if field.common is not None:
         common = np.full((*field.shape, 3, field.common.shape[-1]), np.nan)
-        common[good] = _common_part(field, slopes, surface, options)
+        common[good] = rounded(_common_part(field, slopes, surface, options))
     spacing_px = _step(field)
     # of smoothed displacements it begins with the width of the smoothing
     gauge_px = (options.window - 1) * spacing_px + shared.reach_px

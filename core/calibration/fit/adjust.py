@@ -13,9 +13,10 @@ import numpy as np
 
 from core.arrays import Float
 from core.calibration.fit.layout import Layout, Priors, State
-from core.calibration.fit.normal import Normal, assemble, covariance
+from core.calibration.fit.normal import Covariance, Normal, assemble, covariance, prior_part
 from core.calibration.fit.observations import ViewRows
 from core.errors import CalibrationError
+from core.names import Cause
 
 NOISE_ROUNDS = 4
 _MIN_NOISE_PX = 1e-4  # no localiser is better; keeps noise-free observations and loose priors in one system
@@ -33,6 +34,8 @@ class Adjustment:
         The unknowns, their values, and what was known before.
     covariance
         (m, m) of the unknowns, zero for what is held.
+    by_prior
+        (m, m) parts of it by what was known before: of the stage, and of the target. All else is the views' noise.
     node_sigma_mm
         (n, k) of the nodes' corrections, k of X, Y, Z.
     noise_px
@@ -49,6 +52,7 @@ class Adjustment:
     state: State
     priors: Priors
     covariance: Float
+    by_prior: dict[Cause, Float]
     node_sigma_mm: Float
     noise_px: Float
     redundancy: Float
@@ -131,8 +135,25 @@ def adjust(
     normal = evaluate(state, noise)
     cov = covariance(normal)
     return Adjustment(
-        layout, state, priors, cov.unknowns, cov.node_sigma_mm, noise, counts - cov.taken, normal.cost, iterations
+        layout,
+        state,
+        priors,
+        cov.unknowns,
+        parts_of_priors(layout, normal, cov),
+        cov.node_sigma_mm,
+        noise,
+        counts - cov.taken,
+        normal.cost,
+        iterations,
     )
+
+
+def parts_of_priors(layout: Layout, normal: Normal, found: Covariance) -> dict[Cause, Float]:
+    """Return the parts (m, m) of the unknowns' covariance that what was known of stage and target put there."""
+    return {
+        "stage": prior_part(normal, found, layout.stage),
+        "target": prior_part(normal, found, [layout.pitch_scale], nodes=True),
+    }
 
 
 def _noise(normal: Normal, redundancy: Float) -> Float:

@@ -100,6 +100,13 @@ class Layout:
         except ValueError:
             return None
 
+    @property
+    def stage(self) -> tuple[int, ...]:
+        """Indices of all that is unknown of the stage: tilts, direction, scales, steps."""
+        tilts = [k for c in range(2) for k in range(self.tilt(c).start, self.tilt(c).stop)]
+        first = self.motion + 5
+        return (*tilts, *range(self.motion, self.motion + 4), *range(first, first + len(self.steps)))
+
     def frame(self, number: int) -> slice | None:
         """Pose of a free frame; None for the one that defines the system frame."""
         try:

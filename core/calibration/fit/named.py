@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from core.arrays import Float
 from core.calibration.fit.layout import Layout, Priors
 from core.cameras.camera import POSE_NAMES
-from core.names import CAMERAS
+from core.names import CAMERAS, Cause
 
 
 def parameter_names(layout: Layout, priors: Priors) -> tuple[str, ...]:
@@ -23,6 +25,15 @@ def named_covariance(layout: Layout, priors: Priors, x: Float, covariance: Float
     """Covariance of the parameters in :func:`parameter_names` from that of the unknowns (m, m) at ``x``."""
     J = named_derivatives(layout, priors, x)
     return np.asarray(J @ covariance @ J.T)
+
+
+def named_by_cause(
+    layout: Layout, priors: Priors, x: Float, covariance: Float, by_prior: Mapping[Cause, Float]
+) -> dict[Cause, Float]:
+    """Parts of the covariance of the parameters by cause: the priors', and all else as the calibration's own."""
+    given = {cause: named_covariance(layout, priors, x, part) for cause, part in by_prior.items()}
+    rest = named_covariance(layout, priors, x, covariance) - np.sum(list(given.values()), axis=0)
+    return {"calibration": rest, **given}
 
 
 def named_derivatives(layout: Layout, priors: Priors, x: Float) -> Float:

@@ -337,3 +337,30 @@ def covariance(normal: Normal) -> Covariance:
         for c in range(2):
             taken[c] += float(np.sum(C_nn * normal.V[c].matrix))
     return Covariance(C, node_sigma, taken)
+
+
+def prior_part(normal: Normal, found: Covariance, unknowns: Sequence[int], *, nodes: bool = False) -> Float:
+    """Return the part (m, m) of the unknowns' covariance that priors put there, of some unknowns and of the nodes.
+
+    The estimate's errors are N^-1 times what each observation is off by, a prior being one; so its share of
+    N^-1 (A' W A + sum of priors) N^-1 = N^-1.
+
+    Parameters
+    ----------
+    normal
+        At the minimum.
+    found
+        Its covariance.
+    unknowns
+        Places of the unknowns whose priors count.
+    nodes
+        Count the nodes' priors, too.
+    """
+    C, index = found.unknowns, list(unknowns)
+    out = (C[:, index] * normal.prior[index]) @ C[index]
+    if nodes and normal.h.shape[1]:
+        Y = normal.reduced()[2]
+        assert Y is not None
+        CY = C @ np.swapaxes(Y, 1, 2)
+        out = out + np.einsum("nik,k,njk->ij", CY, normal.node_prior, CY, optimize=True)
+    return np.asarray(0.5 * (out + out.T))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.arrays import Bool, Float
+from core.common.factor import Causes
 from core.field.points.patch import PatchChoice
 from core.field.points.smoothing_record import Smoothing
 from core.field.points.starts import Starts
@@ -110,6 +111,12 @@ class Field:
         (r, c, 3 or 6, k) common factor F, mm for unit causes: what the points share of the uncertainty, from the
         calibration. The whole covariance of points i and j is that of their matching plus F_i F_j'. None where the
         calibration's covariance is not known.
+    causes
+        Causes of its columns.
+    frozen
+        (r, c, 3, 3) part of the own covariance of U, V, W that is noise of the reference pair, the same in all steps
+        of a test; mm^2. That of X, Y, Z, and of both with each other, is so as a whole. None where it is not told
+        apart.
     rejected
         What was measured at rejected points; None unless it was asked for.
     starts
@@ -141,6 +148,8 @@ class Field:
     smoothing: Smoothing | None = None
     cuts: Cuts | None = None
     common: Float | None = None
+    causes: Causes | None = None
+    frozen: Float | None = None
     rejected: Rejected | None = None
     starts: Starts | None = None
     failed_seeds_px: tuple[tuple[float, float], ...] = ()
@@ -166,6 +175,23 @@ class Field:
         if self.common is None:
             return self.covariance
         return np.asarray(self.covariance + self.common @ np.swapaxes(self.common, -1, -2))
+
+    @property
+    def frozen_covariance(self) -> Float | None:
+        """(r, c, n, n) the reference pair's part of the own covariance; None where it is not told apart."""
+        if not self.has_motion:
+            return self.covariance
+        if self.frozen is None:
+            return None
+        out = self.covariance.copy()
+        out[..., 3:, 3:] = self.frozen
+        return out
+
+    @property
+    def reference_alone(self) -> Field | None:
+        """The field with the reference pair's noise alone in its covariance; None where it is not told apart."""
+        frozen = self.frozen_covariance
+        return None if frozen is None else replace(self, covariance=frozen, frozen=None, common=None, causes=None)
 
     @property
     def sigma_mm(self) -> Float:

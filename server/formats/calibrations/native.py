@@ -8,7 +8,7 @@ checks.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,9 @@ from core.calibration import COVARIANCE_NAMES, CalibrationResult, CheckMeasures,
 from core.cameras.camera import POSE_NAMES, Camera, RigidTransform
 from core.cameras.lens import SeidelLens
 from core.cameras.stereo import StereoPair
+from core.common.factor import ParameterCovariance
 from core.errors import FileFormatError
-from core.names import CAMERAS
+from core.names import CAMERAS, CAUSES, Cause
 from core.target import LINE_GRID, GridTarget
 from server.formats.files import write_bytes
 
@@ -67,6 +68,7 @@ def calibration_content(
         "pitch_scale": {"value": result.pitch_scale, "sigma": result.pitch_scale_sigma},
         "image_size_px": {f"cam{c + 1}": list(n.image_size_px) for c, n in enumerate(result.nominals)},
         "covariance": {"names": list(result.names), "matrix": result.covariance.tolist()},
+        "covariance_by_cause": {cause: part.tolist() for cause, part in result.covariance_by_cause.items()},
         "sigma": result.sigma,
         "noise_px": _by_camera(result.noise_px),
         "redundancy": _by_camera(result.redundancy),
@@ -162,6 +164,15 @@ def covariance_in(
 ) -> tuple[tuple[str, ...], NDArray[np.float64]] | None:
     """Return the covariance (n, n) of a calibration.json's content and its parameters' names, None without.
 
+    Takes and raises the same as :func:`parameters_in`.
+    """
+    found = parameters_in(content, name=name, pair=pair)
+    return None if found is None else (tuple(found.names), found.covariance)
+
+
+def parameters_in(content: Mapping[str, object], *, name: str, pair: StereoPair) -> ParameterCovariance | None:
+    """Return the covariance of a calibration.json's content with its parts by cause, None without.
+
     Parameters
     ----------
     content
@@ -205,7 +216,30 @@ def covariance_in(
     matrix = matrix[np.ix_(index, index)]
     if not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T, rtol=1e-6, atol=0.0):
         raise _unusable(name, "its matrix is not finite and symmetric")
-    return tuple(order), matrix
+    return ParameterCovariance(pair, tuple(order), matrix, _by_cause(content, names, index, name=name))
+
+
+def _by_cause(
+    content: Mapping[str, object], names: Sequence[str], index: Sequence[int], *, name: str
+) -> dict[Cause, NDArray[np.float64]] | None:
+    """Parts of the covariance, in its order; None in a file that does not tell them apart."""
+    part = content.get("covariance_by_cause")
+    if part is None:
+        return None
+    if not isinstance(part, Mapping) or not part or any(cause not in CAUSES for cause in part):
+        raise _unusable(name, f"covariance_by_cause must have parts of {', '.join(CAUSES)}")
+    out: dict[Cause, NDArray[np.float64]] = {}
+    for cause in CAUSES:
+        if cause not in part:
+            continue
+        try:
+            matrix = np.asarray(part[cause], dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise _unusable(name, f"its part of {cause} holds something else than numbers") from error
+        if matrix.shape != (len(names), len(names)) or not np.isfinite(matrix).all():
+            raise _unusable(name, f"its part of {cause} is no finite matrix for {len(names)} names")
+        out[cause] = matrix[np.ix_(index, index)]
+    return out
 
 
 def _needed(camera: Camera) -> tuple[str, ...]:

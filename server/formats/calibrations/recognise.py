@@ -17,6 +17,7 @@ from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError
 from core.names import CAMERAS
+from server.formats.calibrations.native import parameters_in
 from server.formats.calibrations.programs.dice_txt import is_dice_txt, parse_dice_txt
 from server.formats.calibrations.programs.dice_xml import is_dice, parse_dice_xml
 from server.formats.calibrations.programs.imported_pair import invalid, unreadable
@@ -200,7 +201,18 @@ def parse_calibration(data: bytes, *, name: str) -> LoadedCalibration:
     if pair.baseline_mm <= _MIN_BASELINE * content["cam1"]["z0_mm"]:  # equal poses differ by rounding
         raise invalid(name, "both cameras have the same position")
     sizes = [_size(content, which) for which in CAMERAS]
+    _check_covariance(content, pair, name)
     return LoadedCalibration(pair, sizes[0], sizes[1], "calibration_json", digest, content)
+
+
+def _check_covariance(content: Mapping[str, object], pair: StereoPair, name: str) -> None:
+    """Refuse a covariance that none can be; one that cannot be read is refused where it is needed."""
+    try:
+        found = parameters_in(content, name=name, pair=pair)
+    except FileFormatError:
+        return
+    if found is not None:
+        found.check()
 
 
 def load_calibration(path: str | Path) -> LoadedCalibration:
@@ -212,6 +224,8 @@ def load_calibration(path: str | Path) -> LoadedCalibration:
         ``file_missing``; ``calibration_unreadable`` (unknown kind, damaged, something missing);
         ``calibration_unsupported`` (a lens model that cannot be carried over exactly);
         ``calibration_invalid`` (NaN, no rotation, no baseline).
+    CalibrationInputError
+        ``covariance_not_positive``, ``covariance_parts_differ``.
     """
     path = Path(path)
     try:

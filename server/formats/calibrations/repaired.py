@@ -16,7 +16,7 @@ from core.cameras.stereo import StereoPair
 from core.names import CAMERAS
 from core.orientation import Repair, RepairLimits
 from core.orientation.change import CHANGE_NAMES
-from core.orientation.propagate import pose_parameters, repaired_covariance
+from core.orientation.propagate import carried_parameters, pose_parameters, repaired_covariance
 from server.formats.calibrations.export import convert_calibration
 from server.formats.calibrations.recognise import LoadedCalibration, parse_calibration
 from server.formats.calibrations.record import CalibrationRecord
@@ -73,8 +73,10 @@ def repaired_content(
     out["cam2"] |= dict(zip(POSE_NAMES, pose_parameters(repair.pair).tolist(), strict=True))
     covariance = _covariance(content, repair)
     if covariance is not None:
-        names, matrix = covariance
+        names, matrix, whole = covariance
         out["covariance"] = {**out["covariance"], "matrix": matrix.tolist()}
+        if isinstance(out.get("covariance_by_cause"), dict):
+            out["covariance_by_cause"] = _by_cause(out["covariance_by_cause"], matrix, whole)
         sigma = dict(zip(names, np.sqrt(np.maximum(np.diagonal(matrix), 0.0)).tolist(), strict=True))
         if isinstance(out.get("sigma"), dict):
             out["sigma"] = {name: sigma.get(name, value) for name, value in out["sigma"].items()}
@@ -120,8 +122,21 @@ def repair_section(repair: Repair, limits: RepairLimits) -> dict[str, Any]:
     }
 
 
-def _covariance(content: Mapping[str, Any], repair: Repair) -> tuple[list[str], NDArray[np.float64]] | None:
-    """Names and covariance of the repaired parameters; None where the old file has none."""
+def _by_cause(parts: Mapping[str, Any], matrix: NDArray[np.float64], whole: NDArray[np.float64]) -> dict[str, Any]:
+    """Parts of the repaired parameters' covariance: what the estimate adds is noise, as the calibration's is."""
+    out = {
+        cause: whole @ np.asarray(part, dtype=np.float64) @ whole.T
+        for cause, part in parts.items()
+        if cause != "calibration"
+    }
+    rest = matrix - np.sum(list(out.values()), axis=0) if out else matrix
+    return {cause: part.tolist() for cause, part in ({"calibration": rest} | out).items()}
+
+
+def _covariance(
+    content: Mapping[str, Any], repair: Repair
+) -> tuple[list[str], NDArray[np.float64], NDArray[np.float64]] | None:
+    """Names, covariance of the repaired parameters, and their slopes over the old; None where the old file has none."""
     part = content.get("covariance")
     if not isinstance(part, dict):
         return None
@@ -133,13 +148,17 @@ def _covariance(content: Mapping[str, Any], repair: Repair) -> tuple[list[str], 
     stepped = [
         (_stepped(content, name, step), _stepped(content, name, -step)) for name, step in zip(names, steps, strict=True)
     ]
-    return names, repaired_covariance(repair, matrix, stepped, steps, [names.index(name) for name in pose])
+    index = [names.index(name) for name in pose]
+    whole = carried_parameters(repair, stepped, steps, index)
+    return names, repaired_covariance(repair, matrix, stepped, steps, index), whole
 
 
 def _stepped(content: Mapping[str, Any], name: str, step: float) -> StereoPair:
     """The pair of a file in which one parameter, ``cam1.phd_px``, has another value."""
     camera, _, parameter = name.partition(".")
-    changed = {key: content[key] for key in content if key not in ("covariance", "views", "repair")}
+    changed = {
+        key: content[key] for key in content if key not in ("covariance", "covariance_by_cause", "views", "repair")
+    }
     if camera in CAMERAS and parameter in content[camera]:
         changed[camera] = {**content[camera], parameter: content[camera][parameter] + step}
     return parse_calibration(json.dumps(changed).encode(), name="The calibration").pair

@@ -15,7 +15,7 @@ from core.common.factor import ParameterCovariance
 from core.errors import TargetError
 from core.names import CAMERAS
 from core.target import LINE_GRID, GridTarget
-from server.formats.calibrations.native import covariance_in
+from server.formats.calibrations.native import parameters_in
 from server.formats.calibrations.recognise import LoadedCalibration
 from server.formats.calibrations.record import ChecksRecord, PoseRecord, TargetRecord
 
@@ -45,15 +45,14 @@ def volume_of(calibration: LoadedCalibration) -> CalibratedVolume | None:
 
 
 def parameter_covariance(calibration: LoadedCalibration) -> ParameterCovariance | None:
-    """Return the covariance of the cameras' parameters; None where the file does not state it.
+    """Return the covariance of the cameras' parameters, by cause; None where the file does not state it.
 
     Raises
     ------
     FileFormatError
         ``calibration_unreadable`` if the file's covariance is not usable.
     """
-    found = covariance_in(calibration.details, name="calibration.json", pair=calibration.pair)
-    return None if found is None else ParameterCovariance(calibration.pair, *found)
+    return parameters_in(calibration.details, name="calibration.json", pair=calibration.pair)
 
 
 def target_of(target: TargetRecord | None) -> GridTarget | BoardTarget | None:

@@ -8,6 +8,13 @@ from typing import Annotated
 
 from pydantic import Field
 
+_BUDGET = (
+    "Standard uncertainties by where they come from, whose squares add up to the whole's: `matching` (noise that is new "
+    "at each step), `reference` (noise of the reference pair, the same in all steps of a test), `calibration` (noise "
+    "of the calibration's views), `stage`, `target`. What is not known is not among them, see `not_told` of the step; "
+    "null where nothing is."
+)
+
 
 @dataclass(frozen=True)
 class Number:
@@ -19,6 +26,7 @@ class Number:
     sigma_calibration: Annotated[
         float | None, Field(description="The calibration's part of sigma; null where it is not known and not included.")
     ] = None
+    budget: Annotated[Mapping[str, float] | None, Field(description=_BUDGET)] = None
 
 
 @dataclass(frozen=True)
@@ -55,6 +63,7 @@ class Numbers:
         Sequence[float | None],
         Field(description="The calibration's part of each sigma; null where it is not known and not included."),
     ] = ()
+    budget: Annotated[Mapping[str, Sequence[float | None]] | None, Field(description=_BUDGET)] = None
 
 
 @dataclass(frozen=True)
@@ -91,11 +100,12 @@ class AreaStatistics:
         float | None,
         Field(description="The calibration's part of mean_sigma; null where it is not known and not included."),
     ] = None
+    mean_budget: Annotated[Mapping[str, float] | None, Field(description=_BUDGET)] = None
 
     @property
     def mean_number(self) -> Number:
         """The mean with its standard deviation."""
-        return Number(self.mean, self.mean_sigma, self.units, self.mean_sigma_calibration)
+        return Number(self.mean, self.mean_sigma, self.units, self.mean_sigma_calibration, self.mean_budget)
 
 
 @dataclass(frozen=True)
@@ -121,6 +131,10 @@ class FrameReading:
     ]
     residual_rms_mm: Annotated[float, Field(description="Root mean square distance of the points from the fit.")]
     points: Annotated[int, Field(description="Points that it was laid through.")]
+    budget_rad: Annotated[Sequence[Mapping[str, float]], Field(description="Budget of each rotation's sigma.")] = ()
+    budget_origin_mm: Annotated[
+        Sequence[Mapping[str, float]], Field(description="Budget of the origin's sigma along each axis.")
+    ] = ()
 
 
 @dataclass(frozen=True)
@@ -149,7 +163,13 @@ class Problem:
 
 @dataclass(frozen=True)
 class StepReadings:
-    """The readings of one step; none where it has a problem."""
+    """The readings of one step; none where it has a problem.
+
+    Attributes
+    ----------
+    not_told
+        What the budgets do not tell apart, and what they do not include.
+    """
 
     n: int
     kind: str
@@ -161,6 +181,7 @@ class StepReadings:
     extensometers: Sequence[ExtensometerReading] = ()
     lines: Sequence[LineReading] = ()
     areas: Sequence[AreaReading] = ()
+    not_told: Sequence[str] = ()
 
     def document(self) -> dict[str, object]:
         """Return it as plain values."""

@@ -78,6 +78,10 @@ CURVATURE = (
         "smaller principal curvature of the reference's surface, positive where it bulges towards the cameras",
     ),
 )
+#: how a common factor is packed
+COLUMN_BY_COLUMN = {"compression": "zlib", "complevel": 1, "shuffle": True}
+#: entries of the reference's part of the displacements' covariance, as they are packed
+FROZEN = (("uu", 0, 0), ("uv", 0, 1), ("uw", 0, 2), ("vv", 1, 1), ("vw", 1, 2), ("ww", 2, 2))
 
 
 def field_variable(result: Field, name: str) -> tuple[NDArray[np.float64], str, str] | None:

@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from core.common.factor import Causes
 from core.errors import FileFormatError
 from core.field.points.patch import PatchChoice
 from core.field.points.result import Field, References
 from core.field.points.smoothing_record import Smoothing
 from core.field.region.cuts import Cuts, from_arrays
-from core.names import CameraName
+from core.names import CAUSES, CameraName
 from core.status import PointStatus
-from server.formats.results.layout import CURVATURE, ENTRIES, FORMAT_VERSION, MOTION, PROPAGATED_FROM, SHAPE
+from server.formats.results.layout import CURVATURE, ENTRIES, FORMAT_VERSION, FROZEN, MOTION, PROPAGATED_FROM, SHAPE
 from server.formats.results.netcdf import opened
 from server.formats.results.settings import current_entries, current_inputs, current_settings, variable_name
 
@@ -64,10 +65,11 @@ def read_field(path: str | Path) -> Field:
                 tail = 2 if v in CURVATURE else 3
                 arrays.setdefault(v.attribute, np.full((*shape, tail), np.nan))[..., v.component] = values
         total = np.asarray(variables["covariance"][...], dtype=np.float64)
-        common = None
+        common, causes = None, None
         if "common_factor" in variables:
             common = np.asarray(variables["common_factor"][...], dtype=np.float64)
             total = total - common @ np.swapaxes(common, -1, -2)
+            causes = _causes_of(variables, common.shape[-1])
         choice, smoothing = (getattr(dataset, name, None) for name in ("patch_choice", "smoothing"))
         return Field(
             **arrays,
@@ -76,6 +78,8 @@ def read_field(path: str | Path) -> Field:
             zncc=np.asarray(variables["zncc"][...], dtype=np.float64),
             covariance=total,
             common=common,
+            causes=causes,
+            frozen=_frozen_of(variables),
             smoothing=None if smoothing is None else Smoothing.from_document(current_entries(json.loads(smoothing))),
             patch=None if choice is None else PatchChoice.from_document(current_entries(json.loads(choice))),
             cuts=_cuts_of(variables),
@@ -106,7 +110,7 @@ def read_measured(path: str | Path) -> Field:
     # files of format 1 have it only beside a smoothed displacement: there, marked points keep the calibration's part
     covariance = read.get("measured_covariance", field.covariance)
     status = np.where(field.status == PointStatus.EXTRAPOLATED, PointStatus.OK, field.status).astype(np.int8)
-    return replace(field, covariance=covariance, common=None, status=status)
+    return replace(field, covariance=covariance, common=None, causes=None, frozen=None, status=status)
 
 
 @dataclass(frozen=True)
@@ -191,6 +195,27 @@ def _references_of(dataset: Any) -> References | None:
             )
             values[origin][..., i, j] = values[origin][..., j, i] = read
     return References(int(dataset.reference_step), steps, values["noise"], values["pattern"])
+
+
+def _causes_of(variables: Any, count: int) -> Causes:
+    if "cause" not in variables:  # files before they were told apart
+        return Causes.untold(count)
+    names = [str(name) for name in variables["cause"][...]]
+    told = str(getattr(variables["common_factor"], "causes", "calibration")).split()
+    columns = [cause for name in names for cause in CAUSES if cause == name]
+    if len(columns) != count:
+        raise FileFormatError(f"The causes {', '.join(names)} of a result file are not known to this program.")
+    return Causes(tuple(columns), tuple(cause for cause in CAUSES if cause in told))
+
+
+def _frozen_of(variables: Any) -> NDArray[np.float64] | None:
+    if "reference_covariance" not in variables:
+        return None
+    packed = np.asarray(variables["reference_covariance"][...], dtype=np.float64)
+    out = np.empty((*packed.shape[:-1], 3, 3))
+    for k, (_, i, j) in enumerate(FROZEN):
+        out[..., i, j] = out[..., j, i] = packed[..., k]
+    return out
 
 
 def _cuts_of(variables: Any) -> Cuts | None:

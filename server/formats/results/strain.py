@@ -11,6 +11,7 @@ import numpy as np
 
 from core.errors import FileFormatError
 from core.strain import STRAIN_STATUS_MEANINGS, StrainField, StrainOptions, StrainStatus
+from server.formats.results.layout import COLUMN_BY_COLUMN
 from server.formats.results.netcdf import opened
 from server.formats.results.settings import current_entries
 
@@ -70,7 +71,12 @@ def put_strain(dataset: Any, strain: StrainField, *, sparse: bool = False) -> No
     if strain.common is not None:
         dataset.createDimension("strain_component", len(_COMPONENTS))
         common = dataset.createVariable(
-            "strain_common_factor", "f4", ("row", "col", "strain_component", "cause"), fill_value=np.nan
+            "common_factor_strain",
+            "f4",
+            ("row", "col", "strain_component", "cause"),
+            fill_value=np.nan,
+            chunksizes=(*strain.common.shape[:2], 1, 1),
+            **COLUMN_BY_COLUMN,
         )
         names = ", ".join(name for name, _ in _COMPONENTS)
         common.setncatts({"units": "1", "long_name": f"F: what all points share of the uncertainty of {names}"})
@@ -143,8 +149,10 @@ def _strain_of(dataset: Any) -> StrainField | None:
     ):
         covariance[..., i, j] = covariance[..., j, i] = variables[name][...]
     common = None
-    if "strain_common_factor" in variables:
-        common = np.asarray(variables["strain_common_factor"][...], dtype=np.float64)
+    # older files have it under another name
+    found = next((name for name in ("common_factor_strain", "strain_common_factor") if name in variables), None)
+    if found is not None:
+        common = np.asarray(variables[found][...], dtype=np.float64)
         covariance = covariance - common @ np.swapaxes(common, -1, -2)
     known = StrainOptions.__dataclass_fields__
     return StrainField(

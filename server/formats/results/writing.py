@@ -16,16 +16,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from core.common.factor import Causes
 from core.field.points.result import Field, References, Rejected
 from core.field.region.cuts import Cuts, as_arrays
+from core.names import CAUSES
 from core.status import STATUS_MEANINGS, PointStatus
 from core.strain import StrainField
 from server.formats.results.layout import (
+    COLUMN_BY_COLUMN,
     COMPARISONS,
     COVARIANCE_NAMES,
     CURVATURE,
     ENTRIES,
     FORMAT_VERSION,
+    FROZEN,
     MOTION,
     PROPAGATED_FROM,
     SHAPE,
@@ -90,7 +94,11 @@ def _put(
     sparse: bool = False,
 ) -> None:
     fill = np.nan if dtype.startswith("f") else False
-    pack = {"compression": "zlib", "complevel": 1, "shuffle": True} if sparse or name in _REPETITIVE else {}
+    pack: dict[str, Any] = {}
+    if sparse or name in _REPETITIVE:
+        pack = {"compression": "zlib", "complevel": 1, "shuffle": True}
+    if dims[-1] == "cause":  # column by column: each is smooth over the points, and has few digits
+        pack = COLUMN_BY_COLUMN | {"chunksizes": (*values.shape[:2], 1, 1)}
     variable = dataset.createVariable(name, dtype, dims, fill_value=fill, **pack)
     variable.setncatts({"units": units, "long_name": long_name})
     variable[...] = values
@@ -189,7 +197,9 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
     )
     if result.common is not None:
         dataset.createDimension("component", n)
-        dataset.createDimension("cause", result.common.shape[-1])
+        causes = Causes.untold(result.common.shape[-1]) if result.causes is None else result.causes
+        dataset.createDimension("cause", len(causes.columns))
+        _put_causes(dataset, causes)
         _put(
             dataset,
             "common_factor",
@@ -200,9 +210,31 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
             dtype="f4",
             sparse=sparse,
         )
-        dataset.variables[
-            "common_factor"
-        ].comment = "the covariance of points a and b is F_a F_b', of a point with itself covariance = own + F F'"
+        dataset.variables["common_factor"].setncatts(
+            {
+                "comment": "points a and b have the covariance F_a F_b', a point with itself covariance = own + F F'",
+                "causes": " ".join(causes.told),
+            }
+        )
+    if result.frozen is not None:
+        dataset.createDimension("frozen", len(FROZEN))
+        _put(
+            dataset,
+            "reference_covariance",
+            np.stack([result.frozen[..., i, j] for _, i, j in FROZEN], axis=-1),
+            ("row", "col", "frozen"),
+            units="mm2",
+            long_name="part of the own covariance of u, v, w that is noise of the reference pair",
+            dtype="f4",
+            sparse=sparse,
+        )
+        dataset.variables["reference_covariance"].setncatts(
+            {
+                "components": " ".join(name for name, _, _ in FROZEN),
+                "comment": "the same in all steps of a test: a difference of two steps has the own covariances of "
+                "both, less both of these, and (F_b - F_a)(F_b - F_a)'; the own covariance of x, y, z is so as a whole",
+            }
+        )
     sigma = result.sigma_mm
     for k, name in enumerate(names):
         _put(
@@ -215,6 +247,20 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
             dtype="f4",
             sparse=sparse,
         )
+
+
+def _put_causes(dataset: Any, causes: Causes) -> None:
+    width = max(len(name) for name in CAUSES)
+    dataset.createDimension("cause_length", width)
+    variable = dataset.createVariable("cause", "S1", ("cause", "cause_length"))
+    variable.setncatts(
+        {
+            "long_name": "where a column's unit cause comes from; the same causes in all steps of a test",
+            "_Encoding": "ascii",
+        }
+    )
+    if causes.columns:
+        variable[...] = np.array(causes.columns, dtype=f"S{width}")
 
 
 def _put_rejected(dataset: Any, rejected: Rejected) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 
 from core.arrays import Float
+from core.common.budget import UNKNOWN, Budget, budget_of
 from core.errors import InputError, MeasurementError, StateError
+from core.field.common import notes_of
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
 from core.gauge.align import Alignment, align_3_2_1, align_plane, aligned
@@ -18,9 +20,11 @@ from core.gauge.area import area_statistics, points_within
 from core.gauge.extensometer import extensometer
 from core.gauge.line import positions_along
 from core.gauge.locate import positions_from_mm
-from core.gauge.reading import Reading
+from core.gauge.reading import Reading, reading_of
 from core.gauge.rigid import RigidMotion, rigid_motion, without_rigid_motion
 from core.gauge.sampling import Samples, sample
+from core.names import BUDGET
+from core.strain.result import StrainField
 from server.formats.files import sha256_of
 from server.formats.gauges.readings import (
     AreaReading,
@@ -259,13 +263,20 @@ def _read_step(
         extensometers=[_extensometer(variables, e.name, *positions[e.name]) for e in request.extensometers],
         lines=[_line(variables, names, line) for line in request.lines],
         areas=[_area(variables, names, a.name, a.corners()) for a in request.areas],
+        not_told=notes_of(field),
     )
 
 
 def _at_positions(variables: Variables, names: Sequence[str], positions: Samples) -> dict[str, Numbers]:
     own = np.arange(len(positions.xy_px))
     variance = np.diagonal(positions.covariance(variables.shared, own, own), axis1=-2, axis2=-1)
-    common = positions.common()
+    at_reference = positions.reference_alone()
+    frozen = (
+        None
+        if at_reference is None
+        else np.diagonal(at_reference.covariance(variables.shared, own, own), axis1=-2, axis2=-1)
+    )
+    common, causes = positions.common(), variables.field.causes
     of_calibration = np.full(variance.shape, np.nan) if common is None else (common**2).sum(axis=-1)
     out = {}
     for name in names:
@@ -278,15 +289,68 @@ def _at_positions(variables: Variables, names: Sequence[str], positions: Samples
         else:
             s = np.full(len(own), np.nan)
         part = np.full(len(own), np.nan) if k is None else np.sqrt(of_calibration[:, k])
-        out[name] = Numbers(_list(positions.of(variable.values)), _list(s), variable.units, _list(part))
+        budgets: Sequence[Budget] = [UNKNOWN] * len(own)
+        if k is not None:
+            budgets = [
+                budget_of(
+                    float(variance[i, k]),
+                    None if frozen is None else float(frozen[i, k]),
+                    None if common is None else common[i, k],
+                    causes,
+                )
+                for i in own
+            ]
+        elif name in STRAIN_NAMES and variables.strain is not None:
+            budgets, part = _of_strain(variables, variables.strain, STRAIN_NAMES.index(name), positions, s)
+        values = positions.of(variable.values)
+        out[name] = Numbers(_list(values), _list(s), variable.units, _list(part), _by_part(budgets))
     return out
+
+
+def _of_strain(
+    variables: Variables, strain: StrainField, axis: int, positions: Samples, sigma: Float
+) -> tuple[list[Budget], Float]:
+    """Budgets of a strain at positions, and the common parts; the reference has the share that it has in u and v."""
+    common = None if strain.common is None else positions.of(strain.common[..., axis, :])
+    part = np.full(len(sigma), np.nan) if common is None else np.linalg.norm(common, axis=-1)
+    own = np.maximum(sigma**2 - np.nan_to_num(part) ** 2, 0.0)
+    field = variables.field
+    share = None
+    if field.frozen is not None:
+        along = np.einsum("rcii->rc", field.frozen[..., :2, :2]), np.einsum("rcii->rc", field.covariance[..., 3:5, 3:5])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            share = positions.of(np.where(field.valid, along[0] / along[1], np.nan))
+    budgets = [
+        budget_of(
+            float(own[i]),
+            None if share is None else float(share[i] * own[i]),
+            None if common is None else common[i],
+            field.causes,
+        )
+        for i in range(len(own))
+    ]
+    return budgets, np.asarray(part)
+
+
+def _by_part(budgets: Sequence[Budget]) -> dict[str, list[float | None]] | None:
+    """Return budgets of positions as a list a part; None where nothing is known."""
+    found = [one.document() for one in budgets]
+    names = [name for name in BUDGET if any(name in one for one in found)]
+    return {name: [one.get(name) for one in found] for name in names} or None
+
+
+def _at(budget: Mapping[str, Sequence[float | None]] | None, i: int) -> dict[str, float] | None:
+    found = {} if budget is None else {name: values[i] for name, values in budget.items()}
+    return {name: value for name, value in found.items() if value is not None} or None
 
 
 def _point(variables: Variables, names: Sequence[str], name: str | None, xy: tuple[float, float]) -> PointReading:
     positions = sample(variables.field, [xy])
     found = _at_positions(variables, names, positions)
     values = {
-        n: Number(reading.value[0], reading.sigma[0], reading.units, reading.sigma_calibration[0])
+        n: Number(
+            reading.value[0], reading.sigma[0], reading.units, reading.sigma_calibration[0], _at(reading.budget, 0)
+        )
         for n, reading in found.items()
     }
     return PointReading(name, xy, positions.missing[0], values)
@@ -310,7 +374,9 @@ def _extensometer(
 ) -> ExtensometerReading:
     got = extensometer(variables.field, a, b, shared=variables.shared)
     readings: dict[str, Reading] = {n: getattr(got, n) for n in _EXTENSOMETER_UNITS}
-    values = {n: _number(r.value, r.sigma, _EXTENSOMETER_UNITS[n], r.sigma_calibration) for n, r in readings.items()}
+    values = {
+        n: _number(r.value, r.sigma, _EXTENSOMETER_UNITS[n], r.sigma_calibration, r.budget) for n, r in readings.items()
+    }
     return ExtensometerReading(name, a, b, got.missing, values)
 
 
@@ -323,14 +389,29 @@ def _area(
     for n in names:
         variable, _ = variables.get(n)
         # the correlation of other variables' errors is not known here: no uncertainty of their mean
-        known, common = variables.own_sigma(n) or (None, None)
+        own = variables.own_sigma(n)
         of_position = component_of(n) in range(3)
         shared = variables.shared.positions if of_position else variables.shared
-        got = area_statistics(field, variable.values, known, inside, shared=shared, common=common)
-        if n in STRAIN_NAMES and got.count:
-            total, part = variables.mean_strain_sigma(inside)
+        got = area_statistics(
+            field,
+            variable.values,
+            None if own is None else own.own,
+            inside,
+            shared=shared,
+            common=None if own is None else own.common,
+            sigma_reference=None if own is None else own.reference,
+        )
+        of_strain = variables.mean_strain_variance(inside) if n in STRAIN_NAMES and got.count else None
+        if of_strain is not None:
             axis = STRAIN_NAMES.index(n)
-            got = replace(got, mean_sigma=total[axis], mean_sigma_calibration=part[axis])
+            mean = reading_of(
+                got.mean,
+                float(of_strain.own[axis]),
+                None if of_strain.reference is None else float(of_strain.reference[axis]),
+                None if of_strain.common is None else of_strain.common[axis],
+                of_strain.causes,
+            )
+            got = replace(got, mean_sigma=mean.sigma, mean_sigma_calibration=mean.sigma_calibration, mean_reading=mean)
         values[n] = AreaStatistics(
             units=variable.units,
             count=got.count,
@@ -341,6 +422,7 @@ def _area(
             min=_finite(got.minimum),
             max=_finite(got.maximum),
             mean_sigma_calibration=_finite(got.mean_sigma_calibration),
+            mean_budget=_plain(got.mean_reading.budget),
         )
     valid = int((inside & field.valid).sum())
     missing = "" if valid else "no valid point in the area"
@@ -356,6 +438,8 @@ def _frame_reading(alignment: Alignment) -> FrameReading:
         sigma_origin_mm=sigma[3:].tolist(),
         residual_rms_mm=alignment.residual_rms_mm,
         points=alignment.points,
+        budget_rad=[one.document() for one in alignment.budgets[:3]],
+        budget_origin_mm=[one.document() for one in alignment.budgets[3:]],
     )
 
 
@@ -364,9 +448,9 @@ def _motion_reading(motion: RigidMotion) -> RigidMotionReading:
     found = np.concatenate([motion.rotation_vector_rad, motion.translation_mm])
     names = [f"{quantity}_{axis}_{unit}" for quantity, unit in _MOTION for axis in "xyz"]
     units = [unit for _, unit in _MOTION for _ in range(3)]
-    numbers = zip(names, found, sigma, units, motion.sigma_common, strict=True)
+    numbers = zip(names, found, sigma, units, motion.sigma_common, motion.budgets, strict=True)
     return RigidMotionReading(
-        values={name: _number(value, s, unit, part) for name, value, s, unit, part in numbers},
+        values={name: _number(value, s, unit, part, budget) for name, value, s, unit, part, budget in numbers},
         centre_mm=motion.centre_mm.tolist(),
         covariance=motion.covariance.tolist(),
         points=motion.points,
@@ -383,5 +467,9 @@ def _list(values: Float) -> list[float | None]:
     return [_finite(v) for v in values]
 
 
-def _number(value: float, sigma: float, units: str, sigma_calibration: float) -> Number:
-    return Number(_finite(value), _finite(sigma), units, _finite(sigma_calibration))
+def _number(value: float, sigma: float, units: str, sigma_calibration: float, budget: Budget) -> Number:
+    return Number(_finite(value), _finite(sigma), units, _finite(sigma_calibration), _plain(budget))
+
+
+def _plain(budget: Budget) -> dict[str, float] | None:
+    return dict(budget.document()) or None

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +15,23 @@ from core.arrays import Float
 from core.errors import InputError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
-from core.strain.mean import mean_strain_sigma
+from core.strain.mean import MeanStrainVariance, mean_strain_variance
+from core.strain.result import StrainField
 from server.base.errors import NotFoundError
 from server.formats.results.layout import COVARIANCE_NAMES, field_variable
 from server.formats.results.strain import read_strain
 from server.results.reader import Variable, read_variable
 
 STRAIN_NAMES = ("exx", "eyy", "exy")
+
+
+@dataclass(frozen=True)
+class OwnSigma:
+    """Of one component: its own standard deviation (r, c), the reference pair's part, its common factor (r, c, k)."""
+
+    own: Float
+    reference: Float | None
+    common: Float | None
 
 
 class Variables:
@@ -35,24 +47,30 @@ class Variables:
             self._read[name] = self._find(name)
         return self._read[name]
 
-    def mean_strain_sigma(self, inside: NDArray[np.bool_]) -> tuple[Float, Float]:
-        """Return standard uncertainties (3,) of the means of exx, eyy, exy over an area, and the calibration's part.
+    @cached_property
+    def strain(self) -> StrainField | None:
+        """Strain of the file; None where it has none."""
+        return read_strain(self.path)
 
-        NaN without strain; the part alone where it is not known.
-        """
-        strain = read_strain(self.path)
+    def mean_strain_variance(self, inside: NDArray[np.bool_]) -> MeanStrainVariance | None:
+        """Return the uncertainty of the means of exx, eyy, exy over an area; None without strain."""
+        strain = self.strain
         if strain is None:
-            return np.full(3, np.nan), np.full(3, np.nan)
+            return None
         # the file's strain is that of the field as it was measured, along the file's axes
-        return mean_strain_sigma(self.measured, strain.options, inside, subset_px=strain.subset_px)
+        return mean_strain_variance(self.measured, strain.options, inside, subset_px=strain.subset_px)
 
-    def own_sigma(self, name: str) -> tuple[Float, Float | None] | None:
-        """Return a component's own standard deviation (r, c) and its common factor (r, c, k); None for others."""
+    def own_sigma(self, name: str) -> OwnSigma | None:
+        """Return a component's own standard deviations; None for others."""
         k = component_of(name)
         if k is None or k >= self.field.covariance.shape[-1]:
             return None
-        own = np.sqrt(np.maximum(self.field.covariance[..., k, k], 0.0))
-        return own, None if self.field.common is None else self.field.common[..., k, :]
+        frozen = self.field.frozen_covariance
+        own, at_reference = (
+            None if c is None else np.sqrt(np.maximum(c[..., k, k], 0.0)) for c in (self.field.covariance, frozen)
+        )
+        assert own is not None
+        return OwnSigma(own, at_reference, None if self.field.common is None else self.field.common[..., k, :])
 
     def known(self, names: Sequence[str]) -> list[str]:
         """Return those that this step has: a shape has no displacement."""
