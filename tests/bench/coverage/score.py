@@ -67,10 +67,15 @@ def scored(replicate: Replicate, run: Run) -> dict[str, list[float]]:
         world = replicate.sheet.seen_by(replicate.cameras[0], px)
         _positions(tally, data, frame.point(world))
     _shape_gauges(tally, run, px, frame.point(world))
+    first: Step | None = None
     for k, (name, A, b) in enumerate(replicate.motions, start=1):
         moved = frame.way(world @ (A - np.eye(3)).T + b)
         with Dataset(run.folder / "results" / f"step_{k:04d}.nc") as data:
             _motion(tally, name, data, moved)
+            step = _step(data, moved)
+            if first is not None and step is not None:
+                _difference(tally, name, first, step)
+            first = first or step
             if "exx" in data.variables:
                 _strain(tally, name, data, _true_strain(replicate, frame, world, A))
         _gauges(tally, name, run.gauges["steps"][k], px, frame.point(world), moved)
@@ -132,6 +137,41 @@ def _motion(tally: Tally, name: str, data: Dataset, true: Array) -> None:
     for k, axis in enumerate("uvw"):
         tally.add(name, axis, error[:, k], total[:, k])
         tally.add(f"{OFF}: {name}", axis, error[:, k], own[:, k])
+
+
+@dataclass(frozen=True)
+class Step:
+    """Of one step: errors (n, 3) of u, v, w, the variance (n, 3) that is new in it, and the common factor by cause."""
+
+    error: Array
+    new: Array
+    factor: dict[str, Array]
+
+
+def _step(data: Dataset, true: Array) -> Step | None:
+    """A step's part of the difference of two; None where the file does not tell the reference's noise apart."""
+    if "reference_covariance" not in data.variables:
+        return None
+    _, own = _covariance(data)
+    frozen = np.ma.filled(data["reference_covariance"][:].astype(float), np.nan)
+    at = [data["reference_covariance"].components.split().index(name) for name in ("uu", "vv", "ww")]
+    new = np.diagonal(own, axis1=-2, axis2=-1)[:, 3:] - frozen.reshape(len(own), -1)[:, at]
+    F = np.ma.filled(data["common_factor"][:].astype(float), np.nan).reshape(len(own), 6, -1)[:, 3:]
+    causes = [str(name).strip() for name in data["cause"][:]]  # its _Encoding makes strings of the characters
+    factor = {name: F[..., [c == name for c in causes]] for name in set(causes)}
+    return Step(_values(data, ("u_mm", "v_mm", "w_mm")) - true, new, factor)
+
+
+def _difference(tally: Tally, name: str, first: Step, step: Step) -> None:
+    """The displacement of a step less that of the first: the columns of a cause that one file leaves out are small."""
+    variance = first.new + step.new
+    for cause in first.factor.keys() | step.factor.keys():
+        parts = [s.factor.get(cause, np.zeros((len(step.new), 3, 0))) for s in (first, step)]
+        width = max(part.shape[-1] for part in parts)
+        a, b = (np.pad(part, ((0, 0), (0, 0), (0, width - part.shape[-1]))) for part in parts)
+        variance = variance + ((b - a) ** 2).sum(axis=-1)
+    for k, axis in enumerate("uvw"):
+        tally.add(name, f"difference {axis}", step.error[:, k] - first.error[:, k], np.sqrt(variance[:, k]))
 
 
 def _true_strain(replicate: Replicate, frame: Frame, world: Array, A: Array) -> Array:
