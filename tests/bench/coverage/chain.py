@@ -121,8 +121,10 @@ def run(replicate: Replicate, folder: Path) -> Run:
         "gauge", results, "--extensometer", _list(ENDS), "--area", _list(INSIDE), "--out", folder / "gauges.json"
     )
     rigid = [k + 1 for k, (name, _, _) in enumerate(replicate.motions) if name.startswith(("rotation", "w"))]
-    chosen = [w for k in rigid for w in ("--step", str(k))]
-    said += command("gauge", results, "--remove-rigid", "--point", _list(ENDS[:2]), *chosen, "--out", folder / "rigid.json")
+    chosen = [w for k in rigid or [1] for w in ("--step", str(k))]
+    said += command(
+        "gauge", results, "--remove-rigid", "--point", _list(ENDS[:2]), *chosen, "--out", folder / "rigid.json"
+    )
     verdict = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))["verdict"]
     return Run(
         folder,
@@ -145,15 +147,19 @@ def _write(path: Path, picture: Any) -> None:
 def _describe(folder: Path, s: Stratum) -> None:
     """Write target and rig as the laboratory declares them."""
     if s.free:
-        shape = f'kind = "checkerboard"\nsize = [{CORNERS[0]}, {CORNERS[1]}]\npitch_mm = {SQUARE_MM}\nflatness_mm = 0.0\n'
+        shape = (
+            f'kind = "checkerboard"\nsize = [{CORNERS[0]}, {CORNERS[1]}]\npitch_mm = {SQUARE_MM}\nflatness_mm = 0.0\n'
+        )
     else:
-        shape = f'kind = "line_grid"\nlines = [{LINES[0]}, {LINES[1]}]\npitch_mm = {PITCH_MM}\nline_width_mm = {WIDTH_MM}\n'
+        shape = (
+            f'kind = "line_grid"\nlines = [{LINES[0]}, {LINES[1]}]\npitch_mm = {PITCH_MM}\nline_width_mm = {WIDTH_MM}\n'
+        )
     shape += f"node_tolerance_mm = {s.tolerance_mm}\npitch_scale_sigma = {s.pitch}\n"
     (folder / "target.toml").write_text(shape, encoding="utf-8")
     rig = []
     for c, sign in enumerate((-1.0, 1.0)):
-        rig += [f"[cam{c + 1}]", f"image_size_px = [{SIZE[0]}, {SIZE[1]}]", f"phd_px = {FOCAL_PX}"]
-        rig += [f"standoff_mm = {STANDOFF_MM}", f"angle_deg = {sign * GAMMA_DEG}", "aspect = 1.0"]
+        rig += [f"[cam{c + 1}]", f"image_size_px = [{SIZE[0]}, {SIZE[1]}]", f"phd_px = {s.reach * FOCAL_PX}"]
+        rig += [f"standoff_mm = {s.reach * STANDOFF_MM}", f"angle_deg = {sign * GAMMA_DEG}", "aspect = 1.0"]
     rig += ["[calibration]", f'lens = "{s.lens_model}"', f'moves = "{"free" if s.free else "cameras"}"']
     rig += [f"stage_scale_sigma = {s.scale}", f"stage_step_sigma_mm = {s.step_mm}"]
     if s.declared_tilt_rad is not None:

@@ -113,7 +113,10 @@ def main() -> int:
                 stratum, entry = jobs[job], job.result()
                 append(stratum, entry)
                 said = entry.get("refused", entry.get("verdict"))
-                print(f"{n} of {len(todo)}: {stratum.name}, seed {entry['seed']}: {said}, {entry['cpu_s']:.1f} s", flush=True)
+                print(
+                    f"{n} of {len(todo)}: {stratum.name}, seed {entry['seed']}: {said}, {entry['cpu_s']:.1f} s",
+                    flush=True,
+                )
     from tests.bench.coverage.page import write_page
 
     print(f"written: {write_page()}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,8 +45,8 @@ class Replicate:
     rng: np.random.Generator
 
 
-def drawn(stratum: Stratum, seed: int) -> Replicate:
-    """Draw a replicate; all of it follows from stratum and seed."""
+def drawn(stratum: Stratum, seed: int, *, only: Sequence[str] = ()) -> Replicate:
+    """Draw a replicate; all of it follows from stratum and seed. With ``only`` it has no more than these motions."""
     names = [s.name for s in STRATA]
     rng = np.random.default_rng([2020, names.index(stratum.name) if stratum.name in names else 999, seed])
     cameras = _camera(rng, -1.0, stratum), _camera(rng, 1.0, stratum)
@@ -54,7 +55,8 @@ def drawn(stratum: Stratum, seed: int) -> Replicate:
     knot = KNOT_MM["discs" if stratum.discs else "soft"] * rng.uniform(0.95, 1.05)
     slope = rng.uniform(-0.1, 0.1, 2)
     sheet = Sheet((float(slope[0]), float(slope[1])), stratum.curvature_per_mm, texture, knot)
-    return Replicate(stratum, cameras, made, views, sheet, _motions(rng), rng)
+    motions = tuple(motion for motion in _motions(rng) if not only or motion[0] in only)
+    return Replicate(stratum, cameras, made, views, sheet, motions, rng)
 
 
 def _turn(alpha: float, beta: float, gamma: float) -> Array:
@@ -65,10 +67,10 @@ def _turn(alpha: float, beta: float, gamma: float) -> Array:
 def _camera(rng: np.random.Generator, sign: float, stratum: Stratum) -> ReliefCamera:
     alpha = (0.0 if stratum.free else 45.0) + rng.uniform(-1.0, 1.0)
     R = _turn(*np.radians([alpha, rng.uniform(-0.3, 0.3), sign * GAMMA_DEG + rng.uniform(-0.5, 0.5)]))
-    t = np.array([*rng.uniform(-0.05, 0.05, 2), STANDOFF_MM + rng.uniform(-0.5, 0.5)])
+    t = np.array([*rng.uniform(-0.05, 0.05, 2), stratum.reach * STANDOFF_MM + rng.uniform(-0.5, 0.5)])
     centre = 0.5 * (np.array(SIZE) - 1.0) + rng.uniform(-2.0, 2.0, 2)
-    t[:2] -= (centre - 0.5 * (np.array(SIZE) - 1.0)) / FOCAL_PX * t[2]
-    focal = FOCAL_PX * (1.0 + 0.01 * rng.uniform(-1.0, 1.0))
+    focal = stratum.reach * FOCAL_PX * (1.0 + 0.01 * rng.uniform(-1.0, 1.0))
+    t[:2] -= (centre - 0.5 * (np.array(SIZE) - 1.0)) / focal * t[2]
     return ReliefCamera(SIZE, focal, (float(centre[0]), float(centre[1])), R, t, stratum.lens)
 
 

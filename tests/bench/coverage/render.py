@@ -99,10 +99,10 @@ def speckled(camera: ReliefCamera, sheet: Sheet, light: Light) -> Array:
     """Grey levels of a sheet, not rounded, without noise.
 
     A soft texture is sampled at three places a side, with the weights that have a blurred pixel's moments to the fifth
-    degree; discs at eight.
+    degree (under a wide blur at places a pixel apart); discs at four a pixel and side.
     """
     sharp = sheet.texture.shape[1] == 3
-    place, weight = _taps(light.blur_px, 6 if sharp else 3 if light.blur_px < _NARROW_PX else 2)
+    place, weight = _taps(light.blur_px, 4 if sharp else 3 if light.blur_px < _NARROW_PX else 1)
     back = np.linalg.inv(sheet.A)
     centre = -camera.R.T @ camera.t
     cover = _speckled(

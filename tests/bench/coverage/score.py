@@ -6,7 +6,7 @@ Files are read with netCDF4 and json alone, by the contract of their documents.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +21,8 @@ from tests.bench.coverage.render import Array
 WITHIN = 1.959964
 SHAPE = "shape"
 OFF = "calibration's part off"
+MEAN = "mean of all steps"
+WHITE = "declared white in time: mean of all steps"
 
 
 @dataclass(frozen=True)
@@ -67,19 +69,21 @@ def scored(replicate: Replicate, run: Run) -> dict[str, list[float]]:
         world = replicate.sheet.seen_by(replicate.cameras[0], px)
         _positions(tally, data, frame.point(world))
     _shape_gauges(tally, run, px, frame.point(world))
-    first: Step | None = None
+    steps: list[Step] = []
     for k, (name, A, b) in enumerate(replicate.motions, start=1):
         moved = frame.way(world @ (A - np.eye(3)).T + b)
         with Dataset(run.folder / "results" / f"step_{k:04d}.nc") as data:
             _motion(tally, name, data, moved)
             step = _step(data, moved)
-            if first is not None and step is not None:
-                _difference(tally, name, first, step)
-            first = first or step
+            if steps and step is not None:
+                _difference(tally, name, steps[0], step)
+            steps += [step] if step is not None else []
             if "exx" in data.variables:
                 _strain(tally, name, data, _true_strain(replicate, frame, world, A))
         _gauges(tally, name, run.gauges["steps"][k], px, frame.point(world), moved)
         _rigid(tally, name, run.moved, k, frame, world, A, b)
+    if len(steps) == len(replicate.motions):
+        _mean(tally, steps)
     return tally.cells
 
 
@@ -141,10 +145,11 @@ def _motion(tally: Tally, name: str, data: Dataset, true: Array) -> None:
 
 @dataclass(frozen=True)
 class Step:
-    """Of one step: errors (n, 3) of u, v, w, the variance (n, 3) that is new in it, and the common factor by cause."""
+    """Of one step: errors (n, 3) of u, v, w, their variances that are new in it and that are the reference's, and F."""
 
     error: Array
     new: Array
+    frozen: Array
     factor: dict[str, Array]
 
 
@@ -155,23 +160,43 @@ def _step(data: Dataset, true: Array) -> Step | None:
     _, own = _covariance(data)
     frozen = np.ma.filled(data["reference_covariance"][:].astype(float), np.nan)
     at = [data["reference_covariance"].components.split().index(name) for name in ("uu", "vv", "ww")]
-    new = np.diagonal(own, axis1=-2, axis2=-1)[:, 3:] - frozen.reshape(len(own), -1)[:, at]
+    frozen = frozen.reshape(len(own), -1)[:, at]
+    new = np.diagonal(own, axis1=-2, axis2=-1)[:, 3:] - frozen
     F = np.ma.filled(data["common_factor"][:].astype(float), np.nan).reshape(len(own), 6, -1)[:, 3:]
     causes = [str(name).strip() for name in data["cause"][:]]  # its _Encoding makes strings of the characters
     factor = {name: F[..., [c == name for c in causes]] for name in set(causes)}
-    return Step(_values(data, ("u_mm", "v_mm", "w_mm")) - true, new, factor)
+    return Step(_values(data, ("u_mm", "v_mm", "w_mm")) - true, new, frozen, factor)
+
+
+def _common(steps: Sequence[Step], weights: Sequence[float]) -> Array:
+    """(n, 3) variance of a weighted sum of steps from the common factor; a file leaves small columns of a cause out."""
+    variance = np.zeros_like(steps[0].new)
+    for cause in set().union(*(step.factor for step in steps)):
+        parts = [step.factor.get(cause, np.zeros((*variance.shape, 0))) for step in steps]
+        width = max(part.shape[-1] for part in parts)
+        wide = [np.pad(part, ((0, 0), (0, 0), (0, width - part.shape[-1]))) for part in parts]
+        variance += (sum(w * part for w, part in zip(weights, wide, strict=True)) ** 2).sum(axis=-1)
+    return variance
 
 
 def _difference(tally: Tally, name: str, first: Step, step: Step) -> None:
-    """The displacement of a step less that of the first: the columns of a cause that one file leaves out are small."""
-    variance = first.new + step.new
-    for cause in first.factor.keys() | step.factor.keys():
-        parts = [s.factor.get(cause, np.zeros((len(step.new), 3, 0))) for s in (first, step)]
-        width = max(part.shape[-1] for part in parts)
-        a, b = (np.pad(part, ((0, 0), (0, 0), (0, width - part.shape[-1]))) for part in parts)
-        variance = variance + ((b - a) ** 2).sum(axis=-1)
+    """The displacement of a step less that of the first: the reference's noise cancels."""
+    variance = first.new + step.new + _common((first, step), (-1.0, 1.0))
     for k, axis in enumerate("uvw"):
         tally.add(name, f"difference {axis}", step.error[:, k] - first.error[:, k], np.sqrt(variance[:, k]))
+
+
+def _mean(tally: Tally, steps: Sequence[Step]) -> None:
+    """The mean displacement of all steps, with the reference's noise in all of them alike, and as if it were not."""
+    n = len(steps)
+    error = np.mean([step.error for step in steps], axis=0)
+    new = np.sum([step.new for step in steps], axis=0) / n**2
+    common = _common(steps, [1.0 / n] * n)
+    frozen = np.mean([np.sqrt(np.maximum(step.frozen, 0.0)) for step in steps], axis=0) ** 2
+    white = np.sum([step.frozen for step in steps], axis=0) / n**2
+    for k, axis in enumerate("uvw"):
+        tally.add(MEAN, axis, error[:, k], np.sqrt(new + frozen + common)[:, k])
+        tally.add(WHITE, axis, error[:, k], np.sqrt(new + white + common)[:, k])
 
 
 def _true_strain(replicate: Replicate, frame: Frame, world: Array, A: Array) -> Array:
