@@ -180,10 +180,15 @@ def _title(part: str) -> str:
 def write_section(name: str, section: Section) -> Path:
     """Put a section into the page of its topic, in place of the one with its title; return the page."""
     topic = next(topic for topic in TOPICS if name in topic.sections)
+    return write_part(topic.name, section.title, _text(section))
+
+
+def write_part(topic_name: str, title: str, text: str) -> Path:
+    """Put a part that begins with its title into a topic's page, in place of the one with that title."""
+    topic = next(topic for topic in TOPICS if topic.name == topic_name)
     path = TOPICS_FOLDER / f"{topic.name}.md"
     head, *parts = _parts(path.read_text(encoding="utf-8")) if path.exists() else [f"# {topic.title}\n"]
-    text = _text(section)
-    same = [i for i, part in enumerate(parts) if _title(part) == section.title]
+    same = [i for i, part in enumerate(parts) if _title(part) == title]
     if same:
         parts[same[0]] = text
     else:

@@ -1,0 +1,108 @@
+"""What laboratories' targets, stages, images and settings are like in the proof of coverage, stratum by stratum."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stratum:
+    """One laboratory. Errors are drawn anew in each replicate; what the files declare is the same unless it says so.
+
+    Attributes
+    ----------
+    tolerance_mm
+        Bound of the nodes' errors, drawn alike within it.
+    step_mm, scale
+        Standard deviations of the stage's steps and of its scale.
+    pitch
+        Standard deviation of the pitch's scale.
+    tilt_rad
+        Standard deviation of the stage axis' tilt, each way.
+    declared_tilt_rad
+        What the rig file says of it; None: nothing, so that the default prior holds.
+    view_noise, view_noise_px
+        Grey levels of the calibration's images, and over how many px it is correlated.
+    free
+        Checkerboard in free poses; else a line grid, each camera on its stage.
+    reach
+        Principal distance and stand-off, over the usual ones: with a long lens the views do not show the axis' tilt.
+    lens
+        k1, k2, p1, p2 of both cameras' lenses, and the model that the rig file asks for.
+    noise, noise_px
+        Grey levels of the measured images, and over how many px that is correlated.
+    declare_white
+        Measure the noise from repeated frames (``stereorig noise``) and give it: its file says nothing of correlation.
+    discs
+        Sharp discs in place of soft speckle.
+    curvature_per_mm
+        Of the measured surface.
+    blur_in_time
+        Rises of the images' blur from the reference to the last step, px.
+    subset_px, options
+        Of ``stereorig measure``.
+    must
+        ``cover``: the asked limits hold; ``fail``: a negative control; ``state``: named on the page with its figures.
+    """
+
+    name: str
+    tolerance_mm: float = 1e-3
+    step_mm: float = 0.0
+    scale: float = 0.0
+    pitch: float = 0.0
+    tilt_rad: float = 0.0
+    declared_tilt_rad: float | None = 0.0
+    view_noise: float = 2.0
+    view_noise_px: float = 0.0
+    free: bool = False
+    reach: float = 1.0
+    lens: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    lens_model: str = "paper"
+    noise: float = 2.0
+    noise_px: float = 0.0
+    declare_white: bool = False
+    discs: bool = False
+    curvature_per_mm: float = 0.0
+    blur_in_time: float = 0.0
+    subset_px: int = 21
+    options: tuple[str, ...] = ("--patch", "affine")
+    main: bool = False
+    must: Literal["cover", "fail", "state"] = "cover"
+
+
+MAIN = (
+    Stratum(name="exact grid", tolerance_mm=0.0, main=True),
+    Stratum(name="grid of 1 um", main=True),
+    Stratum(name="grid of 4 um", tolerance_mm=4e-3, main=True),
+    Stratum(
+        name="grid of 4 um, stage of 5 um and 1e-4, tilt of 1 mrad",
+        tolerance_mm=4e-3,
+        step_mm=5e-3,
+        scale=1e-4,
+        tilt_rad=1e-3,
+        declared_tilt_rad=None,
+        main=True,
+    ),
+)
+OTHERS = (
+    Stratum(name="stage of 1 um", step_mm=1e-3),
+    Stratum(name="pitch of 2e-5", pitch=2e-5),
+    Stratum(name="long lens, tilt of 1 mrad, default prior", tilt_rad=1e-3, declared_tilt_rad=None, reach=3.0),
+    Stratum(name="noise of 6", noise=6.0, view_noise=6.0),
+    Stratum(name="noise of 20", noise=20.0, view_noise=6.0),
+    Stratum(name="correlated noise of the views", view_noise=6.0, view_noise_px=0.8),
+    Stratum(name="board in free poses", tolerance_mm=2e-3, free=True, lens_model="auto"),
+    Stratum(name="lens richer than the model", lens=(-0.6, 0.0, 1.5e-3, -2e-3), must="state"),
+    Stratum(name="the same lens, model chosen", lens=(-0.6, 0.0, 1.5e-3, -2e-3), lens_model="auto", must="state"),
+    Stratum(name="sharp discs", discs=True, must="state"),
+    Stratum(name="curved patch", curvature_per_mm=0.02, options=("--patch", "quadratic")),
+    Stratum(name="subset of 15 px", subset_px=15),
+    Stratum(name="subset of 33 px", subset_px=33),
+    Stratum(name="reference updates", options=("--patch", "affine", "--reference-update", "always")),
+    Stratum(name="blur in time", blur_in_time=0.6, must="state"),
+    Stratum(name="correlated noise of the images", noise=4.0, noise_px=0.45, must="state"),
+    Stratum(name="the same, declared white", noise=4.0, noise_px=0.45, declare_white=True, must="state"),
+)
+CONTROLS = (Stratum(name="long lens, tilt of 1 mrad, prior off", tilt_rad=1e-3, reach=3.0, must="fail"),)
+STRATA = MAIN + OTHERS + CONTROLS
