@@ -11,6 +11,7 @@ import numpy as np
 import scipy.io
 
 from core.errors import InputError
+from server.formats.channel_units import plain_names
 from server.formats.files import written_temporary
 from server.formats.matlab_names import matlab_name
 from server.results.provenance import provenance
@@ -49,7 +50,8 @@ def write_mat(path: Path, steps: Iterable[StepResult], source: Source) -> None:
                 "time_s": np.nan if step.recorded.time_s is None else step.recorded.time_s,
             }
             if step.recorded.channels:
-                held["channels"] = {matlab_name(name): value for name, value in step.recorded.channels.items()}
+                plain = plain_names(step.recorded.channels, matlab_name)
+                held["channels"] = {plain[name]: value for name, value in step.recorded.channels.items()}
             held |= {names[name]: v.values.astype(np.float64) for name, v in step.variables.items()}
             about = {matlab_name(k): _plain(v) for k, v in provenance(step, source).items()}
             about["units"] = {names[name]: v.units for name, v in step.variables.items()}

@@ -22,7 +22,7 @@ from server.formats.files import written_temporary
 from server.formats.images import read_mask
 from server.formats.results.folder import number_of
 from server.formats.results.netcdf import add_scalars
-from server.results.channels import rising
+from server.results.channels import has_more, rising
 from server.results.provenance import provenance
 from server.results.steps import Source, chosen, columns_of, each, read_step, require_known, variables_of, with_coverage
 from server.results.uncertainty import in_file
@@ -104,11 +104,10 @@ def _as_stored(source: Source, files: Sequence[Path], request: ExportRequest, ou
         )
     for path in files:
         copy = _path(out, source, number_of(path), "nc")
-        recorded = read_step(path, []).recorded
         with written_temporary(copy) as temporary:
             shutil.copyfile(path, temporary)
-            if recorded.channels or recorded.load_n is not None:
-                add_scalars(temporary, scalars_of(recorded))
+            if has_more(path):
+                add_scalars(temporary, scalars_of(read_step(path, []).recorded))
         yield copy
 
 

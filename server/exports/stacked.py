@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from core.common.factor import Causes, joined
-from server.formats.channel_units import unit_of
+from server.formats.channel_units import plain_names, unit_of
 from server.formats.results.netcdf import opened, written_dataset
 from server.results.channels import Recorded
 from server.results.provenance import provenance
@@ -84,8 +84,9 @@ def scalars_of(recorded: Recorded) -> Iterator[tuple[str, float, str, str]]:
         yield "load_n", recorded.load_n, "N", LOAD_MEANS
     if recorded.time_s is not None:
         yield "time_s", recorded.time_s, "s", "time since the reference"
+    plain = plain_names(recorded.channels)
     for name, value in recorded.channels.items():
-        yield f"channel_{name}", value, unit_of(name), f"channel {name}, as recorded with the step"
+        yield f"channel_{plain[name]}", value, unit_of(name), f"channel {name}, as recorded with the step"
 
 
 def _begin(data: Any, step: StepResult, count: int) -> None:

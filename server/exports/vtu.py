@@ -163,7 +163,7 @@ def _array(
     size = "" if tuples is None else f' NumberOfTuples="{tuples}"'
     data = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<")).tobytes()
     text = base64.b64encode(np.uint64(len(data)).tobytes() + data).decode("ascii")
-    out.write(f'<DataArray type="{kind}" Name="{escape(name)}"{parts}{size} format="binary">{text}')
+    out.write(f'<DataArray type="{kind}" Name={quoteattr(name)}{parts}{size} format="binary">{text}')
     if units is not None:
         out.write(f'<InformationKey name="UNITS_LABEL" location="vtkDataArray">{escape(units)}</InformationKey>')
     out.write("</DataArray>\n")

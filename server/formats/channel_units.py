@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections.abc import Callable, Iterable
 
 #: what ends a name, and the unit as it is written
 _UNITS = {
@@ -64,6 +65,23 @@ def channel_name(title: str, unit: str = "") -> str:
     name = _word(title) or "channel"
     ending = _WRITTEN.get(unit.strip().lower().replace(" ", ""), _word(unit))
     return (name if not ending or name.endswith(f"_{ending}") else f"{name}_{ending}")[:100]
+
+
+def plain_names(names: Iterable[str], plain: Callable[[str], str] | None = None) -> dict[str, str]:
+    """Return for each channel a name that programs take: letters, digits, underscores; no two alike.
+
+    Parameters
+    ----------
+    plain
+        Makes a name plain in a program's own way.
+    """
+    found: dict[str, str] = {}
+    for name in names:
+        made = re.sub(r"[^A-Za-z0-9_]+", "_", name) if plain is None else plain(name)
+        while made in found.values():
+            made += "_"
+        found[name] = made
+    return found
 
 
 def _word(text: str) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from core.errors import StereorigError
+from server.formats.channel_units import unit_of
 from server.formats.gauges.readings import LineReading, Number, StepReadings
 from server.formats.results.uncertainty import Statement
 from server.report.floor import STRAINS, UM
@@ -83,7 +84,8 @@ def courses(measured: Measured) -> list[Picture] | None:
         drawn.append(axis.draw(lines, "load, N", "Load", text="load", caption="Load as recorded with the steps"))
     for name in measured.channels:
         lines = {name: ([s.channels.get(name) for s in steps], None)}
-        drawn.append(axis.draw(lines, name, name, text=name, caption=f"{name} as recorded with the steps"))
+        label = _with_unit(name)
+        drawn.append(axis.draw(lines, label, name, text=name, caption=f"{name} as recorded with the steps"))
 
     def over(chosen: Sequence[StepFigures]) -> _Axis:
         numbers = {s.n for s in chosen}
@@ -128,6 +130,9 @@ def gauges(source: Source, measured: Measured) -> Gauges | None:
         title = f"Extensometer {extensometer.name}"
         tables.append(_table(extensometer.name, title, _EXTENSOMETER, steps, read))
         curves += _curves(title, _EXTENSOMETER[-1:], [values for values, _ in read], axis, measured.statement)
+        curves += _against_loads(
+            title, [figures[s.n] for s in steps], [values for values, _ in read], measured.statement
+        )
     others: list[tuple[str | None, str, _Readings]] = []
     for k, point in enumerate(steps[0].points):
         others.append((point.name, "Point", [(s.points[k].values, s.points[k].missing) for s in steps]))
@@ -142,6 +147,43 @@ def gauges(source: Source, measured: Measured) -> Gauges | None:
     for line in steps[-1].lines:
         curves += _line(line, steps[-1].n)
     return Gauges(curves, problems, tables, gauge_budgets(steps[-1], measured.statement), steps[-1].n)
+
+
+def _with_unit(channel: str) -> str:
+    return channel if unit_of(channel) == "1" else f"{channel}, {unit_of(channel)}"
+
+
+def _against_loads(
+    title: str, steps: Sequence[StepFigures], read: Sequence[Mapping[str, Number]], statement: Statement
+) -> list[Picture]:
+    """Draw the strain of an extensometer against the load and each channel; what a step lacks is left out."""
+    names = sorted({name for s in steps for name in s.channels})[:4]
+    loads = {_with_unit(name): [s.channels.get(name) for s in steps] for name in names}
+    loads = {"load, N": [s.load_n for s in steps], **loads}
+    drawn = []
+    for label, values in loads.items():
+        points = [
+            (x, 0.0 if v is None or v.value is None else 1e6 * v.value, None if v is None else v.sigma)
+            for s, x, v in zip(steps, values, (numbers.get("strain") for numbers in read), strict=True)
+            # strain is relative to the reference, where it is zero
+            if x is not None and ((v is not None and v.value is not None) or not s.summary.displacement_mm)
+        ]
+        if len({x for x, _, _ in points}) < 2:
+            continue
+        strain = [y for _, y, _ in points]
+        sigma = [None if s is None else statement.k * 1e6 * s for _, _, s in points]
+        name = label.partition(",")[0]
+        data = course(
+            [x for x, _, _ in points],
+            {"strain": (strain, sigma)},
+            x_label=label,
+            y_label="microstrain",
+            title=f"{title} against {name}",
+            as_given=True,
+        )
+        caption = f"{title} against {name}; bars are \u00b1 {statement.text}"
+        drawn.append(Picture(data, SVG, f"{title} against {name}", caption))
+    return drawn
 
 
 def _table(

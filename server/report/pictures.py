@@ -127,17 +127,21 @@ def region(
     return _png(figure)
 
 
-def course(x: Sequence[float], lines: Lines, *, x_label: str, y_label: str, title: str) -> bytes:
+def course(
+    x: Sequence[float], lines: Lines, *, x_label: str, y_label: str, title: str, as_given: bool = False
+) -> bytes:
     """Draw values over the steps; SVG.
 
     Parameters
     ----------
+    as_given
+        Join the points in their order, as a load goes up and down; else by x.
     lines
         By name, the values and their standard deviations (or None), which are drawn as bars of +- 1 sd.
     """
     figure = Figure(figsize=(4.5, 2.6), layout="constrained")
     axis = figure.add_subplot()
-    order = np.argsort(np.asarray(x, dtype=np.float64), kind="stable")
+    order = np.arange(len(x)) if as_given else np.argsort(np.asarray(x, dtype=np.float64), kind="stable")
     for k, (name, (values, sigma)) in enumerate(lines.items()):
         y = np.array([np.nan if v is None else v for v in values])[order]
         bars = None if sigma is None else np.array([np.nan if s is None else s for s in sigma])[order]
@@ -156,8 +160,8 @@ def course(x: Sequence[float], lines: Lines, *, x_label: str, y_label: str, titl
     axis.grid(visible=True, color="0.9", linewidth=0.6)
     axis.spines[["top", "right"]].set_visible(False)
     axis.tick_params(labelsize=7)
-    axis.set_xlabel(x_label, fontsize=8)
-    axis.set_ylabel(y_label, fontsize=8)
+    axis.set_xlabel(_plain(x_label), fontsize=8, parse_math=False)
+    axis.set_ylabel(_plain(y_label), fontsize=8, parse_math=False)
     axis.set_title(_plain(title), fontsize=9, loc="left", parse_math=False)
     if len(lines) > 1:
         legend = axis.legend(frameon=False, fontsize=7, ncols=min(len(lines), 4))

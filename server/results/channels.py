@@ -9,6 +9,7 @@ from datetime import datetime
 from pathlib import Path
 
 from server.formats.channel_units import unit_of
+from server.formats.results.reading import read_head
 from server.store.durable import known_json
 
 
@@ -55,6 +56,13 @@ def recorded_with(result: Path, n: int, reference: int | None) -> Recorded:
         float(one["load_n"]) if isinstance(one.get("load_n"), int | float) else None,
         None if begin is None or end is None else (end - begin).total_seconds(),
     )
+
+
+def has_more(result: Path) -> bool:
+    """Return True if a step's record has more than its result file: channels, or a load that came later."""
+    head = read_head(result)
+    recorded = recorded_with(result, head.step, head.reference_step)
+    return bool(recorded.channels) or (recorded.load_n is not None and recorded.load_n != head.load_n)
 
 
 def step_time(step: Mapping[str, object]) -> datetime | None:

@@ -61,7 +61,7 @@ async function open() {
 async function stop() {
   stopButton.textContent = "STOPPING …";
   try {
-    const answer = await api.post("/stage/stop");
+    const answer = await api.post("/stage:stop");
     notify(`The stop command was sent after ${num(answer.elapsed_ms, 3)} ms.${answer.cancelled_job ? " The job that moved the axis was cancelled." : ""}`, "good");
   } catch (error) {
     notify(error);

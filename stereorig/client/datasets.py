@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     import xarray
 
 
+_AGAINST_REFERENCE = ("elongation_mm", "strain", "true_strain")
+
+
 def _xarray() -> Any:
     try:
         import xarray
@@ -44,7 +47,7 @@ def stacked(files: Mapping[int, bytes]) -> xarray.Dataset:
     positions = [name for name in ("x_px", "y_px") if name in steps[-1]]
     varying = [one.drop_vars(positions, errors="ignore") for one in steps]
     together = xr.concat(varying, dim="step", data_vars="all", coords="minimal", compat="override", join="outer")
-    return together.assign_coords({name: steps[-1][name] for name in positions})  # type: ignore[no-any-return]
+    return together.assign_coords({name: steps[-1][name].drop_vars("step") for name in positions})  # type: ignore[no-any-return]
 
 
 def extensometers(reply: GaugesReply) -> xarray.Dataset:
@@ -62,7 +65,15 @@ def extensometers(reply: GaugesReply) -> xarray.Dataset:
         numbers = [[gauge.values.get(quantity) for gauge in one.extensometers] for one in steps]
         units = next((n.units for row in numbers for n in row if n is not None), "1")
         for prefix, part in (("", "value"), ("sigma_", "sigma")):
-            table = np.array([[_number(n, part) for n in row] for row in numbers], dtype=float)
+            # what is measured against the reference is zero there, by definition
+            at_rest = 0.0 if quantity in _AGAINST_REFERENCE else np.nan
+            table = np.array(
+                [
+                    [at_rest if one.kind == "shape" and not _known(n) else _number(n, part) for n in row]
+                    for one, row in zip(steps, numbers, strict=True)
+                ],
+                dtype=float,
+            )
             held[f"{prefix}{quantity}"] = (("step", "gauge"), table, {"units": units})
     data = xr.Dataset(held, coords={"step": [one.n for one in steps], "gauge": names}, attrs={"frame": reply.frame})
     for name, values, units in _of_steps(reply, steps):
@@ -77,6 +88,10 @@ def _of_steps(reply: GaugesReply, steps: list[Any]) -> list[tuple[str, list[floa
         channel = [_or_nan(one.channels.get(name)) for one in steps]
         found.append((name, channel, reply.channel_units.get(name, "1")))
     return [(name, values, units) for name, values, units in found if np.isfinite(values).any()]
+
+
+def _known(number: Any) -> bool:
+    return number is not None and number.value is not None
 
 
 def _or_nan(value: float | None) -> float:

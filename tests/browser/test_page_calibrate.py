@@ -196,7 +196,7 @@ def test_cancel_and_a_camera_lost_in_mid_run_are_shown(page: Watched, client: ht
     service.rig.pair.units["cam2"].grabber.faults.gone = True  # type: ignore[attr-defined]
     expect(progress.locator(".problem")).to_contain_text("cam2", timeout=SLOW)
     expect(progress).to_contain_text("camera_lost")
-    job = wait_for_job(client, client.post(f"{API}/rig/reconnect").json()["job"])
+    job = wait_for_job(client, client.post(f"{API}/rig:reconnect").json()["job"])
     assert job["state"] == "succeeded"
     wait_for_rig(client)
     page.sound()

@@ -84,7 +84,7 @@ def test_the_skip_link_goes_to_the_content_of_the_same_screen(page: Watched) -> 
 
 
 def stopped(at: Page, act: Callable[[], object]) -> None:
-    with at.expect_response(lambda answer: answer.url.endswith("/stage/stop") and answer.status == 200):
+    with at.expect_response(lambda answer: answer.url.endswith("/stage:stop") and answer.status == 200):
         act()
 
 
@@ -119,7 +119,7 @@ def test_stop_from_anywhere(page: Watched, plate: str) -> None:
     at.wait_for_timeout(1600)
     at.keyboard.press("Escape")
     at.wait_for_timeout(300)
-    assert not [url for url in asked_for if url.endswith("/stage/stop")]
+    assert not [url for url in asked_for if url.endswith("/stage:stop")]
     page.sound()
 
 

@@ -81,7 +81,7 @@ class StageService:
         raise AssertionError(f"the job did not end: {document}")
 
     def home(self) -> None:
-        assert self.done(self.job("/stage/home"))["state"] == "succeeded"
+        assert self.done(self.job("/stage:home"))["state"] == "succeeded"
 
     def stage(self) -> dict[str, Any]:
         answer = self.client.get(f"{API}/stage")

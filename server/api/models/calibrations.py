@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, StringConstraints, with_config
+from pydantic import BeforeValidator, Field, StringConstraints, with_config
 from typing_extensions import TypedDict
 
 from core.plan.settings import PlannedMeasurement, PlannedRig
@@ -257,6 +257,18 @@ class PlanReply(TypedDict, total=False):
     steps: Annotated[list[int] | None, Field(description="Those steps.")]
 
 
+class VerdictReply(Reply):
+    """Verdict on a calibration's quality."""
+
+    level: Literal["good", "warning", "failed"] = Field(description="The verdict.")
+    reasons: list[str] = Field(description="Reasons of the verdict.")
+
+
+def _own_verdict(value: object) -> object:
+    # a file from elsewhere may hold anything by that name
+    return value if isinstance(value, VerdictReply) or (isinstance(value, dict) and "level" in value) else None
+
+
 class CalibrationReply(Reply):
     """A calibration: its plan, and once complete everything in calibration.json; what a verdict refused, too."""
 
@@ -265,6 +277,9 @@ class CalibrationReply(Reply):
     plan: PlanReply = Field(description="Positions, frames and localiser asked for.")
     taken: list[ViewReply] | None = Field(None, description="Views taken, each as in GET /calibrations/{id}/views.")
     problem: JobProblem | None = Field(None, description="Problem that left no calibration.")
+    verdict: Annotated[VerdictReply | None, BeforeValidator(_own_verdict)] = Field(
+        None, description="Its verdict; null: none, as of most imported ones."
+    )
     review: Review | None = Field(None, description="The operator's decision; null: none yet.")
     kept_checks: dict[str, KeptCheck] | None = Field(
         None, description="Checks made since, by name, `known_distance` among them; null: none."
@@ -280,13 +295,6 @@ class CalibrationFile(Reply):
     imported: dict[str, object] | None = Field(
         None, description="Another program's file, whole, in place of the above; its contents are that program's."
     )
-
-
-class VerdictReply(Reply):
-    """Verdict on a calibration's quality."""
-
-    level: Literal["good", "warning", "failed"] = Field(description="The verdict.")
-    reasons: list[str] = Field(description="Reasons of the verdict.")
 
 
 class CalibrationEntry(Reply):

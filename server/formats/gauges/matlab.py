@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from server.formats.channel_units import plain_names
 from server.formats.gauges.readings import GaugeReadings
 from server.formats.gauges.table import columns, table_rows
 from server.formats.matlab_names import matlab_name
@@ -26,7 +27,9 @@ def gauges_mat(readings: GaugeReadings) -> bytes:
     from scipy.io import savemat  # loaded where it is used
 
     rows = list(table_rows(readings))
-    held = {matlab_name(name): _column(name, [value(row) for row in rows]) for name, value in columns(readings).items()}
+    wanted = columns(readings)
+    plain = plain_names(wanted, matlab_name)
+    held = {plain[name]: _column(name, [value(row) for row in rows]) for name, value in wanted.items()}
     about = {k: v if isinstance(v, str) else json.dumps(v, sort_keys=True) for k, v in readings.about().items()}
     out = io.BytesIO()
     save: Any = savemat

@@ -237,7 +237,7 @@ function run(rig, ends, done) {
     start.setAttribute("aria-disabled", "true");
     const bar = h("progress", { max: 1, "aria-label": "Progress of the calibration" });
     const text = h("span");
-    replace(progress, h("div.row", h("span", { style: { flex: 1, minWidth: "10rem" } }, bar), text, action("Cancel", () => api.post(`/jobs/${job.id}/cancel`), { kind: "danger" })));
+    replace(progress, h("div.row", h("span", { style: { flex: 1, minWidth: "10rem" } }, bar), text, action("Cancel", () => api.post(`/jobs/${job.id}:cancel`), { kind: "danger" })));
     try {
       const ended = await api.finished(job.id, { signal: stopped.signal, onprogress: (now) => {
         const { phase: stage, done: ready, total } = now.progress ?? {};

@@ -54,7 +54,7 @@ export async function open(root) {
   }
 
   /** @param {Job} job */
-  const cancel = (job) => action("Cancel", async () => { take(await api.post(`/jobs/${job.id}/cancel`)); }, { kind: "danger", "aria-label": `Cancel ${job.kind} ${job.id}` });
+  const cancel = (job) => action("Cancel", async () => { take(await api.post(`/jobs/${job.id}:cancel`)); }, { kind: "danger", "aria-label": `Cancel ${job.kind} ${job.id}` });
 
   function show() {
     const job = jobs.get(chosen);

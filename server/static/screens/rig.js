@@ -63,7 +63,7 @@ export async function open(root) {
 
 function reconnect() {
   return action("Reconnect", async () => {
-    const { job } = await api.post("/rig/reconnect");
+    const { job } = await api.post("/rig:reconnect");
     const ended = await api.finished(job.id);
     if (ended.state !== "succeeded") throw api.jobProblem(ended);
     notify("Cameras and stage are open again.", "good");
@@ -262,7 +262,7 @@ function stage(ends) {
         h("div.row", h("strong", { "data-role": "position" }, quantity(axis.position_mm, "mm", 6)), h("span", { "data-role": "state" }, stateBadge(axis)),
           h("span.quiet", axis.limits ? `${num(axis.limits.low_mm, 4)} to ${num(axis.limits.high_mm, 4)} mm` : "")),
         h("div.row", jog(-1), jog(1), h("label", { for: `target${axis.axis}` }, "to"), Object.assign(target, { id: `target${axis.axis}` }), h("span.unit", "mm"), go,
-          action("Home", () => run(api.post("/stage/home", { axes: [axis.axis] })))));
+          action("Home", () => run(api.post("/stage:home", { axes: [axis.axis] })))));
     }));
   }
 
@@ -294,7 +294,7 @@ function stage(ends) {
   const timer = setInterval(update, 700);
   ends.push(() => clearInterval(timer), events.on("stage", update));
   return h("section.panel", h("h2", "Stage"), h("div.fields", field("Jog step", step, "mm")), rows,
-    h("div.row", action("Home all", () => run(api.post("/stage/home", {}))), h("span.quiet", "The red button stops every axis at once; so does Esc, pressed twice.")));
+    h("div.row", action("Home all", () => run(api.post("/stage:home", {}))), h("span.quiet", "The red button stops every axis at once; so does Esc, pressed twice.")));
 }
 
 /** @param {Rig} rig */

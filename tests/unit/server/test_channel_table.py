@@ -34,7 +34,7 @@ RECORDS = {
     "brackets": "Time (s),Force (kN)\n0,0\n0.1,1\n0.2,2\n",
     "units in a row": '"Time","Force"\n"(s)","(kN)"\n"0","0"\n"0.1","1"\n"0.2","2"\n',
     "semicolons and commas": "Zeit [s];Force [kN]\n0,0;0,0\n0,1;1,0\n0,2;2,0\n",
-    "tabs and a preamble": "Machine 7\nOperator\tA. B.\tx\n\nTime / ms\tForce / kN\tNote\n0\t0\ta\n100\t1\tb\n200\t2\t\n",
+    "tabs and a preamble": "Machine 7\nBy\tA. B.\n\nTime / ms\tForce / kN\tNote\n0\t0\ta\n100\t1\t\n200\t2\t\n",
     "Latin-1": "Time (s);Force (kN);Temperature (°C)\n0;0;20\n0.1;1;20\n0.2;2;20\n",
 }
 

@@ -19,6 +19,7 @@ from server.api.protocol.problems import errors
 from server.base.errors import NotFoundError
 from server.exports.request import MEDIA_TYPES, ExportFormat, ExportRequest, steps_in
 from server.formats.figure_options import COLOURS, WIDTHS_PX, FigureStyle
+from server.results.channels import has_more
 from server.worker.executor import TaskFuture
 from server.workflows import analysis_start
 from server.workflows.framed import results_in_frame
@@ -130,7 +131,7 @@ async def export(
     wanted = [step] if step is not None else None if steps is None else steps_in(steps)
     files, headers = await run_in_threadpool(_prepared, service, test_id, analysis_id, wanted)
     as_stored = variables is None and coverage.factor == 1.0 and frame in (None, "system")
-    if format == "nc" and len(files) == 1 and as_stored:
+    if format == "nc" and len(files) == 1 and as_stored and not await run_in_threadpool(has_more, files[0]):
         return FileResponse(
             files[0], media_type=MEDIA_TYPES["nc"], headers=headers, filename=f"{test_id}_{analysis_id}_{files[0].name}"
         )

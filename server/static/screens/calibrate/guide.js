@@ -97,7 +97,7 @@ function acquisition(rig, id, job, ended) {
   const path = /** @type {const} */ (`/calibrations/${id}/guide`);
   const take = action("Take a view now", () => api.post(`${path}/views`));
   const finish = action("Finish and fit", () => api.post(`${path}:finish`), { kind: "primary" });
-  const cancel = action("Cancel", () => api.post(`/jobs/${job}/cancel`), { kind: "danger" });
+  const cancel = action("Cancel", () => api.post(`/jobs/${job}:cancel`), { kind: "danger" });
   const root = h("div", { style: { marginTop: "var(--gap)" } }, sentence, figures, h("div.row", take, finish, cancel),
     h("div.grid.two.views", { style: { marginTop: "var(--gap)" } }, views.map((one) => h("div", h("h3", one.cam), one.view.root, one.state))), cover);
 

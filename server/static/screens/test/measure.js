@@ -218,7 +218,7 @@ export async function measurePanel(id, test, ends, done) {
       const bar = h("progress", { max: 1, "aria-label": "Progress of the analysis" });
       const text = h("span");
       const link = h("a.button", { href: `#/results/${id}/${analysis}` }, "Show results");
-      replace(progress, h("div.row", h("span", { style: { flex: 1, minWidth: "10rem" } }, bar), text, action("Cancel", () => api.post(`/jobs/${job.id}/cancel`), { kind: "danger" }), link));
+      replace(progress, h("div.row", h("span", { style: { flex: 1, minWidth: "10rem" } }, bar), text, action("Cancel", () => api.post(`/jobs/${job.id}:cancel`), { kind: "danger" }), link));
       const ended = await api.finished(job.id, { signal: stopped.signal, onprogress: (now) => {
         const { phase: stage, done: ready, total, eta_s: eta } = now.progress ?? {};
         if (total) bar.value = ready / total;

@@ -107,7 +107,7 @@ function capture(id, done, ends, refresh) {
     const made = await api.post(`/tests/${id}/steps`, body);
     if (!("job" in made)) return done(made);
     const bar = h("progress", { max: 1, "aria-label": "Progress of the burst" });
-    replace(progress, bar, action("Cancel", () => api.post(`/jobs/${made.job.id}/cancel`), { kind: "danger" }));
+    replace(progress, bar, action("Cancel", () => api.post(`/jobs/${made.job.id}:cancel`), { kind: "danger" }));
     const ended = await api.finished(made.job.id, { signal: stopped.signal, onprogress: (job) => { if (job.progress?.total) bar.value = job.progress.done / job.progress.total; } });
     replace(progress, ["succeeded", "cancelled"].includes(ended.state) ? h("p", `${count.value} steps were requested; see above.`) : problemText(api.jobProblem(ended)));
     return refresh();

@@ -1,0 +1,214 @@
+"""The client: a whole test in twenty lines as the tutorial prints it, sync and async, its errors and its progress."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+import stereorig
+from core.errors import CalibrationInputError, InputError, StateError, StereorigError
+from server.api.models import AnalysisRequest, JobReply
+from server.config.rig_file import parse_config
+from server.workflows.service import Service
+from stereorig.client import AsyncAnalysis, AsyncClient, AsyncTest
+from stereorig.client.errors import error_of
+from stereorig.client.synchronous import Analysis, Client, Test
+from tests.support.document_scripts import WRITTEN, one_block, run
+from tests.support.service_rig import SMALL, served, wait_for_rig
+
+PAGE = "docs/tutorial/client.md"
+#: what the page's pixels are on the small rig, whose images have half as many
+SMALLER = {"[90, 80, 420, 400]": "[45, 40, 210, 200]", "(120, 240), (390, 240)": "(60, 120), (195, 120)"}
+REGION = {"rectangle": [45, 40, 210, 200]}
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    service = Service(parse_config(SMALL), tmp_path_factory.mktemp("client") / "data").start()
+    try:
+        with served(service) as made:
+            wait_for_rig(made)
+            yield str(made.base_url).rstrip("/")
+    finally:
+        service.close()
+
+
+@pytest.fixture(scope="module")
+def printed(url: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    """What the page's script prints, and its folder."""
+    text = one_block(PAGE, "python", "stereorig.Client")
+    assert len([line for line in text.splitlines() if line.strip()]) <= 20
+    for of_page, here in {WRITTEN: url, **SMALLER}.items():
+        assert of_page in text
+        text = text.replace(of_page, here)
+    folder = tmp_path_factory.mktemp("script")
+    (folder / "script.py").write_text(text, encoding="utf-8")
+    done = run([sys.executable, "script.py"], folder)
+    assert done.returncode == 0, done.stderr
+    return done.stdout, folder
+
+
+def test_a_whole_test_in_twenty_lines(printed: tuple[str, Path]) -> None:
+    text, folder = printed
+    assert re.search(r"^calibration: (good|usable|marginal)$", text, re.MULTILINE), text
+    w_mm, strain, sigma = (
+        float(v) for v in re.findall(r"W from (\S+) mm, strain (\S+), .* uncertainty (\S+)", text)[0]
+    )
+    assert w_mm == pytest.approx(
+        -0.117, abs=0.004
+    )  # the clamped plate's middle; the small rig sees 4 um of noise at most
+    assert 0.0 < sigma < 2e-4
+    assert abs(strain) < 2e-3
+    assert (folder / "strain.png").stat().st_size > 3000
+
+
+@pytest.fixture(scope="module")
+def rig(url: str, printed: tuple[str, Path]) -> Iterator[Client]:
+    """A client of the service on which the page's script ran."""
+    with stereorig.Client(url, progress=False) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def analysis(rig: Client) -> Analysis:
+    return rig.test(rig.tests()[-1].id).analyses()[-1]
+
+
+def test_fields_are_data_arrays_with_units_over_all_steps(analysis: Analysis) -> None:
+    w = analysis.field("w_mm")
+    assert w.dims == ("step", "row", "col")
+    assert list(w.step.values) == [1, 2, 3, 4]  # the reference has no displacement
+    assert w.attrs["units"] == "mm"
+    depth = [float(w.sel(step=n).min()) for n in (1, 2, 3, 4)]
+    assert depth == sorted(depth, reverse=True)  # more pressure, deeper
+    one = analysis.dataset(4)
+    np.testing.assert_array_equal(one["w_mm"].values, w.sel(step=4).values)
+    assert float(one["channel_pressure_kpa"]) == 689.0
+    everything = analysis.dataset()
+    assert list(everything.step.values) == [0, 1, 2, 3, 4]
+    assert np.isnan(everything["w_mm"].sel(step=0)).all()
+
+
+def test_a_strain_gauge_has_its_channels_beside_it(analysis: Analysis) -> None:
+    gauge = analysis.extensometer((60, 120), (195, 120))
+    assert list(gauge.pressure_kpa.values) == [0.0, 172.0, 344.0, 517.0, 689.0]
+    assert gauge.pressure_kpa.attrs["units"] == "kPa"
+    assert float(gauge.strain[0]) == 0.0
+    assert (np.diff(gauge.time_s.values) > 0).all()
+    readings = analysis.gauges(extensometers=[{"a_px": [60, 120], "b_px": [195, 120]}])
+    expected = [s.extensometers[0].values["strain"].value for s in readings.steps[1:]]
+    np.testing.assert_array_equal(gauge.strain.values[1:], np.array(expected, dtype=float))
+
+
+def test_exports_and_the_report_are_written(analysis: Analysis, tmp_path: Path) -> None:
+    assert analysis.export(tmp_path / "a" / "last.csv", "csv", step=4).read_bytes().startswith(b"#")
+    with pytest.raises(InputError) as refused:
+        analysis.export(tmp_path / "b.csv", "csv", step=77)
+    assert refused.value.code == "not_found" or "77" in refused.value.cause
+    assert not (tmp_path / "b.csv").exists()
+
+
+def test_a_job_is_watched_and_its_problem_is_raised(rig: Client) -> None:
+    seen: list[JobReply] = []
+    rig.progress = seen.append
+    try:
+        rig.move(positions_mm={"1": 0.5})
+        rig.move(positions_mm={"1": 0.0})
+        with pytest.raises(StereorigError) as refused:
+            rig.tests_of_nothing = rig.test(rig.tests()[-1].id).measure(
+                region={"rectangle": [0, 0, 20, 20]}, subset_px=401
+            )
+    finally:
+        rig.progress = False
+    assert {job.kind for job in seen} >= {"move"}
+    assert seen[0].progress.total >= 0
+    assert refused.value.remedy
+
+
+def test_what_cannot_be_is_refused_in_the_users_words_before_anything_is_sent() -> None:
+    def refuse(_: httpx.Request) -> httpx.Response:
+        raise AssertionError("nothing may be sent")
+
+    with Client(transport=httpx.MockTransport(refuse)) as rig:
+        test = rig.test("t000001-abcdef")
+        with pytest.raises(InputError, match="subset_px must be odd, got 32"):
+            test.measure(region=REGION, subset_px=32)
+        with pytest.raises(InputError, match="What can be given: by_mm, dz_mm, positions_mm"):
+            rig.move(targets_mm={"1": 2})
+        with pytest.raises(InputError, match="given twice"):
+            test.measure(AnalysisRequest.model_validate({"region": REGION}), subset_px=33)
+
+
+def test_a_refusal_is_the_error_that_it_was_in_the_service(rig: Client) -> None:
+    with pytest.raises(InputError) as unknown:
+        rig.test("t000009-abcdef").document()
+    assert (unknown.value.code, bool(unknown.value.remedy)) == ("not_found", True)
+    with pytest.raises(StereorigError) as limits:
+        rig.move(positions_mm={"1": 99.0})
+    assert limits.value.code == "out_of_limits"
+    with pytest.raises(StateError) as lost:
+        Client("http://127.0.0.1:9", progress=False).rig()
+    assert lost.value.code == "service_lost"
+
+
+@pytest.mark.parametrize(
+    ("problem", "status", "kind"),
+    [
+        ({"code": "calibration_underdetermined", "detail": "a."}, 422, CalibrationInputError),
+        ({"code": "hardware_busy", "cause": "b."}, 409, StateError),
+        ({"code": "of_a_later_version", "detail": "c."}, 422, InputError),
+        ({"code": "of_a_later_version", "detail": "c."}, 409, StateError),
+        ({}, 500, StateError),
+    ],
+)
+def test_codes_become_the_classes_of_the_tree(problem: dict[str, object], status: int, kind: type) -> None:
+    error = error_of({"remedy": "do.", **problem}, status=status)
+    assert type(error) is kind
+    assert error.code == problem.get("code", "http_error")
+
+
+def test_both_clients_have_the_same_methods_and_parameters() -> None:
+    for one, two in ((Client, AsyncClient), (Test, AsyncTest), (Analysis, AsyncAnalysis)):
+        methods = {n: m for n, m in inspect.getmembers(one, inspect.isfunction) if not n.startswith("_")}
+        assert methods.keys() == {n for n, m in inspect.getmembers(two, inspect.isfunction) if not n.startswith("_")}
+        for name, method in methods.items():
+            other = getattr(two, name)
+            assert list(inspect.signature(method).parameters) == list(inspect.signature(other).parameters), name
+            assert inspect.iscoroutinefunction(other) or name in ("test", "analysis"), name
+
+
+def test_the_async_client_reads_what_the_other_reads(url: str, analysis: Analysis) -> None:
+    async def read() -> tuple[list[str], np.ndarray, str]:
+        async with stereorig.AsyncClient(url, progress=False) as rig:
+            accepted = await rig.calibrations(accepted=True)
+            test = rig.test(analysis.test_id)
+            one = (await test.analyses())[-1]
+            field, document, _ = await asyncio.gather(one.field("w_mm", 4), rig.rig(), rig.move(by_mm={"1": 0.1}))
+            await rig.move(by_mm={"1": -0.1})
+            return [c.id for c in accepted], field.values, document.name
+
+    accepted, field, name = asyncio.run(read())
+    assert len(accepted) == 1
+    assert name
+    np.testing.assert_array_equal(field, analysis.field("w_mm", 4).values)
+
+
+def test_a_bar_needs_rich_only_where_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    from stereorig.client.progress import shown
+
+    with shown(None, "Work") as silent:  # no terminal here
+        assert silent is None
+    with shown(True, "Work") as bar:
+        assert bar is not None
+    monkeypatch.setitem(sys.modules, "rich.console", None)
+    with pytest.raises(StateError) as refused, shown(True, "Work"):
+        pass
+    assert refused.value.code == "progress_unavailable"
