@@ -97,7 +97,7 @@ class Estimator:
         A[:, 4:, 1] = _carried(pair, points_mm, displaced_mm, across)
         At = np.swapaxes(A, 1, 2) @ _MATCH_WEIGHTS
         gain = np.linalg.solve(At @ A, At)
-        by_match = gain[:, 2:] - ray[..., None] * gain[:, :1]
+        by_match = np.asarray(gain[:, 2:] - ray[..., None] * gain[:, :1], dtype=np.float64)
         whole = np.zeros((n, 6, 8))
         whole[:, :3, :4] = first
         whole[:, 3:, :4] = -by_match[:, :, :2] @ seen

@@ -9,9 +9,10 @@ from typing import Annotated
 from pydantic import Field
 
 _BUDGET = (
-    "Standard uncertainties by where they come from, whose squares add up to the whole's: `matching` (noise that is new "
-    "at each step), `reference` (noise of the reference pair, the same in all steps of a test), `calibration` (noise of "
-    "its views), `stage`, `target`. What is not known is not among them, see the step's `not_told`; null without any."
+    "Standard uncertainties by where they come from, whose squares add up to the whole's: `matching` (noise that is "
+    "new at each step), `reference` (noise of the reference pair, the same in all steps of a test), `calibration` "
+    "(noise of its views), `stage`, `target`. What is not known is not among them, see the step's `not_told`; null "
+    "without any."
 )
 
 
