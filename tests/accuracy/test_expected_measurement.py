@@ -10,7 +10,7 @@ import pytest
 from core.calibration import CalibrationOptions, CalibrationView, NominalCamera, calibrate
 from core.calibration.expect import expect
 from core.common.factor import ParameterCovariance
-from core.field.common import with_common_factor
+from core.field.common import with_common_parts
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
 from core.field.region.region import PointGrid
@@ -102,7 +102,7 @@ def made(rig: Rig) -> tuple[dict[str, tuple[float, float]], list[PlannedQuantity
     )
     expected = expect(POSITIONS_MM, target, nominals, options, noise_px=LINES_NOISE_PX)
     planned = ParameterCovariance(expected.pair, tuple(expected.parameters), expected.covariance, expected.by_cause)
-    shown, moved = with_common_factor(shape, source), with_common_factor(motion, source)
+    shown, moved = with_common_parts(shape, source, result.pair), with_common_parts(motion, source, result.pair)
     return reported(shown, moved), planned_quantities(expected.pair, (SIZE, SIZE), planned, plan)
 
 
