@@ -13,7 +13,7 @@ import numpy as np
 
 from core.arrays import Float
 from core.cameras.stereo import StereoPair
-from core.common.derivatives import WEIGHTS, across_lines, carried_offset
+from core.common.derivatives import WEIGHTS, carried_offset
 from core.matching.geometry import tangent_frames
 
 
@@ -71,9 +71,11 @@ def match_gain(
     laid = np.linalg.inv(A1 @ tangents)
     first = A2 @ tangents @ laid
     back = np.linalg.inv(first)
-    across = across_lines(pair, points_mm)
     ray = points_mm - pair.cam1.centre_sys_mm
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    along = (A2 @ ray[..., None])[..., 0]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
     depth, sideways = (back @ A2 @ ray[..., None])[..., 0], (back @ across[..., None])[..., 0]
     solved = np.linalg.inv(np.stack([depth, sideways], axis=-1))  # of depth and offset over the shift
     alone = ray[..., None] * solved[:, :1]

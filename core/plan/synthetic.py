@@ -52,12 +52,14 @@ class PlannedField:
         return replace(self.field, covariance=covariance, common=None)
 
     def of_causes(self, source: ParameterCovariance) -> dict[Cause, Field]:
-        """Return by cause the field with the common part alone that it makes."""
+        """Return by cause the field with the common part alone that it makes; not those that make none."""
         found = factor_of(source, self.points, self.displaced)
         covariance = np.where(self.field.valid[..., None, None], np.zeros_like(self.field.covariance), np.nan)
         out = {}
         for cause in found.causes.told:
             own = found.values[..., [name == cause for name in found.causes.columns]]
+            if own.shape[-1] == 0:
+                continue
             common = np.full((*self.field.shape, *own.shape[1:]), np.nan)
             common[self.field.valid] = own
             out[cause] = replace(self.field, covariance=covariance, common=common)

@@ -3,8 +3,8 @@
 A plane patch averages the surface and the displacement below it: it is off by half the second derivative times the
 subset's second moment, (h^2 - 1) / 12 px^2 along either axis. A curved patch follows second derivatives and is off by
 what the fourth ones leave: 3 a^4 / 35 and a^4 / 9 of the Taylor terms x^4 and x^2 y^2, a half the subset. Inverse depth
-and the motion in its measure are linear in the image for planes that move; their differences over neighbours a subset
-away, whose noise is their own, give the derivatives.
+and the motion in its measure are linear in the image for planes that move; their differences over neighbours give the
+derivatives: a subset away, where the noise is their own, of quadratic patches half a subset.
 """
 
 from __future__ import annotations
@@ -42,24 +42,26 @@ def patch_term(field: Field, pair: StereoPair, *, subset_px: int) -> Term:
     if field.patch is None:
         return Term("Not told: the field has no record of its patches.")
     step = steps_px(field)
-    lags = tuple(max(1, int(np.ceil(subset_px / s))) for s in step)
     curved = field.patch.patch == "quadratic"
+    # fourth derivatives need neighbours twice as far, half a subset apart: their noise has little part in them
+    apart_px = 0.5 * subset_px if curved else float(subset_px)
+    lags = tuple(max(1, int(np.ceil(apart_px / s))) for s in step)
     reach = 2 if curved else 1
     if any(lag * s > _FAR_SUBSETS * subset_px for lag, s in zip(lags, step, strict=True)) or (
         field.shape[0] < 2 * reach * lags[1] + 1 or field.shape[1] < 2 * reach * lags[0] + 1
     ):
-        return Term("Not told: too few points lie a subset apart.")
+        return Term("Not told: too few points lie far enough apart.")
     off, noise = _fourth(field, pair, lags, step, subset_px) if curved else _second(field, pair, lags, step, subset_px)
     names = _NAMES[1 if field.has_motion else 0]
     # of neighbouring estimates those a subset apart are independent
-    share = 1.0 / float(lags[0] * lags[1])
+    share = float(np.prod([min(s / subset_px, 1.0) for s in step]))
     figures = {}
     for k, name in enumerate(names):
         figure = figure_of(_TO_UM * off[..., k], _TO_UM**2 * noise[..., k], independent=share)
         if figure is not None:
             figures[name] = figure
     if not figures:
-        return Term("Not told: too few points have neighbours a subset apart.")
+        return Term("Not told: too few points have neighbours at that distance.")
     what = "fourth" if curved else "second"
     kind = "quadratic" if curved else "plane"
     return Term(

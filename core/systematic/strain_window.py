@@ -42,7 +42,7 @@ def window_term(field: Field, strain: StrainField, *, subset_px: int) -> Term:
     """
     half = strain.options.window // 2
     step = steps_px(field)
-    lag = half
+    lag = (half + 1) // 2  # wider differences smooth more of what they are to show, narrower ones are noisier
     if min(field.shape) < 2 * lag + 1:
         return Term("Not told: the field is hardly wider than the window.")
     along, across = (3.0 * half**2 + 3.0 * half - 1.0) / 15.0, half * (half + 1) / 3.0
@@ -72,7 +72,7 @@ def window_term(field: Field, strain: StrainField, *, subset_px: int) -> Term:
         if figure is not None:
             figures[name] = figure
     if not figures:
-        return Term("Not told: too few points have strain half a window away on either side.")
+        return Term("Not told: too few points have strain on either side.")
     return Term(
         f"Second differences of the strain over {lag} points, times the second moments of the window's weights"
         f"{' and of the plane patches' if plane else ''}; noise of the strain taken off.",

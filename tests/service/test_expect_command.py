@@ -1,0 +1,98 @@
+"""``stereorig expect`` and POST /calibrations:expect: the same prediction, of a rig that is there or not."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from server.cli.main import main
+from tests.support.requirements import ROOT
+
+RIG = str(ROOT / "config" / "sim_paper.toml")
+NOT_THERE = [
+    *("--focal-mm", "35", "--pixel-um", "5", "--image-size-px", "2448,2048", "--standoff-mm", "500"),
+    *("--angle-deg", "25", "--pitch-mm", "10", "--lines", "11,11", "--positions", "-10,0,10"),
+]
+
+
+def document(capsys: pytest.CaptureFixture[str], *options: str) -> dict[str, Any]:
+    assert main(["expect", *options, "--json"]) == 0
+    return dict(json.loads(capsys.readouterr().out))
+
+
+def sigma_of(found: dict[str, Any], name: str, of: str, moved: tuple[float, float, float] | None = None) -> float:
+    wanted = None if moved is None else list(moved)
+    one = next(q for q in found["quantities"] if (q["name"], q["of"], q["translation_mm"]) == (name, of, wanted))
+    return float(one["sigma"])
+
+
+def test_a_rig_file_is_predicted_as_a_table_in_micrometres(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["expect", "--rig", RIG]) == 0
+    shown = capsys.readouterr().out
+    assert shown.splitlines()[0].split() == [
+        *("quantity", "after,", "mm", "u", "(k", "=", "1)", "matching", "reference", "calibration", "stage", "target")
+    ]
+    assert "length along X, 10 mm" in shown
+    assert "Not included" in shown
+
+
+def test_a_rig_that_is_not_there_is_predicted_from_options_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    usual = document(capsys, *NOT_THERE)
+    for one in usual["quantities"]:
+        assert one["sigma"] == pytest.approx(np.sqrt(sum(v**2 for v in one["budget"].values())), rel=1e-9)
+    # twice the noise of the images is twice the noise of the matches, and nothing else
+    noisy = document(capsys, *NOT_THERE, "--image-noise-grey", "4")
+    w, doubled = (
+        next(q for q in d["quantities"] if q["name"] == "w" and q["of"] == "point")["budget"] for d in (usual, noisy)
+    )
+    assert doubled["matching"] == pytest.approx(2.0 * w["matching"], rel=0.01)
+    assert doubled["target"] == pytest.approx(w["target"], rel=1e-6)
+    # a scale of the target is one of every length
+    scaled = document(capsys, *NOT_THERE, "--pitch-scale-sigma", "1e-4")
+    length = next(q for q in scaled["quantities"] if q["name"] == "length along X")
+    assert length["budget"]["target"] == pytest.approx(1e-3, rel=0.01)
+    # a longer lens, and so a coarser image of nothing: Z comes down with the pixel's size on the surface
+    longer = document(capsys, *NOT_THERE, "--focal-mm", "50")
+    assert sigma_of(longer, "Z", "point") == pytest.approx(0.7 * sigma_of(usual, "Z", "point"), rel=0.05)
+
+
+def test_what_is_missing_or_out_of_range_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    for options, text in (
+        (["--phd-px", "7000"], "--image-size-px, --standoff-mm"),
+        ([*NOT_THERE, "--subset", "20"], "odd"),
+        ([*NOT_THERE, "--phd-px", "7000"], "phd_px and focal_mm"),
+        ([*NOT_THERE, "--contrast-grey", "x"], "--contrast-grey"),
+        ([*NOT_THERE, "--noise-px", "0"], "--noise-px"),
+    ):
+        assert main(["expect", *options]) == 1, options
+        assert text in capsys.readouterr().err
+
+
+def test_a_length_that_the_cameras_do_not_see_has_no_number(capsys: pytest.CaptureFixture[str]) -> None:
+    found = document(capsys, *NOT_THERE, "--length-mm", "900")
+    lengths = [q for q in found["quantities"] if q["of"] == "length"]
+    assert [q["sigma"] for q in lengths] == [None, None]
+    assert all(q["missing"] and q["budget"] == {} for q in lengths)
+    assert main(["expect", *NOT_THERE, "--length-mm", "900"]) == 0
+
+
+def test_the_service_predicts_the_same_for_a_rig_that_differs_from_its_own(client: httpx.Client) -> None:
+    def asked(**body: object) -> dict[str, Any]:
+        answer = client.post("/api/v1/calibrations:expect", json=body)
+        assert answer.status_code == 200, answer.text
+        return dict(answer.json())
+
+    own = asked()
+    assert {q["name"] for q in own["quantities"]} >= {"X", "Z", "length along X", "u", "v", "w", "exx"}
+    fine = asked(measurement={"image_noise_grey": 0.5, "translations_mm": [0.0]})
+    assert sigma_of(fine, "Z", "point") < sigma_of(own, "Z", "point")
+    # positions that the service's stage does not reach, of a rig that has another
+    far = {"positions_mm": [-20.0, 0.0, 20.0], "held_out_mm": [], "rig": {"stage_step_sigma_mm": 0.01}}
+    stage = next(q for q in asked(**far)["quantities"] if q["name"] == "w" and q["of"] == "point")["budget"]["stage"]
+    assert stage > 0.0
+    wrong = client.post("/api/v1/calibrations:expect", json={"measurement": {"subset_px": 20}})
+    assert wrong.status_code == 422
