@@ -13,10 +13,10 @@ from server.formats.results.uncertainty import Statement
 EXPANDED = "k times the standard uncertainty, where another k than 1 was asked for."
 LACKING = "`calibration not included` where that is so."
 _BUDGET = (
-    "Standard uncertainties by where they come from, whose squares add up to the whole's: `matching` (noise that is new "
-    "at each step), `reference` (noise of the reference pair, the same in all steps of a test), `calibration` (noise "
-    "of the calibration's views), `stage`, `target`. What is not known is not among them, see `not_told` of the step; "
-    "null where nothing is."
+    "Standard uncertainties by where they come from, whose squares add up to the whole's: `matching` (noise that is "
+    "new at each step), `reference` (noise of the reference pair, the same in all steps of a test), `calibration` "
+    "(noise of its views), `stage`, `target`. What is not known is not among them, see the step's `not_told`; null "
+    "without any."
 )
 
 

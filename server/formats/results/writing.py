@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from core.common.factor import Causes
 from core.field.points.result import Field, References, Rejected
 from core.field.region.cuts import Cuts, as_arrays
+from core.field.sequence.propagated import current_covariance
 from core.names import CAUSES
 from core.status import STATUS_MEANINGS, PointStatus
 from core.strain import StrainField
@@ -33,6 +34,7 @@ from server.formats.results.layout import (
     MOTION,
     PROPAGATED_FROM,
     SHAPE,
+    packed,
 )
 from server.formats.results.netcdf import written_dataset
 from server.formats.results.strain import put_strain
@@ -178,19 +180,27 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
     n = result.covariance.shape[-1]
     names = COVARIANCE_NAMES[:n]
     included = Included.of_field(result).text
-    dataset.createDimension("i", n)
-    dataset.createDimension("j", n)
+    if result.has_motion:
+        dataset.createDimension("entry", n * (n + 1) // 2)
+    else:
+        dataset.createDimension("i", n)
+        dataset.createDimension("j", n)
+    total = result.total_covariance
     _put(
         dataset,
         "covariance",
-        result.total_covariance,
-        ("row", "col", "i", "j"),
+        packed(total) if result.has_motion else total,
+        ("row", "col", "entry") if result.has_motion else ("row", "col", "i", "j"),
         units="mm2",
         long_name="covariance of " + ", ".join(names),
         dtype="f4",
         sparse=sparse,
     )
     dataset.variables["covariance"].setncatts({"components": " ".join(names), "includes": included})
+    if result.has_motion:
+        dataset.variables["covariance"].packed = "upper triangle of the 6 x 6 matrix, row by row: " + " ".join(
+            f"{a}_{b}" for k, a in enumerate(names) for b in names[k:]
+        )
     if result.common is not None:
         dataset.createDimension("component", n)
         causes = Causes.untold(result.common.shape[-1]) if result.causes is None else result.causes
@@ -217,7 +227,7 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
         _put(
             dataset,
             "reference_covariance",
-            np.stack([result.frozen[..., i, j] for _, i, j in FROZEN], axis=-1),
+            packed(result.frozen),
             ("row", "col", "frozen"),
             units="mm2",
             long_name="part of the own covariance of u, v, w that is noise of the reference pair",
@@ -226,7 +236,7 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
         )
         dataset.variables["reference_covariance"].setncatts(
             {
-                "components": " ".join(name for name, _, _ in FROZEN),
+                "components": " ".join(FROZEN),
                 "comment": "the same in all steps of a test: a difference of two steps has the own covariances of "
                 "both, less both of these, and (F_b - F_a)(F_b - F_a)'; the own covariance of x, y, z is so as a whole",
             }
@@ -355,16 +365,18 @@ def _put_measured(dataset: Any, result: Field, measured: Field) -> None:
                 dtype="f8",
                 long_name=f"displacement from the reference, {name.upper()}, as measured, before smoothing",
             )
-    if result.covariance is measured.covariance and result.common is None:
+    if not measured.has_motion or (result.covariance is measured.covariance and result.common is None):
         return
+    if "frozen" not in dataset.dimensions:
+        dataset.createDimension("frozen", len(FROZEN))
     _put(
         dataset,
-        "measured_covariance",
-        measured.covariance,
-        ("row", "col", "i", "j"),
+        "measured_current_covariance",
+        packed(current_covariance(measured)),
+        ("row", "col", "frozen"),
         units="mm2",
         dtype="f4",
-        long_name="covariance of x_mm, y_mm, z_mm and the displacement as measured, by image noise alone",
+        long_name="covariance of the current position as measured, by image noise alone: xx xy xz yy yz zz",
     )
 
 
