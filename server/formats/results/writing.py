@@ -263,6 +263,7 @@ def _put_causes(dataset: Any, causes: Causes) -> None:
     variable.setncatts(
         {
             "long_name": "where a column's unit cause comes from; the same causes in all steps of a test",
+            "units": "1",
             "_Encoding": "ascii",
         }
     )
