@@ -8,7 +8,8 @@
 >>> step.dataset["w_mm"].plot()                                                            # doctest: +SKIP
 
 Lengths are mm in the system frame of the calibration, image coordinates px with pixel centres at integers. A point that
-failed has NaN and a `status`; every value has a standard uncertainty beside it (`sigma_*`).
+failed has NaN and a `status`; every value has a standard uncertainty beside it (`sigma_*`, k = 1), and
+``Result.uncertainty_includes`` says what is in it: the calibration's part is missing where its covariance is not known.
 
 :class:`stereorig.Client` and :class:`stereorig.AsyncClient` drive a running service instead: rig, tests, results.
 """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,21 +16,24 @@ from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
 from core.gauge.area import AreaStatistics, area_statistics, points_within
 from core.gauge.extensometer import Extensometer, extensometer
+from core.gauge.reading import reading_of
 from core.gauge.rigid import RigidMotion, rigid_motion, without_rigid_motion
 from core.settings import AnalysisSettings, StrainSettings
 from core.strain import StrainField, StrainOptions, surface_strain
+from core.strain.mean import mean_strain_variance
 from server.formats.results.dataset import as_dataset
-from server.formats.results.layout import field_variable
+from server.formats.results.layout import COVARIANCE_NAMES, field_variable
 from server.formats.results.reading import read_field, read_head
 from server.formats.results.settings import stored_settings
 from server.formats.results.strain import read_strain
+from server.formats.results.uncertainty import Included
 from server.formats.results.writing import Provenance, write_field
 from server.formats.version import software_version
 
 if TYPE_CHECKING:
     import xarray
 
-_STRAIN = ("exx", "eyy", "exy")
+_STRAIN, _POSITION = ("exx", "eyy", "exy"), ("x_mm", "y_mm", "z_mm")
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,16 +133,48 @@ class Result:
         """
         return extensometer(self.field, a_px, b_px, shared=self._shared)
 
+    @property
+    def uncertainty_includes(self) -> str:
+        """What every standard uncertainty (``sigma``, k = 1) includes; says where the calibration is not included."""
+        return Included.of_field(self.field).text
+
     def area(self, name: str, polygon_px: ArrayLike | None = None) -> AreaStatistics:
         """Return the statistics of a variable over a polygon (n, 2), px; None: over the whole field.
+
+        Means of positions, displacements and strains have a standard uncertainty, others have none.
 
         Raises
         ------
         StereorigError
             ``field_missing``, ``gauge_outside`` or ``region_unusable``.
         """
-        values, sigma = self[name], self._values(f"sigma_{name}")
-        return area_statistics(self.field, values, sigma, points_within(self.field, polygon_px), shared=self._shared)
+        values, inside, shared = self[name], points_within(self.field, polygon_px), self._shared
+        field, frozen = self.field, self.field.frozen_covariance
+        if name in COVARIANCE_NAMES[: field.covariance.shape[-1]]:
+            k = COVARIANCE_NAMES.index(name)
+            return area_statistics(
+                field,
+                values,
+                np.sqrt(np.maximum(field.covariance[..., k, k], 0.0)),
+                inside,
+                shared=shared.positions if k < len(_POSITION) else shared,
+                # what all points share does not shrink in a mean
+                common=None if field.common is None else field.common[..., k, :],
+                sigma_reference=None if frozen is None else np.sqrt(np.maximum(frozen[..., k, k], 0.0)),
+            )
+        found = area_statistics(field, values, None, inside, shared=shared)
+        if name not in _STRAIN or self.strain is None or not found.count:
+            return found
+        k = _STRAIN.index(name)
+        of = mean_strain_variance(self.field, self.strain.options, inside, subset_px=self.strain.subset_px)
+        mean = reading_of(
+            found.mean,
+            float(of.own[k]),
+            None if of.reference is None else float(of.reference[k]),
+            None if of.common is None else of.common[k],
+            of.causes,
+        )
+        return replace(found, mean_sigma=mean.sigma, mean_sigma_calibration=mean.sigma_calibration, mean_reading=mean)
 
     @cached_property
     def _shared(self) -> SharedPixels:

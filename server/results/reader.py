@@ -235,7 +235,7 @@ def probe_result(path: Path, x_px: float, y_px: float, asked: CoverageFields) ->
         col=col,
         distance_px=float(distance[row, col]),
         status=PointStatus(int(variables["status"].values[row, col])).name.lower(),
-        values={n: number(n, v) for n, v in variables.items() if v.values.ndim <= 3},
+        values={n: number(n, v) for n, v in variables.items() if v.values.ndim <= 3 and not n.endswith("covariance")},
         uncertainty=statement.document(),
     )
 

@@ -24,7 +24,7 @@ from server.formats.results.settings import current_inputs, current_settings
 from server.formats.results.uncertainty import Included, Statement
 from server.results.channels import Recorded, recorded_with
 from server.results.reader import Variable
-from server.results.uncertainty import COMMON_FACTOR, in_file, matrix_columns, with_intervals
+from server.results.uncertainty import COMMON_FACTOR, as_matrix, in_file, matrix_columns, with_intervals
 from server.store.durable import known_json
 
 ALWAYS = ("x_px", "y_px", "x_mm", "y_mm", "z_mm", "status")
@@ -192,7 +192,7 @@ def _read(path: Path, data: Any, names: Sequence[str] | None, always: Sequence[s
             available=sorted(over_grid),
         )
     wanted = set(over_grid) if names is None else {*always, *names}
-    variables = {name: Variable.of(data.variables[name]) for name in over_grid if name in wanted}
+    variables = {name: as_matrix(name, Variable.of(data.variables[name])) for name in over_grid if name in wanted}
     cuts = None
     if "cut_line" in data.variables:
         points = np.stack([np.asarray(data.variables[n][...], dtype=np.float64) for n in ("cut_x_px", "cut_y_px")], 1)

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from core.settings import CoverageFields
 from server.formats.results.budgets import STRAIN_NAMES
-from server.formats.results.layout import COVARIANCE_NAMES
+from server.formats.results.layout import COVARIANCE_NAMES, unpacked
 from server.formats.results.uncertainty import Included, Statement
 from server.results.reader import Variable, read_variable
 
 SIGMA, EXPANDED = "sigma_", "expanded_"
-COMMON_FACTOR = "common_factor"
+COMMON_FACTOR, COVARIANCES = "common_factor", ("covariance", "measured_covariance")
 
 
 def in_file(name: str, asked: CoverageFields) -> str:
@@ -63,6 +63,15 @@ def with_intervals(variables: dict[str, Variable], included: Included, asked: Co
     return out
 
 
+def as_matrix(name: str, variable: Variable) -> Variable:
+    """Return a covariance that its file holds as packed triangles as (r, c, n, n) matrices; other variables as is."""
+    values = variable.values
+    n = len(COVARIANCE_NAMES)
+    if name not in COVARIANCES or values.ndim != 3 or values.shape[-1] != n * (n + 1) // 2:
+        return variable
+    return replace(variable, values=unpacked(values, n).astype(values.dtype), dimensions=("row", "col", "i", "j"))
+
+
 def matrix_columns(name: str, variable: Variable) -> dict[str, Variable] | None:
     """Return the entries of a covariance's upper triangle, or of a common factor, by name; None for other variables.
 
@@ -71,7 +80,7 @@ def matrix_columns(name: str, variable: Variable) -> dict[str, Variable] | None:
     name
         Of the variable in the result file.
     variable
-        (r, c, n, n) or packed (r, c, n (n + 1) / 2) covariance, row by row; (r, c, n, k) factor.
+        (r, c, n, n) covariance, or packed with the names of its parts; (r, c, n, k) factor.
     """
     values = variable.values
     if name.endswith("covariance") and values.ndim == 4:
@@ -79,10 +88,7 @@ def matrix_columns(name: str, variable: Variable) -> dict[str, Variable] | None:
         rows, cols = np.triu_indices(n)
         return _columns(name, variable, values[..., rows, cols], _pairs(n))
     if name.endswith("covariance") and values.ndim == 3:
-        if len(variable.parts) == values.shape[-1]:
-            return _columns(name, variable, values, variable.parts)
-        n = round((np.sqrt(8 * values.shape[-1] + 1) - 1) / 2)
-        return _columns(name, variable, values, _pairs(n))
+        return _columns(name, variable, values, variable.parts)
     if name.startswith(COMMON_FACTOR) and values.ndim == 4:
         n, k = values.shape[2:]
         names = STRAIN_NAMES if "strain" in name else COVARIANCE_NAMES

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from core.cameras.camera import Camera
 from server.exports.mesh import triangles_of
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.results.reading import read_field
+from server.formats.results.writing import Provenance, write_field
+from server.store.index import analysis_entry
 from tests.support import results_page
 from tests.support.page_bench import UNREACHED, Watched, tabbed, watched
 from tests.support.results_page import API, ENDS, LINE, Bench, drawn, given, shown, with_a_cut
@@ -134,6 +137,57 @@ def test_what_is_under_the_mouse_is_the_probes(page: Watched, bench: Bench) -> N
     expect(pinned).to_contain_text(f"row {reply['row']}, column {reply['col']}, step 2")
     row = pinned.locator("tr", has=at.get_by_role("cell", name="w_mm", exact=True))
     expect(row).to_contain_text(f"{reply['values']['w_mm']['value']:.5f}".replace("-", "\N{MINUS SIGN}")[:7])
+    page.sound()
+
+
+def test_the_interval_is_chosen_and_a_click_shows_the_budget(page: Watched, bench: Bench) -> None:
+    at = shown(page, bench)
+    spot = (103.4, 98.2)
+    query = {"x_px": spot[0], "y_px": spot[1], "step": 2, "coverage": 0.95}
+    w = bench.client.get(f"{bench.path()}/probe", params=query).json()["values"]["w_mm"]
+    readout, says = at.locator(".view .readout").first, at.locator('[data-role="includes"]')
+    expect(says).to_contain_text("u (k = 1) includes matching, reference, calibration")
+    at.mouse.move(*point_on_screen(at, *spot))
+    expect(readout).to_contain_text(f"± {w['sigma']:.2g}")
+    expect(readout).to_contain_text("u, k = 1")
+    at.get_by_label("Uncertainties shown").select_option("95 %")
+    expect(says).to_contain_text("U (k = 1.96, 95 %) includes")
+    at.mouse.move(*point_on_screen(at, spot[0] + 0.2, spot[1]))
+    expect(readout).to_contain_text(f"± {w['expanded']:.2g}")
+    at.mouse.click(*point_on_screen(at, *spot))
+    row = at.locator('[data-role="probe"] tr', has=at.get_by_role("cell", name="w_mm", exact=True)).first
+    budget = row.locator('[data-role="budget"]')
+    expect(budget).to_be_hidden()
+    row.get_by_role("button").click()
+    expect(budget).to_be_visible()
+    for cause, part in w["budget"].items():
+        expect(budget.locator("tr", has_text=cause)).to_contain_text(f"{100 * part**2 / w['sigma'] ** 2:.2g}"[:3])
+    page.sound()
+
+
+def test_numbers_without_the_calibrations_uncertainty_say_so(page: Watched, bench: Bench) -> None:
+    whole = bench.service.tests.analysis_path(bench.test_id, bench.analysis_id)
+    stored = bench.service.tests.analysis(bench.test_id, bench.analysis_id).plain()
+    kept = {k: stored[k] for k in ("kind", "settings", "steps", "inputs", "software")}
+    document = bench.service.tests.create_analysis(bench.test_id, {**kept, "label": "as imported"})
+    bench.service.catalog.put_entry("analysis", bench.test_id, document.id, analysis_entry(document))
+    folder = bench.service.tests.analysis_path(bench.test_id, document.id)
+    for n in stored["steps"]:
+        field = replace(read_field(whole / f"step_{n:04d}.nc"), common=None, causes=None)
+        write_field(
+            folder / f"step_{n:04d}.nc", field, Provenance({"subset_px": 25, "spacing_px": 10}, {}, "0", step=n)
+        )
+    at = shown(page, bench, analysis_id=document.id)
+    lacking = "calibration not included"
+    expect(at.locator('[data-role="includes"] .badge')).to_have_text(lacking)
+    at.mouse.move(*point_on_screen(at, 103.4, 98.2))
+    expect(at.locator(".view .readout").first).to_contain_text(lacking)
+    at.mouse.click(*point_on_screen(at, 103.4, 98.2))
+    expect(at.locator('[data-role="probe"] table caption').first).to_contain_text(lacking)
+    at.locator("summary", has_text="Extensometers").click()
+    given(at, ENDS, (80, 90, 160, 90))
+    at.locator("details", has=at.get_by_label(ENDS[0])).get_by_role("button", name="Use").click()
+    expect(at.get_by_text(f"± u (k = 1) includes matching only; {lacking}")).to_be_visible()
     page.sound()
 
 

@@ -31,6 +31,7 @@ from server.formats.files import make_folder, sha256_of, write_bytes
 from server.formats.images import encode_png, read_mask
 from server.formats.noise_json import LoadedNoise
 from server.formats.results.summary import SequenceSummary, region_found, to_json
+from server.formats.results.uncertainty import NOT_INCLUDED
 from server.formats.version import software_version
 from server.worker.tasks import StepImages
 
@@ -61,6 +62,18 @@ def _strain_noise(strain: dict[str, Any] | None) -> str:
         return f"no strain (no window of {strain['window']} points is whole enough), "
     floor = strain["noise_floor_microstrain"]["exx"]
     return f"strain noise {floor:.0f} microstrain over {strain['gauge_mm']:.3g} mm, "
+
+
+def _uncertainty(summary: Mapping[str, Any]) -> str:
+    """Return the line on a step's uncertainty: medians over its points, by cause."""
+    parts = []
+    for name in ("z_mm", "w_mm"):
+        sigma, causes = summary["sigma_median_mm"].get(name), summary["budget_median_mm"].get(name)
+        if sigma is not None and causes:
+            each = ", ".join(f"{cause} {1e3 * part:.2g}" for cause, part in causes.items())
+            parts.append(f"{name[0].upper()} {1e3 * sigma:.2g} um ({each})")
+    lacking = "" if summary["sigma_calibration_median_mm"] else f"; {NOT_INCLUDED}"
+    return f"u (k = 1) of step {summary['n']}, medians: {'; '.join(parts)}{lacking}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,6 +140,8 @@ def measure_sequence(job: MeasureJob, progress: ProgressLine) -> dict[str, Any]:
         seconds = round(time.monotonic() - started, 3)
         summary = _write_summary(runner, seconds, error)
     failed = f", {len(runner.failed)} failed" if runner.failed else ""
+    if written and written[-1]["valid"]:
+        progress.note(_uncertainty(written[-1]))
     progress.note(f"{len(written)} steps in {duration(seconds)}{failed}: {job.out / 'summary.json'}")
     if error is not None:
         raise error

@@ -222,7 +222,12 @@ def test_scipy_opens_the_matlab_file(source: Source, stored: list[xr.Dataset], t
         for name, variable in held.variables.items():
             if variable.dims[:2] == ("row", "col"):
                 assert step[name].dtype == np.float64
-                np.testing.assert_array_equal(step[name], np.squeeze(variable.values.astype(float)), err_msg=str(name))
+                values = step[name]
+                if name == "covariance" and n:  # a matrix here, its upper triangle row by row there
+                    i, j = np.triu_indices(6)
+                    np.testing.assert_array_equal(values, np.swapaxes(values, -1, -2))
+                    values = values[..., i, j]
+                np.testing.assert_array_equal(values, np.squeeze(variable.values.astype(float)), err_msg=str(name))
                 assert about["units"][name] == variable.attrs["units"]
         assert step["n"] == n
         assert step["label"] == f"Stufe {n} µ"
@@ -253,7 +258,13 @@ def test_h5py_opens_the_stack(source: Source, stored: list[xr.Dataset], tmp_path
             for name, variable in held.variables.items():
                 if variable.dims[:2] == ("row", "col") and name not in ("x_px", "y_px"):
                     part = tuple(slice(0, k) for k in variable.shape[2:])
-                    np.testing.assert_array_equal(file[name][(n, slice(None), slice(None), *part)], variable.values)
+                    values = variable.values
+                    if name == "covariance" and n:  # a matrix here, its upper triangle row by row there
+                        i, j = np.triu_indices(6)
+                        np.testing.assert_array_equal(file[name][n][..., i, j], values)
+                        np.testing.assert_array_equal(file[name][n][..., j, i], values)
+                        continue
+                    np.testing.assert_array_equal(file[name][(n, slice(None), slice(None), *part)], values)
         assert file["u_mm"].attrs["units"] == b"mm"
         assert json.loads(file.attrs["settings"]) == SETTINGS
     with xr.open_dataset(path) as opened:

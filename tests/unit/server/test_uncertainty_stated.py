@@ -21,19 +21,23 @@ from PIL import Image
 
 from core.common.factor import Causes
 from core.errors import InputError
-from core.settings import Coverage
+from core.settings import AnalysisSettings, Coverage
 from core.strain import StrainOptions, surface_strain
 from server.cli.main import main
 from server.exports.request import ExportRequest
 from server.exports.run import export
 from server.exports.source import find_source
 from server.formats.results.reading import read_field
+from server.formats.results.strain import read_strain
 from server.formats.results.summary import summarise
 from server.formats.results.uncertainty import Included, coverage_of
 from server.formats.results.writing import Provenance, write_field
 from server.results.field_forms import Part, encode, take
+from server.results.gauges.readings import read_gauges
+from server.results.gauges.request import GaugeRequest
 from server.results.reader import probe_result, read_variable
 from server.results.steps import Source
+from stereorig.result import Result
 from tests.support.export_results import CALIBRATION, COLS, ROWS, SETTINGS, write_results
 from tests.support.gauge_field import SUBSET, make_field
 
@@ -42,6 +46,7 @@ K95 = float(scipy.stats.norm.ppf(0.975))
 NINETY_FIVE = Coverage(coverage=0.95, k=None)
 COLUMNS = {0: ("calibration",), 1: ("calibration", "stage"), 2: ("calibration", "calibration", "target")}
 """Of each step's factor: a step does without the columns that it does not need."""
+AREA = {"areas": [{"name": "all"}], "variables": ["x_mm", "w_mm", "exx"]}
 TOLD = ("calibration", "stage", "target")
 
 
@@ -152,13 +157,13 @@ def test_forms_that_hold_matrices_hold_the_total_covariance_and_the_factor_by_ca
     (path,) = made(source, tmp_path, "mat", steps=[2])
     held = scipy.io.loadmat(path, simplify_cells=True)
     np.testing.assert_array_equal(held["step_0002"]["common_factor"], stored[2].common_factor.values)
-    np.testing.assert_array_equal(held["step_0002"]["covariance"], stored[2].covariance.values)
+    rows, cols = np.triu_indices(6)
+    triangle = stored[2].covariance.values.reshape(-1, 21)
+    np.testing.assert_array_equal(held["step_0002"]["covariance"][..., rows, cols].reshape(-1, 21), triangle)
     assert held["about_0002"]["parts"]["common_factor"].split() == list(COLUMNS[2])
     # VTU: the upper triangle and the factor as components
     path = made(source, tmp_path, "vtu", steps=[2])[0]
     mesh = meshio.read(path)
-    rows, cols = np.triu_indices(6)
-    triangle = stored[2].covariance.values[..., rows, cols].reshape(-1, 21)
     np.testing.assert_array_equal(mesh.point_data["covariance"], triangle)
     assert mesh.point_data["common_factor"].shape[1] == 6 * len(COLUMNS[2])
     assert 'ComponentName1="x_mm_calibration_2"' in path.read_text()
@@ -269,3 +274,20 @@ def test_steps_that_do_not_all_include_the_calibration_do_not() -> None:
     part = Included(False, ("matching", "reference"))
     assert Included.in_all([whole, whole]).text == "matching, reference, calibration"
     assert Included.in_all([whole, part]).lacking == LACKING
+
+
+def test_a_mean_by_the_library_keeps_what_all_points_share(imported: Path, known: Path) -> None:
+    for folder in (known, imported):
+        field, strain = read_field(folder / "step_0001.nc"), read_strain(folder / "step_0001.nc")
+        settings = AnalysisSettings.model_validate({"region": {}, "subset_px": SUBSET, "spacing_px": 7})
+        result = Result(field, strain, settings, 1)
+        by_gauge = read_gauges([folder / "step_0001.nc"], GaugeRequest.model_validate(AREA)).steps[0].areas[0].values
+        for name in ("x_mm", "w_mm", "exx"):
+            mean = result.area(name)
+            assert mean.mean_sigma == pytest.approx(by_gauge[name].mean_sigma)
+            assert mean.mean_reading.budget.document() == pytest.approx(by_gauge[name].mean_budget)
+        assert (LACKING in result.uncertainty_includes) == (folder is imported)
+        if field.common is not None:
+            shared = np.linalg.norm(field.common[field.valid][:, 5].mean(axis=0))
+            assert result.area("w_mm").mean_sigma > shared  # as all points' errors are one
+            assert result.area("w_mm").mean_sigma_calibration == pytest.approx(shared)
