@@ -17,7 +17,7 @@ from playwright.sync_api import Browser, Page, expect
 from core.cameras.camera import Camera
 from server.exports.mesh import triangles_of
 from server.formats.calibrations.recognise import load_calibration
-from server.formats.results.reading import read_field
+from server.formats.results.reading import read_field, read_head
 from server.formats.results.writing import Provenance, write_field
 from server.store.index import analysis_entry
 from tests.support import results_page
@@ -237,7 +237,7 @@ def test_places_are_those_of_the_images(bench: Bench) -> None:
     }
     x, y = bench.field(0, "x_px"), bench.field(0, "y_px")
     assert np.abs(expected["cam1"] - np.stack([x, y], axis=-1)).max() < 0.1
-    xyz = np.stack([bench.field(0, f"{a}_mm") for a in "xyz"], axis=-1)
+    xyz = np.stack([bench.field(0, f"{a}_mm", frame="system") for a in "xyz"], axis=-1)
     camera: Camera = calibration.pair.cam2
     p = xyz @ camera.cam_from_sys.rotation.T + camera.cam_from_sys.translation_mm
     content = json.loads(bench.service.tests.calibration_file(bench.test_id).read_text())["cam2"]
@@ -514,6 +514,11 @@ def test_settings_checks_and_files(page: Watched, bench: Bench) -> None:
     expect(about.get_by_text("rectangle 60, 60, 180, 170")).to_be_visible()
     expect(about.locator("tbody tr")).to_have_count(3)
     at.get_by_text("Export and report").click()
+    # what is saved is in the axes that are shown, unless others are asked for
+    with at.expect_download() as saved:
+        at.get_by_role("button", name="Save the file").click()
+    assert read_head(saved.value.path()).frame.startswith("aligned by plane, X along camera 1's image rows")
+    at.get_by_label("frame", exact=True).fill("system")
     with at.expect_download() as saved:
         at.get_by_role("button", name="Save the file").click()
     content = bench.service.tests.result_file(bench.test_id, bench.analysis_id, 2).read_bytes()

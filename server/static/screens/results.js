@@ -167,8 +167,9 @@ async function show(root, testId, analysisId, query) {
       await redraw();
       return;
     }
-    message.textContent = `${state.info.about.replace(/([XYZ])_(frame|sys)/, "$1").replace("axis 1", "X").replace("axis 2", "Y")} · axes: ${axesText((await result.fields(state.step)).frame)}`;
+    const { frame } = await result.fields(state.step);
     if (!(await map.load(result, state.step, state.info, state.image))) return;
+    message.textContent = `${state.info.about.replace(/([XYZ])_(frame|sys)/, "$1").replace("axis 1", "X").replace("axis 2", "Y")} · axes: ${axesText(frame)}`;
     await redraw();
   }
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import netCDF4
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from core.arrays import Float
 from core.errors import InputError, RegionError
@@ -22,26 +21,10 @@ from server.results.gauges.readings import read_gauges
 from server.results.gauges.request import Alignment, AreaGauge, GaugeRequest, PlaneAlignment, PointGauge
 from server.workflows.framed import FramedResults
 from tests.support.gauge_field import SUBSET, make_field
+from tests.support.tension import LATERAL, SHIFT, SYS_FROM_IMAGE, TENSION, pulled, shape
 
-TENSION, LATERAL = 2000e-6, -661e-6
-# the system frame in the image: 45 degrees about the line of sight, as a grid on its corner makes it, and a tilt
-SYS_FROM_IMAGE = Rotation.from_euler("xz", [4.0, 45.0], degrees=True).as_matrix()
-SHIFT = np.array([3.0, -1.0, 40.0])
 # the file holds positions and displacements as float32: 3e-6 of 2 um between neighbours 0.14 mm apart
 TOLERANCE = 3e-6
-
-
-def shape(x_px: Float, y_px: Float) -> Float:
-    flat = np.stack([0.02 * (x_px - 90.0), 0.02 * (y_px - 100.0), np.zeros_like(x_px)], axis=-1)
-    return np.asarray(flat @ SYS_FROM_IMAGE.T + SHIFT)
-
-
-def pulled(x: Float) -> Float:
-    E = SYS_FROM_IMAGE @ np.diag([LATERAL, TENSION, 0.0]) @ SYS_FROM_IMAGE.T
-    # Green-Lagrange of a symmetric stretch U: (U^2 - 1) / 2
-    values, vectors = np.linalg.eigh(np.eye(3) + 2.0 * E)
-    U = vectors @ np.diag(np.sqrt(values)) @ vectors.T
-    return np.asarray((x - SHIFT) @ U.T + SHIFT + [0.05, 0.02, -0.03])
 
 
 @pytest.fixture(scope="module")
