@@ -21,6 +21,7 @@ from core.matching.geometry import covariance_xyzuvw, motion_geometry, shape_geo
 _APART_PX = 11.0  # between subsets of one difference: two large speckles, which they do not share
 _MIN_INDEPENDENT = 40.0  # subsets beside one another: the standard deviation is then known to some 10 %
 _QUANTILE, _OF_NORMAL = 0.8, 1.2816  # localised strain and wrong matches are beyond
+_AS_REPORTED = (0.92, 1.08)  # within, nothing is changed
 _MAX_RAISE = 1.5
 _FLAT = 1e-2  # extent along the normal, of the largest, that is none
 _DIFFERENCES = ((1.0, -2.0, 1.0), (1.0, -3.0, 3.0, -1.0))
@@ -46,7 +47,8 @@ def observed_over_reported(
 
     Returns
     -------
-    (3,) ratios, system frame; NaN where too few points tell.
+    Float
+        (3,) ratios, system frame; NaN where too few points tell.
     """
     which = np.zeros(len(xy_px), bool)
     which[index] = np.isfinite(points.covariance[index]).all(axis=(1, 2))
@@ -77,7 +79,10 @@ def bring_to_observed(
 ) -> None:
     """Bring the covariances of a motion's points in place to what :func:`observed_over_reported` finds."""
     ratio = observed_over_reported(pair, points, index, xy_px, shape, subset_px)
-    ratio = np.where(np.isfinite(ratio), np.minimum(ratio, _MAX_RAISE), 1.0)
+    other = (ratio < _AS_REPORTED[0]) | (ratio > _AS_REPORTED[1])
+    if not other.any():
+        return
+    ratio = np.where(other, np.minimum(ratio, _MAX_RAISE), 1.0)
     R = pair.cam1.cam_from_sys.rotation
     change = np.eye(points.covariance.shape[-1])
     change[1:4, 1:4] = R @ np.diag(ratio) @ R.T
