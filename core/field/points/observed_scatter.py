@@ -22,7 +22,7 @@ _APART_PX = 11.0  # between subsets of one difference: two large speckles, which
 _MIN_INDEPENDENT = 40.0  # subsets beside one another: the standard deviation is then known to some 10 %
 _QUANTILE, _OF_NORMAL = 0.8, 1.2816  # localised strain and wrong matches are beyond
 _AS_REPORTED = (0.92, 1.08)  # within, nothing is changed
-_MAX_RAISE = 1.5
+_MAX_RAISE = 2.0
 _FLAT = 1e-2  # extent along the normal, of the largest, that is none
 _DIFFERENCES = ((1.0, -2.0, 1.0), (1.0, -3.0, 3.0, -1.0))
 
