@@ -30,10 +30,10 @@ def reduced_moments(weights: Float, seen: Bool, half: int, order: int) -> Float:
     Planes give the slope in the middle of a window's connected points, quadratics that in the window's middle; the
     moments are about that position, where the second order has no effect on the slope.
     """
-    t, s = np.broadcast_to(window_offsets(half)[0].T.astype(np.float64)[:, None, :], (2, *seen.shape))
-    if order == 1:
-        count = np.maximum(seen.sum(axis=1, keepdims=True), 1)
-        t, s = (a - (a * seen).sum(axis=1, keepdims=True) / count for a in (t, s))
+    if order == 2:
+        return third_moments(weights, half)
+    count = np.maximum(seen.sum(axis=1, keepdims=True), 1)
+    t, s = (a - (a * seen).sum(axis=1, keepdims=True) / count for a in window_offsets(half)[0].T.astype(np.float64))
     return np.asarray(weights @ _thirds(s, t))
 
 
@@ -45,7 +45,10 @@ def second_moments(weights: Float, half: int) -> Float:
 
 def _thirds(s: Float, t: Float) -> Float:
     """(..., n, 4) terms of a Taylor series."""
-    return np.asarray(np.stack([s**3, s * s * t, s * t * t, t**3], axis=-1) * _FACTORS)
+    ss, tt = s * s, t * t
+    out = np.stack([ss * s, ss * t, s * tt, tt * t], axis=-1)
+    out *= _FACTORS
+    return np.asarray(out)
 
 
 def whole_second_derivatives(values: Float, half: int) -> Float:

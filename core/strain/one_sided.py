@@ -60,7 +60,7 @@ def raise_order(slopes: Slopes, surface: OnSurface, tensor: StrainTensor) -> tup
     Parameters
     ----------
     slopes
-        Of planes, with the quadratics beside them (order ``auto``).
+        Of planes (order ``auto``); quadratics' weights take the place of planes' in ``reduced``.
     surface
         The same on the surface.
     tensor
@@ -76,34 +76,32 @@ def raise_order(slopes: Slopes, surface: OnSurface, tensor: StrainTensor) -> tup
     good = slopes.status == StrainStatus.OK
     number = np.cumsum(good).reshape(good.shape) - 1
     left, raised = np.zeros((*good.shape, 3)), np.zeros(good.shape, bool)
-    slope, spread, moments, reduced = slopes.slope.copy(), slopes.spread.copy(), slopes.moments.copy(), []
+    slope, spread, moments = slopes.slope.copy(), slopes.spread.copy(), slopes.moments.copy()
     bending = _metric_gradients(slopes, tensor)
-    for (rows, cols, weights), curved in zip(slopes.reduced, slopes.quadratics, strict=True):
-        ok = slopes.status[rows, cols] == StrainStatus.OK
-        reduced.append((rows, cols, weights))
-        if not ok.any():
+    for (rows, cols, weights), seen in zip(slopes.reduced, slopes.seen, strict=True):
+        ok = np.flatnonzero(slopes.status[rows, cols] == StrainStatus.OK)
+        if len(ok) == 0:
             continue
         r, c = rows[ok], cols[ok]
         at = number[r, c]
-        steep, noise = _around(bending, slopes.second_spread, good, r, c, curved.seen[ok])
-        bent, per_mm = curved.bent[ok], surface.per_mm[at]
-        off = np.einsum("mak,mbk->mab", steep, bent)
+        curved = slopes.windows.quadratics(r, c, seen[ok], weights[ok])
+        steep, noise = _around(bending, slopes.second_spread, good, r, c, seen[ok])
+        per_mm = surface.per_mm[at]
+        off = np.einsum("mak,mbk->mab", steep, curved.bent)
         off = np.swapaxes(per_mm, -1, -2) @ (0.5 * (off + np.swapaxes(off, -1, -2))) @ per_mm
         bias = as_tensor(np.stack([off[:, 0, 0], off[:, 1, 1], off[:, 0, 1]], axis=-1), surface.strain[at], tensor)
+        bent = curved.bent
         own = _diagonal(surface.covariance(bent @ noise @ np.swapaxes(bent, -1, -2), tensor, at))
         square = np.maximum(bias**2 - own, 0.0)
         planes = _diagonal(surface.covariance(slopes.spread[r, c], tensor, at)) + square
-        quadratics = _diagonal(surface.covariance(curved.spread[ok], tensor, at))
-        better = (curved.status[ok] == StrainStatus.OK) & (quadratics.sum(axis=1) < planes.sum(axis=1))
+        quadratics = _diagonal(surface.covariance(curved.spread, tensor, at))
+        better = (curved.status == StrainStatus.OK) & (quadratics.sum(axis=1) < planes.sum(axis=1))
         left[r, c] = np.where(better[:, None], 0.0, square)
-        raised[r[better], c[better]] = True
-        which = np.flatnonzero(ok)[better]
-        r, c = rows[which], cols[which]
-        slope[r, c], spread[r, c], moments[r, c] = curved.slope[which], curved.spread[which], curved.moments[which]
-        weights = weights.copy()
-        weights[which] = curved.weights[which]
-        reduced[-1] = rows, cols, weights
-    return replace(slopes, slope=slope, spread=spread, moments=moments, reduced=reduced), left, raised
+        r, c = r[better], c[better]
+        raised[r, c] = True
+        slope[r, c], spread[r, c], moments[r, c] = curved.slope[better], curved.spread[better], curved.moments[better]
+        weights[ok[better]] = curved.weights[better]  # where they are: a field's weights are its largest array
+    return replace(slopes, slope=slope, spread=spread, moments=moments), left, raised
 
 
 def _metric_gradients(slopes: Slopes, tensor: StrainTensor) -> Float:

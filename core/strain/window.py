@@ -8,6 +8,7 @@ of the surface.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from scipy import ndimage
@@ -21,11 +22,13 @@ from core.strain.options import StrainOptions
 from core.strain.result import StrainStatus
 
 _AT_ONCE = 1024
+_VALUES_AT_ONCE = 1_000_000  # of one quantity: large windows come in smaller batches
+_RANK = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
 class Quadratics:
-    """Fits of quadratics over a batch of m windows that planes were fitted to, and what the planes leave out.
+    """Fits of quadratics over m windows that planes were fitted to, and what the planes leave out.
 
     Attributes
     ----------
@@ -35,8 +38,6 @@ class Quadratics:
         As those of planes, in :class:`Slopes`.
     bent
         (m, 2, 3) the planes' weights' sums of s^2/2, s t, t^2/2 about the point: what second derivatives add to slopes.
-    seen
-        (m, n) True for the windows' connected points.
     """
 
     status: np.ndarray
@@ -45,7 +46,89 @@ class Quadratics:
     moments: Float
     weights: Float
     bent: Float
-    seen: Bool
+
+
+class Correlation:
+    """How the errors of a window's points correlate: by distance, so that windows are filtered along rows and columns.
+
+    Parameters
+    ----------
+    shared
+        The correlation of neighbouring points' errors.
+    step
+        Distance of neighbouring columns and rows, px.
+    half
+        Points to each side of a window's middle.
+    """
+
+    def __init__(self, shared: SharedPixels, step: tuple[float, float], half: int) -> None:
+        lag = np.arange(-2 * half, 2 * half + 1)
+        down, size, along = np.linalg.svd(shared.correlation(lag[None, :] * step[0], lag[:, None] * step[1]))
+        between = np.subtract.outer(np.arange(2 * half + 1), np.arange(2 * half + 1)) + 2 * half
+        self._pairs = [
+            (s * down[:, i][between], along[i][between]) for i, s in enumerate(size) if s > _RANK * float(size[0])
+        ]
+        offsets, _ = window_offsets(half)
+        self._place = (offsets + half) @ np.array([2 * half + 1, 1])
+
+    def spread(self, weights: Float) -> Float:
+        """Covariance (m, a, a) of sums with weights (m, a, n), in units of a point's."""
+        m, a, n = weights.shape
+        side = len(self._pairs[0][0])
+        by_place = np.empty((m, a, n))
+        by_place[..., self._place] = weights
+        square = by_place.reshape(m, a, side, side)
+        together = sum(down @ square @ along.T for down, along in self._pairs)
+        return np.asarray(np.einsum("maij,mbij->mab", together, square))
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedWindows:
+    """What fits over windows need that edges, holes or cuts have reduced.
+
+    Attributes
+    ----------
+    values
+        (r, c, 6) X Y Z U V W, mm.
+    valid
+        (r, c) True where there are values.
+    correlation
+        Of the points of a window.
+    options
+        Window, order, limits.
+    """
+
+    values: Float
+    valid: Bool
+    correlation: Correlation
+    options: StrainOptions
+
+    @cached_property
+    def _padded(self) -> Float:
+        half = self.options.window // 2
+        held = np.where(self.valid[..., None], self.values, 0.0)
+        return np.pad(held, ((half, half), (half, half), (0, 0))).reshape(-1, 6)
+
+    def data(self, rows: np.ndarray, cols: np.ndarray) -> Float:
+        """Values (m, n, 6) of the windows about points (m,), from the centre's on, so that no digits are lost."""
+        half = self.options.window // 2
+        width = self.valid.shape[1] + 2 * half
+        here = (rows + half) * width + cols + half
+        reach = window_offsets(half)[0] @ np.array([width, 1])
+        around = self._padded.take(here[:, None] + reach, axis=0)
+        return np.asarray(around - self.values[rows, cols][:, None, :])
+
+    def fitted(self, seen: Bool, data: Float, order: int) -> tuple[np.ndarray, Float, Float, Float, Float]:
+        """Status, slope, spread, third moments and weights of windows' fits, as in :class:`Slopes`."""
+        half = self.options.window // 2
+        found, weights = _weights(seen, half, order, self.options)
+        slope = np.einsum("man,mnb->mba", weights, data)
+        return found, slope, self.correlation.spread(weights), reduced_moments(weights, seen, half, order), weights
+
+    def quadratics(self, rows: np.ndarray, cols: np.ndarray, seen: Bool, planes: Float) -> Quadratics:
+        """Return the quadratics of windows with these connected points (m, n) and weights (m, 2, n) of planes."""
+        raised = self.fitted(seen, self.data(rows, cols), 2)
+        return Quadratics(*raised, second_moments(planes, self.options.window // 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +150,10 @@ class Slopes:
     reduced
         Of windows that edges, holes or cuts have reduced, in batches: rows (m,), columns (m,), and weights (m, 2, n) of
         the points of ``window_offsets`` in the slopes.
-    quadratics
-        Of order ``auto``: the same batches' quadratics; else empty.
+    seen
+        Of order ``auto``: the same batches' (m, n) True for the windows' connected points; else empty.
+    windows
+        What fits over reduced windows need.
     second_spread
         Of order ``auto``: (r, c, 3, 3) covariance of ``second`` in units of a point's, zero where undetermined.
     """
@@ -79,7 +164,8 @@ class Slopes:
     second: Float
     moments: Float
     reduced: list[tuple[np.ndarray, np.ndarray, Float]]
-    quadratics: list[Quadratics] = field(default_factory=list)
+    windows: ReducedWindows
+    seen: list[Bool] = field(default_factory=list)
     second_spread: Float | None = None
 
 
@@ -106,8 +192,6 @@ def window_slopes(
     half = options.window // 2
     offsets, _ = window_offsets(half)
     step = steps_of(xy_px)
-    lag = (offsets[:, None, :] - offsets[None, :, :]).astype(np.float64)
-    rho = shared.correlation(lag[..., 1] * step[0], lag[..., 0] * step[1])
     whole = ndimage.minimum_filter(valid, size=options.window, mode="constant", cval=False)
     crossed = ways_cut(valid, xy_px, cuts, half)
     whole &= ~crossed.any(axis=-1) if crossed is not None else True
@@ -115,55 +199,40 @@ def window_slopes(
     slope = _whole_slopes(values, half)
     spread = np.zeros((*valid.shape, 2, 2))
     c = plane_weights(half)
+    down, along = (np.subtract.outer(o, o).astype(np.float64) for o in offsets.T)
+    rho = shared.correlation(along * step[0], down * step[1])
+    del down, along
     spread[...] = c @ rho @ c.T
     positions = np.concatenate([values[..., :3], values[..., :3] + values[..., 3:]], axis=-1)
     second = whole_second_derivatives(positions, half)
     moments = np.empty((*valid.shape, 2, 4))
     moments[...] = third_moments(c, half)
-    second_spread, quadratics = None, []
+    second_spread = None
     if options.order == "auto":
         every = second_weights(np.ones((1, len(offsets)), bool), half)[0]
         second_spread = np.where(whole[..., None, None], every @ rho @ every.T, 0.0)
+    del rho
+    windows = ReducedWindows(values, valid, Correlation(shared, step, half), options)
     rows, cols = np.nonzero(valid & ~whole)
-    reduced = []
+    reduced, connected = [], []
     there = np.pad(valid, half)
-    padded = np.pad(np.where(valid[..., None], values, 0.0), ((half, half), (half, half), (0, 0))).reshape(-1, 6)
-    width = there.shape[1]
-    reach = offsets @ np.array([width, 1])
-    for first in range(0, len(rows), _AT_ONCE):
-        r, k = rows[first : first + _AT_ONCE], cols[first : first + _AT_ONCE]
-        here = (r + half) * width + k + half
+    at_once = min(_AT_ONCE, max(_VALUES_AT_ONCE // len(offsets), 1))
+    for first in range(0, len(rows), at_once):
+        r, k = rows[first : first + at_once], cols[first : first + at_once]
+        here = (r + half) * there.shape[1] + k + half
         seen = connected_points(there, here, None if crossed is None else crossed[r, k], half)
-        # from the centre's values on, so that no digits are lost
-        data = padded.take(here[:, None] + reach, axis=0) - values[r, k][:, None, :]
+        data = windows.data(r, k)
         there_now = np.concatenate([data[..., :3], data[..., :3] + data[..., 3:]], axis=-1)
         bending = second_weights(seen, half)
         second[r, k] = np.einsum("man,mnb->mba", bending, there_now)
-        status[r, k], slope[r, k], spread[r, k], moments[r, k], weights = _fitted(
-            seen, data, rho, half, 2 if options.order == 2 else 1, options
+        status[r, k], slope[r, k], spread[r, k], moments[r, k], weights = windows.fitted(
+            seen, data, 2 if options.order == 2 else 1
         )
         reduced.append((r, k, weights))
         if second_spread is not None:
-            second_spread[r, k] = _spread(bending, rho)
-            raised = _fitted(seen, data, rho, half, 2, options)
-            quadratics.append(Quadratics(*raised, second_moments(weights, half), seen))
-    return Slopes(status, slope, spread, second, moments, reduced, quadratics, second_spread)
-
-
-def _fitted(
-    seen: Bool, data: Float, rho: Float, half: int, order: int, options: StrainOptions
-) -> tuple[np.ndarray, Float, Float, Float, Float]:
-    """Status, slope, spread, third moments and weights of windows' fits, as in :class:`Slopes`."""
-    found, weights = _weights(seen, half, order, options)
-    slope = np.einsum("man,mnb->mba", weights, data)
-    return found, slope, _spread(weights, rho), reduced_moments(weights, seen, half, order), weights
-
-
-def _spread(weights: Float, rho: Float) -> Float:
-    """Covariance (m, a, a) of sums with weights (m, a, n), in units of a point's."""
-    # one large product instead of many small ones
-    together = (weights.reshape(-1, len(rho)) @ rho).reshape(weights.shape)
-    return np.asarray(np.einsum("man,mbn->mab", together, weights))
+            second_spread[r, k] = windows.correlation.spread(bending)
+            connected.append(seen)
+    return Slopes(status, slope, spread, second, moments, reduced, windows, connected, second_spread)
 
 
 def slopes_of(values: Float, valid: Bool, slopes: Slopes, half: int) -> Float:

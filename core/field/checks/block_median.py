@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from core.arrays import Bool, Float
 
@@ -47,17 +48,30 @@ def block_medians(
         Another one than the median.
     """
     rows, cols = shape
-    level, used = values.reshape(shape), known.reshape(shape)
-    out = np.full(shape, otherwise)
-    for top in range(0, rows, reach):
-        for left in range(0, cols, reach):
-            about = (
-                slice(max(top - reach // 2, 0), top + reach + reach // 2 + 1),
-                slice(max(left - reach // 2, 0), left + reach + reach // 2 + 1),
-            )
-            there = level[about][used[about]]
-            if len(there) >= _FEW:
-                out[top : top + reach, left : left + reach] = (
-                    np.median(there) if quantile == 0.5 else np.quantile(there, quantile)
-                )
-    return out.ravel()
+    beside = reach // 2
+    width = reach + 2 * beside + 1
+    # all blocks at once; what is not known, or beyond the grid, is sorted behind everything
+    padded = np.full((rows + reach + width, cols + reach + width), np.inf)
+    padded[beside : beside + rows, beside : beside + cols] = np.where(known, values, np.inf).reshape(shape)
+    counted = np.zeros(padded.shape, bool)
+    counted[beside : beside + rows, beside : beside + cols] = known.reshape(shape)
+    every = slice(0, rows, reach), slice(0, cols, reach)
+    ordered = sliding_window_view(padded, (width, width))[every]
+    blocks = ordered.shape[:2]
+    ordered = np.sort(ordered.reshape(*blocks, -1), axis=-1)
+    count = sliding_window_view(counted, (width, width))[every].sum(axis=(2, 3))
+    at = quantile * (np.maximum(count, 1) - 1)
+    low = np.floor(at).astype(int)
+    share = at - low
+    below, above = (
+        np.take_along_axis(ordered, i[..., None], axis=-1)[..., 0] for i in (low, np.where(share > 0.0, low + 1, low))
+    )
+    enough = count >= _FEW
+    below, above = np.where(enough, below, 0.0), np.where(enough, above, 0.0)
+    # rounded as numpy's interpolation between the two
+    step = above - below
+    found = np.where(share < 0.5, below + step * share, above - step * (1.0 - share))
+    if quantile == 0.5:
+        found = (below + above) / 2.0
+    level = np.where(enough, found, otherwise)
+    return np.repeat(np.repeat(level, reach, axis=0), reach, axis=1)[:rows, :cols].ravel()

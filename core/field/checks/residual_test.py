@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from core.arrays import Bool, Float
 from core.field.points.fitter import Fitter, PointFits
+from core.field.points.observed_scatter import bring_to_observed
 from core.field.points.starts import depth_per_px
 from core.matching.cluster_robust import cluster_robust_covariances
 from core.progress import CancelToken, raise_if_cancelled
@@ -36,6 +37,8 @@ _ALIKE = float(np.log(2.0))  # variances within a factor of two are one kind's: 
 _TINY = 1e-9
 _UNCORRELATED = (0.65, 1.5)  # variances with correlated blocks over those with independent ones: within, they are
 _KIND_UNCERTAINTY = 1.25  # of a kind's standard deviation, from few blocks
+_MANY = 0.05  # share rejected, beyond which what is left is a selection
+_NEARLY_ALL = 0.99
 _AT_ONCE = 4096
 
 
@@ -66,6 +69,7 @@ def residual_test(
     xy_px: Float,
     texture: Float,
     max_sigma_px: float,
+    shape: tuple[int, int] | None = None,
     cancel: CancelToken | None = None,
 ) -> TestedResiduals:
     """Scale the covariances of points in place and reject points whose standard deviation is too large.
@@ -81,6 +85,9 @@ def residual_test(
     max_sigma_px
         Standard deviation of a match, in camera 1's current image or of what determines the depth in camera 2's, beyond
         which a point with residuals that are not noise is rejected.
+    shape
+        Rows and columns of the n points: where residuals are not noise, a motion's standard deviations follow how its
+        points scatter. None: the points are no grid.
     cancel
         Stops the work.
 
@@ -118,6 +125,7 @@ def residual_test(
     _scale(points, usual, correction / np.where(correction > 1.0, _shared_texture(points, usual), 1.0))
     rejected = 0
     if (correction[:-1] > 1.0).any():
+        _as_observed(fitter, points, usual, xy_px, shape)
         rejected = _reject_far(fitter, points, usual, xy_px, max_sigma_px)
     if len(alone) == 0:
         return TestedResiduals(factor=factor, one_by_one=0, rejected=rejected)
@@ -125,16 +133,23 @@ def residual_test(
     quiet = (usual_energy / np.maximum(energy[unusual], usual_energy)).min(axis=1) * (len(usual) > 0)
     alike = _robust(fitter, points, alone[np.unique(spread_indices(len(alone), _SAMPLE))], xy_px)
     structure = _Structure.of(alike) if len(alike.independent) >= _MIN_POINTS else None
+    kind = np.full((len(alone), q), np.nan)
     for first in range(0, len(alone), _AT_ONCE):
         raise_if_cancelled(cancel)
-        index = alone[first : first + _AT_ONCE]
-        found = _robust(fitter, points, index, xy_px)
-        kind = _replace(points, found, structure, quiet[first : first + _AT_ONCE][found.known])
-        rejected += _reject_far(fitter, points, index, xy_px, max_sigma_px)
-        left = points.ok[found.points]
-        rejected += _reject_far(
-            fitter, points, found.points[left], xy_px, max_sigma_px, _KIND_UNCERTAINTY * np.sqrt(kind[left])
-        )
+        part = slice(first, first + _AT_ONCE)
+        found = _robust(fitter, points, alone[part], xy_px)
+        kind[part][found.known] = _replace(points, found, structure, quiet[part][found.known])
+    kind *= _as_observed(fitter, points, alone, xy_px, shape)
+    rejected += _reject_far(fitter, points, alone, xy_px, max_sigma_px)
+    left = points.ok[alone] & np.isfinite(kind).all(axis=1)
+    sd = _KIND_UNCERTAINTY * np.sqrt(kind[left])
+    rejected += _reject_far(fitter, points, alone[left], xy_px, max_sigma_px, sd)
+    if rejected > _MANY * len(alone):  # those left are the ones whose own estimate happens to be small
+        left = alone[points.ok[alone]]
+        _as_observed(fitter, points, left, xy_px, shape)
+        # of a whole field that scatters too far, the last hundredth is within the limit by chance
+        few = len(alone) == len(ok) and rejected > _NEARLY_ALL * len(alone)
+        rejected += _reject_far(fitter, points, left, xy_px, 0.0 if few else max_sigma_px)
     return TestedResiduals(factor=factor, one_by_one=len(alone), rejected=rejected)
 
 
@@ -235,6 +250,18 @@ def _replace(points: PointFits, found: _Robust, structure: _Structure | None, qu
     points.epipolar_sigma_px[found.points] = np.sqrt(covariance[:, -1, -1])
     # where a kind scatters too far, those that are within the limit are so by chance
     return np.asarray(_diagonal(found.root @ kind @ np.swapaxes(found.root, 1, 2) / shared))
+
+
+def _as_observed(
+    fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, shape: tuple[int, int] | None
+) -> Float:
+    """Bring covariances to what the points' scatter shows; returns the variances' (m, q) ratios."""
+    if shape is None or fitter.comparisons != 3:
+        return np.ones((len(index), points.covariance.shape[-1]))
+    before = _diagonal(points.covariance[index])
+    bring_to_observed(fitter.pair, points, index, xy_px, shape, fitter.options.subset_px)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(before > 0.0, _diagonal(points.covariance[index]) / before, 1.0)
 
 
 def _shared_texture(points: PointFits, index: NDArray[np.intp]) -> Float:

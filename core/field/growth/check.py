@@ -89,6 +89,7 @@ def check_residuals(inputs: FieldInputs, state: GrowthState) -> None:
         xy_px=inputs.xy_px,
         texture=inputs.texture,
         max_sigma_px=inputs.options.validity.max_sigma_px,
+        shape=inputs.grid.shape,
         cancel=inputs.cancel,
     )
     if tested.rejected:

@@ -17,6 +17,7 @@ import matplotlib as mpl
 mpl.use("Agg")
 
 from tests.bench.accuracy import adversarial as accuracy_adversarial
+from tests.bench.accuracy import blur_in_time as accuracy_blur
 from tests.bench.accuracy import bumps as accuracy_bumps
 from tests.bench.accuracy import calibration as accuracy_calibration
 from tests.bench.accuracy import calibration_beside as accuracy_beside
@@ -74,6 +75,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "noise-random": accuracy_noise.random_error,
     "noise-mean": accuracy_noise.mean_error,
     "noise-model": accuracy_noise.camera_noise,
+    **accuracy_blur.SECTIONS,
     "prefilter": accuracy_prefilter.prefilter,
     "smoothing": accuracy_smoothing.smoothing,
     "bumps": accuracy_bumps.bumps,

@@ -30,7 +30,7 @@ TOPICS = (
     ),
     Topic("targets", "Targets", ("targets",)),
     Topic("shape_and_motion", "Shape and motion", ("plane", "translation", "strain", "rotation")),
-    Topic("noise", "Random error and its bound", ("noise-random", "noise-model")),
+    Topic("noise", "Random error and its bound", ("noise-random", "noise-model", "blur-in-time")),
     Topic("bias", "Bias over the sub-pixel phase", ("noise-mean", "prefilter")),
     Topic("curved_patches", "Curved patches", ("curved-sphere", "curved-noise", "curved-bending", "curved-auto")),
     Topic("large_motion", "Large motion in one step", ("large",)),
