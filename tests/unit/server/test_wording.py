@@ -58,13 +58,17 @@ def told(model: type[BaseModel], body: dict[str, Any]) -> list[str]:
         (
             GaugeRequest,
             {"align": {"x_direction": [1, 0, 0]}},
-            "align: needs 'kind', which says what it is; one of 'plane', '3-2-1'.",
+            "align: needs 'kind', which says what it is; one of 'plane', '3-2-1', 'given'.",
         ),
-        (GaugeRequest, {"align": {"kind": "2-2"}}, "align: 'kind' must be one of 'plane', '3-2-1', not '2-2'."),
+        (
+            GaugeRequest,
+            {"align": {"kind": "2-2"}},
+            "align: 'kind' must be one of 'plane', '3-2-1', 'given', not '2-2'.",
+        ),
         (
             GaugeRequest,
             {"align": {"kind": "plane", "tilt": 1}},
-            "align.tilt: is not known here. What can be given: kind, polygon_px, rectangle_px, x_direction.",
+            "align.tilt: is not known here. What can be given: kind, polygon_px, rectangle_px, x_direction, x_line_px.",
         ),
         (
             SceneRequest,
