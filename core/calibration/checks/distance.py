@@ -281,5 +281,5 @@ def _finding(
     else:
         text += f"beyond 3 sigma = {limit:.4f} mm: the pitch of the calibration's target may be wrong by that factor."
     if not known:
-        text += " The calibration's own uncertainty is not known and does not count."
+        text += " Calibration not included: its own uncertainty is not known and does not count."
     return DistanceCheck(measured, known_mm, ratio, sigma, agrees, text, points, residual_mm, known)

@@ -154,6 +154,7 @@ class FrameReading:
     budget_origin_mm: Annotated[
         Sequence[Mapping[str, float]], Field(description="Budget of the origin's sigma along each axis.")
     ] = ()
+    not_included: Annotated[str, Field(description=LACKING)] = ""
 
 
 @dataclass(frozen=True)

@@ -61,9 +61,12 @@ def field_budgets(field: Field, points: Bool) -> dict[str, PointBudget]:
     dict
         By the quantity's name in result files: ``x_mm`` ...
     """
-    own = np.diagonal(field.covariance[points], axis1=-2, axis2=-1)
-    at_reference = field.frozen_covariance
-    frozen = None if at_reference is None else np.diagonal(at_reference[points], axis1=-2, axis2=-1)
+    own = _diagonal(field.covariance)[points]
+    frozen = None
+    if not field.has_motion:
+        frozen = own  # a position's noise is the reference pair's
+    elif field.frozen is not None:
+        frozen = np.concatenate([own[:, :3], _diagonal(field.frozen)[points]], axis=1)
     common = None if field.common is None else field.common[points]
     return {
         name: _budget(
@@ -85,7 +88,7 @@ def strain_budgets(field: Field, strain: StrainField, points: Bool) -> dict[str,
     points
         (r, c) True at the points that are asked for.
     """
-    own = np.diagonal(strain.covariance[points], axis1=-2, axis2=-1)
+    own = _diagonal(strain.covariance)[points]
     share = reference_share(field)
     common = None if strain.common is None else strain.common[points]
     return {
@@ -107,6 +110,10 @@ def reference_share(field: Field) -> Float | None:
         return np.asarray(
             np.einsum("rcii->rc", field.frozen[..., :2, :2]) / np.einsum("rcii->rc", field.covariance[..., 3:5, 3:5])
         )
+
+
+def _diagonal(covariance: Float) -> Float:
+    return np.asarray(np.diagonal(covariance, axis1=-2, axis2=-1))
 
 
 def _budget(own: Float, frozen: Float | None, common: Float | None, causes: Causes | None) -> PointBudget:

@@ -10,12 +10,13 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from core.common.budget import CALIBRATION_UNKNOWN
 from core.errors import InputError
 from core.field.points.result import Field
 from core.settings import Coverage, CoverageFields
 from server.formats.results.netcdf import opened
 
-NOT_INCLUDED = "calibration not included"
+NOT_INCLUDED = CALIBRATION_UNKNOWN
 #: what no file's uncertainties hold
 SYSTEMATIC = (
     "systematic terms (interpolation, order of the patch, strain window)",

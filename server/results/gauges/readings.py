@@ -149,6 +149,8 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
     frame = first.frame
     if request.align is not None:
         frame = f"{text_of(request.align)}; before: {frame}"
+    statement = Statement(Included.in_all(included), request)
+    laid = None if alignment is None else _frame_reading(alignment)
     return GaugeReadings(
         software_version=software_version(),
         settings=request.model_dump(mode="json"),
@@ -158,8 +160,8 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
         frame=frame,
         subset_px=first.settings["subset_px"],
         smoothing_window=first.settings.get("smoothing_window"),
-        alignment=None if alignment is None else _frame_reading(alignment),
-        statement=Statement(Included.in_all(included), request),
+        alignment=None if laid is None else replace(laid, not_included=statement.included.lacking),
+        statement=statement,
         steps=steps,
     )
 

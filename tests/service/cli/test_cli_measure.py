@@ -168,7 +168,13 @@ def test_several_paths_a_mask_seeds_and_the_other_models(folder: Path, tmp_path:
         assert (data["status"].values[~masked] == 0).mean() > 0.99
         assert json.loads(data.attrs["settings"])["patch"] == "rigid"
         assert "mask" in json.loads(data.attrs["inputs_sha256"])
-    assert "step 1 of 1" in capfd.readouterr().err
+    err = capfd.readouterr().err
+    assert "step 1 of 1" in err
+    assert "u (k = 1) of step 1, medians: Z" in err
+    assert "calibration not included" in err  # parameters alone have no covariance
+    summary = json.loads((out / "summary.json").read_text())["steps"][1]
+    assert list(summary["budget_median_mm"]["w_mm"]) == ["matching", "reference"]
+    assert "calibration not included" in summary["uncertainty_includes"]
 
 
 def test_a_test_folder_copied_by_hand(folder: Path, tmp_path: Path, measured: Path) -> None:
