@@ -195,7 +195,9 @@ class ParameterCovariance:
                 remedy="Calibrate anew, or take the covariance out of the file; results then do not include it.",
             )
         kept = value > 0.0
-        return np.asarray(scale[:, None] * vector[:, kept] * np.sqrt(value[kept]))
+        # a parameter that was held has no part in what rounding leaves
+        held = np.diagonal(self.covariance) <= 0.0
+        return np.asarray(np.where(held, 0.0, scale)[:, None] * vector[:, kept] * np.sqrt(value[kept]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,7 @@ from tests.support.field_bench import pair
 from tests.support.gauge_field import SUBSET, make_field
 
 
-def _measured(drawn: StereoPair, seen: list[Any], seen_now: list[Any], before: Any, current: Any) -> Any:
+def measured_numerically(drawn: StereoPair, seen: list[Any], seen_now: list[Any], before: Any, current: Any) -> Any:
     """What a measurement makes of images with drawn cameras: one step of least squares, slopes by differences.
 
     Unknowns: depth along camera 1's ray of the pixel, camera 2's offset across the epipolar line, the current point;
@@ -85,7 +85,7 @@ def test_the_calibrations_part_is_the_scatter_of_drawn_calibrations() -> None:
             for values, part in zip(nominal, np.split(change, 2), strict=True)
         ]
         drawn_pair = StereoPair(*cameras)
-        found.append(_measured(drawn_pair, *seen, before, current))
+        found.append(measured_numerically(drawn_pair, *seen, before, current))
     drawn_mm = np.asarray(found)
     np.testing.assert_allclose(np.sqrt(np.diagonal(predicted, axis1=1, axis2=2)), drawn_mm.std(axis=0), rtol=0.06)
     # and between the points: 3,000 draws give a correlation to 0.02

@@ -45,7 +45,7 @@ _MANY_EMPTY = 0.2
 _REPETITIVE = ("x_px", "y_px", "status", "iterations", "zncc")
 _INCLUDES = {
     False: "the matching of the point and, as F F', the calibration",
-    True: "the matching of the point; the calibration is not included: its covariance is not known",
+    True: "matching only: the calibration is not included, its covariance is not known",
 }
 _FRAMES = {
     "target": "sys: X_sys, Y_sys in the calibration target's plane at its first position, Z_sys away from the cameras",
@@ -266,6 +266,7 @@ def _put_causes(dataset: Any, causes: Causes) -> None:
     variable.setncatts(
         {
             "long_name": "where a column's unit cause comes from; the same causes in all steps of a test",
+            "units": "1",
             "_Encoding": "ascii",
         }
     )
