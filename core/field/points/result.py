@@ -199,4 +199,4 @@ class Field:
         own = np.diagonal(self.covariance, axis1=-2, axis2=-1)
         if self.common is None:
             return np.sqrt(own)
-        return np.sqrt(own + np.einsum("...nk,...nk->...n", self.common, self.common))
+        return np.asarray(np.sqrt(own + np.einsum("...nk,...nk->...n", self.common, self.common)))
