@@ -21,6 +21,7 @@ from core.compiling import report_compiling
 from core.field.region.region import PointGrid
 from core.field.seeding.seeds import Seed
 from core.measure import MeasureOptions, ReferencePair
+from core.systematic.interpolation import SmoothSlopes, interpolation_term
 from core.threads import set_threads
 from server.compute.background_compilation import BackgroundCompilation
 from server.compute.sequence import Pair, SequenceMeasurement
@@ -133,3 +134,5 @@ def warm_up(threads: int) -> None:
         shape = reference.shape(grid, options, seeds=seeds)
         compilation.wait()
         reference.motion(left.copy(), right.copy(), grid, options, shape=shape)
+        one, two = (image.prepared(options.interpolation) for image in (reference.image1, reference.image2))
+        interpolation_term(shape, pair, SmoothSlopes.of(one), [two], subset_px=options.subset_px)

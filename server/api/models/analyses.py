@@ -10,6 +10,7 @@ from core import settings
 from core.settings import StoredSettings, disagreement
 from server.api.models.cameras_moved import CameraMotion
 from server.api.models.jobs import Accepted, JobProblem
+from server.api.models.systematic import SystematicTerms
 from server.api.models.tests import AnalysisEntry
 from server.api.models.warnings import AnalysisWarning
 from server.base.json_values import Nested
@@ -122,6 +123,9 @@ class StepFigures(Reply):
     status: dict[str, int] | None = Field(None, description="Points by status.")
     camera_motion: CameraMotion | None = Field(
         None, description="Whether a camera moved, by the epipolar offset; null: too few points to tell."
+    )
+    systematic: SystematicTerms | None = Field(
+        None, description="What no standard uncertainty holds; null: not estimated, by an earlier version."
     )
     wall_s: float | None = Field(None, description="Seconds that the step took.")
 

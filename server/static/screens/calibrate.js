@@ -287,11 +287,21 @@ function expectedUncertainty(estimated) {
     estimated.refused ? h("div.problem", h("p", h("strong", "Such views would be refused.")), h("ul", estimated.reasons.map((text) => h("li", text))), h("p", "Increase the distance between the positions.")) : null,
     table([["Point", (row) => row[0]], ...["X", "Y", "Z"].map((axis, k) => numeric(`σ ${axis}`, (/** @type {[string, number[]]} */ row) => um(row[1][k])))],
       /** @type {[string, number[]][]} */ ([["middle of the volume", middle.sigma_mm], ["worst corner", worst]]), { caption: `Standard uncertainty of a point from that of the parameters; the corners are at ±${num(Math.abs(corners[0].xyz_mm[0]), 3)}, ±${num(Math.abs(corners[0].xyz_mm[1]), 3)}, ±${num(Math.abs(corners[0].xyz_mm[2]), 3)} mm` }),
+    table([["Measurement", (row) => row[0]], numeric("u", (/** @type {[string, number | null]} */ row) => um(row[1]))], foreseen(estimated), { caption: "Standard uncertainty (k = 1) of what a measurement will report, image noise included" }),
     h("details", h("summary", "Parameters and assumptions"),
       table([["Parameter", (name) => [symbol(name), " ", h("span.quiet", UNIT[name])]], ...CAMERAS.map((cam) => numeric(`σ ${cam}`, (/** @type {string} */ name) => num(sigma(cam, name), 3)))], NAMES, { caption: "Expected standard uncertainties" }),
       definitions([["shape", `${um(estimated.shape_rms_mm)} rms over the volume`], ["scale", quantity(100 * estimated.scale, "%", 2)], ["visible intersections", `cam1 ${num(100 * estimated.seen_share.cam1, 3)} %, cam2 ${num(100 * estimated.seen_share.cam2, 3)} %`]]),
-      h("p.quiet", String(estimated.assumed.text))),
+      h("p.quiet", String(estimated.assumed.text)), h("p.quiet", estimated.measurement.text)),
   ];
+}
+
+/**
+ * @param {Expected} estimated
+ * @returns {[string, number | null][]}
+ */
+function foreseen({ quantities }) {
+  const shown = quantities.filter((one) => one.name === "length along X" || (one.name === "w" && one.of === "point"));
+  return shown.map((one) => [one.of === "length" ? `a length of ${num(one.size_mm, 3)} mm` : `w after ${num(one.translation_mm?.[2], 3)} mm along Z`, one.sigma]);
 }
 
 /** @param {Calibration} document_ */

@@ -133,3 +133,30 @@ def test_an_unknown_patch_is_refused(folder: Path, tmp_path: Path, capfd: Any) -
     assert stopped.value.code == 2
     assert "quadratic" in capfd.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_step_states_what_its_patches_are_off_by(rig: SimRig, folder: Path, tmp_path: Path) -> None:
+    assert (
+        main(
+            command(
+                folder,
+                tmp_path / "out",
+                patch="affine",
+                cam1=str(folder / "cam1_[01].tif"),
+                cam2=str(folder / "cam2_[01].tif"),
+            )
+        )
+        == 0
+    )
+    steps = json.loads((tmp_path / "out" / "summary.json").read_text())["steps"]
+    with xr.open_dataset(tmp_path / "out" / "step_0000.nc") as data:
+        assert json.loads(data.attrs["systematic"]) == steps[0]["systematic"]
+        off = float(np.mean(errors_um(rig, data, "still")[0]))
+    stated = steps[0]["systematic"]["patch_order"]["figures"]["z_um"]
+    # the mean over the field leaves little noise, and perspective little variation of the curvature
+    assert stated["rms"] == pytest.approx(abs(off), rel=0.25)
+    assert steps[0]["systematic"]["strain_window"] is None
+    # a block's motion is no work for higher orders
+    moved = steps[1]["systematic"]["patch_order"]["figures"]["w_um"]
+    assert moved["below"] < 0.3 * stated["rms"]
+    assert steps[1]["systematic"]["interpolation"]["text"]
