@@ -210,8 +210,7 @@ def _coarse(grey: Float32, target: GridTarget, options: GridOptions) -> tuple[La
         # the depth filled by chance is well below the noise's own standard deviation
         if picture.threshold < picture.noise / max(factor, 1.0):
             failure = failure or not_found(
-                f"no lines: the deepest structures stand out by {picture.threshold:.3g} grey levels from a noise of"
-                f" {picture.noise:.3g}"
+                f"no lines: the deepest structures are {picture.clearness:.3g} times as deep as the noise"
             )
             continue
         try:

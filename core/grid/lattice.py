@@ -92,8 +92,8 @@ def find_lattice(picture: LinePicture, found: Directions) -> Lattice:
                 best, best_seen = lattice, seen
     if best is None:
         raise not_found(
-            f"no two families of lines: {max_counts[0]} and {max_counts[1]} parallel lines at best, with a threshold of"
-            f" {picture.threshold:.3g} grey levels over a noise of {picture.noise:.3g}",
+            f"no two families of lines: {max_counts[0]} and {max_counts[1]} parallel lines at best, among"
+            f" structures {picture.clearness:.3g} times as deep as the noise or deeper",
             found_a=max_counts[0],
             found_b=max_counts[1],
         )

@@ -49,6 +49,11 @@ class LinePicture:
     noise: float
     factor: float
 
+    @property
+    def clearness(self) -> float:
+        """The threshold over the noise: the same for images of any depth, averaged or not; infinite without noise."""
+        return self.threshold / self.noise if self.noise > 0.0 else float("inf")
+
 
 def checked_image(image: NDArray[Any]) -> Float32:
     """Return a 2-D gray image as float32.

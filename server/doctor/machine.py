@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
+import re
 import time
 from importlib import metadata
 from pathlib import Path
@@ -12,7 +13,11 @@ from pathlib import Path
 from server.doctor.report import Notebook
 from server.formats.version import software_version
 
+#: whose versions matter in a report of trouble
 _PACKAGES = ("numpy", "scipy", "opencv-python-headless", "numba", "pyserial", "fastapi", "netCDF4", "tifffile")
+#: what more can be done with packages that need not be there
+_EXTRAS = {"xarray": ("xarray", "data sets"), "progress": ("rich", "progress bars"), "aravis": ("PyGObject", "GenICam")}
+_NAME = re.compile(r"^[A-Za-z0-9._-]+")
 _MEMORY_GIB = 1.0
 # of the wall clock against the monotonic one while the doctor runs; slewing by NTP stays below 0.5 ms a second
 _STEP_S = 0.05
@@ -34,12 +39,8 @@ class _Timex(ctypes.Structure):
 
 def check_software(book: Notebook) -> None:
     """Note the versions that matter in a report of trouble."""
-    found, missing = [], []
-    for name in _PACKAGES:
-        try:
-            found.append(f"{name} {metadata.version(name)}")
-        except metadata.PackageNotFoundError:
-            missing.append(name)
+    found = [f"{name} {metadata.version(name)}" for name in _PACKAGES if _installed(name)]
+    missing = [name for name in required() if not _installed(name)]
     versions = f"stereorig {software_version()}, Python {platform.python_version()}, {', '.join(found)}"
     if missing:
         book.note(
@@ -47,10 +48,32 @@ def check_software(book: Notebook) -> None:
             "packages",
             "failed",
             f"{', '.join(missing)} missing ({versions})",
-            remedy="Install stereorig anew: pip install stereorig.",
+            remedy=f"pip install {' '.join(missing)}",
         )
     else:
         book.note("software", "packages", "ok", versions)
+    there = [extra for extra, (name, _) in _EXTRAS.items() if _installed(name)]
+    lacking = [f"{extra} ({what}: {name})" for extra, (name, what) in _EXTRAS.items() if extra not in there]
+    text = "; ".join(filter(None, (", ".join(there), f"not installed: {', '.join(lacking)}" if lacking else "")))
+    book.note("software", "extras", "ok", text)
+
+
+def required() -> list[str]:
+    """Return the packages that the program needs, as its distribution states them."""
+    try:
+        stated = metadata.requires("stereorig") or []
+    except metadata.PackageNotFoundError:  # run from its source
+        return list(_PACKAGES)
+    plain = [one for one in stated if "extra ==" not in one]
+    return sorted({*_PACKAGES, *(match[0] for one in plain if (match := _NAME.match(one)))})
+
+
+def _installed(name: str) -> bool:
+    try:
+        metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return False
+    return True
 
 
 def check_machine(book: Notebook) -> None:

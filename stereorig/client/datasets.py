@@ -32,7 +32,7 @@ def _xarray() -> Any:
 
 
 def stacked(files: Mapping[int, bytes]) -> xarray.Dataset:
-    """Return the steps' NetCDF files as one data set with the dimension ``step``; NaN where a step lacks a variable."""
+    """Return the steps' NetCDF files as one data set with the dimension ``step``; NaN where a step lacks one."""
     xr = _xarray()
     steps = []
     with tempfile.TemporaryDirectory() as folder:
@@ -45,9 +45,15 @@ def stacked(files: Mapping[int, bytes]) -> xarray.Dataset:
     if len(steps) == 1:
         return steps[0]  # type: ignore[no-any-return]
     positions = [name for name in ("x_px", "y_px") if name in steps[-1]]
-    varying = [one.drop_vars(positions, errors="ignore") for one in steps]
+    varying = [one.drop_vars([*positions, *_of_other_shape(one, steps[-1])], errors="ignore") for one in steps]
     together = xr.concat(varying, dim="step", data_vars="all", coords="minimal", compat="override", join="outer")
     return together.assign_coords({name: steps[-1][name].drop_vars("step") for name in positions})  # type: ignore[no-any-return]
+
+
+def _of_other_shape(one: Any, last: Any) -> list[str]:
+    """Return variables that cannot be stacked: a shape compares two images, where a displacement compares four."""
+    sizes = last.sizes
+    return [name for name, v in one.variables.items() if any(sizes.get(d, n) != n for d, n in v.sizes.items())]
 
 
 def extensometers(reply: GaugesReply) -> xarray.Dataset:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import stereorig
-from core.errors import CalibrationInputError, InputError, StateError, StereorigError
+from core.errors import CalibrationInputError, Cancelled, InputError, StateError, StereorigError
 from server.api.models import AnalysisRequest, JobReply
 from server.config.rig_file import parse_config
 from server.workflows.service import Service
@@ -56,6 +56,7 @@ def printed(url: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Pa
     return done.stdout, folder
 
 
+@pytest.mark.deep
 def test_a_whole_test_in_twenty_lines(printed: tuple[str, Path]) -> None:
     text, folder = printed
     assert re.search(r"^calibration: (good|usable|marginal)$", text, re.MULTILINE), text
@@ -78,10 +79,18 @@ def rig(url: str, printed: tuple[str, Path]) -> Iterator[Client]:
 
 
 @pytest.fixture(scope="module")
+def tiny(client: httpx.Client) -> Iterator[Client]:
+    """A client of a service on which nothing is measured."""
+    with stereorig.Client(str(client.base_url), progress=False) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
 def analysis(rig: Client) -> Analysis:
     return rig.test(rig.tests()[-1].id).analyses()[-1]
 
 
+@pytest.mark.deep
 def test_fields_are_data_arrays_with_units_over_all_steps(analysis: Analysis) -> None:
     w = analysis.field("w_mm")
     assert w.dims == ("step", "row", "col")
@@ -97,6 +106,7 @@ def test_fields_are_data_arrays_with_units_over_all_steps(analysis: Analysis) ->
     assert np.isnan(everything["w_mm"].sel(step=0)).all()
 
 
+@pytest.mark.deep
 def test_a_strain_gauge_has_its_channels_beside_it(analysis: Analysis) -> None:
     gauge = analysis.extensometer((60, 120), (195, 120))
     assert list(gauge.pressure_kpa.values) == [0.0, 172.0, 344.0, 517.0, 689.0]
@@ -108,7 +118,8 @@ def test_a_strain_gauge_has_its_channels_beside_it(analysis: Analysis) -> None:
     np.testing.assert_array_equal(gauge.strain.values[1:], np.array(expected, dtype=float))
 
 
-def test_exports_and_the_report_are_written(analysis: Analysis, tmp_path: Path) -> None:
+@pytest.mark.deep
+def test_exports_are_written(analysis: Analysis, tmp_path: Path) -> None:
     assert analysis.export(tmp_path / "a" / "last.csv", "csv", step=4).read_bytes().startswith(b"#")
     with pytest.raises(InputError) as refused:
         analysis.export(tmp_path / "b.csv", "csv", step=77)
@@ -116,21 +127,21 @@ def test_exports_and_the_report_are_written(analysis: Analysis, tmp_path: Path) 
     assert not (tmp_path / "b.csv").exists()
 
 
-def test_a_job_is_watched_and_its_problem_is_raised(rig: Client) -> None:
+def test_a_job_is_watched_and_its_problem_is_raised(tiny: Client) -> None:
     seen: list[JobReply] = []
-    rig.progress = seen.append
+    tiny.progress = seen.append
     try:
-        rig.move(positions_mm={"1": 0.5})
-        rig.move(positions_mm={"1": 0.0})
-        with pytest.raises(StereorigError) as refused:
-            rig.tests_of_nothing = rig.test(rig.tests()[-1].id).measure(
-                region={"rectangle": [0, 0, 20, 20]}, subset_px=401
-            )
+        done = tiny.move(positions_mm={"1": 0.5})
+        assert done.state == "succeeded"
+        begun = tiny.ask("POST", "/stage/moves", json={"positions_mm": {"1": 4.0, "2": -4.0}}).json()["job"]["id"]
+        assert tiny.cancel(begun).state == "cancelled"
+        with pytest.raises(Cancelled):
+            tiny.wait(begun)
+        tiny.move(positions_mm={"1": 0.0, "2": 0.0})
     finally:
-        rig.progress = False
-    assert {job.kind for job in seen} >= {"move"}
-    assert seen[0].progress.total >= 0
-    assert refused.value.remedy
+        tiny.progress = False
+    assert {job.kind for job in seen} == {"move"}
+    assert {job.state for job in seen} >= {"succeeded", "cancelled"}
 
 
 def test_what_cannot_be_is_refused_in_the_users_words_before_anything_is_sent() -> None:
@@ -147,12 +158,12 @@ def test_what_cannot_be_is_refused_in_the_users_words_before_anything_is_sent() 
             test.measure(AnalysisRequest.model_validate({"region": REGION}), subset_px=33)
 
 
-def test_a_refusal_is_the_error_that_it_was_in_the_service(rig: Client) -> None:
+def test_a_refusal_is_the_error_that_it_was_in_the_service(tiny: Client) -> None:
     with pytest.raises(InputError) as unknown:
-        rig.test("t000009-abcdef").document()
+        tiny.test("t000009-abcdef").document()
     assert (unknown.value.code, bool(unknown.value.remedy)) == ("not_found", True)
     with pytest.raises(StereorigError) as limits:
-        rig.move(positions_mm={"1": 99.0})
+        tiny.move(positions_mm={"1": 99.0})
     assert limits.value.code == "out_of_limits"
     with pytest.raises(StateError) as lost:
         Client("http://127.0.0.1:9", progress=False).rig()
@@ -185,6 +196,7 @@ def test_both_clients_have_the_same_methods_and_parameters() -> None:
             assert inspect.iscoroutinefunction(other) or name in ("test", "analysis"), name
 
 
+@pytest.mark.deep
 def test_the_async_client_reads_what_the_other_reads(url: str, analysis: Analysis) -> None:
     async def read() -> tuple[list[str], np.ndarray, str]:
         async with stereorig.AsyncClient(url, progress=False) as rig:
@@ -199,6 +211,23 @@ def test_the_async_client_reads_what_the_other_reads(url: str, analysis: Analysi
     assert len(accepted) == 1
     assert name
     np.testing.assert_array_equal(field, analysis.field("w_mm", 4).values)
+
+
+def test_tests_are_made_and_captured_by_both(tiny: Client) -> None:
+    async def made() -> tuple[int, dict[str, float]]:
+        async with AsyncClient(tiny.url, progress=False) as rig:
+            test = await rig.new_test("async", calibration_id=None)
+            step = await test.capture(label="one", channels={"force_kn": 1.5})
+            return step.n, step.channels
+
+    assert asyncio.run(made()) == (0, {"force_kn": 1.5})
+    test = tiny.new_test("sync", calibration_id=None, specimen="Al")
+    assert [step.n for step in test.capture_burst(count=2)] == [0, 1]
+    assert [one.name for one in tiny.tests()][-2:] == ["async", "sync"]
+    assert test.document().specimen == "Al"
+    with pytest.raises(StateError) as refused:
+        tiny.new_test("third")
+    assert refused.value.code == "no_calibration_accepted"
 
 
 def test_a_bar_needs_rich_only_where_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:

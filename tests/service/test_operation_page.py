@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import tomllib
 
 import httpx
 import pytest
@@ -100,3 +101,12 @@ def test_what_it_says_to_run_in_a_container_is_what_the_file_says() -> None:
 
 def test_the_readme_leads_to_it() -> None:
     assert "(docs/how_to/operate.md)" in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_the_container_is_built_of_every_package_and_of_the_simulated_rigs() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    wanted = {pattern.rstrip("*") for pattern in project["tool"]["setuptools"]["packages"]["find"]["include"]}
+    wanted |= {"config"}  # the wheel holds the simulated rigs
+    container = (ROOT / "deploy" / "Containerfile").read_text(encoding="utf-8")
+    assert wanted <= set(re.findall(r"^COPY (\w+) \1$", container, re.MULTILINE))
+    assert wanted <= set(re.findall(r"^!(\w+)$", (ROOT / ".containerignore").read_text(encoding="utf-8"), re.MULTILINE))

@@ -283,7 +283,7 @@ def _grid_along_its_normal() -> bytes:
 
 def _test(session: Session, calibration: str) -> str:
     call, client = session.call, session.client
-    body = {"name": "Plate under pressure", "specimen": "Al 6061-T6, 1.5 mm", "calibration_id": "accepted"}
+    body = {"name": "Plate under pressure", "specimen": "Al 6061-T6, 1.5 mm", "calibration_id": "latest"}
     test = str(call("create_test", summary="With the newest accepted calibration", body=body).json()["id"])
     call("put_scene", summary="A clamped plate under 20 kPa", body={"scene": "plate", "load": 0.0})
     readings = {"stroke_mm": 0.42, "temperature_c": 21.3}
@@ -296,6 +296,16 @@ def _test(session: Session, calibration: str) -> str:
     form = {"label": "from another program", "load_n": 1300.0, "channels": '{"stroke_mm": 0.42}'}
     files = {cam: image(k) for k, cam in enumerate(("cam1", "cam2"))}
     imported = call("import_images", test, summary="A pair of image files", form=form, files=files).json()["n"]
+    record = b"Time (s),Force (kN),Stroke (um)\n0.0,0.00,420\n0.5,0.01,421\n1.0,0.02,422\n"
+    aligned = {"at_step": 0, "at_s": 0.75, "max_gap_s": 1.0}
+    call(
+        "import_channels",
+        test,
+        summary="A load frame's record; step 0 was taken 0.75 s after its beginning",
+        form=aligned,
+        files={"file": record},
+        text_files=True,
+    )
     call("list_tests")
     etag = call("get_test", test).headers["ETag"]
     notes = {"notes": "Second plate of the batch."}
