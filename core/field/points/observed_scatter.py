@@ -20,7 +20,8 @@ from core.matching.geometry import covariance_xyzuvw, motion_geometry, shape_geo
 
 _APART_PX = 11.0  # between subsets of one difference: two large speckles, which they do not share
 _MIN_INDEPENDENT = 40.0  # subsets beside one another: the standard deviation is then known to some 10 %
-_QUANTILE, _OF_NORMAL = 0.8, 1.2816  # localised strain and wrong matches are beyond
+_QUANTILES, _OF_NORMAL = (0.8, 0.95, 0.99), (1.2816, 1.96, 2.5758)  # localised strain and wrong matches are beyond 0.8
+_UNCERTAINTY = 1.03  # of a standard deviation from so many points
 _AS_REPORTED = (0.92, 1.08)  # within, nothing is changed
 _MAX_RAISE = 2.0
 _FLAT = 1e-2  # extent along the normal, of the largest, that is none
@@ -70,7 +71,9 @@ def observed_over_reported(
     for i, weights in enumerate(_DIFFERENCES):
         ratio = _differences(off.reshape(*shape, 3), variance.reshape(*shape, 3), lag, np.array(weights))
         if len(ratio) * area >= _MIN_INDEPENDENT:
-            out[i] = np.quantile(np.abs(ratio), _QUANTILE, axis=0) / _OF_NORMAL
+            scale = np.quantile(np.abs(ratio), _QUANTILES, axis=0) / np.array(_OF_NORMAL)[:, None]
+            # points of unlike noise have wide tails: lowered no further than these, raised by the bulk
+            out[i] = np.maximum(scale[0], np.minimum(_UNCERTAINTY * scale.max(axis=0), 1.0))
     return np.asarray(np.fmin(out[0], out[1]))
 
 
