@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.field.points.fitter import PointFits
-from core.matching.geometry import covariance_xyzuvw, motion_geometry, shape_geometry
+from core.field.points.starts import current_position
+from core.matching.geometry import covariance_xyzuvw
 
 _APART_PX = 11.0  # between subsets of one difference: two large speckles, which they do not share
 _MIN_INDEPENDENT = 40.0  # subsets beside one another: the standard deviation is then known to some 10 %
@@ -62,9 +63,9 @@ def observed_over_reported(
     xy, w, G = xy_px[which], points.w[which], points.G[which]
     covariance = covariance_xyzuvw(pair, xy, w, G, points.covariance[which])
     variance[which] = np.diagonal(covariance, axis1=1, axis2=2)[:, 3:]
-    off[which] = _beyond_linear(
-        shape_geometry(pair, xy, w).xyz_mm, motion_geometry(pair, xy, w, G).uvw_mm, variance[which]
-    )
+    here = pair.cam1.rays_cam(xy).xyz_mm / w[:, :1]
+    moved = (current_position(w, G) - here) @ pair.cam1.cam_from_sys.rotation
+    off[which] = _beyond_linear(here, moved, variance[which])
     lag = int(np.ceil((subset_px + _APART_PX) / spacing))
     area = min(1.0, (spacing / subset_px) ** 2)
     out = np.full((len(_DIFFERENCES), 3), np.nan)
