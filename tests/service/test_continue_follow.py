@@ -261,6 +261,7 @@ def test_a_step_that_fails_while_an_analysis_follows_is_named_and_the_rest_is_me
     assert client.post(f"{growing}/steps:import", files=images).status_code == 201
     deadline = time.monotonic() + 240
     while not client.get(url).json()["steps_failed"] and time.monotonic() < deadline:
+        assert state_of(client, job)[0] == "running"
         time.sleep(0.01)
     wait_until_it_waits(client, job)  # for more, as if nothing had been
     assert client.get(url).json()["steps_finished"] == [0]

@@ -45,8 +45,8 @@ class BlurredPlate:
     """A tilted plate that is turned, strained and moved; at t both cameras are out of focus."""
 
     texture: Texture
-    size: tuple[int, int] = (640, 512)
-    samples: int = 16
+    size: tuple[int, int] = (512, 416)
+    samples: int = 8
 
     @cached_property
     def _bodies(self) -> tuple[Body, Body]:

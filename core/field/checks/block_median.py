@@ -53,13 +53,18 @@ def block_medians(
     # all blocks at once; what is not known, or beyond the grid, is sorted behind everything
     padded = np.full((rows + reach + width, cols + reach + width), np.inf)
     padded[beside : beside + rows, beside : beside + cols] = np.where(known, values, np.inf).reshape(shape)
-    counted = np.zeros(padded.shape, bool)
-    counted[beside : beside + rows, beside : beside + cols] = known.reshape(shape)
-    every = slice(0, rows, reach), slice(0, cols, reach)
-    ordered = sliding_window_view(padded, (width, width))[every]
+    total = np.zeros((padded.shape[0] + 1, padded.shape[1] + 1), np.int64)  # of the points known before
+    total[beside + 1 : beside + rows + 1, beside + 1 : beside + cols + 1] = known.reshape(shape)
+    np.cumsum(total, axis=0, out=total)
+    np.cumsum(total, axis=1, out=total)
+    ordered = sliding_window_view(padded, (width, width))[:rows:reach, :cols:reach]
     blocks = ordered.shape[:2]
-    ordered = np.sort(ordered.reshape(*blocks, -1), axis=-1)
-    count = sliding_window_view(counted, (width, width))[every].sum(axis=(2, 3))
+    ordered = ordered.reshape(*blocks, -1)
+    ordered.sort(axis=-1)
+    first, last = (slice(0, rows, reach), slice(0, cols, reach)), (slice(width, None, reach), slice(width, None, reach))
+    after, left, above = total[last], total[last[0], first[1]], total[first[0], last[1]]
+    r, c = blocks
+    count = after[:r, :c] - left[:r, :c] - above[:r, :c] + total[first]
     at = quantile * (np.maximum(count, 1) - 1)
     low = np.floor(at).astype(int)
     share = at - low

@@ -144,7 +144,8 @@ def residual_test(
     left = points.ok[alone] & np.isfinite(kind).all(axis=1)
     sd = _KIND_UNCERTAINTY * np.sqrt(kind[left])
     rejected += _reject_far(fitter, points, alone[left], xy_px, max_sigma_px, sd)
-    if rejected > _MANY * len(alone):  # those left are the ones whose own estimate happens to be small
+    # those left are the ones whose own estimate happens to be small
+    if shape is not None and fitter.comparisons == 3 and rejected > _MANY * len(alone):
         left = alone[points.ok[alone]]
         _as_observed(fitter, points, left, xy_px, shape)
         # of a whole field that scatters too far, the last hundredth is within the limit by chance

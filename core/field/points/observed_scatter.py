@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.field.points.fitter import PointFits
-from core.matching.geometry import covariance_xyzuvw, motion_geometry, shape_geometry
+from core.field.points.starts import current_position
+from core.matching.geometry import covariance_xyzuvw
 
 _APART_PX = 11.0  # between subsets of one difference: two large speckles, which they do not share
 _MIN_INDEPENDENT = 40.0  # subsets beside one another: the standard deviation is then known to some 10 %
-_QUANTILE, _OF_NORMAL = 0.8, 1.2816  # localised strain and wrong matches are beyond
+_QUANTILES, _OF_NORMAL = (0.8, 0.95, 0.99), (1.2816, 1.96, 2.5758)  # localised strain and wrong matches are beyond 0.8
+_UNCERTAINTY = 1.03  # of a standard deviation from so many points
 _AS_REPORTED = (0.92, 1.08)  # within, nothing is changed
 _MAX_RAISE = 2.0
 _FLAT = 1e-2  # extent along the normal, of the largest, that is none
@@ -61,16 +63,18 @@ def observed_over_reported(
     xy, w, G = xy_px[which], points.w[which], points.G[which]
     covariance = covariance_xyzuvw(pair, xy, w, G, points.covariance[which])
     variance[which] = np.diagonal(covariance, axis1=1, axis2=2)[:, 3:]
-    off[which] = _beyond_linear(
-        shape_geometry(pair, xy, w).xyz_mm, motion_geometry(pair, xy, w, G).uvw_mm, variance[which]
-    )
+    here = pair.cam1.rays_cam(xy).xyz_mm / w[:, :1]
+    moved = (current_position(w, G) - here) @ pair.cam1.cam_from_sys.rotation
+    off[which] = _beyond_linear(here, moved, variance[which])
     lag = int(np.ceil((subset_px + _APART_PX) / spacing))
     area = min(1.0, (spacing / subset_px) ** 2)
     out = np.full((len(_DIFFERENCES), 3), np.nan)
     for i, weights in enumerate(_DIFFERENCES):
         ratio = _differences(off.reshape(*shape, 3), variance.reshape(*shape, 3), lag, np.array(weights))
         if len(ratio) * area >= _MIN_INDEPENDENT:
-            out[i] = np.quantile(np.abs(ratio), _QUANTILE, axis=0) / _OF_NORMAL
+            scale = np.quantile(np.abs(ratio), _QUANTILES, axis=0) / np.array(_OF_NORMAL)[:, None]
+            # points of unlike noise have wide tails: lowered no further than these, raised by the bulk
+            out[i] = np.maximum(scale[0], np.minimum(_UNCERTAINTY * scale.max(axis=0), 1.0))
     return np.asarray(np.fmin(out[0], out[1]))
 
 

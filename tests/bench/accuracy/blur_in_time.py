@@ -68,7 +68,7 @@ def blur_in_time(figures: Path) -> Section:
         "Defocus in time",
         "A tilted plate, turned, strained and moved; the pictures at t of both cameras are blurred by a Gaussian before "
         "their noise. Four textures, subsets of 15, 21 and 33 px, noise 2 and 6, every kind of patch; u, v and w; rms over "
-        "some 2,700 points. Pictures by a renderer that shares nothing with the program.",
+        "some 1,600 points. Pictures by a renderer that shares nothing with the program.",
         rows,
         [(path.name, "True error over reported sigma, plane patches")],
         ["Points whose standard deviation exceeds `max_sigma_px` are rejected: all of them at 2 px in small subsets."],

@@ -18,11 +18,11 @@ from core.cameras.stereo import StereoPair
 from server.formats.calibrations.programs.imported_pair import (
     euler_zyx,
     euler_zyx_deg,
-    invalid,
     opencv_lens,
     pair_of,
     unreadable,
 )
+from server.formats.calibrations.programs.named_numbers import named_numbers
 
 _CAMERA = {
     "fx": "Fx [pixels]",
@@ -55,7 +55,7 @@ def parse_caldat(data: bytes, *, name: str) -> StereoPair:
     FileFormatError
         ``calibration_unreadable`` or ``calibration_invalid``.
     """
-    values = _values(data, name)
+    values = named_numbers(data, name=name, line_form=_LINE, key_of=_key, is_remark=_is_remark)
     prefixes = sorted({key.split("_", 1)[0] for key in values if re.match(r"cam\d_", key)})
     if len(prefixes) != 2:
         raise unreadable(name, f"it names the cameras {', '.join(prefixes) or 'none'}; a pair has two")
@@ -72,26 +72,8 @@ def _key(text: str) -> str:
     return re.sub(r"\[[^\]]*\]|\s+", "", text).lower()
 
 
-def _values(data: bytes, name: str) -> dict[str, float]:
-    values: dict[str, float] = {}
-    for number, line in enumerate(data.decode("utf-8-sig", "replace").splitlines(), 1):
-        if not line.strip():
-            continue
-        found = _LINE.fullmatch(line)
-        if found is None:
-            raise unreadable(name, f"line {number} is no name and value")
-        key = _key(found[1])
-        if key in values:
-            raise unreadable(name, f"{found[1]} occurs twice in it")
-        try:
-            values[key] = float(found[2])
-        except ValueError as error:
-            if re.match(r"cam\d_", key) or key in {_key(k) for k in _POSE}:
-                raise unreadable(name, f"{found[1]} is {found[2]!r}, not a number") from error
-            continue  # a remark
-        if not np.isfinite(values[key]):
-            raise invalid(name, f"{found[1]} is {found[2]}")
-    return values
+def _is_remark(key: str) -> bool:
+    return re.match(r"cam\d_", key) is None and key not in {_key(k) for k in _POSE}
 
 
 def _lens(values: Mapping[str, float], prefix: str, name: str) -> OpenCVLens:

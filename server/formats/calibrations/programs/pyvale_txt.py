@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import re
 
-import numpy as np
-
 from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
-from server.formats.calibrations.programs.imported_pair import euler_zyx, invalid, opencv_lens, pair_of, unreadable
+from server.formats.calibrations.programs.imported_pair import euler_zyx, opencv_lens, pair_of, unreadable
+from server.formats.calibrations.programs.named_numbers import named_numbers
 
 _PIXELS = ("fx", "fy", "fs", "cx", "cy")
 _BENT = ("k1", "k2", "p1", "p2", "k3")
@@ -36,7 +35,7 @@ def parse_pyvale(data: bytes, *, name: str) -> StereoPair:
     FileFormatError
         ``calibration_unreadable`` or ``calibration_invalid``.
     """
-    values = _values(data, name)
+    values = named_numbers(data, name=name, line_form=_LINE, key_of=str, is_remark=lambda _: False)
     needed = [f"cam{k}_{key}_px" for k in (0, 1) for key in _PIXELS]
     needed += [f"cam{k}_{key}" for k in (0, 1) for key in _BENT]
     missing = [key for key in (*needed, *_SHIFT, *_ANGLES) if key not in values]
@@ -44,26 +43,6 @@ def parse_pyvale(data: bytes, *, name: str) -> StereoPair:
         raise unreadable(name, f"it lacks {', '.join(missing)}")
     lens1, lens2 = (_lens(values, f"cam{k}", name) for k in (0, 1))
     return pair_of(name, lens1, lens2, euler_zyx(*(values[key] for key in _ANGLES)), [values[key] for key in _SHIFT])
-
-
-def _values(data: bytes, name: str) -> dict[str, float]:
-    values: dict[str, float] = {}
-    for number, line in enumerate(data.decode("utf-8-sig", "replace").splitlines(), 1):
-        if not line.strip():
-            continue
-        found = _LINE.fullmatch(line)
-        if found is None:
-            raise unreadable(name, f"line {number} is no name and value")
-        key, text = found[1], found[2]
-        if key in values:
-            raise unreadable(name, f"{key} occurs twice in it")
-        try:
-            values[key] = float(text)
-        except ValueError as error:
-            raise unreadable(name, f"{key} is {text!r}, not a number") from error
-        if not np.isfinite(values[key]):
-            raise invalid(name, f"{key} is {text}")
-    return values
 
 
 def _lens(values: dict[str, float], camera: str, name: str) -> OpenCVLens:
