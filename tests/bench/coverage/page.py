@@ -11,7 +11,7 @@ import numpy as np
 from tests.bench.accuracy.pages import FIGURES, write_part
 from tests.bench.coverage.coverage import MAIN_REPLICATES, OUT, kept
 from tests.bench.coverage.pooled import WHITE, Cell, Pool, mean, pooled, sharpness
-from tests.bench.coverage.score import MEAN, OFF
+from tests.bench.coverage.score import MEAN, OFF, SHAPE
 from tests.bench.coverage.strata import CONTROLS, MAIN, OTHERS
 from tests.bench.documents.prose import wrapped
 
@@ -20,6 +20,8 @@ import matplotlib.pyplot as plt
 
 TITLE = "The whole chain through the command line"
 FIGURE = "coverage_by_cell.png"
+TILTED = ((SHAPE, "X"), (SHAPE, "length"), ("w of 2 mm", "mean w"))
+"""Cells that an axis' tilt shows in."""
 _HOW = """Each replicate draws a target with errors of its nodes, pitch and stage, two cameras, a texture and its phase, image noise
 and the signs of the motions. Its views of the target are rendered and calibrated by `stereorig calibrate`, a tilted plane (a
 curved one where the stratum says so) and seven motions of it are rendered and measured by `stereorig measure`, lengths of 10 mm,
@@ -173,8 +175,8 @@ def _controls(main: Sequence[Pool], by_name: dict[str, Pool]) -> list[str]:
         shown = _shown(white.of(MEAN))
         lines.append(f"| {p.stratum.name}, frozen noise of the reference declared white in time: {MEAN} | {shown} |")
     for p in (by_name[s.name] for s in CONTROLS if s.name in by_name):
-        for quantity in ("u", "v", "mean u", "mean v"):
-            lines.append(f"| {p.stratum.name}: {quantity} at w of 2 mm | {_shown(p.of('w of 2 mm', quantity))} |")
+        for motion, quantity in TILTED:
+            lines.append(f"| {p.stratum.name}: {quantity}, {motion} | {_shown(p.of(motion, quantity))} |")
     return lines
 
 
