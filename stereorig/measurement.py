@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from core.errors import InputError
 from core.field.checks.extrapolated import mark_extrapolated
-from core.field.common import with_common_factor, with_frozen_noise
+from core.field.common import with_common_parts
 from core.field.points.images import MeasureImage, check_calibrated_size
 from core.field.points.result import Field
 from core.field.region.lay_points import make_grid
@@ -146,8 +146,7 @@ class Measurement:
         if settings.smoothing_window and field.has_motion:
             field = smoothed_displacement(field, settings.smoothing_window, subset_px=settings.subset_px)
         field = mark_extrapolated(field, volume_of(self.calibration))
-        field = with_common_factor(field, parameter_covariance(self.calibration))
-        field = with_frozen_noise(field, self.calibration.pair)
+        field = with_common_parts(field, parameter_covariance(self.calibration), self.calibration.pair)
         options = StrainOptions.of(settings.strain)
         if options is not None and field.has_motion:
             strain = surface_strain(field, options, subset_px=settings.subset_px)

@@ -16,7 +16,7 @@ import numpy as np
 
 from core.arrays import Float
 from core.cameras.stereo import StereoPair
-from core.common.derivatives import measured_derivatives
+from core.common.derivatives import Estimator, measured_derivatives
 from core.errors import CalibrationInputError
 from core.names import CAUSES, Cause
 
@@ -25,8 +25,10 @@ KEPT = 0.999
 _NEGATIVE = 1e-9  # of the largest eigenvalue: what rounding leaves of a covariance that is positive
 _SUM = 1e-6  # of two standard deviations: by what parts may miss the covariance
 _NOTHING = 1e-10  # of all variance that a calibration gives points: columns beyond it are rounding
-_AT_ONCE = 20_000
-_FINE = 1 / 256  # of a component's common standard deviation: what a factor is rounded to, to be short in files
+FINE = 1 / 128
+"""Of a component's common standard deviation: what a factor is rounded to, to be short in files."""
+_SAMPLE = 500  # points by which columns are chosen
+_OWN_FINE = 1 / 1024
 _DEPTHS = (0.97, 1.0, 1.03)  # of the stand-off: points by which columns are ordered
 
 
@@ -193,7 +195,9 @@ class ParameterCovariance:
                 remedy="Calibrate anew, or take the covariance out of the file; results then do not include it.",
             )
         kept = value > 0.0
-        return np.asarray(scale[:, None] * vector[:, kept] * np.sqrt(value[kept]))
+        # a parameter that was held has no part in what rounding leaves
+        held = np.diagonal(self.covariance) <= 0.0
+        return np.asarray(np.where(held, 0.0, scale)[:, None] * vector[:, kept] * np.sqrt(value[kept]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,7 +216,14 @@ class Factor:
     causes: Causes
 
 
-def factor_of(source: ParameterCovariance, points_mm: Float, displaced_mm: Float | None = None) -> Factor:
+def factor_of(
+    source: ParameterCovariance,
+    points_mm: Float,
+    displaced_mm: Float | None = None,
+    *,
+    own_mm: Float | None = None,
+    estimator: Estimator | None = None,
+) -> Factor:
     """Return the common factor of points, with as few columns as hold :data:`KEPT` of each point's common variance.
 
     Parameters
@@ -223,6 +234,10 @@ def factor_of(source: ParameterCovariance, points_mm: Float, displaced_mm: Float
         (n, 3) points at the reference, system frame, all finite.
     displaced_mm
         (n, 3) their current positions.
+    own_mm
+        (3,) or (6,) typical standard deviations of the points' own; what is far below them is rounded away.
+    estimator
+        At these points, if it is known.
 
     Raises
     ------
@@ -230,27 +245,36 @@ def factor_of(source: ParameterCovariance, points_mm: Float, displaced_mm: Float
         ``covariance_not_positive``.
     """
     L, causes = source.columns
-    size = 3 if displaced_mm is None else 6
-    whole = np.empty((len(points_mm), size, L.shape[1]))
-    for first in range(0, len(points_mm), _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
-        now = None if displaced_mm is None else displaced_mm[part]
-        whole[part] = measured_derivatives(source.pair, points_mm[part], source.names, now) @ L
-    kept = fewest_columns(whole, causes)
-    return Factor(rounded(whole[..., kept]), Causes(tuple(causes.columns[k] for k in kept), causes.told))
+    at = Estimator.at(source.pair, points_mm, displaced_mm) if estimator is None else estimator
+    # which columns: the factor changes slowly from point to point
+    some = slice(None, None, max(len(points_mm) // _SAMPLE, 1))
+    now = None if displaced_mm is None else displaced_mm[some]
+    by_match = None if at.by_match is None else at.by_match[some]
+    sampled = Estimator(source.pair, points_mm[some], now, at.by_image[some], by_match)
+    kept = fewest_columns(sampled.through(source.names, L), causes)
+    values = at.through(source.names, L[:, kept])
+    return Factor(rounded(values, own_mm), Causes(tuple(causes.columns[k] for k in kept), causes.told))
 
 
-def rounded(factor: Float) -> Float:
-    """Return a factor (n, m, k) rounded to 1/256 of each component's standard deviation, as a power of two.
+def rounded(factor: Float, own: Float | None = None, *, fine: float = FINE) -> Float:
+    """Return a factor (n, m, k) rounded to a small part of each component's standard deviation, as a power of two.
 
     It stays far below what the points' own noise and the columns left out change, and is the same in memory and in
-    single precision in a file, where smooth columns of few digits take little room.
+    single precision in a file, where smooth columns of few digits take little room. ``own`` (m,) are standard
+    deviations of the points' own: rounding never needs to be finer than 1/1024 of them.
     """
     if not factor.size:
         return factor
-    middle = np.sqrt(np.median((factor**2).sum(axis=-1), axis=0))
-    step = 2.0 ** np.floor(np.log2(np.where(middle > 0.0, _FINE * middle, 1.0)))[:, None]
-    return np.asarray(np.where(middle[:, None] > 0.0, np.round(factor / step) * step, factor))
+    some = factor[:: max(len(factor) // _SAMPLE, 1)]
+    middle = np.sqrt(np.median((some**2).sum(axis=-1), axis=0))
+    step = fine * middle
+    if own is not None:
+        step = np.maximum(step, _OWN_FINE * np.where(np.isfinite(own), own, 0.0))
+    step = (2.0 ** np.floor(np.log2(np.where(step > 0.0, step, 1e-300))))[:, None]
+    out = factor / step
+    np.rint(out, out=out)
+    out *= step
+    return np.asarray(out)
 
 
 def common_factor(source: ParameterCovariance, points_mm: Float, displaced_mm: Float | None = None) -> Float:

@@ -6,16 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 
+from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.common.budget import budget_of
-from core.common.derivatives import new_noise_share
+from core.common.derivatives import Estimator
 from core.common.factor import ParameterCovariance, factor_of
 from core.field.points.result import Field
-from core.field.points.shared_pixels import roots_of
+
+_FIRM = 1e-12  # of the variance: smoothed noise may have no variance in a direction
 
 
-def with_common_factor(field: Field, source: ParameterCovariance | None) -> Field:
-    """Return the field with the common factor of its points; without one where the covariance is not known.
+def with_common_parts(field: Field, source: ParameterCovariance | None, pair: StereoPair) -> Field:
+    """Return the field with what is common in its uncertainty, to all its points and to all steps of a test.
+
+    It gets the common factor of its points, none where the calibration's covariance is not known, and the part of the
+    displacement's noise that is the reference pair's, none for later references.
 
     Parameters
     ----------
@@ -23,21 +28,46 @@ def with_common_factor(field: Field, source: ParameterCovariance | None) -> Fiel
         In the system frame, as it is shown: smoothed or not. Smoothing reproduces what varies slowly over its window.
     source
         Covariance of the cameras' parameters.
+    pair
+        The cameras.
 
     Raises
     ------
     CalibrationInputError
         ``covariance_not_positive``.
     """
-    if source is None:
-        return replace(field, common=None, causes=None)
     valid = field.valid
     points = field.xyz_mm[valid]
     now = None if field.uvw_mm is None else points + field.uvw_mm[valid]
-    found = factor_of(source, points, now)
-    out = np.full((*field.shape, *found.values.shape[1:]), np.nan)
-    out[valid] = found.values
-    return replace(field, common=out, causes=found.causes)
+    own = field.covariance[valid]
+    at = Estimator.at(pair, points, now)
+    common, causes, frozen = None, None, None
+    if source is not None:
+        middle = np.sqrt(np.median(np.diagonal(own, axis1=1, axis2=2), axis=0)) if len(own) else None
+        found = factor_of(source, points, now, own_mm=middle, estimator=at)
+        causes = found.causes
+        common = _spread(found.values, valid)
+    if now is not None and field.references is None:
+        frozen = _spread(_frozen(own[:, 3:, 3:], at), valid)
+    return replace(field, common=common, causes=causes, frozen=frozen)
+
+
+def _spread(values: Float, valid: Bool) -> Float:
+    """(r, c, ...) of the values (n, ...) of valid points, NaN elsewhere."""
+    if valid.all():
+        return values.reshape(*valid.shape, *values.shape[1:])
+    out = np.full((*valid.shape, *values.shape[1:]), np.nan)
+    out[valid] = values
+    return out
+
+
+def _frozen(own: Float, at: Estimator) -> Float:
+    """(n, 3, 3) of the covariance of U, V, W what is the reference pair's noise."""
+    size = np.trace(own, axis1=1, axis2=2)[:, None, None]
+    new = (
+        np.linalg.cholesky(own + np.maximum(_FIRM * size, np.finfo(np.float64).tiny) * np.eye(3)) @ at.new_noise_share()
+    )
+    return np.asarray(own - new @ np.swapaxes(new, 1, 2))
 
 
 def notes_of(field: Field) -> tuple[str, ...]:
@@ -45,24 +75,3 @@ def notes_of(field: Field) -> tuple[str, ...]:
     at_reference = None if field.frozen_covariance is None else 0.0
     row = None if field.common is None else np.zeros(field.common.shape[-1])
     return budget_of(0.0, at_reference, row, field.causes).notes
-
-
-def with_frozen_noise(field: Field, pair: StereoPair) -> Field:
-    """Return the field with the part of its displacement's noise that is the reference pair's, in all steps alike.
-
-    Parameters
-    ----------
-    field
-        In the system frame, as it is shown: smoothed or not.
-    pair
-        The cameras.
-    """
-    if field.uvw_mm is None or field.references is not None:
-        return replace(field, frozen=None)
-    valid = field.valid
-    points = field.xyz_mm[valid]
-    own = field.covariance[valid][:, 3:, 3:]
-    root = roots_of(own)
-    out = np.full((*field.shape, 3, 3), np.nan)
-    out[valid] = own - root @ new_noise_share(pair, points, points + field.uvw_mm[valid]) @ root
-    return replace(field, frozen=out)

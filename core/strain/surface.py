@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from core.arrays import Bool, Float
-from core.common.factor import rounded
+from core.common.factor import FINE, rounded
 from core.errors import InputError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
@@ -71,7 +71,8 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
     common = None
     if field.common is not None:
         common = np.full((*field.shape, 3, field.common.shape[-1]), np.nan)
-        common[good] = rounded(_common_part(field, slopes, surface, options))
+        # slopes hold the points' own rounding: finer digits would be noise
+        common[good] = rounded(_common_part(field, slopes, surface, options), fine=2.0 * FINE)
     spacing_px = _step(field)
     # of smoothed displacements it begins with the width of the smoothing
     gauge_px = (options.window - 1) * spacing_px + shared.reach_px

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from core.errors import FileFormatError, MeasurementError, SeedError
 from core.field.checks.extrapolated import mark_extrapolated
-from core.field.common import with_common_factor, with_frozen_noise
+from core.field.common import with_common_parts
 from core.field.points.images import MeasureImage, check_calibrated_size
 from core.field.points.result import Field
 from core.field.region.lay_points import make_grid
@@ -234,8 +234,7 @@ class SequenceMeasurement:
         began = time.perf_counter()
         subset_px = self.settings.subset_px
         shown = smoothed_step(result, self.settings.smoothing_window, subset_px=subset_px)
-        shown = with_common_factor(mark_extrapolated(shown, self._volume), self._parameters)
-        shown = with_frozen_noise(shown, self.calibration.pair)
+        shown = with_common_parts(mark_extrapolated(shown, self._volume), self._parameters, self.calibration.pair)
         strain = strain_of_step(shown, StrainOptions.of(self.settings.strain), subset_px=subset_px)
         path = self.file_of(step.n)
         summary = {

@@ -15,9 +15,11 @@ from core.calibration.fit.problem import started
 from core.calibration.prepare import problem_of
 from core.calibration.uncertainty import volume_uncertainty
 from core.cameras.stereo import StereoPair
+from core.common.factor import ParameterCovariance, factor_of
 from tests.bench.accuracy.calibration_beside import CASES, HALF, NOT_ABOVE, compare
 from tests.support.calibration_rigs import (
     LENSES,
+    Array,
     OpenCVResult,
     checkerboard,
     hand_held,
@@ -27,7 +29,14 @@ from tests.support.calibration_rigs import (
     stereo_calibrate,
     views_of_poses,
 )
-from tests.support.mrcal_witness import PACKAGES, calibrate_by_mrcal, mrcal_is_there, shape_sigma_um
+from tests.support.mrcal_witness import (
+    PACKAGES,
+    MrcalResult,
+    calibrate_by_mrcal,
+    mrcal_is_there,
+    ray_slopes,
+    shape_sigma_um,
+)
 from tests.support.requirements import missing
 
 NOISE_PX = 0.02
@@ -49,6 +58,20 @@ def seen() -> tuple[list[CalibrationView], tuple[NominalCamera, NominalCamera], 
     return views, (nominal, nominal), stereo_calibrate(views, checkerboard().points_mm(), cameras[0].size_px)
 
 
+def lengths_agree(source: ParameterCovariance, points: Array, theirs: MrcalResult) -> None:
+    """Lengths between points: the common factor beside mrcal's covariance, carried there by OpenCV's derivatives."""
+    factor = factor_of(source, points).values
+    placed = source.pair.cam1.cam_from_sys
+    slopes = ray_slopes(theirs, placed.apply(points))  # camera 1's frame: lengths know of none
+    root = np.linalg.cholesky(theirs.covariance)
+    for a, b in ((0, 11), (1, 10), (0, 1), (3, 8)):
+        along = points[b] - points[a]
+        along /= np.linalg.norm(along)
+        mine = float(np.linalg.norm(along @ (factor[b] - factor[a])))
+        other = float(np.linalg.norm(placed.rotation @ along @ (slopes[b] - slopes[a]) @ root))
+        assert mine == pytest.approx(other, rel=WITHIN)
+
+
 def test_covariances_are_those_of_mrcal_under_opencvs_lens(
     seen: tuple[list[CalibrationView], tuple[NominalCamera, NominalCamera], OpenCVResult],
 ) -> None:
@@ -64,6 +87,8 @@ def test_covariances_are_those_of_mrcal_under_opencvs_lens(
     points = ours.uncertainty.points_mm
     in_camera = ours.pair.cam1.cam_from_sys.apply(points)
     assert 1e3 * ours.uncertainty.shape_rms_mm == pytest.approx(shape_sigma_um(theirs, in_camera), rel=WITHIN)
+    some = np.stack(np.meshgrid([-50.0, 0.0, 50.0], [-40.0, 40.0], [-30.0, 30.0]), axis=-1).reshape(-1, 3)
+    lengths_agree(ParameterCovariance(ours.pair, ours.names, ours.covariance), some, theirs)
     # and the minimum is the same: a hundredth of a standard deviation is where ours stops
     lens = ours.pair.cam1.lens
     values = np.array([getattr(lens, n) for n in names])
@@ -109,6 +134,7 @@ def test_covariances_are_those_of_mrcal_of_a_pinhole(
     assert 1e3 * ours.shape_rms_mm == pytest.approx(
         shape_sigma_um(theirs, pair.cam1.cam_from_sys.apply(points)), rel=WITHIN
     )
+    lengths_agree(ParameterCovariance(pair, names, covariance), points, theirs)
 
 
 @pytest.mark.parametrize("case", CASES, ids=[c.name for c in CASES])

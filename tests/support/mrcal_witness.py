@@ -140,3 +140,48 @@ def shape_sigma_um(result: MrcalResult, points_mm: Array) -> float:
     design = motions.reshape(-1, 6)
     G = G - design @ np.linalg.lstsq(design, G, rcond=None)[0]
     return 1e3 * float(np.sqrt(np.einsum("ip,pq,iq->", G, result.covariance, G, optimize=True) / len(G)))
+
+
+def ray_slopes(result: MrcalResult, points_mm: Array) -> Array:
+    """Derivatives (n, 3, p) of points, camera 1's frame, over the parameters of mrcal's covariance, images held.
+
+    A point stays on camera 1's ray of its pixel, where camera 2 sees it nearest to its pixel along the epipolar line.
+    The images and their derivatives are OpenCV's, by differences.
+    """
+
+    def seen(k: int, x: Array, points: Array) -> Array:
+        n_lens = result.intrinsics.shape[1]
+        i = x[k * n_lens : (k + 1) * n_lens]
+        rt = np.zeros(6) if k == 0 else x[2 * n_lens :]
+        K = np.array([[i[0], 0.0, i[2]], [0.0, i[1], i[3]], [0.0, 0.0, 1.0]])
+        d = i[4:] if n_lens > 4 else np.zeros(5)
+        return np.asarray(cv2.projectPoints(points.reshape(-1, 1, 3), rt[:3], rt[3:], K, d)[0].reshape(-1, 2))
+
+    x0 = np.concatenate([result.intrinsics.ravel(), result.rt21])
+    pixels = [seen(k, x0, points_mm) for k in range(2)]
+    ahead = seen(1, x0, points_mm * 1.001) - seen(1, x0, points_mm * 0.999)
+    along = ahead / np.linalg.norm(ahead, axis=1)[:, None]
+
+    def measured(x: Array) -> Array:
+        point = points_mm.copy()
+        for _ in range(4):
+            # the ray: two coordinates by camera 1's image at this depth
+            step = 1e-3 * point[:, 2:]
+            gx, gy = (
+                (seen(0, x, point + step * axis) - seen(0, x, point - step * axis)) / (2.0 * step)
+                for axis in np.eye(3)[:2]
+            )
+            miss = pixels[0] - seen(0, x, point)
+            point[:, :2] += np.linalg.solve(np.stack([gx, gy], axis=-1), miss[..., None])[..., 0]
+            miss1 = ((pixels[1] - seen(1, x, point)) * along).sum(axis=1)
+            slope = ((seen(1, x, point * 1.0005) - seen(1, x, point * 0.9995)) * along).sum(axis=1) / 1e-3
+            point *= (1.0 + miss1 / slope)[:, None]
+        return point
+
+    out = np.empty((len(points_mm), 3, len(x0)))
+    for k, sd in enumerate(np.sqrt(np.diagonal(result.covariance))):
+        step = 0.1 * float(sd)
+        e = np.zeros(len(x0))
+        e[k] = step
+        out[..., k] = (measured(x0 + e) - measured(x0 - e)) / (2.0 * step)
+    return out

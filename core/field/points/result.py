@@ -197,4 +197,6 @@ class Field:
     def sigma_mm(self) -> Float:
         """(r, c, 3 or 6) standard deviations, the root of the total covariance's diagonal."""
         own = np.diagonal(self.covariance, axis1=-2, axis2=-1)
-        return np.sqrt(own if self.common is None else own + (self.common**2).sum(axis=-1))
+        if self.common is None:
+            return np.sqrt(own)
+        return np.sqrt(own + np.einsum("...nk,...nk->...n", self.common, self.common))

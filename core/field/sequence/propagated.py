@@ -120,12 +120,19 @@ def pattern_share(zncc: Float) -> Float:
     return np.where(np.isfinite(share), np.maximum(share, 0.0), 0.0)
 
 
+def current_covariance(field: Field) -> Float:
+    """Return the own covariance (r, c, 3, 3) of the current positions, mm^2, in the precision that a file keeps."""
+    C = field.covariance
+    both = C[..., :3, 3:]
+    total = C[..., :3, :3] + (both + np.swapaxes(both, -1, -2)) + C[..., 3:, 3:]
+    return np.asarray(total.astype(np.float32).astype(np.float64))
+
+
 def first_propagated(field: Field, pair: StereoPair, totals: Totals, subset_px: int, slope_share: float) -> Propagated:
     """Return the covariance, px^2, propagated to a segment that begins at a field of the first reference."""
     n = len(totals.w)
-    C = field.covariance.reshape(n, 6, 6).astype(np.float32).astype(np.float64)
     R = pair.cam1.cam_from_sys.rotation
-    mm = R @ (C[:, :3, :3] + C[:, :3, 3:] + C[:, 3:, :3] + C[:, 3:, 3:]) @ R.T
+    mm = R @ current_covariance(field).reshape(n, 3, 3) @ R.T
     P, seen = totals.current_cam1_mm, totals.seen
     J = np.zeros((n, 2, 3))
     J[:, 0, 0] = J[:, 1, 1] = 1.0

@@ -9,10 +9,10 @@ from typing import Annotated
 from pydantic import Field
 
 _BUDGET = (
-    "Standard uncertainties by where they come from, whose squares add up to the whole's: `matching` (noise that is new "
-    "at each step), `reference` (noise of the reference pair, the same in all steps of a test), `calibration` (noise "
-    "of the calibration's views), `stage`, `target`. What is not known is not among them, see `not_told` of the step; "
-    "null where nothing is."
+    "Standard uncertainties by where they come from, whose squares add up to the whole's: `matching` (noise that is "
+    "new at each step), `reference` (noise of the reference pair, the same in all steps of a test), `calibration` "
+    "(noise of its views), `stage`, `target`. What is not known is not among them, see the step's `not_told`; null "
+    "without any."
 )
 
 

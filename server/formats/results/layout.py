@@ -81,7 +81,21 @@ CURVATURE = (
 #: how a common factor is packed
 COLUMN_BY_COLUMN = {"compression": "zlib", "complevel": 1, "shuffle": True}
 #: entries of the reference's part of the displacements' covariance, as they are packed
-FROZEN = (("uu", 0, 0), ("uv", 0, 1), ("uw", 0, 2), ("vv", 1, 1), ("vw", 1, 2), ("ww", 2, 2))
+FROZEN = ("uu", "uv", "uw", "vv", "vw", "ww")
+
+
+def packed(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the upper triangles (..., n (n + 1) / 2) of symmetric matrices (..., n, n), row by row."""
+    i, j = np.triu_indices(covariance.shape[-1])
+    return covariance[..., i, j]
+
+
+def unpacked(triangles: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+    """Return the symmetric matrices (..., n, n) of :func:`packed`."""
+    i, j = np.triu_indices(n)
+    out = np.empty((*triangles.shape[:-1], n, n))
+    out[..., i, j] = out[..., j, i] = triangles
+    return out
 
 
 def field_variable(result: Field, name: str) -> tuple[NDArray[np.float64], str, str] | None:

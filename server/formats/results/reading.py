@@ -20,7 +20,7 @@ from core.field.points.smoothing_record import Smoothing
 from core.field.region.cuts import Cuts, from_arrays
 from core.names import CAUSES, CameraName
 from core.status import PointStatus
-from server.formats.results.layout import CURVATURE, ENTRIES, FORMAT_VERSION, FROZEN, MOTION, PROPAGATED_FROM, SHAPE
+from server.formats.results.layout import CURVATURE, ENTRIES, FORMAT_VERSION, MOTION, PROPAGATED_FROM, SHAPE, unpacked
 from server.formats.results.netcdf import opened
 from server.formats.results.settings import current_entries, current_inputs, current_settings, variable_name
 
@@ -65,6 +65,8 @@ def read_field(path: str | Path) -> Field:
                 tail = 2 if v in CURVATURE else 3
                 arrays.setdefault(v.attribute, np.full((*shape, tail), np.nan))[..., v.component] = values
         total = np.asarray(variables["covariance"][...], dtype=np.float64)
+        if total.ndim == 3:  # packed
+            total = unpacked(total, 6)
         common, causes = None, None
         if "common_factor" in variables:
             common = np.asarray(variables["common_factor"][...], dtype=np.float64)
@@ -109,6 +111,10 @@ def read_measured(path: str | Path) -> Field:
         field = replace(field, uvw_mm=uvw, smoothing=None)
     # files of format 1 have it only beside a smoothed displacement: there, marked points keep the calibration's part
     covariance = read.get("measured_covariance", field.covariance)
+    if "measured_current_covariance" in read:  # what later steps go on from, exact: the other parts are as they are
+        now, both = unpacked(read["measured_current_covariance"], 3), covariance[..., :3, 3:]
+        covariance = covariance.copy()
+        covariance[..., 3:, 3:] = now - (covariance[..., :3, :3] + (both + np.swapaxes(both, -1, -2)))
     status = np.where(field.status == PointStatus.EXTRAPOLATED, PointStatus.OK, field.status).astype(np.int8)
     return replace(field, covariance=covariance, common=None, causes=None, frozen=None, status=status)
 
@@ -211,11 +217,7 @@ def _causes_of(variables: Any, count: int) -> Causes:
 def _frozen_of(variables: Any) -> NDArray[np.float64] | None:
     if "reference_covariance" not in variables:
         return None
-    packed = np.asarray(variables["reference_covariance"][...], dtype=np.float64)
-    out = np.empty((*packed.shape[:-1], 3, 3))
-    for k, (_, i, j) in enumerate(FROZEN):
-        out[..., i, j] = out[..., j, i] = packed[..., k]
-    return out
+    return unpacked(np.asarray(variables["reference_covariance"][...], dtype=np.float64), 3)
 
 
 def _cuts_of(variables: Any) -> Cuts | None:

@@ -145,6 +145,8 @@ def summarise(
     n = int(valid.sum())
     epipolar = result.epipolar_px[valid]
     names = ("x_mm", "y_mm", "z_mm", "u_mm", "v_mm", "w_mm")[: result.covariance.shape[-1]]
+    sigma = result.sigma_mm[valid]
+    common = None if result.common is None else np.einsum("...nk,...nk->...n", result.common, result.common)[valid]
     summary = StepSummary(
         kind="displacement" if result.has_motion else "shape",
         points=points,
@@ -161,15 +163,10 @@ def summarise(
             name: float(np.median(result.zncc[valid][:, k])) if n else None
             for k, name in enumerate(COMPARISONS[: result.zncc.shape[-1]])
         },
-        sigma_median_mm={
-            name: float(np.median(result.sigma_mm[valid][:, k])) if n else None for k, name in enumerate(names)
-        },
+        sigma_median_mm={name: float(np.median(sigma[:, k])) if n else None for k, name in enumerate(names)},
         sigma_calibration_median_mm=None
-        if result.common is None
-        else {
-            name: float(np.median(np.linalg.norm(result.common[valid][:, k], axis=-1))) if n else None
-            for k, name in enumerate(names)
-        },
+        if common is None
+        else {name: float(np.median(np.sqrt(common[:, k]))) if n else None for k, name in enumerate(names)},
         smoothing=result.smoothing,
         patch=result.patch,
         camera_motion=camera_motion,

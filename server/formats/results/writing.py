@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from core.common.factor import Causes
 from core.field.points.result import Field, References, Rejected
 from core.field.region.cuts import Cuts, as_arrays
+from core.field.sequence.propagated import current_covariance
 from core.names import CAUSES
 from core.status import STATUS_MEANINGS, PointStatus
 from core.strain import StrainField
@@ -33,6 +34,7 @@ from server.formats.results.layout import (
     MOTION,
     PROPAGATED_FROM,
     SHAPE,
+    packed,
 )
 from server.formats.results.netcdf import written_dataset
 from server.formats.results.strain import put_strain
@@ -43,7 +45,7 @@ _MANY_EMPTY = 0.2
 _REPETITIVE = ("x_px", "y_px", "status", "iterations", "zncc")
 _INCLUDES = {
     False: "the matching of the point and, as F F', the calibration",
-    True: "the matching of the point; the calibration is not included: its covariance is not known",
+    True: "matching only: the calibration is not included, its covariance is not known",
 }
 _FRAMES = {
     "target": "sys: X_sys, Y_sys in the calibration target's plane at its first position, Z_sys away from the cameras",
@@ -180,13 +182,17 @@ def fill(dataset: Any, result: Field, provenance: Provenance, strain: StrainFiel
 def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
     n = result.covariance.shape[-1]
     names = COVARIANCE_NAMES[:n]
-    dataset.createDimension("i", n)
-    dataset.createDimension("j", n)
+    if result.has_motion:
+        dataset.createDimension("entry", n * (n + 1) // 2)
+    else:
+        dataset.createDimension("i", n)
+        dataset.createDimension("j", n)
+    total = result.total_covariance
     _put(
         dataset,
         "covariance",
-        result.total_covariance,
-        ("row", "col", "i", "j"),
+        packed(total) if result.has_motion else total,
+        ("row", "col", "entry") if result.has_motion else ("row", "col", "i", "j"),
         units="mm2",
         long_name="covariance of " + ", ".join(names),
         dtype="f4",
@@ -195,6 +201,10 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
     dataset.variables["covariance"].setncatts(
         {"components": " ".join(names), "includes": _INCLUDES[result.common is None]}
     )
+    if result.has_motion:
+        dataset.variables["covariance"].packed = "upper triangle of the 6 x 6 matrix, row by row: " + " ".join(
+            f"{a}_{b}" for k, a in enumerate(names) for b in names[k:]
+        )
     if result.common is not None:
         dataset.createDimension("component", n)
         causes = Causes.untold(result.common.shape[-1]) if result.causes is None else result.causes
@@ -221,7 +231,7 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
         _put(
             dataset,
             "reference_covariance",
-            np.stack([result.frozen[..., i, j] for _, i, j in FROZEN], axis=-1),
+            packed(result.frozen),
             ("row", "col", "frozen"),
             units="mm2",
             long_name="part of the own covariance of u, v, w that is noise of the reference pair",
@@ -230,7 +240,7 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
         )
         dataset.variables["reference_covariance"].setncatts(
             {
-                "components": " ".join(name for name, _, _ in FROZEN),
+                "components": " ".join(FROZEN),
                 "comment": "the same in all steps of a test: a difference of two steps has the own covariances of "
                 "both, less both of these, and (F_b - F_a)(F_b - F_a)'; the own covariance of x, y, z is so as a whole",
             }
@@ -256,6 +266,7 @@ def _put_causes(dataset: Any, causes: Causes) -> None:
     variable.setncatts(
         {
             "long_name": "where a column's unit cause comes from; the same causes in all steps of a test",
+            "units": "1",
             "_Encoding": "ascii",
         }
     )
@@ -358,16 +369,18 @@ def _put_measured(dataset: Any, result: Field, measured: Field) -> None:
                 dtype="f8",
                 long_name=f"displacement from the reference, {name.upper()}, as measured, before smoothing",
             )
-    if result.covariance is measured.covariance and result.common is None:
+    if not measured.has_motion or (result.covariance is measured.covariance and result.common is None):
         return
+    if "frozen" not in dataset.dimensions:
+        dataset.createDimension("frozen", len(FROZEN))
     _put(
         dataset,
-        "measured_covariance",
-        measured.covariance,
-        ("row", "col", "i", "j"),
+        "measured_current_covariance",
+        packed(current_covariance(measured)),
+        ("row", "col", "frozen"),
         units="mm2",
         dtype="f4",
-        long_name="covariance of x_mm, y_mm, z_mm and the displacement as measured, by image noise alone",
+        long_name="covariance of the current position as measured, by image noise alone: xx xy xz yy yz zz",
     )
 
 

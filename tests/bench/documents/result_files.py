@@ -52,6 +52,8 @@ CALIBRATION = {
     "pitch_scale": "relative error of the target's pitch: `value`, `sigma`; zero where it was held",
     "covariance": "`names` of the estimated parameters (with the paper's lens 20: all but the aspects) and their `matrix`, in the units of the "
     "names, squared",
+    "covariance_by_cause": "parts of the covariance's matrix that add up to it: `calibration` (noise of the views, and all else), `stage` "
+    "(what was known of steps, scale, tilt), `target` (of pitch, nodes)",
     "sigma": "standard uncertainty of each parameter, by its name",
     "noise_px": "standard deviation of a coordinate of a point of the target, from the residuals, by camera",
     "redundancy": "observations beyond the unknowns, by camera",
@@ -99,9 +101,15 @@ w = ncread('result/step_0001.nc', 'w_mm');    % col by row in MATLAB
 or steps share the second part, so that
 
 ```python
-own_a, own_b = covariance[a] - F[a] @ F[a].T, covariance[b] - F[b] @ F[b].T
+total = np.zeros((*covariance.shape[:2], 6, 6))  # packed: the upper triangle, row by row
+i, j = np.triu_indices(6)
+total[..., i, j] = total[..., j, i] = covariance
+own_a, own_b = total[a] - F[a] @ F[a].T, total[b] - F[b] @ F[b].T
 variance_of_b_minus_a = own_a + own_b + (F[b] - F[a]) @ (F[b] - F[a]).T  # apart by a subset or more
 ```
+
+Between two steps of a test the columns of F that have the same `cause`, counted from the first of that cause, are the same; where a
+step has fewer, they are zero. There take `reference_covariance` (of U, V, W) of both steps from `own_a + own_b`.
 
 Without `common_factor` the calibration's covariance is not known, and its part not included (attribute `includes`).
 
@@ -132,10 +140,15 @@ def _everything() -> tuple[Field, Field]:
         reduced=0,
         raw=0,
     )
-    common = np.zeros((*field.shape, 6, 1))
+    common, frozen = np.zeros((*field.shape, 6, 1)), np.zeros((*field.shape, 3, 3))
     rejected = Rejected(field.xyz_mm, field.uvw_mm, field.zncc, field.epipolar_px)
     field = replace(
-        field, curvature_per_mm=np.zeros((*field.shape, 2)), references=references, common=common, rejected=rejected
+        field,
+        curvature_per_mm=np.zeros((*field.shape, 2)),
+        references=references,
+        common=common,
+        frozen=frozen,
+        rejected=rejected,
     )
     return replace(field, smoothing=smoothing, covariance=2.0 * field.covariance), field
 
