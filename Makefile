@@ -15,7 +15,7 @@ ARGS ?=
 # only compile the same kernels again
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n > 3 ? 4 : n + 1)))
 
-.PHONY: help demo quick test test-deep serve check check-page bench format accuracy fuzz load openapi reference docs torture pagespeed pagepictures clean
+.PHONY: help demo quick test test-deep serve check check-page bench format accuracy coverage fuzz load openapi reference docs torture pagespeed pagepictures clean
 
 help:
 	@echo "make demo    start the service on the simulated paper rig and run the plate experiment over HTTP"
@@ -33,6 +33,7 @@ help:
 	@echo "make reference  write the pages of docs/reference that are made from the program"
 	@echo "make pagespeed  measure the page in Chromium: first paint, live views, a field of 100,000 points; writes docs/explanation/page_speed.md"
 	@echo "make accuracy   measure every figure of docs/explanation/accuracy again (about twenty minutes)"
+	@echo "make coverage   replicates of the whole chain against its uncertainty: hours, goes on where it was; writes docs/explanation/accuracy/coverage.md (ARGS='--threads N --replicates N --others N --strata WORD' or --page)"
 
 $(PROGRAM): pyproject.toml
 	@command -v $(PYTHON) >/dev/null || { echo "stereorig needs Python 3.11 or newer. Install it: apt-get install python3 python3-venv"; exit 1; }
@@ -105,6 +106,9 @@ bench: $(STAMP) $(PEER_STAMP)
 
 accuracy: $(STAMP)
 	$(BIN)/python -m tests.bench.accuracy.accuracy $(ARGS)
+
+coverage: $(STAMP)
+	$(BIN)/python -m tests.bench.coverage.coverage $(ARGS)
 
 load: $(STAMP)
 	$(BIN)/python -m tests.bench.reliability.load --page $(ARGS)

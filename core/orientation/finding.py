@@ -152,8 +152,8 @@ def judge_offsets(
     points
         The step's points as matched.
     before
-        Points of the reference or of another step, and their offsets (m,); the calibration's own error, the same in
-        both, cancels then.
+        Points of the reference or of another step, and their offsets (m,); of the calibration's own error that part
+        cancels then which is the same at both depths.
     against
         What the offsets are held against.
     covariance, names
@@ -175,16 +175,20 @@ def judge_offsets(
     if good.sum() < MIN_POINTS:
         return None
     points, offset = MatchedPoints(points.xy1_px[good], points.xy2_px[good], points.step[good]), offset[good]
-    unsure = np.zeros((6, 6))
-    if before is not None:
-        offset, unsure = _less(points, offset, *before)
+    earlier = None if before is None else _earlier(points, *before)
+    if earlier is not None:
+        offset = offset - earlier.offset_px
     smooth = smooth_offsets(points, offset)
-    C = smooth.covariance + unsure + _FLOOR_PX[against] ** 2 * np.eye(6)
-    known = against != "calibration"
-    if against == "calibration" and covariance is not None:
-        J = smooth.projector @ calibration_slopes(pair, points, names)
+    C = smooth.covariance + _FLOOR_PX[against] ** 2 * np.eye(6)
+    J = np.zeros((6, len(names))) if covariance is None else smooth.projector @ calibration_slopes(pair, points, names)
+    if earlier is not None and before is not None:
+        C = C + earlier.covariance
+        if covariance is not None:
+            # a motion in depth brings another part of the calibration's error to the same place of the image
+            J = J - earlier.projector @ calibration_slopes(pair, before[0], names)
+    known = against != "calibration" or covariance is not None
+    if covariance is not None:
         C = C + J @ covariance @ J.T
-        known = True
     c = smooth.coefficients
     chi_square = float(c @ np.linalg.solve(C, c))
     p_value = float(chi2.sf(chi_square, 6))
@@ -220,19 +224,31 @@ def judge_offsets(
     return _with_text(finding)
 
 
-def _less(points: MatchedPoints, offset_px: Float, earlier: MatchedPoints, earlier_px: Float) -> tuple[Float, Float]:
-    """Offsets less the smooth part of earlier ones at the same place of the image, and its covariance (6, 6).
+@dataclass(frozen=True, eq=False)
+class _Earlier:
+    """The smooth part of earlier offsets at the same place of the image.
 
-    At the same place: an error of the calibration belongs to the image, not to the point of the specimen.
+    ``offset_px`` (n,) at the points; ``covariance`` (6, 6) of its coefficients over the points' terms, and
+    ``projector`` (6, m) that makes them of the earlier offsets.
     """
+
+    offset_px: Float
+    covariance: Float
+    projector: Float
+
+
+def _earlier(points: MatchedPoints, earlier: MatchedPoints, earlier_px: Float) -> _Earlier:
+    """At the same place, since an error of the calibration belongs to the image, not to the point of the specimen."""
     fit = smooth_offsets(earlier, earlier_px)
     # the earlier terms at the points, through the plain polynomial of all positions together
     both = smooth_terms(np.concatenate([earlier.xy1_px, points.xy1_px]))
     there, here = both[: len(earlier_px)], both[len(earlier_px) :]
     turn = np.linalg.lstsq(there, fit.terms, rcond=None)[0]
     terms = here @ turn
-    onto = np.linalg.qr(smooth_terms(points.xy1_px))[0].T / np.sqrt(len(offset_px)) @ terms
-    return offset_px - terms @ fit.coefficients, onto @ fit.covariance @ onto.T
+    mine = np.linalg.qr(smooth_terms(points.xy1_px))[0] * np.sqrt(len(points.xy1_px))
+    mine *= np.sign(mine[0, 0])
+    onto = mine.T / len(points.xy1_px) @ terms
+    return _Earlier(terms @ fit.coefficients, onto @ fit.covariance @ onto.T, onto @ fit.projector)
 
 
 _SAYS = {

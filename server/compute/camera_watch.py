@@ -123,6 +123,8 @@ class CameraWatch:
                 points,
                 before=(other, self.pair.epipolar_residual_px(other.xy1_px, other.xy2_px)),
                 against=name,
+                covariance=covariance,
+                names=names,
             )
             for other, name in compared
         )

@@ -11,6 +11,7 @@ import argparse
 import json
 import os
 import tempfile
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -92,6 +93,17 @@ def wanted(strata: Sequence[Stratum], main: int, others: int, folder: Path = OUT
                     yield stratum, seed
 
 
+def _end_with(parent: int) -> None:
+    """End this worker when the process that started it does: killed, it tells nobody."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 def main() -> int:
     """Run what is missing, or write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -107,7 +119,8 @@ def main() -> int:
         for name in _THREAD_SETTINGS:  # a process each: their kernels share nothing
             os.environ[name] = "1"
         todo = list(wanted(chosen, args.replicates, args.others))
-        with ProcessPoolExecutor(args.threads, mp_context=get_context("spawn")) as pool:
+        workers = ProcessPoolExecutor(args.threads, get_context("spawn"), _end_with, (os.getpid(),))
+        with workers as pool:
             jobs = {pool.submit(replicate, stratum, seed): stratum for stratum, seed in todo}
             for n, job in enumerate(as_completed(jobs), start=1):
                 stratum, entry = jobs[job], job.result()

@@ -170,6 +170,28 @@ def test_the_offset_of_a_calibration_s_own_error_is_not_called_a_motion() -> Non
     assert 1.0 < np.mean([f.chi_square for f in with_it if f]) < 7.5
 
 
+def test_a_motion_in_depth_under_an_uncertain_calibration_is_no_camera_s() -> None:
+    rng = np.random.default_rng(6)
+    covariance = np.diag((4.0 * SIGMA) ** 2)
+    before, now = (matches(CAM1, CAM2, rng, pose=k) for k in (1, 2))  # 14 mm and 18 degrees apart
+    with_it, without = [], []
+    for _ in range(40):
+        pair = drawn(rng, covariance)
+        held = before, pair.epipolar_residual_px(before.xy1_px, before.xy2_px)
+        without.append(judge_offsets(pair, now, before=held, against="reference"))
+        with_it.append(judge_offsets(pair, now, before=held, against="reference", covariance=covariance))
+    assert all(f.camera_moved is False for f in with_it if f)
+    assert sum(bool(f.camera_moved) for f in without if f) > 10
+    assert 1.0 < np.mean([f.chi_square for f in with_it if f]) < 7.5  # six squares, as above
+    # at the same depths it cancels, and a bump is told as before
+    bumped = matches(CAM1, turned(CAM2, (0.0, 0.02, 0.0)), rng)
+    still = matches(CAM1, CAM2, rng)
+    held = still, PAIR.epipolar_residual_px(still.xy1_px, still.xy2_px)
+    told = judge_offsets(PAIR, bumped, before=held, against="reference", covariance=covariance)
+    assert told is not None
+    assert told.camera_moved
+
+
 def test_slopes_of_the_offset_are_its_differences() -> None:
     points = matches(CAM1, CAM2, np.random.default_rng(7))
     slopes = calibration_slopes(PAIR, points)
