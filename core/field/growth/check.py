@@ -9,11 +9,11 @@ import numpy as np
 from core.field.checks.blank_centres import centre_px, reject_blank_centres
 from core.field.checks.edges import reject_near_edges
 from core.field.checks.residual_test import residual_test
-from core.field.checks.straddling import reject_straddling
 from core.field.checks.unreached import mark_outside
 from core.field.checks.validity import apply_validity_checks
 from core.field.growth.grow import grow
 from core.field.growth.state import FieldInputs, GrowthState
+from core.field.parts.straddling import reject_straddling
 from core.field.points.fitter import PointFits
 
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from core.arrays import Bool, Float
 from core.field.checks.block_median import block_medians, reach_of
 from core.field.checks.lost_correlation import SIGMAS_OF_QUARTER, SIGMAS_OF_TENTH
-from core.field.checks.subset_parts import Pull, pull_of_parts
-from core.field.checks.subset_residuals import subset_residuals
+from core.field.parts.subset_parts import Pull, pull_of_parts
+from core.field.parts.subset_residuals import subset_residuals
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.starts import depth_per_px
 from core.progress import CancelToken, raise_if_cancelled

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arrays import Bool, Float
-from core.field.checks.subset_residuals import SubsetResiduals
+from core.field.parts.subset_residuals import SubsetResiduals
 
 _CELLS = 6  # across a subset
 _MOST = 0.6  # of a subset's cells in a part
