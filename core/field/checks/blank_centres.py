@@ -1,7 +1,8 @@
 """Points beside the end of the surface whose own position shows nothing: the patch there is the rim, extended.
 
 Beside a hole or behind an outline before a plain background a subset matches by the part that lies on the surface. Its
-centre, which the result is for, may lie where there is no surface.
+centre, which the result is for, may lie where there is no surface: in a plain area, as wide as a subset's centre, that
+holds points without a match.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from core.arrays import Bool, Float
+from core.arrays import Bool, Float, Float32
 from core.field.points.fitter import PointFits
 from core.status import PointStatus
 
@@ -17,6 +18,8 @@ CENTRE = 1.0 / 3.0
 """Width of what counts as a subset's centre, over the subset's."""
 _NOISE = 4.0  # variances of the noise: what a plain centre shows at most
 _TEXTURE = 0.02  # of the subset's variance
+_WINDOW_PX = 5  # of the variance about a pixel
+_RIM_PX = _WINDOW_PX // 2 + 1  # by which the plain area seems smaller than it is
 
 
 def centre_px(subset_px: int) -> int:
@@ -30,10 +33,14 @@ def reject_blank_centres(
     shape: tuple[int, int],
     texture: Float,
     centre_texture: Float,
+    image: Float32,
+    xy_px: Float,
     subset_px: int,
     spacing_px: float,
 ) -> int:
     """Reject points, LOW_TEXTURE, within a subset of points without a match whose centre is plain; return their number.
+
+    A centre is plain, too, that lies in a plain area, as wide as itself, together with points without a match.
 
     Parameters
     ----------
@@ -43,13 +50,19 @@ def reject_blank_centres(
         Rows and columns.
     texture, centre_texture
         (n,) grey-level variance of the subset and of its centre, camera 1's reference image.
+    image
+        (rows, cols) that image.
+    xy_px
+        (n, 2) the points in it.
     subset_px, spacing_px
         Width of the subset, distance of neighbouring points.
     """
     beside = _beside_gaps(points.ok, shape, subset_px / spacing_px)
     noise = np.nan_to_num(points.noise) ** 2 + 1.0 / 12.0  # rounding's, too
     plain = (centre_texture < _NOISE * noise) & (centre_texture < _TEXTURE * texture)
-    bad: Bool = points.ok & beside & plain
+    level = float(np.median(noise[points.ok])) if points.ok.any() else 0.0
+    inside = _in_plain_areas(image, _NOISE * level, centre_px(subset_px), xy_px, points.ok)
+    bad: Bool = points.ok & beside & (plain | inside)
     points.reject(bad, PointStatus.LOW_TEXTURE)
     return int(bad.sum())
 
@@ -58,3 +71,19 @@ def _beside_gaps(ok: Bool, shape: tuple[int, int], reach: float) -> Bool:
     side = 2 * int(np.ceil(reach)) + 1
     gaps = (~ok.reshape(shape)).astype(np.uint8)
     return np.asarray(cv2.dilate(gaps, np.ones((side, side), np.uint8)).ravel() > 0)
+
+
+def _in_plain_areas(image: Float32, variance: float, width_px: int, xy_px: Float, ok: Bool) -> Bool:
+    """Return (n,) True in areas of at least ``width_px`` without texture that hold points without a match."""
+    window = (_WINDOW_PX, _WINDOW_PX)
+    about = image - np.float32(image.mean())
+    scatter = cv2.blur(about * about, window) - cv2.blur(about, window) ** 2
+    wide = cv2.morphologyEx(
+        (scatter < variance).astype(np.uint8), cv2.MORPH_OPEN, np.ones((width_px, width_px), np.uint8)
+    )
+    rim = 2 * _RIM_PX + 1
+    areas = cv2.connectedComponents(cv2.dilate(wide, np.ones((rim, rim), np.uint8)))[1]
+    rows, cols = image.shape
+    x, y = (np.clip(np.rint(xy_px[:, k]), 0, last - 1).astype(int) for k, last in ((0, cols), (1, rows)))
+    own = areas[y, x]
+    return np.asarray((own > 0) & np.isin(own, own[~ok]))

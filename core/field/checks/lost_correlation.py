@@ -23,9 +23,10 @@ _LOST_TO_VIEW = 0.015
 """1 - zncc over the squared excess of the blur's variance, relative to one camera's own: three times what real speckle
 loses on faces of 45 degrees."""
 _MOST_EXCESS = 3.0  # a surface that is seen at half the width
-_SIGMAS_OF_QUARTER, _SIGMAS_OF_TENTH = 0.6745, 1.2816  # below the middle of a normal distribution
+SIGMAS_OF_QUARTER, SIGMAS_OF_TENTH = 0.6745, 1.2816  # below the middle of a normal distribution
 _LEAST_IN_TIME = 0.675  # of the bound where something may have changed the view
 _FINE = 2.0
+_SHAPE_FACTOR, _SHAPE_LOSS = 12.0, 0.04
 _WIDER = 3  # so far about a point that a crack is in a small part of it
 _FEW = 12
 _LEAST = 1e-7
@@ -85,6 +86,8 @@ def lost_correlation(
         excess = np.log(loss / level)
         scatter = MAD_TO_SIGMA * block_medians(np.abs(excess), ok, shape, reach, otherwise=np.inf)
         allowed = np.clip(np.exp(limits.sigmas * scatter), limits.min_factor, limits.max_factor)
+        if points.zncc.shape[1] == 1:  # what takes less than this from a shape is found in the parts of its subset
+            allowed = np.maximum(allowed, np.minimum(_SHAPE_FACTOR, _SHAPE_LOSS / level))
         if k == 1:
             best, strict = _of_the_best(loss, texture, ok, shape, _WIDER * reach, limits)
             # a face that loses much between the cameras before anything moves is a fine texture: it loses in time, too
@@ -125,8 +128,8 @@ def _of_the_best(
         )
 
     quarter = lower(energy, 0.25)
-    scatter = np.maximum((quarter - lower(energy, 0.1)) / (_SIGMAS_OF_TENTH - _SIGMAS_OF_QUARTER), 0.0)
-    level = np.exp(quarter + _SIGMAS_OF_QUARTER * scatter) / texture
+    scatter = np.maximum((quarter - lower(energy, 0.1)) / (SIGMAS_OF_TENTH - SIGMAS_OF_QUARTER), 0.0)
+    level = np.exp(quarter + SIGMAS_OF_QUARTER * scatter) / texture
     least = max(_LEAST_IN_TIME * limits.min_factor, 1.0)
     return level, np.clip(np.exp(limits.sigmas * scatter), least, limits.max_factor)
 

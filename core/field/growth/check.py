@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from core.field.checks.blank_centres import centre_px, reject_blank_centres
 from core.field.checks.edges import reject_near_edges
 from core.field.checks.residual_test import residual_test
-from core.field.checks.straddling import reject_straddling
 from core.field.checks.unreached import mark_outside
 from core.field.checks.validity import apply_validity_checks
 from core.field.growth.grow import grow
 from core.field.growth.state import FieldInputs, GrowthState
+from core.field.parts.straddling import reject_straddling
 from core.field.points.fitter import PointFits
 
 
@@ -55,34 +57,26 @@ def fill(inputs: FieldInputs, state: GrowthState) -> GrowthState:
 
 
 def check_edges(inputs: FieldInputs, state: GrowthState) -> None:
-    """Reject the points of a shape whose subset lies on two faces or whose centre is plain; a motion measures none."""
-    if state.fitter.comparisons == 3:
+    """Reject the points of a shape whose centre is plain beside the end of the surface; a motion measures none."""
+    if state.fitter.comparisons == 3 or state.points.ok.all():
         return
-    rejected = reject_straddling(
-        state.fitter,
+    options = inputs.options
+    rejected = reject_blank_centres(
         state.points,
         shape=inputs.grid.shape,
+        texture=inputs.texture,
+        centre_texture=inputs.ref1.subset_variance(inputs.xy_px, centre_px(options.subset_px)),
+        image=inputs.matcher.ref1.pixels,
         xy_px=inputs.xy_px,
-        rays=inputs.rays,
+        subset_px=options.subset_px,
         spacing_px=inputs.grid.spacing_px,
-        cancel=inputs.cancel,
     )
-    options = inputs.options
-    if not state.points.ok.all():
-        rejected += reject_blank_centres(
-            state.points,
-            shape=inputs.grid.shape,
-            texture=inputs.texture,
-            centre_texture=inputs.ref1.subset_variance(inputs.xy_px, centre_px(options.subset_px)),
-            subset_px=options.subset_px,
-            spacing_px=inputs.grid.spacing_px,
-        )
     if rejected:
         check(inputs, state.points)
 
 
 def check_residuals(inputs: FieldInputs, state: GrowthState) -> None:
-    """Test the residuals, then reject points whose patch leaves the images or the prefilter's valid area."""
+    """Test the residuals of points and of parts of subsets, then reject points whose patch leaves the images."""
     tested = residual_test(
         state.fitter,
         state.points,
@@ -92,7 +86,18 @@ def check_residuals(inputs: FieldInputs, state: GrowthState) -> None:
         shape=inputs.grid.shape,
         cancel=inputs.cancel,
     )
-    if tested.rejected:
+    rejected = tested.rejected + reject_straddling(
+        state.fitter,
+        state.points,
+        shape=inputs.grid.shape,
+        xy_px=inputs.xy_px,
+        rays=inputs.rays,
+        texture=inputs.texture,
+        spacing_px=inputs.grid.spacing_px,
+        noise_factor=float(np.nanmax(tested.factor[:-1], initial=1.0)),
+        cancel=inputs.cancel,
+    )
+    if rejected:
         check(inputs, state.points)  # isolated points fail the neighbour check
     mark_outside(state.fitter, state.points, inputs.xy_px, inputs.usable)
     if inputs.options.blur is not None:

@@ -9,7 +9,6 @@ from typing import cast
 import numpy as np
 import pytest
 
-from core.field.checks.straddling import half_subsets
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field
@@ -114,14 +113,6 @@ def test_points_beyond_a_gap_are_found_where_the_others_say() -> None:
     assert not seen_elsewhere(
         matcher, points, XY, rays(), rest, w
     )  # camera 1 shows them there: nothing else to look for
-
-
-def test_each_half_of_a_subset_holds_its_middle() -> None:
-    halves = half_subsets(SUBSET_PX)
-    assert halves.shape == (8, SUBSET_PX, SUBSET_PX)
-    assert halves[:, SUBSET_PX // 2, SUBSET_PX // 2].all()
-    assert (np.abs(halves.mean(axis=(1, 2)) - 0.5) < 0.03).all()
-    np.testing.assert_array_equal(np.maximum(halves[::2], halves[1::2]), 1)
 
 
 @pytest.mark.parametrize("hidden", [False, True])

@@ -1,0 +1,1 @@
+"""Parts of a subset: what each of them does to its match."""

@@ -1,0 +1,229 @@
+"""Subsets of which a part lies on another face, moves otherwise or shows something else.
+
+A patch that straddles a step, a ridge or a crack averages both sides, and its correlation need not show it: a part of
+the subset pulls the match. Where the shape or the motion bends or jumps between points a subset apart, beside gaps, and
+where residuals are larger than about them, the match is compared with what it is without each part of the subset. What
+a part changes is the point's error to first order: within the noise's reach it is added to the point's standard
+deviation; a point that is off by more is rejected.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arrays import Bool, Float
+from core.field.checks.block_median import block_medians, reach_of
+from core.field.checks.lost_correlation import SIGMAS_OF_QUARTER, SIGMAS_OF_TENTH
+from core.field.parts.subset_parts import Pull, pull_of_parts
+from core.field.parts.subset_residuals import subset_residuals
+from core.field.points.fitter import Fitter, PointFits
+from core.field.points.starts import depth_per_px
+from core.progress import CancelToken, raise_if_cancelled
+from core.robust import MAD_TO_SIGMA, spread_indices
+from core.status import PointStatus
+
+_FLOOR_PX = 0.05
+_SIGMAS = 8.0
+_PAIRS = 4000  # for the scatter of the pairs of one offset
+_MIN_PAIRS = 12
+_FEW = 12
+_WIDER = 3
+_LOUDER = 4.0  # robust standard deviations of the residuals' energy about a point
+_PART_SIGMAS = 5.0  # of the change without a part; some thirty parts are tried
+_MOST_CORRELATED = 2.0  # variance of a match over that by white residuals, up to which it is no part's doing
+_FAR_SIGMAS = 4.0  # a change beyond what correlated residuals are counted as
+_OFF_SIGMAS, _OFF_PX = 3.0, 0.03  # what a part changes by, over the point's standard deviation and px: rejected
+_AT_ONCE = 256
+
+
+def reject_straddling(
+    fitter: Fitter,
+    points: PointFits,
+    *,
+    shape: tuple[int, int],
+    xy_px: Float,
+    rays: Float,
+    texture: Float,
+    spacing_px: float,
+    noise_factor: float = 1.0,
+    cancel: CancelToken | None = None,
+) -> int:
+    """Reject points, NEIGHBOUR_MISMATCH, of which a part of the subset is off; return their number.
+
+    Points whose match a part changes by less get that change added to their standard deviation.
+
+    Parameters
+    ----------
+    fitter, points
+        The matcher, and n = rows x columns points with their tested covariances, changed in place.
+    shape
+        Rows and columns.
+    xy_px, rays
+        (n, 2) px of camera 1, and (n, 3) normalised.
+    texture
+        (n,) grey-level variance of camera 1's subset.
+    spacing_px
+        Distance of neighbouring points.
+    noise_factor
+        Variance of a usual point's match over that by white noise.
+    cancel
+        Stops the work.
+    """
+    index = np.flatnonzero(_suspects(fitter, points, shape, rays, texture, spacing_px) & points.ok)
+    rejected = 0
+    for start in range(0, len(index), _AT_ONCE):
+        raise_if_cancelled(cancel)
+        some = index[start : start + _AT_ONCE]
+        bad = np.zeros(len(points.status), bool)
+        bad[some] = _pulled(fitter, points, some, xy_px, rays, max(noise_factor, 1.0))
+        points.reject(bad, PointStatus.NEIGHBOUR_MISMATCH)
+        rejected += int(bad.sum())
+    return rejected
+
+
+def _suspects(
+    fitter: Fitter, points: PointFits, shape: tuple[int, int], rays: Float, texture: Float, spacing_px: float
+) -> Bool:
+    """Return (n,) True beside gaps, where shape or motion bends or jumps, and where residuals are unusual."""
+    ok = points.ok
+    if ok.sum() < _FEW:
+        return ok
+    subset = fitter.options.subset_px
+    about = np.ones((2 * int(np.ceil(0.5 * subset / spacing_px)) + 3,) * 2, np.uint8)
+    # a gap of a single point is noise's
+    gaps = cv2.morphologyEx((~ok).astype(np.uint8).reshape(shape), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    out = cv2.dilate(gaps, about).ravel() > 0
+    out |= _beside_edges(fitter, points, shape, rays, spacing_px)
+    reach = _WIDER * reach_of(subset, spacing_px)
+    for k in range(points.zncc.shape[1]):
+        energy = np.log(np.where(ok, np.maximum((1.0 - points.zncc[:, k]) * texture, 1e-9), 1.0))
+        # what pulls at many points in a row raises their middle: those that lose least are the measure
+        quarter, tenth = (
+            block_medians(energy, ok, shape, reach, otherwise=float(np.quantile(energy[ok], q)), quantile=q)
+            for q in (0.25, 0.1)
+        )
+        scatter = np.maximum((quarter - tenth) / (SIGMAS_OF_TENTH - SIGMAS_OF_QUARTER), 0.0)
+        out |= energy - quarter > (_LOUDER + SIGMAS_OF_QUARTER) * scatter
+    return np.asarray(out)
+
+
+def _beside_edges(fitter: Fitter, points: PointFits, shape: tuple[int, int], rays: Float, spacing_px: float) -> Bool:
+    """Return (n,) True within a subset of where the shape or the motion between two points is not that of one surface.
+
+    On a surface that bends evenly what changes between two points changes by the mean of their slopes.
+    """
+    rows, cols = shape
+    ok = points.ok.reshape(shape)
+    flagged = np.zeros(shape, np.uint8)
+    valid = np.flatnonzero(points.ok)
+    if len(valid) < _MIN_PAIRS:
+        return flagged.ravel() > 0
+    ray = rays[:, :2].reshape(rows, cols, 2)
+    quantities = [_per_px(values, scale, valid, shape) for values, scale in _quantities(fitter, points, rays, valid)]
+    subset = fitter.options.subset_px
+    for reach in sorted({max(1, round(f * subset / spacing_px)) for f in (0.5, 1.0)}):
+        for dr, dc in ((0, reach), (reach, 0), (reach, reach), (reach, -reach)):
+            if dr >= rows or abs(dc) >= cols:
+                continue
+            here = (slice(0, rows - dr), slice(max(-dc, 0), cols - max(dc, 0)))
+            there = (slice(dr, rows), slice(max(dc, 0), cols + min(dc, 0)))
+            both = ok[here] & ok[there]
+            if both.sum() < _MIN_PAIRS:
+                continue
+            step = (ray[there] - ray[here])[both]
+            for level, slope, per_px in quantities:
+                mean = 0.5 * (slope[there] + slope[here])[both]
+                off = (level[there][both] - level[here][both] - (mean * step).sum(axis=1)) / per_px[here][both]
+                some = off[spread_indices(len(off), _PAIRS)] if len(off) > _PAIRS else off
+                middle = float(np.median(some))
+                sigma = MAD_TO_SIGMA * float(np.median(np.abs(some - middle)))
+                bad = np.flatnonzero(np.abs(off - middle) > _FLOOR_PX + _SIGMAS * sigma)
+                if len(bad):
+                    r, c = (k[bad] for k in np.nonzero(both))
+                    flagged[r + (dr + 1) // 2, c + max(-dc, 0) + dc // 2] = 1
+    if not flagged.any():
+        return flagged.ravel() > 0
+    width = 2 * int(np.ceil(subset / spacing_px)) + 1
+    return np.asarray(cv2.dilate(flagged, np.ones((width, width), np.uint8))).ravel() > 0
+
+
+def _quantities(fitter: Fitter, points: PointFits, rays: Float, valid: NDArray[np.intp]) -> list[tuple[Float, Float]]:
+    """Value and slopes (m, 3) of what must be smooth, and what a pixel of camera 2's or 1's image is of it (m,)."""
+    w = points.w[valid]
+    per_px = depth_per_px(fitter.pair, rays[valid], w[:, 0])
+    if fitter.comparisons == 1:
+        return [(w[:, :3], per_px)]
+    G = points.G[valid]
+    depth = G[:, 2, 0]
+    one_px = 1.0 / np.sqrt(np.abs(np.linalg.det(fitter.pair.cam1.lens.image_jacobian(rays[valid, :2]))))
+    place = [(G[:, k, :3] - (G[:, k, :1] / depth[:, None]) * G[:, 2, :3]) / depth[:, None] for k in (0, 1)]
+    for k in (0, 1):
+        place[k][:, 0] = G[:, k, 0] / depth
+    now = w[:, :3] / depth[:, None] - (w[:, :1] / depth[:, None] ** 2) * G[:, 2, :3]
+    now[:, 0] = w[:, 0] / depth
+    return [(place[0], one_px), (place[1], one_px), (now, per_px / depth)]
+
+
+def _per_px(values: Float, scale: Float, valid: NDArray[np.intp], shape: tuple[int, int]) -> tuple[Float, Float, Float]:
+    out = np.full((shape[0] * shape[1], 4), np.nan)
+    out[valid, :3], out[valid, 3] = values, scale
+    grid = out.reshape(*shape, 4)
+    return grid[..., 0], grid[..., 1:3], grid[..., 3]
+
+
+def _pulled(
+    fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, rays: Float, noise_factor: float
+) -> Bool:
+    """Return (m,) True where a part of the subset is off by too much; what others change goes into the covariance."""
+    found, visible = subset_residuals(fitter, points, index, xy_px)
+    degree = 2 if fitter.terms == 6 else 1
+    pulls = [pull_of_parts(one, visible, degree) for one in found]
+    unit = _unit_px(fitter, points, index, rays)
+    covariance = points.covariance[index]
+    bad = np.zeros(len(index), bool)
+    for unknown, pull, direction, before in _compared(pulls):
+        sd = np.sqrt(covariance[:, unknown, unknown]) * unit[:, unknown]
+        # residuals that are correlated everywhere, as those of blur, are no single part's
+        correlated = np.clip((sd / pull.sigma_px[:, direction]) ** 2, noise_factor, _MOST_CORRELATED)
+        shift = _change(pull, direction, before)
+        sure, far = pull.significance[:, direction] / _PART_SIGMAS, np.abs(shift) > _FAR_SIGMAS * sd
+        shift = np.where((sure > np.sqrt(correlated)) | ((sure > np.sqrt(noise_factor)) & far), shift, 0.0)
+        bad |= np.abs(shift) > np.maximum(_OFF_SIGMAS * sd, _OFF_PX)
+        points.covariance[index, unknown, unknown] += (shift / unit[:, unknown]) ** 2
+    points.epipolar_sigma_px[index] = np.sqrt(points.covariance[index, -1, -1])
+    for pull in pulls[-2:]:
+        bad |= pull.other_centre
+    return bad
+
+
+def _compared(pulls: list[Pull]) -> list[tuple[int, Pull, int, Pull | None]]:
+    """Unknown, comparison, direction there, and the comparison whose change does not count."""
+    if len(pulls) == 1:
+        return [(0, pulls[0], 0, None), (1, pulls[0], 1, None)]
+    shape, camera1, camera2 = pulls
+    return [(1, camera1, 0, None), (2, camera1, 1, None), (3, camera2, 0, shape)]
+
+
+def _change(pull: Pull, direction: int, before: Pull | None) -> Float:
+    """(m,) px by which the most significant part changes the match."""
+    part = pull.part[:, direction, None]
+    shift = np.take_along_axis(pull.shift_px[:, direction], part, axis=1)[:, 0]
+    if before is not None:  # what camera 2 shows at both times is the shape's
+        shift = shift - np.take_along_axis(before.shift_px[:, direction], part, axis=1)[:, 0]
+    return np.asarray(shift)
+
+
+def _unit_px(fitter: Fitter, points: PointFits, index: NDArray[np.intp], rays: Float) -> Float:
+    """(m, q) px that a unit of each unknown moves an image by."""
+    w0 = points.w[index, 0]
+    per_px = depth_per_px(fitter.pair, rays[index], w0)
+    out = np.ones((len(index), points.covariance.shape[-1]))
+    out[:, 0] = 1.0 / per_px
+    if fitter.comparisons == 3:
+        z = points.G[index, 2, 0]
+        px = np.sqrt(np.abs(np.linalg.det(fitter.pair.cam1.lens.image_jacobian(rays[index, :2]))))
+        out[:, 1] = out[:, 2] = px / z
+        out[:, 3] = w0 / z**2 / per_px
+    return out
