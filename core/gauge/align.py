@@ -272,13 +272,17 @@ def aligned(field: Field, alignment: Alignment) -> Field:
     R = alignment.rotation
     n = field.covariance.shape[-1] // 3
     J = np.kron(np.eye(n), R)
+    covariance = J @ field.covariance @ J.T
+    k = np.arange(covariance.shape[-1])
+    # a point known along a direction exactly is given a variance of -1e-20 there by rounding
+    covariance[..., k, k] = np.maximum(covariance[..., k, k], 0.0)
     return replace(
         field,
         xyz_mm=(field.xyz_mm - alignment.origin_mm) @ R.T,
         normal_sys=field.normal_sys @ R.T,
         uvw_mm=None if field.uvw_mm is None else field.uvw_mm @ R.T,
         rotation_rad=None if field.rotation_rad is None else field.rotation_rad @ R.T,
-        covariance=J @ field.covariance @ J.T,
+        covariance=covariance,
         common=None if field.common is None else J @ field.common,
         frozen=None if field.frozen is None else R @ field.frozen @ R.T,
         starts=None,

@@ -15,6 +15,7 @@ from core.errors import InputError, StorageError
 from core.field.region.cuts import Cuts
 from server.base.errors import NotFoundError
 from server.formats.figure import Picture, PictureForm, draw, draw_pixels, scale_of
+from server.formats.figure_axes import directions_of
 from server.formats.figure_options import FigureStyle
 from server.formats.files import write_bytes, written_temporary
 from server.formats.images import read_image
@@ -56,6 +57,7 @@ def picture_of(step: StepResult, name: str, source: Source, image: NDArray[np.ge
     label = f" ({step.label})" if step.label else ""
     cuts: Cuts | None = step.cuts
     return Picture(
+        axes=directions_of(*(columns[at].values for at in ("x_px", "y_px", "x_mm", "y_mm"))),
         values=variable.values,
         x_px=columns["x_px"].values,
         y_px=columns["y_px"].values,

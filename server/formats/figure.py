@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from core.arrays import Float
 from core.field.region.cuts import Cuts
+from server.formats.figure_axes import Directions, draw_axes
 from server.formats.figure_options import FigureStyle
 
 PictureForm = Literal["png", "svg"]
@@ -62,6 +63,8 @@ class Picture:
         Cracks and borders of holes.
     flags
         Name of each value, for a map of states.
+    axes
+        Where X and Y point in the image; drawn into a corner.
     """
 
     values: NDArray[Any]
@@ -75,6 +78,7 @@ class Picture:
     image: NDArray[Any] | None = None
     cuts: Cuts | None = None
     flags: Mapping[int, str] | None = None
+    axes: Directions | None = None
 
 
 def scale_of(values: NDArray[Any], style: FigureStyle) -> tuple[float, float] | None:
@@ -154,6 +158,8 @@ def _figure(picture: Picture, style: FigureStyle) -> Figure:
     drawn, ticks = _draw_map(axis, picture, style)
     for line in picture.cuts.lines_px if picture.cuts else ():
         axis.plot(line[:, 0], line[:, 1], "-", color="black", linewidth=1.0)
+    if picture.axes is not None:
+        draw_axes(axis, picture.axes)
     axis.set_xlabel("x, px of camera 1", fontsize=_SMALL)
     axis.set_ylabel("y, px", fontsize=_SMALL)
     axis.tick_params(labelsize=_SMALL - 1)

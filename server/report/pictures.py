@@ -19,6 +19,7 @@ from core.field.region.cuts import Cuts
 from core.status import PointStatus
 from core.strain import StrainField
 from server.formats.figure import Picture, draw
+from server.formats.figure_axes import directions_of
 from server.formats.figure_options import FigureStyle
 
 #: by name, values and their standard deviations
@@ -58,7 +59,9 @@ def field_map(
     """Draw a length or strain over the points; PNG."""
     factor, units = unit or unit_for(values, strain=strain)
     shown = np.where(field.valid, factor * values, np.nan)
-    return _cropped(draw(Picture(shown, field.x_px, field.y_px, name, units, title, cuts=field.cuts), _HALF, "png"))
+    axes = directions_of(field.x_px, field.y_px, field.xyz_mm[..., 0], field.xyz_mm[..., 1])
+    picture = Picture(shown, field.x_px, field.y_px, name, units, title, cuts=field.cuts, axes=axes)
+    return _cropped(draw(picture, _HALF, "png"))
 
 
 def status_map(field: Field, title: str) -> bytes:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import netCDF4
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from core.arrays import Float
 from core.errors import InputError, RegionError
+from core.gauge.align import align_given, aligned
 from core.strain import StrainOptions, surface_strain
 from server.formats.results.reading import read_field, read_head
 from server.formats.results.strain import read_strain
@@ -133,3 +136,17 @@ def test_a_step_in_a_frame_is_made_once(files: list[Path], tmp_path: Path) -> No
     assert mean_strain(first) == pytest.approx([LATERAL, TENSION, 0.0], abs=TOLERANCE)
     other = kept.file(files, PlaneAlignment(kind="plane"))
     assert other != first
+
+
+def test_a_variance_that_vanishes_stays_zero_and_turns_no_sigma_into_nothing() -> None:
+    field = make_field(None, shape=shape)
+    ray = np.array([0.3, -0.1, 0.95])
+    field = replace(field, covariance=np.broadcast_to(1e-6 * np.outer(ray, ray), (*field.shape, 3, 3)).copy())
+    for degrees in range(0, 360, 7):
+        R = Rotation.from_euler("xyz", [degrees, 2 * degrees, 5.0], degrees=True).as_matrix()
+        assert np.isfinite(aligned(field, align_given(R, [0.0, 0.0, 0.0])).sigma_mm).all()
+    # the axes' own first row along the ray: nothing is left across it
+    across = np.linalg.svd(ray[None])[2]
+    across[0] *= np.sign(np.linalg.det(across))
+    sigma = aligned(field, align_given(across, [0.0, 0.0, 0.0])).sigma_mm
+    assert np.nanmax(sigma[..., 1:]) < 1e-9
