@@ -16,6 +16,7 @@ from core.calibration.fit.layout import camera_of
 from core.calibration.fit.named import named_by_cause, named_derivatives, parameter_names
 from core.calibration.fit.problem import started
 from core.calibration.prepare import covariance_parts_at, problem_of
+from core.cameras.camera import TEN_PARAMETER_NAMES, Camera
 from core.cameras.stereo import StereoPair
 from core.common.budget import budget_of, budget_of_difference
 from core.common.derivatives import Estimator, measured_derivatives
@@ -26,6 +27,7 @@ from core.gauge.area import area_statistics
 from core.gauge.extensometer import extensometer
 from core.gauge.reading import difference
 from core.gauge.rigid import rigid_motion, without_rigid_motion
+from core.measure import MeasureOptions, ReferencePair
 from core.names import BUDGET, CAMERAS, CAUSES
 from core.target import GridTarget
 from server.formats.results.reading import read_field
@@ -34,7 +36,7 @@ from tests.accuracy.test_common_part import SHARED, measured_numerically, moved_
 from tests.bench.accuracy.coverage import Grid
 from tests.support.calibrated_volume import covariance
 from tests.support.calibration_rigs import LENSES, Array, flat, observed, ordinary_pair
-from tests.support.field_bench import pair
+from tests.support.field_bench import grid, pair, take
 from tests.support.gauge_field import SUBSET
 
 NOISE_PX, POSITIONS, LINES, PITCH_MM = 0.01, (0.0, 10.0, 20.0), (6, 6), 28.0
@@ -270,3 +272,71 @@ def test_a_field_gets_its_factor_and_the_references_share_of_its_noise() -> None
     none = with_common_parts(field, None, pair())
     assert none.common is None
     assert none.frozen is not None
+
+
+def measured_field(reference: Any, now: Any, points: Any, options: MeasureOptions) -> Any:
+    """A displacement by the measurement, from rendered images."""
+    first = ReferencePair(pair(), *reference)
+    return first.motion(*now, points, options, shape=first.shape(points, options))
+
+
+@pytest.mark.deep
+def test_rendered_steps_scatter_by_their_new_noise_about_one_reference_pair() -> None:
+    points = grid(spacing_px=20.0)
+    options = MeasureOptions(subset_px=21)
+    motion = (0.2, 0.1, 0.3, 0.0, 0.0, 0.0)
+    now = [take("block", 1.0, motion, seed=100 + k) for k in range(12)]
+    once = take("block", seed=1)
+    about_one = [measured_field(once, images, points, options) for images in now]
+    about_many = [measured_field(take("block", seed=200 + k), images, points, options) for k, images in enumerate(now)]
+    ok = np.all([f.valid for f in about_one + about_many], axis=0)
+    new, every = (np.stack([f.uvw_mm[ok] for f in fields]).std(axis=0, ddof=1) for fields in (about_one, about_many))
+    told = with_common_parts(about_one[0], None, pair())
+    assert told.frozen is not None
+    own = np.diagonal(told.covariance[ok][:, 3:, 3:], axis1=1, axis2=2)
+    frozen = np.diagonal(told.frozen[ok], axis1=1, axis2=2)
+    # 12 draws at some hundred points, which share few pixels, know a share to some per cent
+    for k in range(3):
+        seen = float(np.sqrt(np.mean(new[:, k] ** 2) / np.mean(every[:, k] ** 2)))
+        stated = float(np.sqrt(1.0 - frozen[:, k].mean() / own[:, k].mean()))
+        assert seen == pytest.approx(stated, rel=0.1)
+
+
+@pytest.mark.deep
+def test_the_joint_covariance_of_20_points_has_the_eigenvalues_of_sampled_ones() -> None:
+    rng = np.random.default_rng(20)
+    rig, noise, draws = pair(), 0.001, 1500
+    before = np.column_stack([rng.uniform(-5.0, 5.0, (20, 2)), rng.uniform(-0.5, 0.5, 20)])
+    current = before + np.array([0.3, -0.2, 0.8])
+    source = ParameterCovariance(rig, COVARIANCE_NAMES, covariance())
+    found = factor_of(source, before, current)
+    at = Estimator.at(rig, before, current)
+    own = at.by_match @ (noise**2 * np.kron(np.eye(3) + 1.0, np.eye(2))) @ np.swapaxes(at.by_match, 1, 2)  # type: ignore[operator]
+    F = found.values[:, 3:].reshape(60, -1)
+    stated = F @ F.T
+    for k in range(20):
+        stated[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += own[k]
+    seen = [[c.project(p).xy for c in (rig.cam1, rig.cam2)] for p in (before, current)]
+    nominal = [camera.paper_parameters() for camera in (rig.cam1, rig.cam2)]
+    got = []
+    for change in rng.multivariate_normal(np.zeros(20), source.covariance, draws):
+        cameras = [
+            Camera.from_paper(
+                **{**values, **{n: values[n] + d for n, d in zip(TEN_PARAMETER_NAMES, part, strict=True)}}
+            )
+            for values, part in zip(nominal, np.split(change, 2), strict=True)
+        ]
+        n = noise * rng.standard_normal((4, 20, 2))  # the reference subset's, camera 2's at t0, both at t
+        noisy = [seen[0][0], seen[0][1] + n[1] - n[0]], [seen[1][0] + n[2] - n[0], seen[1][1] + n[3] - n[0]]
+        got.append(measured_numerically(StereoPair(*cameras), *noisy, before, current)[:, 3:].ravel())
+    sampled = np.cov(np.asarray(got).T)
+    value, vector = np.linalg.eigh(stated)
+    assert np.linalg.norm(F) ** 2 > 0.3 * np.trace(stated)
+    # along the stated axes: 1,500 draws know each variance to 3.7 %
+    ratio = np.einsum("ij,ik,kj->j", vector, sampled, vector) / value
+    assert np.abs(np.mean(ratio) - 1.0) < 0.03
+    assert np.abs(ratio - 1.0).max() < 0.15
+    # eigenvalues of samples spread by themselves: beside those of as many draws of the stated covariance
+    root = np.linalg.cholesky(stated)
+    alike = [np.linalg.eigvalsh(np.cov(root @ rng.standard_normal((60, draws)))) for _ in range(8)]
+    np.testing.assert_allclose(np.linalg.eigvalsh(sampled) / np.mean(alike, axis=0), 1.0, atol=0.1)
