@@ -346,6 +346,23 @@ def test_noise_floor_is_that_of_the_static_steps(page: Page, plate: Measurement)
     assert "1, 2, 3" in page.texts["noise-floor"]
 
 
+def test_uncertainty_has_a_sentence_to_quote_and_a_budget(page: Page, plate: Measurement) -> None:
+    sentence = page.texts["uncertainty-sentence"]
+    for part in ("k = 1", "normal", "exact perspective", "common factor", "Not included: systematic terms"):
+        assert part in sentence
+    assert "calibration not included" not in sentence.lower()
+    with xarray.open_dataset(plate.folder / "step_0005.nc") as data:
+        sigma, F = float(data["sigma_w_mm"].median()), data["common_factor"].values.astype(float)
+    _, _, matching, reference, calibration, stage, target, total = page.rows["budget.W"].numbers
+    assert total == pytest.approx(1e3 * sigma, rel=1e-3)
+    parts = [part or 0.0 for part in (matching, reference, calibration, stage, target)]
+    assert np.sum(np.square(parts)) == pytest.approx((total or 0.0) ** 2, rel=0.1)  # medians of each
+    common = 1e3 * float(np.nanmedian(np.linalg.norm(F[..., 5, :], axis=-1)))
+    assert np.sqrt(np.sum(np.square(parts[2:]))) == pytest.approx(common, rel=0.1)
+    assert page.rows["budget.ax<i>al.strain"].numbers[7] is not None
+    assert "includes matching, reference, calibration" in page.texts["histories"]
+
+
 def test_noise_of_the_images_is_the_sensors(page: Page) -> None:
     noise = tomllib.loads(SMALL)["sim"]["noise"]
     # electrons to grey levels of 8 bit, at half of full scale, with the rounding to whole grey levels
@@ -570,6 +587,9 @@ def test_results_of_files_without_a_rig(plate: Measurement, tmp_path: Path) -> N
         assert name in missing, missing
     assert any(name.startswith("Calibration checks") for name in missing)
     assert len(page.pictures()) >= 7
+    assert "Calibration not included" in page.texts["uncertainty-sentence"]
+    assert page.rows["budget.W"].cells[4:7] == ["not included"] * 3  # never zero
+    assert "calibration not included" in page.texts["steps"]
     # without calibration and images, what needs them is missing and the rest is reported
     for path in [*tmp_path.glob("cam*.tif"), tmp_path / "calibration.json"]:
         path.unlink()

@@ -265,6 +265,9 @@ class GaugeStep(Reply):
     extensometers: list[ExtensometerReading] = Field(default_factory=list, description="Lengths, elongations, strains.")
     lines: list[LineReading] = Field(default_factory=list, description="Values along lines; null where missing.")
     areas: list[AreaReading] = Field(default_factory=list, description="Statistics, with the mean's uncertainty.")
+    not_told: list[str] = Field(
+        default_factory=list, description="What the budgets do not tell apart, and what they do not include."
+    )
     problem: JobProblem | None = Field(None, description="Problem that left the step without readings.")
 
 
