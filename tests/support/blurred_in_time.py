@@ -45,15 +45,15 @@ class BlurredPlate:
     """A tilted plate that is turned, strained and moved; at t both cameras are out of focus."""
 
     texture: Texture
-    size: tuple[int, int] = (512, 416)
-    samples: int = 8
+    size: tuple[int, int] = (640, 512)
+    samples: int = 24
 
     @cached_property
     def _bodies(self) -> tuple[Body, Body]:
         c, s = np.cos(_TILT_RAD), np.sin(_TILT_RAD)
         body = Body(texture=self.texture).moved(np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]), np.zeros(3))
         axis = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])
-        cross = np.cross(np.eye(3), axis).T
+        cross = np.cross(axis, np.eye(3)).T
         turned = np.eye(3) + np.sin(_TURN_RAD) * cross + (1.0 - np.cos(_TURN_RAD)) * cross @ cross
         strained = np.eye(3) + np.array([[1e-3, 3e-4, 0.0], [3e-4, -5e-4, 0.0], [0.0, 0.0, 0.0]])
         return body, body.moved(turned @ strained, np.array([0.083, -0.147, 0.21]))
