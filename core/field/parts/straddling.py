@@ -26,11 +26,11 @@ from core.status import PointStatus
 
 _FLOOR_PX = 0.05
 _SIGMAS = 8.0
-_PAIRS = 4000  # for the scatter of the pairs of one offset
+_PAIRS = 1000  # for the scatter of the pairs of one offset
 _MIN_PAIRS = 12
 _FEW = 12
 _WIDER = 3
-_LOUDER = 4.0  # robust standard deviations of the residuals' energy about a point
+_LOUDER = 4.5  # robust standard deviations of the residuals' energy about a point
 _PART_SIGMAS = 5.0  # of the change without a part; some thirty parts are tried
 _MOST_CORRELATED = 2.0  # variance of a match over that by white residuals, up to which it is no part's doing
 _FAR_SIGMAS = 4.0  # a change beyond what correlated residuals are counted as
@@ -97,11 +97,14 @@ def _suspects(
     out = cv2.dilate(gaps, about).ravel() > 0
     out |= _beside_edges(fitter, points, shape, rays, spacing_px)
     reach = _WIDER * reach_of(subset, spacing_px)
+    every = np.zeros(shape, bool)
+    every[::2, ::2] = True  # enough for a quantile of some subsets' points
+    known = ok & every.ravel()
     for k in range(points.zncc.shape[1]):
         energy = np.log(np.where(ok, np.maximum((1.0 - points.zncc[:, k]) * texture, 1e-9), 1.0))
         # what pulls at many points in a row raises their middle: those that lose least are the measure
         quarter, tenth = (
-            block_medians(energy, ok, shape, reach, otherwise=float(np.quantile(energy[ok], q)), quantile=q)
+            block_medians(energy, known, shape, reach, otherwise=float(np.quantile(energy[ok], q)), quantile=q)
             for q in (0.25, 0.1)
         )
         scatter = np.maximum((quarter - tenth) / (SIGMAS_OF_TENTH - SIGMAS_OF_QUARTER), 0.0)
@@ -115,7 +118,6 @@ def _beside_edges(fitter: Fitter, points: PointFits, shape: tuple[int, int], ray
     On a surface that bends evenly what changes between two points changes by the mean of their slopes.
     """
     rows, cols = shape
-    ok = points.ok.reshape(shape)
     flagged = np.zeros(shape, np.uint8)
     valid = np.flatnonzero(points.ok)
     if len(valid) < _MIN_PAIRS:
@@ -124,25 +126,24 @@ def _beside_edges(fitter: Fitter, points: PointFits, shape: tuple[int, int], ray
     quantities = [_per_px(values, scale, valid, shape) for values, scale in _quantities(fitter, points, rays, valid)]
     subset = fitter.options.subset_px
     for reach in sorted({max(1, round(f * subset / spacing_px)) for f in (0.5, 1.0)}):
-        for dr, dc in ((0, reach), (reach, 0), (reach, reach), (reach, -reach)):
+        for dr, dc in ((0, reach), (reach, 0), (reach, reach), (reach, -reach))[: 4 if fitter.comparisons == 1 else 2]:
             if dr >= rows or abs(dc) >= cols:
                 continue
             here = (slice(0, rows - dr), slice(max(-dc, 0), cols - max(dc, 0)))
             there = (slice(dr, rows), slice(max(dc, 0), cols + min(dc, 0)))
-            both = ok[here] & ok[there]
-            if both.sum() < _MIN_PAIRS:
-                continue
-            step = (ray[there] - ray[here])[both]
+            step = ray[there] - ray[here]
             for level, slope, per_px in quantities:
-                mean = 0.5 * (slope[there] + slope[here])[both]
-                off = (level[there][both] - level[here][both] - (mean * step).sum(axis=1)) / per_px[here][both]
-                some = off[spread_indices(len(off), _PAIRS)] if len(off) > _PAIRS else off
-                middle = float(np.median(some))
-                sigma = MAD_TO_SIGMA * float(np.median(np.abs(some - middle)))
-                bad = np.flatnonzero(np.abs(off - middle) > _FLOOR_PX + _SIGMAS * sigma)
-                if len(bad):
-                    r, c = (k[bad] for k in np.nonzero(both))
-                    flagged[r + (dr + 1) // 2, c + max(-dc, 0) + dc // 2] = 1
+                mean = 0.5 * (slope[there] + slope[here])
+                off = (level[there] - level[here] - (mean * step).sum(axis=-1)) / per_px[here]
+                known = off.ravel()[spread_indices(off.size, _PAIRS)]
+                known = known[np.isfinite(known)]
+                if len(known) < _MIN_PAIRS:
+                    continue
+                middle = float(np.median(known))
+                sigma = MAD_TO_SIGMA * float(np.median(np.abs(known - middle)))
+                with np.errstate(invalid="ignore"):
+                    r, c = np.nonzero(np.abs(off - middle) > _FLOOR_PX + _SIGMAS * sigma)
+                flagged[r + (dr + 1) // 2, c + max(-dc, 0) + dc // 2] = 1
     if not flagged.any():
         return flagged.ravel() > 0
     width = 2 * int(np.ceil(subset / spacing_px)) + 1
