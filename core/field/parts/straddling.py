@@ -32,6 +32,7 @@ _FEW = 12
 _WIDER = 3
 _LOUDER = 4.5  # robust standard deviations of the residuals' energy about a point
 _PART_SIGMAS = 5.0  # of the change without a part; some thirty parts are tried
+_EDGE_SIGMAS = 4.0  # the same where the shape shows an edge, so that a part's pull is to be expected
 _MOST_CORRELATED = 2.0  # variance of a match over that by white residuals, up to which it is no part's doing
 _FAR_SIGMAS = 4.0  # a change beyond what correlated residuals are counted as
 _OFF_SIGMAS, _OFF_PX = 3.0, 0.03  # what a part changes by, over the point's standard deviation and px: rejected
@@ -71,22 +72,22 @@ def reject_straddling(
     cancel
         Stops the work.
     """
-    index = np.flatnonzero(_suspects(fitter, points, shape, rays, texture, spacing_px) & points.ok)
+    edges = _beside_edges(fitter, points, shape, rays, spacing_px)
+    index = np.flatnonzero((edges | _suspects(fitter, points, shape, texture, spacing_px)) & points.ok)
+    least = np.where(edges, _EDGE_SIGMAS, _PART_SIGMAS)
     rejected = 0
     for start in range(0, len(index), _AT_ONCE):
         raise_if_cancelled(cancel)
         some = index[start : start + _AT_ONCE]
         bad = np.zeros(len(points.status), bool)
-        bad[some] = _pulled(fitter, points, some, xy_px, rays, max(noise_factor, 1.0))
+        bad[some] = _pulled(fitter, points, some, xy_px, rays, least[some], max(noise_factor, 1.0))
         points.reject(bad, PointStatus.NEIGHBOUR_MISMATCH)
         rejected += int(bad.sum())
     return rejected
 
 
-def _suspects(
-    fitter: Fitter, points: PointFits, shape: tuple[int, int], rays: Float, texture: Float, spacing_px: float
-) -> Bool:
-    """Return (n,) True beside gaps, where shape or motion bends or jumps, and where residuals are unusual."""
+def _suspects(fitter: Fitter, points: PointFits, shape: tuple[int, int], texture: Float, spacing_px: float) -> Bool:
+    """Return (n,) True beside gaps, and where residuals are unusual."""
     ok = points.ok
     if ok.sum() < _FEW:
         return ok
@@ -95,7 +96,6 @@ def _suspects(
     # a gap of a single point is noise's
     gaps = cv2.morphologyEx((~ok).astype(np.uint8).reshape(shape), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     out = cv2.dilate(gaps, about).ravel() > 0
-    out |= _beside_edges(fitter, points, shape, rays, spacing_px)
     reach = _WIDER * reach_of(subset, spacing_px)
     every = np.zeros(shape, bool)
     every[::2, ::2] = True  # enough for a quantile of some subsets' points
@@ -175,7 +175,13 @@ def _per_px(values: Float, scale: Float, valid: NDArray[np.intp], shape: tuple[i
 
 
 def _pulled(
-    fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, rays: Float, noise_factor: float
+    fitter: Fitter,
+    points: PointFits,
+    index: NDArray[np.intp],
+    xy_px: Float,
+    rays: Float,
+    least: Float,
+    noise_factor: float,
 ) -> Bool:
     """Return (m,) True where a part of the subset is off by too much; what others change goes into the covariance."""
     found, visible = subset_residuals(fitter, points, index, xy_px)
@@ -189,7 +195,7 @@ def _pulled(
         # residuals that are correlated everywhere, as those of blur, are no single part's
         correlated = np.clip((sd / pull.sigma_px[:, direction]) ** 2, noise_factor, _MOST_CORRELATED)
         shift = _change(pull, direction, before)
-        sure, far = pull.significance[:, direction] / _PART_SIGMAS, np.abs(shift) > _FAR_SIGMAS * sd
+        sure, far = pull.significance[:, direction] / least, np.abs(shift) > _FAR_SIGMAS * sd
         shift = np.where((sure > np.sqrt(correlated)) | ((sure > np.sqrt(noise_factor)) & far), shift, 0.0)
         bad |= np.abs(shift) > np.maximum(_OFF_SIGMAS * sd, _OFF_PX)
         points.covariance[index, unknown, unknown] += (shift / unit[:, unknown]) ** 2
