@@ -19,7 +19,7 @@ CENTRE = 1.0 / 3.0
 _NOISE = 4.0  # variances of the noise: what a plain centre shows at most
 _TEXTURE = 0.02  # of the subset's variance
 _WINDOW_PX = 5  # of the variance about a pixel
-_RIM_PX = _WINDOW_PX // 2 + 1  # by which the plain area seems smaller than it is
+_RIM_PX = _WINDOW_PX // 2 + 2  # by which the plain area seems smaller than it is
 
 
 def centre_px(subset_px: int) -> int:

@@ -26,12 +26,13 @@ from core.status import PointStatus
 
 _FLOOR_PX = 0.05
 _SIGMAS = 8.0
-_PAIRS = 4000  # for the scatter of the pairs of one offset
+_PAIRS = 1000  # for the scatter of the pairs of one offset
 _MIN_PAIRS = 12
 _FEW = 12
 _WIDER = 3
-_LOUDER = 4.0  # robust standard deviations of the residuals' energy about a point
+_LOUDER = 4.5  # robust standard deviations of the residuals' energy about a point
 _PART_SIGMAS = 5.0  # of the change without a part; some thirty parts are tried
+_EDGE_SIGMAS = 4.0  # the same where the shape shows an edge, so that a part's pull is to be expected
 _MOST_CORRELATED = 2.0  # variance of a match over that by white residuals, up to which it is no part's doing
 _FAR_SIGMAS = 4.0  # a change beyond what correlated residuals are counted as
 _OFF_SIGMAS, _OFF_PX = 3.0, 0.03  # what a part changes by, over the point's standard deviation and px: rejected
@@ -71,22 +72,22 @@ def reject_straddling(
     cancel
         Stops the work.
     """
-    index = np.flatnonzero(_suspects(fitter, points, shape, rays, texture, spacing_px) & points.ok)
+    edges = _beside_edges(fitter, points, shape, rays, spacing_px)
+    index = np.flatnonzero((edges | _suspects(fitter, points, shape, texture, spacing_px)) & points.ok)
+    least = np.where(edges, _EDGE_SIGMAS, _PART_SIGMAS)
     rejected = 0
     for start in range(0, len(index), _AT_ONCE):
         raise_if_cancelled(cancel)
         some = index[start : start + _AT_ONCE]
         bad = np.zeros(len(points.status), bool)
-        bad[some] = _pulled(fitter, points, some, xy_px, rays, max(noise_factor, 1.0))
+        bad[some] = _pulled(fitter, points, some, xy_px, rays, least[some], max(noise_factor, 1.0))
         points.reject(bad, PointStatus.NEIGHBOUR_MISMATCH)
         rejected += int(bad.sum())
     return rejected
 
 
-def _suspects(
-    fitter: Fitter, points: PointFits, shape: tuple[int, int], rays: Float, texture: Float, spacing_px: float
-) -> Bool:
-    """Return (n,) True beside gaps, where shape or motion bends or jumps, and where residuals are unusual."""
+def _suspects(fitter: Fitter, points: PointFits, shape: tuple[int, int], texture: Float, spacing_px: float) -> Bool:
+    """Return (n,) True beside gaps, and where residuals are unusual."""
     ok = points.ok
     if ok.sum() < _FEW:
         return ok
@@ -95,13 +96,15 @@ def _suspects(
     # a gap of a single point is noise's
     gaps = cv2.morphologyEx((~ok).astype(np.uint8).reshape(shape), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     out = cv2.dilate(gaps, about).ravel() > 0
-    out |= _beside_edges(fitter, points, shape, rays, spacing_px)
     reach = _WIDER * reach_of(subset, spacing_px)
+    every = np.zeros(shape, bool)
+    every[::2, ::2] = True  # enough for a quantile of some subsets' points
+    known = ok & every.ravel()
     for k in range(points.zncc.shape[1]):
         energy = np.log(np.where(ok, np.maximum((1.0 - points.zncc[:, k]) * texture, 1e-9), 1.0))
         # what pulls at many points in a row raises their middle: those that lose least are the measure
         quarter, tenth = (
-            block_medians(energy, ok, shape, reach, otherwise=float(np.quantile(energy[ok], q)), quantile=q)
+            block_medians(energy, known, shape, reach, otherwise=float(np.quantile(energy[ok], q)), quantile=q)
             for q in (0.25, 0.1)
         )
         scatter = np.maximum((quarter - tenth) / (SIGMAS_OF_TENTH - SIGMAS_OF_QUARTER), 0.0)
@@ -115,7 +118,6 @@ def _beside_edges(fitter: Fitter, points: PointFits, shape: tuple[int, int], ray
     On a surface that bends evenly what changes between two points changes by the mean of their slopes.
     """
     rows, cols = shape
-    ok = points.ok.reshape(shape)
     flagged = np.zeros(shape, np.uint8)
     valid = np.flatnonzero(points.ok)
     if len(valid) < _MIN_PAIRS:
@@ -124,25 +126,24 @@ def _beside_edges(fitter: Fitter, points: PointFits, shape: tuple[int, int], ray
     quantities = [_per_px(values, scale, valid, shape) for values, scale in _quantities(fitter, points, rays, valid)]
     subset = fitter.options.subset_px
     for reach in sorted({max(1, round(f * subset / spacing_px)) for f in (0.5, 1.0)}):
-        for dr, dc in ((0, reach), (reach, 0), (reach, reach), (reach, -reach)):
+        for dr, dc in ((0, reach), (reach, 0), (reach, reach), (reach, -reach))[: 4 if fitter.comparisons == 1 else 2]:
             if dr >= rows or abs(dc) >= cols:
                 continue
             here = (slice(0, rows - dr), slice(max(-dc, 0), cols - max(dc, 0)))
             there = (slice(dr, rows), slice(max(dc, 0), cols + min(dc, 0)))
-            both = ok[here] & ok[there]
-            if both.sum() < _MIN_PAIRS:
-                continue
-            step = (ray[there] - ray[here])[both]
+            step = ray[there] - ray[here]
             for level, slope, per_px in quantities:
-                mean = 0.5 * (slope[there] + slope[here])[both]
-                off = (level[there][both] - level[here][both] - (mean * step).sum(axis=1)) / per_px[here][both]
-                some = off[spread_indices(len(off), _PAIRS)] if len(off) > _PAIRS else off
-                middle = float(np.median(some))
-                sigma = MAD_TO_SIGMA * float(np.median(np.abs(some - middle)))
-                bad = np.flatnonzero(np.abs(off - middle) > _FLOOR_PX + _SIGMAS * sigma)
-                if len(bad):
-                    r, c = (k[bad] for k in np.nonzero(both))
-                    flagged[r + (dr + 1) // 2, c + max(-dc, 0) + dc // 2] = 1
+                mean = 0.5 * (slope[there] + slope[here])
+                off = (level[there] - level[here] - (mean * step).sum(axis=-1)) / per_px[here]
+                known = off.ravel()[spread_indices(off.size, _PAIRS)]
+                known = known[np.isfinite(known)]
+                if len(known) < _MIN_PAIRS:
+                    continue
+                middle = float(np.median(known))
+                sigma = MAD_TO_SIGMA * float(np.median(np.abs(known - middle)))
+                with np.errstate(invalid="ignore"):
+                    r, c = np.nonzero(np.abs(off - middle) > _FLOOR_PX + _SIGMAS * sigma)
+                flagged[r + (dr + 1) // 2, c + max(-dc, 0) + dc // 2] = 1
     if not flagged.any():
         return flagged.ravel() > 0
     width = 2 * int(np.ceil(subset / spacing_px)) + 1
@@ -174,7 +175,13 @@ def _per_px(values: Float, scale: Float, valid: NDArray[np.intp], shape: tuple[i
 
 
 def _pulled(
-    fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, rays: Float, noise_factor: float
+    fitter: Fitter,
+    points: PointFits,
+    index: NDArray[np.intp],
+    xy_px: Float,
+    rays: Float,
+    least: Float,
+    noise_factor: float,
 ) -> Bool:
     """Return (m,) True where a part of the subset is off by too much; what others change goes into the covariance."""
     found, visible = subset_residuals(fitter, points, index, xy_px)
@@ -188,7 +195,7 @@ def _pulled(
         # residuals that are correlated everywhere, as those of blur, are no single part's
         correlated = np.clip((sd / pull.sigma_px[:, direction]) ** 2, noise_factor, _MOST_CORRELATED)
         shift = _change(pull, direction, before)
-        sure, far = pull.significance[:, direction] / _PART_SIGMAS, np.abs(shift) > _FAR_SIGMAS * sd
+        sure, far = pull.significance[:, direction] / least, np.abs(shift) > _FAR_SIGMAS * sd
         shift = np.where((sure > np.sqrt(correlated)) | ((sure > np.sqrt(noise_factor)) & far), shift, 0.0)
         bad |= np.abs(shift) > np.maximum(_OFF_SIGMAS * sd, _OFF_PX)
         points.covariance[index, unknown, unknown] += (shift / unit[:, unknown]) ** 2

@@ -20,9 +20,9 @@ _CELLS = 6  # across a subset
 _MOST = 0.6  # of a subset's cells in a part
 _LEAST_SHARE = 0.02  # of the whole's variance: the linear step is no better
 _TINY_VARIANCE = 1.0 / 12.0  # of rounding
-_CENTRE = 1.0 / 6.0  # half of a subset's centre that must be what it seems, over the subset
+_CENTRES = (1.0 / 6.0, 1.0 / 10.0)  # half of a subset's centre that must be what it seems, over the subset
 _CENTRE_LOSS = 0.2  # of the texture's variance
-_CENTRE_TIMES = 1.5  # the whole subset's mean
+_CENTRE_SIGMAS = 5.0  # of the mean square of so many pixels, over the whole subset's
 
 
 class Pull(NamedTuple):
@@ -141,17 +141,16 @@ def _parts() -> NDArray[np.bool_]:
 
 
 def _other_centre(found: SubsetResiduals, visible: Bool) -> Bool:
+    def energy(values: Float, seen: Bool) -> Float:
+        return np.asarray((values**2 * seen).sum(axis=(1, 2)) / np.maximum(seen.sum(axis=(1, 2)), 1))
+
     width = found.residual.shape[1]
-    reach = max(round(_CENTRE * width), 2)
-    middle = slice(width // 2 - reach, width // 2 + reach + 1)
-
-    def energy(values: Float, where: tuple[slice, ...]) -> Float:
-        seen = visible[where]
-        return np.asarray((values[where] ** 2 * seen).sum(axis=(1, 2)) / np.maximum(seen.sum(axis=(1, 2)), 1))
-
-    everywhere = (slice(None),)
-    own = energy(found.residual, (slice(None), middle, middle))
-    least = np.maximum(
-        _CENTRE_LOSS * energy(found.reference, everywhere), _CENTRE_TIMES * energy(found.residual, everywhere)
-    )
-    return np.asarray(own > least)
+    texture, usual = energy(found.reference, visible), energy(found.residual, visible)
+    out = np.zeros(len(texture), bool)
+    for part in _CENTRES:
+        reach = max(round(part * width), 2)
+        middle = (slice(None), *(slice(width // 2 - reach, width // 2 + reach + 1),) * 2)
+        seen = visible[middle]
+        by_chance = 1.0 + _CENTRE_SIGMAS * np.sqrt(2.0 / np.maximum(seen.sum(axis=(1, 2)), 1))
+        out |= energy(found.residual[middle], seen) > np.maximum(_CENTRE_LOSS * texture, by_chance * usual)
+    return out

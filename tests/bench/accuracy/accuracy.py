@@ -17,6 +17,7 @@ import matplotlib as mpl
 mpl.use("Agg")
 
 from tests.bench.accuracy import adversarial as accuracy_adversarial
+from tests.bench.accuracy import adversarial_reliefs as accuracy_adversarial_reliefs
 from tests.bench.accuracy import blur_in_time as accuracy_blur
 from tests.bench.accuracy import bumps as accuracy_bumps
 from tests.bench.accuracy import calibration as accuracy_calibration
@@ -71,6 +72,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "large": accuracy_large.large_motion,
     "updates": sequence.updates,
     "adversarial": accuracy_adversarial.adversarial,
+    **accuracy_adversarial_reliefs.SECTIONS,
     **accuracy_reliefs.SECTIONS,
     "noise-random": accuracy_noise.random_error,
     "noise-mean": accuracy_noise.mean_error,

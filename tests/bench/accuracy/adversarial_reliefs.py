@@ -133,7 +133,7 @@ def cases() -> list[Case]:
         Case("plates before a plate, occluding edges", 27, _plate(*_sheets())),
         Case("holes and a wire in front", 21, _plate(*obstructed)),
         Case("holes and a wire in front", 33, _plate(*obstructed)),
-        Case("gloss", 27, _plate(*_steps(), *_round()[1:]), Optics(samples=8, gloss=1.0, gloss_rad=0.15)),
+        Case("gloss", 27, _plate(*_steps(), *_round()[1:]), Optics(samples=8, gloss=0.5, gloss_rad=0.15)),
         Case("defocus by depth, 0.15 px a mm", 27, _plate(*_steps(), *_ridges(30.0, 45.0, 45.0)[:1]), blurred),
         Case("JPEG of quality 25", 33, _plate(*_ridges(30.0, 45.0, 45.0)), after=lambda p: jpeg(p, 25)),
         Case("sharp discs", 27, _plate(*_steps(), texture=discs)),

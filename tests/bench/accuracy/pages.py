@@ -40,7 +40,7 @@ TOPICS = (
     Topic("long_sequences", "Long sequences", ("updates",)),
     Topic("smoothing", "Smoothing", ("smoothing",)),
     Topic("faces", "Every face of a part", ("faces-plate", "faces-ball", "faces-misfit", "faces-cylinder")),
-    Topic("difficult_images", "Difficult images", ("adversarial",)),
+    Topic("difficult_images", "Difficult images", ("adversarial", "adversarial-reliefs")),
     Topic("experiments", "The paper's experiments, simulated", ("plate", "steel", "panel")),
     Topic("coverage", "Does the uncertainty cover", ("coverage",)),
     Topic("camera_bumps", "A camera that was bumped", ("bumps",)),
