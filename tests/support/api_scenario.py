@@ -328,6 +328,10 @@ def _test(session: Session, calibration: str) -> str:
     }
     call("put_metadata", test, summary="What the guide's tables ask for and no device can say", body=metadata)
     call("get_metadata", test)
+    frame = {"frame": {"kind": "plane", "x_line_px": [[80.0, 120.0], [180.0, 121.5]]}}
+    call("put_test_frame", test, summary="X along a line of two positions", body=frame)
+    call("get_test_frame", test)
+    call("delete_test_frame", test)
     watch = {"channel": "load_n", "threshold": 500.0, "frames": 1}
     call("put_watch", test, summary="A step at each further 500 N", body=watch)
     call("get_watch", test)
