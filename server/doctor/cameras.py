@@ -14,7 +14,7 @@ from drivers.acquisition.sources import common_clock
 from drivers.acquisition.unit import CameraUnit
 from server.config.rig_file import RigConfig
 from server.doctor.report import Notebook, State, percentile
-from server.results.quality import image_quality
+from server.results.images.quality import image_quality
 from server.rig.cameras import CameraPair, CapturedPair
 
 #: relative difference of a setting that is the device's rounding; beyond it the device has another value

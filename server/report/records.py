@@ -39,7 +39,7 @@ class RigRecord(Record):
 
 
 class ImageFigures(Record):
-    """Figures of one camera's image, see :class:`server.results.quality.ImageQuality`."""
+    """Figures of one camera's image, see :class:`server.results.images.quality.ImageQuality`."""
 
     mean_grey: float | None = None
     contrast_grey: float | None = None

@@ -11,7 +11,7 @@ from core.names import CAMERAS
 from server.base.metrics import timed_capture
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import GrayImage, decode, encode_tiff
-from server.results.quality import image_quality, pair_quality
+from server.results.images.quality import image_quality, pair_quality
 from server.rig.cameras import CapturedPair
 from server.store.documents import StepMetadata, StepRecord
 from server.store.folder import now_utc

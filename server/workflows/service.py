@@ -37,7 +37,7 @@ from server.store.trash import Trash
 from server.worker.dask_cluster import ClusterExecutor
 from server.worker.embedded import ComputeWorker, make_worker
 from server.worker.executor import TaskExecutor
-from server.workflows.framed import FramedResults
+from server.workflows.analysis.framed import FramedResults
 
 _log = logging.getLogger("stereorig.service")
 _OPEN_WAIT_S = 5.0

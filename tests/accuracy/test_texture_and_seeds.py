@@ -14,7 +14,7 @@ from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
 from core.field.seeding.seeds import Seed, seeds_of
 from server.formats.results.settings import stored_settings
-from server.results.texture import errors_at, speckle_quality
+from server.results.images.texture import errors_at, speckle_quality
 from tests.support.service_rig import SMALL, new_test, true_cameras
 
 pytestmark = pytest.mark.timeout(180)

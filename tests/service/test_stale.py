@@ -21,8 +21,8 @@ from core.names import CAMERAS
 from server.cli import main
 from server.cli.measurement.measure import SOME_FAILED
 from server.formats.images import write_image
-from server.workflows import analysis_start
-from server.workflows.analysis_run import task_of
+from server.workflows.analysis import start as analysis_start
+from server.workflows.analysis.run import task_of
 from server.workflows.service import Service
 from sim.catalog import make_scene
 from sim.render import RenderOptions, render

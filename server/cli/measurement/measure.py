@@ -36,7 +36,7 @@ from server.compute.seeds import check_positions
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.formats.images import read_mask
 from server.formats.noise_json import load_noise
-from server.results.projected_pattern import check_settings
+from server.results.images.projected_pattern import check_settings
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

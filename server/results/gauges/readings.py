@@ -52,7 +52,7 @@ from server.results.gauges.fields import FieldWriter
 from server.results.gauges.frames import lay, text_of
 from server.results.gauges.request import ExtensometerGauge, GaugeRequest, LineGauge, PointGauge
 from server.results.gauges.variables import STRAIN_NAMES, Variables, component_of
-from server.results.projected_pattern import check_gauges
+from server.results.images.projected_pattern import check_gauges
 from server.results.reader import read_variable
 from server.results.staleness import stale_results
 

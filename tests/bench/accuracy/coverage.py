@@ -99,7 +99,7 @@ def errors(result: CalibrationResult, cameras: tuple[TrueCamera, TrueCamera]) ->
     """Errors of positions, lengths and displacements over the middle of the volume."""
     side = np.linspace(-50.0, 50.0, 5)
     before = np.stack(np.meshgrid(side, side, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
-    source = ParameterCovariance(result.pair, result.names, result.covariance)
+    source = ParameterCovariance(result.pair, result.names, result.covariance, result.covariance_by_cause)
     by: dict[str, tuple[Array, Array]] = {}
     for name, shift in MOTIONS.items():
         current = before + np.array(shift)

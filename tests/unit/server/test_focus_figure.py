@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from server.results.quality import image_quality
+from server.results.images.quality import image_quality
 
 _OVER = 4  # samples a pixel
 _BLURS_PX = (0.0, 0.7, 1.5, 2.5, 4.0)

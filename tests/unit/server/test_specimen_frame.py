@@ -22,7 +22,7 @@ from server.results.gauges.framed import write_framed
 from server.results.gauges.frames import SPECIMEN, frame_asked, frame_of_test
 from server.results.gauges.readings import read_gauges
 from server.results.gauges.request import Alignment, AreaGauge, GaugeRequest, PlaneAlignment, PointGauge
-from server.workflows.framed import FramedResults
+from server.workflows.analysis.framed import FramedResults
 from tests.support.gauge_field import SUBSET, make_field
 from tests.support.tension import LATERAL, SHIFT, SYS_FROM_IMAGE, TENSION, pulled, shape
 

@@ -17,8 +17,8 @@ from server.base.errors import NotFoundError
 from server.base.models import Ids, JobState
 from server.jobs.idempotency import RequestMark
 from server.store.documents import Finished
-from server.workflows import analysis_start
-from server.workflows.analysis_warnings import warnings_of, with_warnings
+from server.workflows.analysis import start as analysis_start
+from server.workflows.analysis.warnings import warnings_of, with_warnings
 from server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}/analyses", tags=["analyses"])

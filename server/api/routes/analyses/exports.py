@@ -21,8 +21,8 @@ from server.exports.request import MEDIA_TYPES, ExportFormat, ExportRequest, ste
 from server.formats.figure_options import COLOURS, WIDTHS_PX, FigureStyle
 from server.results.channels import has_more
 from server.worker.executor import TaskFuture
-from server.workflows import analysis_start
-from server.workflows.framed import results_in_frame
+from server.workflows.analysis import start as analysis_start
+from server.workflows.analysis.framed import results_in_frame
 from server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])

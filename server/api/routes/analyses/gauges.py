@@ -18,7 +18,7 @@ from server.formats.gauges.table import gauges_csv
 from server.results.gauges.fields import FieldWriter
 from server.results.gauges.readings import read_gauges
 from server.results.gauges.request import GaugeRequest
-from server.workflows.framed import asked_of
+from server.workflows.analysis.framed import asked_of
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
 _MATLAB = "application/x-matlab-data"

@@ -22,7 +22,7 @@ from server.compute.seeds import distances_px, epipolar_line
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import decode_mask, read_image
 from server.formats.noise_json import load_noise
-from server.results.texture import speckle_quality
+from server.results.images.texture import speckle_quality
 
 router = APIRouter(prefix="/tests/{test_id}", tags=["analyses"])
 

@@ -14,7 +14,7 @@ from server.api.protocol.dependencies import CalibrationId, Camera, ServiceDep, 
 from server.api.protocol.problems import errors
 from server.base.models import Reply
 from server.formats.images import GrayImage, read_image
-from server.results.previews import MapKind, overlay, preview
+from server.results.images.previews import MapKind, overlay, preview
 from server.workflows.service import Service
 
 router = APIRouter(tags=["previews"])

@@ -17,7 +17,7 @@ from server.api.protocol.problems import errors
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import encode_png, read_image
 from server.formats.results.summary import region_found
-from server.results.found_region import region_to_edit
+from server.results.images.found_region import region_to_edit
 
 router = APIRouter(prefix="/tests/{test_id}", tags=["analyses"])
 

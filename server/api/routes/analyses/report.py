@@ -14,8 +14,8 @@ from server.api.protocol.problems import errors
 from server.api.routes.analyses.exports import finished
 from server.base.errors import NotFoundError
 from server.report.task import NAME, report_task
-from server.workflows import analysis_start
-from server.workflows.framed import asked_of, results_in_frame
+from server.workflows.analysis import start as analysis_start
+from server.workflows.analysis.framed import asked_of, results_in_frame
 from server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])

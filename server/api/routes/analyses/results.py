@@ -24,7 +24,7 @@ from server.results.gauges.frames import text_of
 from server.results.positions import image_positions
 from server.results.reader import list_variables, probe_result, read_cut_pieces
 from server.results.uncertainty import read_interval
-from server.workflows.framed import asked_of, result_in
+from server.workflows.analysis.framed import asked_of, result_in
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
 FieldName = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,63}$", description="Variable of the result file.")]

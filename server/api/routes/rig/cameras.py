@@ -36,7 +36,7 @@ from server.api.protocol.problems import errors
 from server.base.models import Ids
 from server.formats.images import encode_tiff
 from server.jobs.job import Job, Phase
-from server.results.quality import image_quality
+from server.results.images.quality import image_quality
 from server.workflows.calibration.guided import GUIDED_PURPOSE
 from server.workflows.service import Service
 

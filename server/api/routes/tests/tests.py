@@ -38,7 +38,7 @@ from server.jobs.idempotency import RequestMark
 from server.store.documents import StepMetadata
 from server.store.index import step_entry, test_entry
 from server.wording import problems_in
-from server.workflows.analysis_warnings import with_warnings
+from server.workflows.analysis.warnings import with_warnings
 from server.workflows.burst import start_burst
 from server.workflows.capture import capture_step, import_step
 from server.workflows.service import Service

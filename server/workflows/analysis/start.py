@@ -16,11 +16,11 @@ from server.formats.noise_json import load_noise
 from server.formats.version import software_version
 from server.jobs.idempotency import RequestMark
 from server.jobs.job import Job, Phase
-from server.results.projected_pattern import check_settings
+from server.results.images.projected_pattern import check_settings
 from server.results.staleness import stale_inputs
 from server.store.documents import AnalysisRecord
 from server.store.index import analysis_entry
-from server.workflows.analysis_run import AnalysisRun, calibration_changed, close
+from server.workflows.analysis.run import AnalysisRun, calibration_changed, close
 from server.workflows.camera_identity import check_same_cameras
 from server.workflows.service import Service
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from server.results.texture import GOOD_PX, NOISE_SHARE, USABLE_PX, errors_at
+from server.results.images.texture import GOOD_PX, NOISE_SHARE, USABLE_PX, errors_at
 
 MapKind = Literal["saturation", "texture"]
 _TILES_ACROSS = 64

@@ -9,7 +9,7 @@ from core.errors import FileFormatError
 from server.base.errors import NotFoundError
 from server.base.problem import JobProblem
 from server.results.warnings.analysis import analysis_warnings
-from server.workflows.analysis_start import stale_reasons
+from server.workflows.analysis.start import stale_reasons
 from server.workflows.service import Service
 
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from server.results.quality import gradients
+from server.results.images.quality import gradients
 
 #: noise for which errors are reported where it is not known, as a share of full scale: 2.55 grey levels of 255
 NOISE_SHARE = 0.01
