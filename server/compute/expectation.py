@@ -54,11 +54,11 @@ def rig_as_planned(rig: dict[str, Any], planned: PlannedRig) -> dict[str, Any]:
     return out
 
 
-def _stated(values: dict[str, Any]) -> dict[str, Any]:
+def _stated(values: dict[str, object]) -> dict[str, object]:
     return {key: value for key, value in values.items() if value is not None}
 
 
-def expectation_document(rig: dict[str, Any], plan: PlannedCalibration, measured: PlannedMeasurement) -> dict[str, Any]:
+def expectation_document(rig: dict[str, Any], plan: PlannedCalibration, measured: PlannedMeasurement) -> dict[str, object]:
     """Return what a plan may be expected to leave uncertain.
 
     Parameters
@@ -119,7 +119,7 @@ def _line_model(target: AnyTarget, localiser: Localiser) -> LineModel:
     return "parabola"
 
 
-def _calibration_part(found: Expectation) -> dict[str, Any]:
+def _calibration_part(found: Expectation) -> dict[str, object]:
     return {
         "parameters": {n: {"value": v, "sigma": found.sigma[n]} for n, v in found.parameters.items()},
         "points": [

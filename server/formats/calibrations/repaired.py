@@ -96,7 +96,7 @@ def repaired_content(
     return out
 
 
-def repair_section(repair: Repair, limits: RepairLimits) -> dict[str, Any]:
+def repair_section(repair: Repair, limits: RepairLimits) -> dict[str, object]:
     """Return the finding of a repair as plain values."""
     sigma = np.sqrt(np.diagonal(repair.estimate.covariance))
     turn = float(np.degrees(np.linalg.norm(repair.change[:3])))
@@ -122,7 +122,7 @@ def repair_section(repair: Repair, limits: RepairLimits) -> dict[str, Any]:
     }
 
 
-def _by_cause(parts: Mapping[str, Any], matrix: NDArray[np.float64], whole: NDArray[np.float64]) -> dict[str, Any]:
+def _by_cause(parts: Mapping[str, Any], matrix: NDArray[np.float64], whole: NDArray[np.float64]) -> dict[str, object]:
     """Parts of the repaired parameters' covariance: what the estimate adds is noise, as the calibration's is."""
     out = {
         cause: whole @ np.asarray(part, dtype=np.float64) @ whole.T

@@ -12,7 +12,8 @@ from server.formats.results.settings import current_summary
 from server.store.durable import known_json
 
 Level = Literal["failed", "warning"]
-_Steps = Mapping[int, Mapping[str, Any]]
+_Summary = Mapping[str, Any]
+_Steps = Mapping[int, _Summary]
 
 #: share of the region's points with values below which a step warns, and fails
 COVERAGE_WARNING, COVERAGE_FAILED = 0.8, 0.5
@@ -94,7 +95,7 @@ def analysis_warnings(
     return sorted(made, key=lambda one: one.level != "failed")
 
 
-def _own_summaries(folder: Path) -> Iterable[dict[str, Any]]:
+def _own_summaries(folder: Path) -> Iterable[_Summary]:
     """Yield the summaries that the service keeps beside each step's result."""
     for path in sorted(folder.glob("step_[0-9]*.json")):
         found = known_json(path)
@@ -110,7 +111,7 @@ def _of(numbers: Sequence[int]) -> str:
     return f"{len(numbers)} steps ({listed})"
 
 
-def _worst(steps: _Steps, value: Callable[[Mapping[str, Any]], float | None]) -> tuple[int, Mapping[str, Any]]:
+def _worst(steps: _Steps, value: Callable[[_Summary], float | None]) -> tuple[int, _Summary]:
     return max(steps.items(), key=lambda item: value(item[1]) or 0.0)
 
 
