@@ -36,6 +36,8 @@ _EDGE_SIGMAS = 4.0  # the same where the shape shows an edge, so that a part's p
 _MOST_CORRELATED = 2.0  # variance of a match over that by white residuals, up to which it is no part's doing
 _FAR_SIGMAS = 4.0  # a change beyond what correlated residuals are counted as
 _OFF_SIGMAS, _OFF_PX = 3.0, 0.03  # what a part changes by, over the point's standard deviation and px: rejected
+_USUAL = 128  # points that tell how much parts change a usual match
+_OF_WHITE, _SCATTER_OF_WHITE = 2.0, 0.26  # median of the largest change's significance, its logarithm's scatter
 _AT_ONCE = 256
 
 
@@ -74,13 +76,16 @@ def reject_straddling(
     """
     edges = _beside_edges(fitter, points, shape, rays, spacing_px)
     index = np.flatnonzero((edges | _suspects(fitter, points, shape, texture, spacing_px)) & points.ok)
+    if len(index) == 0:
+        return 0
     least = np.where(edges, _EDGE_SIGMAS, _PART_SIGMAS)
+    usual = _usual_factors(fitter, points, xy_px, max(noise_factor, 1.0))
     rejected = 0
     for start in range(0, len(index), _AT_ONCE):
         raise_if_cancelled(cancel)
         some = index[start : start + _AT_ONCE]
         bad = np.zeros(len(points.status), bool)
-        bad[some] = _pulled(fitter, points, some, xy_px, rays, least[some], max(noise_factor, 1.0))
+        bad[some] = _pulled(fitter, points, some, xy_px, rays, least[some], usual)
         points.reject(bad, PointStatus.NEIGHBOUR_MISMATCH)
         rejected += int(bad.sum())
     return rejected
@@ -174,6 +179,21 @@ def _per_px(values: Float, scale: Float, valid: NDArray[np.intp], shape: tuple[i
     return grid[..., 0], grid[..., 1:3], grid[..., 3]
 
 
+def _usual_factors(fitter: Fitter, points: PointFits, xy_px: Float, least: float) -> Float:
+    """(o, 2) variance of what parts change at usual points over that by white noise, by comparison and direction.
+
+    A prefilter, blur at t or paint that changes with the load correlate the residuals of all points, and not all alike:
+    a wider scatter of the significance, too, raises what is unusual.
+    """
+    ok = np.flatnonzero(points.ok)
+    found, visible = subset_residuals(fitter, points, ok[spread_indices(len(ok), _USUAL)], xy_px)
+    pulls = [pull_of_parts(one, visible, 2 if fitter.terms == 6 else 1) for one in found]
+    half, upper = np.log(np.quantile([pull.significance for pull in pulls], (0.5, 0.75), axis=1))
+    wider = np.maximum((upper - half) / SIGMAS_OF_QUARTER - _SCATTER_OF_WHITE, 0.0)
+    unusual = (np.log(_PART_SIGMAS) - np.log(_OF_WHITE)) / _SCATTER_OF_WHITE
+    return np.asarray(np.maximum(np.exp(2.0 * (half - np.log(_OF_WHITE) + unusual * wider)), least))
+
+
 def _pulled(
     fitter: Fitter,
     points: PointFits,
@@ -181,7 +201,7 @@ def _pulled(
     xy_px: Float,
     rays: Float,
     least: Float,
-    noise_factor: float,
+    usual: Float,
 ) -> Bool:
     """Return (m,) True where a part of the subset is off by too much; what others change goes into the covariance."""
     found, visible = subset_residuals(fitter, points, index, xy_px)
@@ -190,10 +210,13 @@ def _pulled(
     unit = _unit_px(fitter, points, index, rays)
     covariance = points.covariance[index]
     bad = np.zeros(len(index), bool)
-    for unknown, pull, direction, before in _compared(pulls):
+    for unknown, which, direction, before in _compared(pulls):
+        pull = pulls[which]
         sd = np.sqrt(covariance[:, unknown, unknown]) * unit[:, unknown]
         # residuals that are correlated everywhere, as those of blur, are no single part's
-        correlated = np.clip((sd / pull.sigma_px[:, direction]) ** 2, noise_factor, _MOST_CORRELATED)
+        noise_factor = usual[which, direction]
+        most = max(_MOST_CORRELATED, noise_factor)
+        correlated = np.clip((sd / pull.sigma_px[:, direction]) ** 2, noise_factor, most)
         shift = _change(pull, direction, before)
         sure, far = pull.significance[:, direction] / least, np.abs(shift) > _FAR_SIGMAS * sd
         shift = np.where((sure > np.sqrt(correlated)) | ((sure > np.sqrt(noise_factor)) & far), shift, 0.0)
@@ -205,12 +228,11 @@ def _pulled(
     return bad
 
 
-def _compared(pulls: list[Pull]) -> list[tuple[int, Pull, int, Pull | None]]:
+def _compared(pulls: list[Pull]) -> list[tuple[int, int, int, Pull | None]]:
     """Unknown, comparison, direction there, and the comparison whose change does not count."""
     if len(pulls) == 1:
-        return [(0, pulls[0], 0, None), (1, pulls[0], 1, None)]
-    shape, camera1, camera2 = pulls
-    return [(1, camera1, 0, None), (2, camera1, 1, None), (3, camera2, 0, shape)]
+        return [(0, 0, 0, None), (1, 0, 1, None)]
+    return [(1, 1, 0, None), (2, 1, 1, None), (3, 2, 0, pulls[0])]
 
 
 def _change(pull: Pull, direction: int, before: Pull | None) -> Float:
