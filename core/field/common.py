@@ -64,9 +64,15 @@ def _spread(values: Float, valid: Bool) -> Float:
 def _frozen(own: Float, at: Estimator) -> Float:
     """(n, 3, 3) of the covariance of U, V, W what is the reference pair's noise."""
     size = np.trace(own, axis1=1, axis2=2)[:, None, None]
-    new = (
-        np.linalg.cholesky(own + np.maximum(_FIRM * size, np.finfo(np.float64).tiny) * np.eye(3)) @ at.new_noise_share()
-    )
+    firm = own + np.maximum(_FIRM * size, np.finfo(np.float64).tiny) * np.eye(3)
+    try:
+        root = np.linalg.cholesky(firm)
+    except np.linalg.LinAlgError:  # rounding left one of them a negative variance
+        value, vector = np.linalg.eigh(firm)
+        upper = np.linalg.qr(np.sqrt(np.maximum(value, 0.0))[:, :, None] * np.swapaxes(vector, 1, 2), mode="r")
+        sign = np.where(np.diagonal(upper, axis1=1, axis2=2) < 0.0, -1.0, 1.0)
+        root = np.swapaxes(upper, 1, 2) * sign[:, None, :]
+    new = root @ at.new_noise_share()
     return np.asarray(own - new @ np.swapaxes(new, 1, 2))
 
 

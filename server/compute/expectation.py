@@ -58,7 +58,9 @@ def _stated(values: dict[str, object]) -> dict[str, object]:
     return {key: value for key, value in values.items() if value is not None}
 
 
-def expectation_document(rig: dict[str, Any], plan: PlannedCalibration, measured: PlannedMeasurement) -> dict[str, object]:
+def expectation_document(
+    rig: dict[str, Any], plan: PlannedCalibration, measured: PlannedMeasurement
+) -> dict[str, object]:
     """Return what a plan may be expected to leave uncertain.
 
     Parameters

@@ -213,7 +213,10 @@ def check_field(shown: Page, client: httpx.Client, test_id: str) -> None:
     expect(canvas).to_be_attached()
     fields: dict[str, Any] = {
         name: np.array(
-            client.get(f"{API}/tests/{test_id}/analyses/{analysis}/steps/2/fields/{name}").json()["values"], dtype=float
+            client.get(
+                f"{API}/tests/{test_id}/analyses/{analysis}/steps/2/fields/{name}", params={"frame": "specimen"}
+            ).json()["values"],
+            dtype=float,
         )
         for name in ("x_px", "y_px", "w_mm", "x_mm", "y_mm", "status")
     }

@@ -6,6 +6,7 @@ import asyncio
 import inspect
 import re
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -137,6 +138,7 @@ def test_a_job_is_watched_and_its_problem_is_raised(tiny: Client) -> None:
         assert tiny.cancel(begun).state == "cancelled"
         with pytest.raises(Cancelled):
             tiny.wait(begun)
+        time.sleep(0.3)  # a stop is sent again until the job has let the stage go
         tiny.move(positions_mm={"1": 0.0, "2": 0.0})
     finally:
         tiny.progress = False

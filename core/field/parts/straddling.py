@@ -195,13 +195,7 @@ def _usual_factors(fitter: Fitter, points: PointFits, xy_px: Float, least: float
 
 
 def _pulled(
-    fitter: Fitter,
-    points: PointFits,
-    index: NDArray[np.intp],
-    xy_px: Float,
-    rays: Float,
-    least: Float,
-    usual: Float,
+    fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, rays: Float, least: Float, usual: Float
 ) -> Bool:
     """Return (m,) True where a part of the subset is off by too much; what others change goes into the covariance."""
     found, visible = subset_residuals(fitter, points, index, xy_px)

@@ -141,5 +141,6 @@ def _route(scope: Scope) -> str:
     template: str | None = getattr(scope.get("route"), "path", None)
     if template is None:
         return "none"
+    template = re.sub(r":\w+\}", "}", template)  # without what a parameter may hold
     prefix = "/api/v1"
     return template if template.startswith(prefix) or not scope["path"].startswith(prefix) else prefix + template
