@@ -134,6 +134,8 @@ def ended(job: JobReply, on_progress: OnProgress | None = None) -> Operation[Job
     if job.state == "succeeded":
         return job
     problem = {} if job.problem is None else job.problem.model_dump()
+    if job.state == "cancelled":  # whatever the cancelling stopped, a motion for example
+        problem["code"] = "cancelled"
     raise error_of({"code": f"job_{job.state}", "detail": f"The {job.kind} is {job.state}.", **problem})
 
 

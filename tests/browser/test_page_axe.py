@@ -159,7 +159,7 @@ def test_results(page: Watched, bench: Bench, audit: Audit) -> None:
         button.click()
     for role in ("line-chart", "extensometer-chart"):
         expect(at.locator(f'[data-role="{role}"] canvas')).to_be_visible()
-    expect(at.locator('[data-role="area"] > table')).to_be_visible()
+    expect(at.locator('[data-role="area"] table').first).to_be_visible()
     expect(at.get_by_role("button", name="Save the file")).to_be_visible()
     at.locator(".view .frame").first.click()
     expect(at.locator('[data-role="probe"] table')).to_be_visible()

@@ -526,7 +526,7 @@ def test_settings_checks_and_files(page: Watched, bench: Bench) -> None:
     with xarray.open_dataset(saved.value.path()) as one, xarray.open_dataset(stored) as other:
         xarray.testing.assert_identical(one[list(other.variables)].drop_attrs(), other.drop_attrs())
         # what was recorded with the step stands beside its result
-        assert set(one.variables) - set(other.variables) <= {"load_n", "time_s", "channel_pressure_kpa"}
+        assert set(one.variables) - set(other.variables) <= {"load_n", "time_s", "channel_stroke_mm"}
     # an analysis that is not there
     at.goto(f"{page.origin}/#/results/{bench.test_id}/a000099-ffffff")
     expect(at.locator(".problem")).to_contain_text("a000099-ffffff")

@@ -36,7 +36,7 @@ _EDGE_SIGMAS = 4.0  # the same where the shape shows an edge, so that a part's p
 _MOST_CORRELATED = 2.0  # variance of a match over that by white residuals, up to which it is no part's doing
 _FAR_SIGMAS = 4.0  # a change beyond what correlated residuals are counted as
 _OFF_SIGMAS, _OFF_PX = 3.0, 0.03  # what a part changes by, over the point's standard deviation and px: rejected
-_USUAL = 128  # points that tell how much parts change a usual match
+_USUAL = 256  # points that tell how much parts change a usual match
 _OF_WHITE, _SCATTER_OF_WHITE = 2.0, 0.26  # median of the largest change's significance, its logarithm's scatter
 _AT_ONCE = 256
 
@@ -188,10 +188,12 @@ def _usual_factors(fitter: Fitter, points: PointFits, xy_px: Float, least: float
     ok = np.flatnonzero(points.ok)
     found, visible = subset_residuals(fitter, points, ok[spread_indices(len(ok), _USUAL)], xy_px)
     pulls = [pull_of_parts(one, visible, 2 if fitter.terms == 6 else 1) for one in found]
-    half, upper = np.log(np.quantile([pull.significance for pull in pulls], (0.5, 0.75), axis=1))
-    wider = np.maximum((upper - half) / SIGMAS_OF_QUARTER - _SCATTER_OF_WHITE, 0.0)
+    # edges pull at many points: those that are changed least are the measure
+    quarter, tenth = np.log(np.quantile([pull.significance for pull in pulls], (0.25, 0.1), axis=1))
+    scatter = np.maximum((quarter - tenth) / (SIGMAS_OF_TENTH - SIGMAS_OF_QUARTER), _SCATTER_OF_WHITE)
     unusual = (np.log(_PART_SIGMAS) - np.log(_OF_WHITE)) / _SCATTER_OF_WHITE
-    return np.asarray(np.maximum(np.exp(2.0 * (half - np.log(_OF_WHITE) + unusual * wider)), least))
+    level = quarter + SIGMAS_OF_QUARTER * scatter - np.log(_OF_WHITE)
+    return np.asarray(np.maximum(np.exp(2.0 * (level + unusual * (scatter - _SCATTER_OF_WHITE))), least))
 
 
 def _pulled(
