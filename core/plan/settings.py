@@ -23,7 +23,7 @@ from core.settings import (
     require_odd,
 )
 
-Positive = Annotated[Real, Field(gt=0.0, le=1e6)]
+Positive = Annotated[Real, Field(ge=1e-3, le=1e6)]
 Share = Annotated[Real, Field(ge=0.0, le=0.1)]
 
 
@@ -47,7 +47,7 @@ class PlannedMeasurement(Settings):
         description="Size of the pattern's features in the image: full width at half height of its autocorrelation, "
         "taken for a Gaussian's.",
     )
-    gradient_grey_per_px: Annotated[Real, Field(ge=1e-3, le=1e5)] | None = Field(
+    gradient_grey_per_px: Annotated[Real, Field(ge=0.05, le=1e5)] | None = Field(
         None,
         description="Root mean square of the pattern's gradient along one direction, where it is known: it takes the "
         "place of speckle_px. null: 2.35 contrast_grey / speckle_px.",
@@ -76,7 +76,7 @@ class PlannedRig(Settings):
         Field(None, description="Width and height of both images.")
     )
     standoff_mm: Positive | None = Field(None, description="Distance of both cameras from the target.")
-    angle_deg: Annotated[Real, Field(gt=0.0, lt=170.0)] | None = Field(
+    angle_deg: Annotated[Real, Field(ge=0.1, lt=170.0)] | None = Field(
         None, description="Angle between the optical axes; each camera stands at half of it."
     )
     pitch_mm: Positive | None = Field(None, description="Pitch of the target.")

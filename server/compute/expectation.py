@@ -11,7 +11,7 @@ from core.calibration.expect import Expectation, LineModel, expect
 from core.calibration.inputs import AnyTarget
 from core.calibration.prepare import EXPECTED_NOISE_PX
 from core.common.factor import ParameterCovariance
-from core.errors import CalibrationInputError
+from core.errors import CalibrationError, CalibrationInputError
 from core.names import CAMERAS
 from core.plan.quantities import planned_quantities
 from core.plan.settings import PlannedMeasurement, PlannedRig
@@ -87,12 +87,20 @@ def expectation_document(
         )
     model = _line_model(target, plan.localiser)
     noise = EXPECTED_NOISE_PX if plan.noise_px is None else plan.noise_px
-    found = expect(
-        plan.positions_mm, target, nominals, options, noise_px=noise, roll_deg=plan.roll_deg, line_model=model
-    )
     sizes = nominals[0].image_size_px, nominals[1].image_size_px
-    source = ParameterCovariance(found.pair, tuple(found.parameters), found.covariance, found.by_cause)
-    quantities = planned_quantities(found.pair, sizes, source, measured)
+    try:
+        with np.errstate(over="raise", divide="raise", invalid="raise"):
+            found = expect(
+                plan.positions_mm, target, nominals, options, noise_px=noise, roll_deg=plan.roll_deg, line_model=model
+            )
+            source = ParameterCovariance(found.pair, tuple(found.parameters), found.covariance, found.by_cause)
+            quantities = planned_quantities(found.pair, sizes, source, measured)
+    except (ArithmeticError, np.linalg.LinAlgError) as error:
+        raise CalibrationError(
+            f"The planned rig has no numbers that a calculation could go on with ({error}).",
+            code="calibration_singular",
+            remedy="Plan cameras at an angle, a stand-off and a target that a rig can have.",
+        ) from error
     return {
         "assumed": {
             "noise_px": noise,

@@ -162,7 +162,7 @@ def test_results(page: Watched, bench: Bench, audit: Audit) -> None:
     expect(at.locator('[data-role="area"] table').first).to_be_visible()
     expect(at.get_by_role("button", name="Save the file")).to_be_visible()
     at.locator(".view .frame").first.click()
-    expect(at.locator('[data-role="probe"] table')).to_be_visible()
+    expect(at.locator('[data-role="probe"] table').first).to_be_visible()
     audit("a field with gauges, a probe and everything open")
     shown(page, bench, name="status")
     audit("a field of flags")
