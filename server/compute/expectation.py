@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
+import numpy as np
+
 from core.boards import BoardTarget
 from core.calibration.expect import Expectation, LineModel, expect
 from core.calibration.inputs import AnyTarget
