@@ -76,8 +76,10 @@ def lost_correlation(
         return bad
     reach = reach_of(subset_px, spacing_of(xy_px, shape))
     texture = np.maximum(texture, 1e-6)
-    expected = np.zeros_like(points.zncc)
-    for k in range(points.zncc.shape[1]):
+    # in a motion both cameras at the reference do not count: the shape was measured with them, and checked
+    expected = np.full_like(points.zncc, np.inf)
+    counted = range(1) if points.zncc.shape[1] == 1 else range(1, points.zncc.shape[1])
+    for k in counted:
         loss = np.where(ok, np.maximum(1.0 - points.zncc[:, k], _LEAST), 1.0)
         alike = block_medians(loss, ok, shape, reach, otherwise=float(np.median(loss[ok])))
         energy = loss * texture
@@ -97,8 +99,6 @@ def lost_correlation(
         if k == 2:  # of camera 2 nothing but what is new
             level = np.maximum(level, 1.0 - points.zncc[:, 0])
         expected[:, k] = level * allowed
-    if points.zncc.shape[1] == 3:
-        expected[:, 0] = np.inf  # both cameras at the reference: the shape was measured with it, and checked
     with np.errstate(invalid="ignore"):
         suspect = np.flatnonzero(ok & (1.0 - points.zncc > expected).any(axis=1))
     if len(suspect):
