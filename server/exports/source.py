@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from core.errors import InputError
+from server.formats.calibrations.in_test import calibration_id_in
 from server.formats.results.folder import first_results, results_in
 from server.formats.results.reading import read_head
 from server.results.staleness import stale_results
@@ -54,7 +55,7 @@ def source_of(folder: Path, files: list[Path]) -> Source:
         about |= {
             "test_id": document.get("id", test.name),
             "test": document.get("name", ""),
-            "calibration_id": document.get("calibration_id"),
+            "calibration_id": calibration_id_in(document, heads[0].inputs_sha256.get("calibration")),
             "specimen": document.get("specimen", ""),
         }
         name, title = test.name, str(document.get("name") or test.name)

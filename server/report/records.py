@@ -81,6 +81,8 @@ class TestRecord(Record):
     id: str = ""
     name: str = ""
     calibration_id: str | None = None
+    calibration_sha256: str | None = None
+    calibrations: dict[str, str | None] = Field(default={})
     specimen: str = ""
     notes: str = ""
     metadata: dict[str, object] = Field(default={}, validation_alias=AliasChoices(*METADATA_NAMES))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from core.errors import InputError, StereorigError
 from core.names import CameraName
 from server.base.errors import NotFoundError
+from server.formats.calibrations.in_test import calibration_id_in, calibration_in
 from server.formats.calibrations.kept_checks import read_checks, with_checks
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.formats.files import known_sha256
@@ -219,8 +220,9 @@ def _with_kept_checks(
 ) -> LoadedCalibration:
     """Add the checks made of a calibration since: beside its file, or beside the one that a test's is a copy of."""
     kept = read_checks(file, loaded.sha256)
-    if home is not None and test_record.calibration_id:
-        folder = home.parent.parent / "calibrations" / Path(test_record.calibration_id).name
+    name = calibration_id_in(test_record.model_dump(), loaded.sha256)
+    if home is not None and name:
+        folder = home.parent.parent / "calibrations" / Path(name).name
         kept = {**read_checks(folder / "calibration.json", loaded.sha256), **kept}
     return replace(loaded, details=with_checks(loaded.details, kept)) if kept else loaded
 
@@ -282,7 +284,7 @@ def _calibration(
     sha256 = inputs.get("calibration")
     candidates = [] if given is None else [given]
     if given is None:
-        candidates += [] if test is None else [test / "calibration.json"]
+        candidates += [] if test is None else [calibration_in(test, sha256)]
         candidates += [] if made.calibration is None else [made.calibration.file]
     for path in candidates:
         if not path.is_file():

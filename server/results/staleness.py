@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from core.names import CAMERAS
+from server.formats.calibrations.in_test import LATER, calibration_in
 from server.formats.files import known_sha256
 from server.formats.results.folder import number_of, results_in
 from server.formats.results.reading import ResultHead
@@ -78,15 +79,18 @@ def stale_results(files: Sequence[Path], heads: Sequence[ResultHead], folder: Pa
     reference = heads[-1].reference_step or 0
     steps.setdefault(reference, {cam: heads[-1].inputs_sha256.get(f"reference_{cam}") for cam in CAMERAS})
     calibration = None
+    sha256 = heads[0].inputs_sha256.get("calibration")
     if test is not None and folder.parent.name == "analyses":
-        calibration = test / "calibration.json"
+        calibration = calibration_in(test, sha256)
     elif isinstance(summary.get("calibration"), dict):
         calibration = Path(str(summary["calibration"].get("file")))
-        if test is not None and calibration.name == "calibration.json" and calibration.parent.name == test.name:
-            calibration = test / "calibration.json"  # independent of the folder that the measurement was started from
+        own = {test.name, LATER} if test is not None else set()
+        if test is not None and calibration.suffix == ".json" and calibration.parent.name in own:
+            calibration = calibration_in(
+                test, sha256
+            )  # independent of the folder that the measurement was started from
         elif not calibration.is_absolute() and not calibration.is_file():
             calibration = None
-    sha256 = heads[0].inputs_sha256.get("calibration")
     found = _missing_results(folder, summary)
     if test is not None:
         return found + stale_inputs(

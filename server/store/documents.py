@@ -157,6 +157,7 @@ class TestRecord(Kept):
     notes: str | None = None
     calibration_id: str | None = None
     calibration_sha256: str | None = None
+    calibrations: dict[str, str | None] = Field(default_factory=dict)
     metadata: object = Field(None, validation_alias=AliasChoices(*METADATA_NAMES))
     request: KeptRequest | None = None
 
@@ -173,6 +174,7 @@ class AnalysisRecord(Kept):
 
     id: str
     test_id: str
+    calibration_id: str | None = None
     created_utc: str | None = None
     kind: str | None = None
     label: str | None = None

@@ -48,7 +48,7 @@ def analysis_entry(
     analysis: AnalysisRecord, job_id: str | None = None, steps_failed: Sequence[int] = ()
 ) -> dict[str, object]:
     """Entry of an analysis in a list, with the last job that worked on it, and the steps that failed in it."""
-    names = ("id", "kind", "label", "created_utc")
+    names = ("id", "kind", "label", "calibration_id", "created_utc")
     entry = {**{name: getattr(analysis, name) for name in names}, "job_id": job_id}
     return {**entry, "steps_failed": sorted(steps_failed)} if steps_failed else entry
 

@@ -7,6 +7,7 @@ images. A folder that a kill left without it is listed as incomplete and never r
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import re
@@ -20,6 +21,7 @@ from core.errors import FileFormatError, StateError, StorageError
 from core.names import CAMERAS
 from server.base.errors import NotFoundError
 from server.formats import disk as _disk
+from server.formats.calibrations.in_test import LATER, calibration_id_in, calibration_in, later_file
 from server.formats.files import fsync_path, known_sha256, recorded_sha256, sha256_of, storage_error
 from server.formats.results.settings import current_step, current_summary
 from server.store.documents import (
@@ -172,22 +174,50 @@ class TestStore:
 
     def is_calibrated(self, test_id: str) -> bool:
         """Return True if the test has a calibration to measure with."""
-        return (self.path(test_id) / "calibration.json").is_file()
+        return calibration_in(self.path(test_id)).is_file()
 
-    def calibration_file(self, test_id: str) -> Path:
-        """The test's own copy of its calibration.
+    def keep_calibration(self, test_id: str, calibration_id: str, content: bytes, *, in_force: bool) -> TestRecord:
+        """Give the test its own copy of another calibration; durable when this returns.
+
+        The copies that it has stay, for the analyses that were measured with them.
+
+        Parameters
+        ----------
+        content
+            The calibration's file.
+        in_force
+            New analyses are measured with it, unless they name another one.
+        """
+        test = self.path(test_id)
+        sha256 = hashlib.sha256(content).hexdigest()
+        with self._lock:
+            document = read_json(test / "test.json")
+            before = document.get("calibration_sha256")
+            if sha256 not in {before, *document.get("calibrations", {})}:
+                if not (test / LATER).is_dir():
+                    make_folder(test / LATER)
+                write_bytes(later_file(test, sha256), content)
+            first = {} if before is None else {before: document.get("calibration_id")}
+            document["calibrations"] = {**first, **document.get("calibrations", {}), sha256: calibration_id}
+            if in_force:
+                document |= {"calibration_id": calibration_id, "calibration_sha256": sha256}
+            write_json(test / "test.json", document)
+        return record_of(TestRecord, document, test / "test.json")
+
+    def calibration_file(self, test_id: str, sha256: str | None = None) -> Path:
+        """The test's own copy of a calibration: of the one in force, or of the one with a checksum.
 
         Raises
         ------
         StateError
             ``not_calibrated`` if the test has none.
         """
-        path = self.path(test_id) / "calibration.json"
+        path = calibration_in(self.path(test_id), sha256)
         if not path.is_file():
             raise StateError(
                 f"Test {test_id} has no calibration.",
                 code="not_calibrated",
-                remedy="Make the test with a calibration_id.",
+                remedy="Give the test a calibration, or name one for the analysis (calibration_id).",
             )
         return path
 
@@ -348,8 +378,12 @@ class TestStore:
         return AnalysisRecord.model_validate(document)
 
     def analysis(self, test_id: str, analysis_id: str) -> AnalysisRecord:
-        """Return ``analysis.json``."""
-        return read_record(AnalysisRecord, self.analysis_path(test_id, analysis_id) / "analysis.json")
+        """Return ``analysis.json``, with the id of its calibration where an earlier version did not write it."""
+        found = read_record(AnalysisRecord, self.analysis_path(test_id, analysis_id) / "analysis.json")
+        if found.calibration_id is not None:
+            return found
+        known = calibration_id_in(self.read(test_id).model_dump(), found.inputs.calibration_sha256)
+        return found if known is None else found.model_copy(update={"calibration_id": known})
 
     def analysis_jobs(self, test_id: str, analysis_id: str) -> list[AnalysisJob]:
         """Jobs that worked on an analysis, the last one last."""

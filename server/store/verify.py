@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from core.errors import FileFormatError, StorageError
 from core.names import CAMERAS
+from server.formats.calibrations.in_test import LATER
 from server.formats.calibrations.kept_checks import KEPT_CHECKS
 from server.formats.files import recorded_sha256, sha256_of, storage_error
 from server.store.durable import read_json
@@ -31,7 +32,7 @@ _KNOWN = {
     "calibration": r"(plan|target|view|review|judgement|failure|rejected)\.json|"
     r"(calibration\.json|residuals\.nc)(\.sha256)?|calibration\.checks\.json|views",
     "noise": r"(plan|frames|failure)\.json|noise\.json(\.sha256)?|frames",
-    "test": r"(test|calibration|watch)\.json|steps|analyses|exports",
+    "test": r"(test|calibration|watch)\.json|calibrations|steps|analyses|exports",
     "step": r"step\.json|cam[12]\.tif",
     "analysis": r"(analysis|jobs|noise|summary)\.json|mask\.png|step_\d+\.(nc|nc\.sha256|json)|starts_\d+\.npz",
 }
@@ -176,16 +177,30 @@ class _Walk:
     def test(self, path: Path) -> None:
         self.there.add(("test", "", path.name))
         document = self.document(path / "test.json")
-        if document is not None and (path / "calibration.json").exists():
-            self.compare(path / "calibration.json", document.get("calibration_sha256"))
-        elif document is not None and document.get("calibration_sha256") is not None:
-            self.report("damaged", path / "calibration.json", "the file is gone")
+        if document is not None:
+            self.calibrations_of(path, document)
         self.strangers(path, "test")
         self.documents(path, "watch.json")
         for step in sorted((path / "steps").iterdir()) if (path / "steps").is_dir() else ():
             self.step(path.name, step)
         for analysis in self.entries(path / "analyses", "a", "analysis.json"):
             self.analysis(path.name, analysis)
+
+    def calibrations_of(self, path: Path, document: dict[str, Any]) -> None:
+        """Check a test's copies of calibrations: the first, and those that it was given since."""
+        in_force = document.get("calibration_sha256")
+        given = document.get("calibrations") or {}
+        later = sorted((path / LATER).iterdir()) if (path / LATER).is_dir() else []
+        for file in later:
+            if re.fullmatch(r"[0-9a-f]{64}\.json", file.name):
+                self.compare(file, file.stem)
+            elif not file.name.endswith(".part"):
+                self.report("foreign", file, "this name is not one that the service makes")
+        first = {*given, in_force} - {None} - {file.stem for file in later}
+        if (path / "calibration.json").exists():
+            self.compare(path / "calibration.json", next(iter(first)) if len(first) == 1 else in_force)
+        elif first:
+            self.report("damaged", path / "calibration.json", "the file is gone")
 
     def step(self, test_id: str, path: Path) -> None:
         if path.suffix == ".deleted" and number_of(path.stem) is not None and path.is_file():

@@ -62,6 +62,11 @@ class AnalysisRequest(settings.AnalysisSettings):
         "projected pattern, which shows no displacement.",
     )
     region: Region = Field(description="Region of interest.")
+    calibration_id: Annotated[str, StringConstraints(max_length=40)] | None = Field(
+        None,
+        description="Calibration to measure with, of which the test keeps a copy; `latest`: the newest one accepted; "
+        "left out: that of the test.",
+    )
     noise_id: Annotated[str, StringConstraints(max_length=40)] | None = Field(
         None, description="Noise measurement that weighs the pixels; without it, residuals give the noise."
     )
@@ -92,7 +97,7 @@ class AnalysisRequest(settings.AnalysisSettings):
 
     def stored(self) -> StoredSettings:
         """Return the settings as results keep them, without the noise model."""
-        asked = self.model_dump(exclude={"kind", "label", "steps", "noise_id", "follow"})
+        asked = self.model_dump(exclude={"kind", "label", "steps", "noise_id", "calibration_id", "follow"})
         mask = asked["region"].pop("mask_png_base64")
         asked["region"]["mask"] = None if mask is None else "mask.png"
         return StoredSettings.model_validate(asked)
@@ -150,6 +155,8 @@ class AnalysisReply(Reply):
     job_id: str | None = Field(None, description="Its job; the last one, where it was continued.")
     follow: bool = Field(False, description="True if it goes on with each step that lands.")
     steps: list[int] = Field(default_factory=list, description="Steps that it measures, the reference first.")
+    calibration_id: str | None = Field(None, description="Calibration that it is measured with; null: not known.")
+    calibration_sha256: str | None = Field(None, description="Checksum of that calibration's file.")
     settings: StoredSettings = Field(description="Settings, fixed.")
     steps_finished: list[int] = Field(description="Steps whose results can be read now.")
     steps_failed: dict[str, JobProblem] = Field(
@@ -271,11 +278,19 @@ class GaugeStep(Reply):
     problem: JobProblem | None = Field(None, description="Problem that left the step without readings.")
 
 
+class MeasuredWith(Reply):
+    """A calibration that results were measured with."""
+
+    id: str | None = Field(None, description="Its id; null: not known.")
+    sha256: str | None = Field(None, description="Checksum of its file.")
+
+
 class GaugesReply(Reply):
     """Readings over the steps; each number with `value`, `sigma` (standard uncertainty) and `units`."""
 
     software_version: str = Field(description="Program that read them.")
     settings: GaugeRequest = Field(description="The request, with its defaults.")
+    calibration: MeasuredWith = Field(description="Calibration that was measured with.")
     inputs_sha256: dict[str, str] = Field(description="Checksum of each result file.")
     stale: bool = Field(False, description="True if inputs or results are gone or were replaced since.")
     stale_reasons: list[str] = Field(default_factory=list, description="Inputs that are gone or were replaced.")

@@ -35,6 +35,11 @@ class TestPatch(Request):
     name: Annotated[str, StringConstraints(min_length=1, max_length=300)] | None = Field(None, description="Name.")
     specimen: Label | None = Field(None, description="The specimen.")
     notes: Annotated[str, StringConstraints(max_length=20000)] | None = Field(None, description="Free text.")
+    calibration_id: Annotated[str, StringConstraints(max_length=40)] | None = Field(
+        None,
+        description="Calibration that new analyses are measured with; `latest`: the newest one accepted. Analyses that "
+        "there are keep theirs.",
+    )
 
 
 class TestEntry(Reply):
@@ -68,6 +73,7 @@ class AnalysisEntry(Reply):
     id: str = Field(description="Id.", examples=["a000001-77d0b3"])
     kind: str | None = Field(None, description="`profile` or `displacement`.")
     label: str | None = Field(None, description="Free text.")
+    calibration_id: str | None = Field(None, description="Calibration that it is measured with; null: not known.")
     created_utc: str | None = Field(None, description="Time at which it was begun.")
     job_id: str | None = Field(None, description="Its job.")
     steps_failed: list[int] = Field(default_factory=list, description="Steps that could not be measured.")
@@ -85,7 +91,12 @@ class TestReply(Reply):
     name: str = Field(description="Name.")
     specimen: str = Field(description="The specimen.")
     notes: str = Field(description="Free text.")
-    calibration_id: str | None = Field(None, description="Calibration it measures with.")
+    calibration_id: str | None = Field(None, description="Calibration that new analyses are measured with.")
+    calibrations: dict[str, str | None] = Field(
+        default_factory=dict,
+        description="Where another one was chosen since: ids of the calibrations that it, or an analysis, was given, "
+        "by their checksum.",
+    )
     created_utc: str = Field(description="Time at which it was made.")
     steps: list[StepEntry] = Field(default_factory=list, description="Its complete steps.")
     incomplete_steps: list[int] = Field(default_factory=list, description="Step folders without their commit mark.")

@@ -11,12 +11,14 @@ from core.errors import InputError
 from server.cli.measurement import calibration_repair
 from server.cli.measurement.calibration_checks import ACTIONS, add_check_actions, run_check
 from server.formats.calibrations.export import FORMS, ConversionReport, convert_calibration
+from server.formats.calibrations.in_test import calibration_in
 from server.formats.calibrations.kept_checks import read_checks
 from server.formats.calibrations.programs.plausibility import CalibrationCheck, Residual, check_calibration
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.formats.files import make_folder, write_bytes
 from server.formats.images import read_file
 from server.formats.results.folder import first_results
+from server.formats.results.reading import read_head
 from server.results.epipolar_check import EpipolarComparison, check_against
 
 
@@ -84,7 +86,8 @@ def _against(loaded: LoadedCalibration, folder: Path, measured_with: Path | None
     folders = [folder, folder / "exports" / "measure", *sorted((folder / "analyses").glob("*"))]
     files = first_results(folder, folders)
     if measured_with is None:
-        measured_with = files[0].absolute().parent.parent.parent / "calibration.json"
+        test = files[0].absolute().parent.parent.parent
+        measured_with = calibration_in(test, read_head(files[0]).inputs_sha256.get("calibration"))
         if not measured_with.is_file():
             raise InputError(
                 f"The calibration that {files[0]} was measured with is not known.",

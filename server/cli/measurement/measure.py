@@ -33,6 +33,7 @@ from server.cli.measurement.sequence import MeasureJob, measure_sequence
 from server.cli.measurement.specimen import SPECIMEN_FILE, found_specimen
 from server.cli.terminal import ProgressLine
 from server.compute.seeds import check_positions
+from server.formats.calibrations.in_test import calibration_in
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.formats.images import read_mask
 from server.formats.noise_json import load_noise
@@ -235,7 +236,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
     strain, prefilter_px = _strain(args), _prefilter_px(args, subset)
     files = _pairs(args, progress)
     folder = None if args.folder is None else Path(args.folder)
-    calibration_file = Path(args.calibration) if args.calibration or folder is None else folder / "calibration.json"
+    calibration_file = Path(args.calibration) if args.calibration or folder is None else calibration_in(folder)
     calibration = load_calibration(calibration_file)
     if folder is not None and not args.calibration:
         _check_calibration(folder, calibration)

@@ -221,6 +221,8 @@ class GaugeReadings:
     ----------
     settings
         The request.
+    calibration
+        ``id``, None where it is not known, and ``sha256`` of the calibration that was measured with.
     inputs_sha256
         Of each result file, by its name.
     stale, stale_reasons
@@ -237,6 +239,7 @@ class GaugeReadings:
 
     software_version: str
     settings: Mapping[str, object]
+    calibration: Mapping[str, str | None]
     inputs_sha256: Mapping[str, str]
     stale: bool
     stale_reasons: Sequence[str]
@@ -266,6 +269,7 @@ class GaugeReadings:
             "subset_px": self.subset_px,
             "smoothing_window": self.smoothing_window,
             "settings": self.settings,
+            "calibration": self.calibration,
             "inputs_sha256": self.inputs_sha256,
             "alignment": None if self.alignment is None else asdict(self.alignment),
             "uncertainty": self.statement.document(),

@@ -25,6 +25,7 @@ from core.gauge.rigid import RigidMotion, rigid_motion, without_rigid_motion
 from core.gauge.sampling import Samples, sample
 from core.names import BUDGET
 from core.strain.result import StrainField
+from server.formats.calibrations.in_test import calibration_id_in
 from server.formats.files import sha256_of
 from server.formats.gauges.readings import (
     AreaReading,
@@ -55,6 +56,7 @@ from server.results.gauges.variables import STRAIN_NAMES, Variables, component_o
 from server.results.images.projected_pattern import check_gauges
 from server.results.reader import read_variable
 from server.results.staleness import stale_results
+from server.store.durable import known_json
 
 _Positions = dict[str | None, list[tuple[float, float]]]
 MAX_NUMBERS = 3_000_000
@@ -154,6 +156,7 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
     return GaugeReadings(
         software_version=software_version(),
         settings=request.model_dump(mode="json"),
+        calibration=_calibration(chosen[-1], first),
         inputs_sha256=hashes,
         stale=bool(stale),
         stale_reasons=stale,
@@ -164,6 +167,13 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
         statement=statement,
         steps=steps,
     )
+
+
+def _calibration(path: Path, head: ResultHead) -> dict[str, str | None]:
+    """Return id and checksum of the calibration that a file was measured with."""
+    sha256 = head.inputs_sha256.get("calibration")
+    test = known_json(path.absolute().parent.parent.parent / "test.json")
+    return {"id": calibration_id_in(test, sha256), "sha256": sha256}
 
 
 def _chosen(files: Sequence[Path], wanted: Sequence[int] | None) -> list[Path]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from server.formats.calibrations.in_test import calibration_id_in, calibration_in, measured_with
 from server.formats.results.camera_motion import MOVED_REMEDY
 from server.formats.results.settings import current_summary
 from server.store.durable import known_json
@@ -86,7 +87,7 @@ def analysis_warnings(
         *_epipolar(found),
         *_off_zero(taken),
         *_coverage(found),
-        *([] if home is None else _calibration(home)),
+        *([] if home is None else _calibration(home, measured_with(folder))),
         *_moved(found),
         *_failed_steps(problems if isinstance(problems, dict) else {}),
         *_quality(taken),
@@ -171,9 +172,8 @@ def _coverage(steps: _Steps) -> list[ResultWarning]:
     return [ResultWarning("low_coverage", level, text, remedy, tuple(sorted(low)))]
 
 
-def _calibration(home: Path) -> list[ResultWarning]:
-    test = known_json(home / "test.json")
-    name = str(test.get("calibration_id") or "")
+def _calibration(home: Path, sha256: str | None) -> list[ResultWarning]:
+    name = calibration_id_in(known_json(home / "test.json"), sha256) or ""
     made = []
     folder = home.parent.parent / "calibrations" / Path(name).name
     review = next((kept for n in ("review.json", "judgement.json") if (kept := known_json(folder / n))), {})
@@ -183,11 +183,11 @@ def _calibration(home: Path) -> list[ResultWarning]:
             ResultWarning(
                 "calibration_discarded",
                 "failed",
-                f"The test's calibration {name} was discarded{note}.",
+                f"The calibration {name} was discarded{note}.",
                 "Measure with another calibration, or take the decision back.",
             )
         )
-    verdict = known_json(home / "calibration.json").get("verdict")
+    verdict = known_json(calibration_in(home, sha256)).get("verdict")
     found = verdict.get("level") if isinstance(verdict, dict) else None
     accepted = review.get("decision") == "accepted"  # by someone who saw the verdict
     if isinstance(verdict, dict) and (found == "failed" or (found == "warning" and not accepted)):

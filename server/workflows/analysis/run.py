@@ -234,7 +234,8 @@ class AnalysisRun:
         """Refuse a step of other cameras: what lands later was not there to be checked when the analysis was made."""
         if not self._document.follow:
             return
-        calibration = self._service.tests.calibration_file(self._test_id)
+        measured = self._document.inputs.calibration_sha256
+        calibration = self._service.tests.calibration_file(self._test_id, measured)
         check_same_cameras(calibration, self._service.tests.step(self._test_id, n).document.cameras, f"Step {n}")
 
     def _take_new_steps(self) -> bool:
@@ -279,7 +280,8 @@ def task_of(
                 code="step_changed",
                 remedy="Start a new analysis.",
             )
-    if sha256_of(service.tests.calibration_file(test_id)) != document.inputs.calibration_sha256:
+    calibration = service.tests.calibration_file(test_id, document.inputs.calibration_sha256)
+    if sha256_of(calibration) != document.inputs.calibration_sha256:
         raise calibration_changed(f"of test {test_id}, on which the analysis rests,")
     settings = stored_settings(document.settings)
     earlier: dict[int, StepFiles] = {}
@@ -295,7 +297,7 @@ def task_of(
     folder = service.tests.analysis_path(test_id, document.id)
     return StepTask(
         folder=folder,
-        calibration=service.tests.calibration_file(test_id),
+        calibration=calibration,
         settings=settings,
         reference=images_of(reference, ref),
         step=images_of(n, now),

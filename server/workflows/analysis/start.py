@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from core.errors import InputError, StateError
@@ -10,6 +11,7 @@ from core.field.region.lay_points import make_grid
 from core.settings import AnalysisSettings, NoiseRecord, StoredSettings
 from server.base.models import Ids
 from server.compute.seeds import check_seeds
+from server.formats.calibrations.in_test import calibration_id_in, calibration_in
 from server.formats.files import sha256_of
 from server.formats.images import decode_mask, read_image
 from server.formats.noise_json import load_noise
@@ -23,6 +25,7 @@ from server.store.index import analysis_entry
 from server.workflows.analysis.run import AnalysisRun, calibration_changed, close
 from server.workflows.camera_identity import check_same_cameras
 from server.workflows.service import Service
+from server.workflows.test_start import calibration_asked, give_calibration
 
 
 def steps_to_measure(service: Service, test_id: str, reference: int, wanted: list[int] | None) -> list[int]:
@@ -76,23 +79,41 @@ def stale_reasons(service: Service, test_id: str, document: AnalysisRecord) -> l
     return stale_inputs(
         test,
         {int(n): hashes for n, hashes in inputs.steps.items()},
-        calibration=test / "calibration.json",
+        calibration=calibration_in(test, inputs.calibration_sha256),
         calibration_sha256=inputs.calibration_sha256,
         reference=document.steps[0],
     )
 
 
-def check_calibration(service: Service, test_id: str, calibration: Path) -> None:
-    """Refuse a calibration other than the one the test was made with.
+@dataclass(frozen=True)
+class MeasuredWith:
+    """A test's own copy of a calibration."""
+
+    calibration_id: str | None
+    file: Path
+
+
+def calibration_of(service: Service, test_id: str, calibration_id: str | None) -> MeasuredWith:
+    """Return the calibration of a new analysis: the one it names, of which the test then has a copy, or the test's.
 
     Raises
     ------
+    StateError
+        ``not_calibrated`` if the test has none, and none is named; see :func:`give_calibration`.
     FileFormatError
-        ``calibration_changed``.
+        ``calibration_changed`` if the copy is not the one that the test was given.
     """
-    made_with = service.tests.read(test_id).calibration_sha256
-    if made_with is not None and sha256_of(calibration) != made_with:
+    test = service.tests.read(test_id)
+    sha256 = test.calibration_sha256
+    if calibration_id is not None:
+        wanted, path = calibration_asked(service, calibration_id)
+        sha256 = sha256_of(path)
+        if sha256 != test.calibration_sha256:
+            test = give_calibration(service, test_id, wanted, in_force=False)
+    file = service.tests.calibration_file(test_id, sha256)
+    if sha256 is not None and sha256_of(file) != sha256:
         raise calibration_changed(f"of test {test_id}")
+    return MeasuredWith(calibration_id_in(test.model_dump(), sha256), file)
 
 
 def check_region(
@@ -115,6 +136,7 @@ def begin(
     follow: bool,
     mask: bytes | None,
     noise_id: str | None,
+    calibration_id: str | None = None,
 ) -> Ids:
     """Check everything that can be checked now, make the analysis and its job.
 
@@ -130,6 +152,8 @@ def begin(
         Image file of camera 1's size, white where points may lie.
     noise_id
         Noise measurement that weighs the pixels.
+    calibration_id
+        Calibration to measure with; None: that of the test.
 
     Returns
     -------
@@ -137,8 +161,8 @@ def begin(
         ``analysis_id`` and ``job_id``.
     """
     check_settings(settings, displacement=kind == "displacement")
-    calibration = service.tests.calibration_file(test_id)
-    check_calibration(service, test_id, calibration)
+    made_with = calibration_of(service, test_id, calibration_id)
+    calibration = made_with.file
     measured = steps_to_measure(service, test_id, settings.reference, steps)
     for n in measured:
         check_same_cameras(calibration, service.tests.step(test_id, n).document.cameras, f"Step {n}")
@@ -154,6 +178,7 @@ def begin(
     document = {
         "kind": kind,
         "label": label,
+        "calibration_id": made_with.calibration_id,
         "settings": settings.model_dump(),
         "steps": measured,
         "follow": follow,

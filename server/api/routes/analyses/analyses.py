@@ -61,6 +61,7 @@ def _begin(service: Service, test_id: str, body: AnalysisRequest, request: Reque
         follow=body.follow,
         mask=mask_of(body.region),
         noise_id=body.noise_id,
+        calibration_id=body.calibration_id,
     )
 
 
@@ -108,6 +109,7 @@ def analysis_reply(service: Service, test_id: str, analysis_id: str) -> Analysis
     stale = analysis_start.stale_reasons(service, test_id, document)
     reply = {
         **document.shown(),
+        "calibration_sha256": document.inputs.calibration_sha256,
         "state": state,
         "job_id": job_id,
         "problem": None if problem is None else problem.plain(),

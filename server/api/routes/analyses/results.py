@@ -155,7 +155,8 @@ def get_positions(
 ) -> Response:
     """Return column and row of each point, where it is at that step, by the calibration; null where it has none."""
     result = service.tests.result_file(test_id, analysis_id, n)
-    positions = image_positions(result, service.tests.calibration_file(test_id), cam)
+    measured = service.tests.analysis(test_id, analysis_id).inputs.calibration_sha256
+    positions = image_positions(result, service.tests.calibration_file(test_id, measured), cam)
     if format == "npy":
         buffer = io.BytesIO()
         np.save(buffer, positions, allow_pickle=False)

@@ -42,7 +42,7 @@ from server.workflows.analysis.warnings import with_warnings
 from server.workflows.burst import start_burst
 from server.workflows.capture import capture_step, import_step
 from server.workflows.service import Service
-from server.workflows.test_start import create
+from server.workflows.test_start import create, give_calibration
 
 router = APIRouter(prefix="/tests", tags=["tests"])
 _CHANNELS: TypeAdapter[dict[str, float]] = TypeAdapter(Channels)
@@ -89,16 +89,24 @@ def get_test(service: ServiceDep, test_id: TestId, response: Response) -> TestRe
 
 
 @router.patch(
-    "/{test_id:plain_id}", summary="Change a test's name, specimen or notes", responses=errors(404, 412, 422, 428, 507)
+    "/{test_id:plain_id}",
+    summary="Change a test's name, specimen, notes or calibration",
+    responses=errors(404, 409, 412, 422, 428, 507),
 )
 def patch_test(
     service: ServiceDep, test_id: TestId, body: TestPatch, response: Response, if_match: IfMatch = None
 ) -> TestReply:
-    """Change what is given; If-Match names which state of the test was meant."""
+    """Change what is given; If-Match names which state of the test was meant.
+
+    With another calibration new analyses are measured; those that there are keep the one that they were made with.
+    """
     service.tests.path(test_id)
     changes = {k: v for k, v in body.model_dump(exclude_unset=True).items() if v is not None}
     with service.changes:  # no other change comes between the check and this one
         require_match(if_match, etag_of(_reply(service, test_id)), f"test {test_id}")
+        calibration_id = changes.pop("calibration_id", None)
+        if calibration_id is not None:
+            give_calibration(service, test_id, str(calibration_id), in_force=True)
         document = service.tests.update(test_id, changes)
         service.catalog.put_entry("test", "", test_id, test_entry(document))
         return _shown(service, test_id, tagged(response, _reply(service, test_id)))
