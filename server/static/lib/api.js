@@ -157,9 +157,10 @@ export const put = async (path, body, headers) => json(await send("PUT", path, {
  * @template {string} const P
  * @param {P & Address<"patch", P>} path
  * @param {Body<"patch", P>} body
+ * @param {Record<string, string>} [headers]
  * @returns {Promise<Reply<"patch", P>>}
  */
-export const patch = async (path, body) => json(await send("PATCH", path, { body }));
+export const patch = async (path, body, headers) => json(await send("PATCH", path, { body, headers }));
 
 /**
  * @template {string} const P

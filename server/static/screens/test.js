@@ -5,7 +5,7 @@ import { stepsPanel } from "./test/steps.js";
 import { metadataPanel } from "./test/metadata.js";
 import { measurePanel } from "./test/measure.js";
 import { warningsCell } from "./results/warnings.js";
-import { h, replace, field, select, action, table, when, notify } from "../lib/dom.js";
+import { h, replace, field, select, action, table, when, notify, problemText } from "../lib/dom.js";
 
 /** @import { Here } from "../main.js" */
 /** @import { Ends } from "#dom" */
@@ -19,12 +19,19 @@ export async function open(root, { path }) {
   return path[0] ? one(root, path[0]) : all(root);
 }
 
-/** Calibrations to choose from: the newest accepted one first, then the newest. */
-async function calibrationChoice() {
+/**
+ * Calibrations to choose from: the newest accepted one first, then the newest.
+ * @param {string} [chosen] of a test; left out: the one to begin with
+ */
+async function calibrationChoice(chosen) {
   const usable = (await api.get("/calibrations")).calibrations.filter((c) => c.state === "complete" && c.decision !== "discarded").toReversed();
   const first = usable.find((c) => c.decision === "accepted") ?? usable[0];
   const text = (/** @type {Reply<"get", "/calibrations">["calibrations"][number]} */ c) => `${c.label || c.id} · ${c.verdict?.level ?? "imported"}${c.decision === "accepted" ? " · accepted" : ""} · ${when(c.created_utc)}`;
-  return select([...usable.map((c) => [c.id, text(c)]), ["", "none: images only"]], first?.id ?? "");
+  /** @type {[string, string][]} */
+  const options = usable.map((c) => [c.id, text(c)]);
+  if (chosen === undefined) return select([...options, ["", "none: images only"]], first?.id ?? "");
+  if (chosen && !usable.some((c) => c.id === chosen)) options.unshift([chosen, `${chosen} · gone or discarded since`]);
+  return select(chosen ? options : [["", usable.length ? "choose one …" : "there is none yet"], ...options], chosen);
 }
 
 /** @param {HTMLElement} root */
@@ -67,19 +74,50 @@ async function one(root, id) {
   const head = h("section.panel");
   const analyses = h("section.panel", { "aria-label": "Analyses" });
 
+  /** @param {import("#routes").Body<"patch", "/tests/{test_id}">} changes */
+  async function change(changes) {
+    const { etag } = await api.getTagged(`/tests/${id}`);
+    return api.patch(`/tests/${id}`, changes, etag === null ? {} : { "If-Match": etag });
+  }
+  /** The calibration that new analyses are measured with; a test that has none says what to do about it. */
+  async function calibrationRow() {
+    const choice = Object.assign(await calibrationChoice(test.calibration_id ?? ""), { id: "test-calibration" });
+    choice.style.maxWidth = "100%";
+    const said = h("small.hint", { role: "status" }, "Analyses that are there keep theirs.");
+    choice.addEventListener("change", async () => {
+      if (!choice.value) return;
+      try {
+        test = await change({ calibration_id: choice.value });
+        drawHead();
+        await measure.steps(test);
+        notify("New analyses are measured with this calibration.", "good");
+      } catch (error) {
+        choice.value = test.calibration_id ?? "";
+        replace(said, problemText(error));
+      }
+    });
+    const row = h("div.row", h("label", { for: "test-calibration" }, "Calibration"), choice, h("a", { href: test.calibration_id ? `#/calibrate/${test.calibration_id}` : "#/calibrate" }, test.calibration_id ? "look at it" : "make or import one"), said);
+    return test.calibration_id ? row : h("div.caution", { "data-role": "uncalibrated" }, h("p", "This test names no calibration: choose one, and its images can be measured. It can be changed at any time."), row);
+  }
+  let drawn = 0;
   function drawHead() {
+    drawn += 1;
+    const mine = drawn;
+    const calibration = h("div", { "data-role": "calibration" });
+    calibrationRow().then((row) => { if (mine === drawn) replace(calibration, row); }, (error) => replace(calibration, problemText(error)));
     const name = h("input", { type: "text", maxlength: 300, value: test.name });
     const specimen = h("input", { type: "text", maxlength: 300, value: test.specimen });
     const notes = h("textarea", { rows: 3, maxlength: 20000, value: test.notes });
-    replace(head, h("p", test.specimen ? `${test.specimen} · ` : "", test.calibration_id ? ["calibration ", h("a", { href: `#/calibrate/${test.calibration_id}` }, test.calibration_id)] : "no calibration: its images can be viewed, not measured", ` · made ${when(test.created_utc)} · `, h("code", test.id)),
-      test.notes ? h("p.quiet", test.notes) : null,
+    replace(head, h("p", test.specimen ? `${test.specimen} · ` : "", `made ${when(test.created_utc)} · `, h("code", test.id)),
+      test.notes ? h("p.quiet", test.notes) : null, calibration,
       h("details", h("summary", "Name, specimen and notes"), h("div.fields", field("Name", name), field("Specimen", specimen)), field("Notes", notes),
-        action("Save", async () => { test = await api.patch(`/tests/${id}`, { name: name.value, specimen: specimen.value, notes: notes.value }); title.textContent = test.name; drawHead(); notify("Saved.", "good"); })),
+        action("Save", async () => { test = await change({ name: name.value, specimen: specimen.value, notes: notes.value }); title.textContent = test.name; drawHead(); notify("Saved.", "good"); })),
       metadataPanel(id));
   }
   function drawAnalyses() {
     replace(analyses, h("h2", "Analyses"), table([
-      ["Analysis", (a) => h("a", { href: `#/results/${id}/${a.id}` }, a.label || a.id)], ["Kind", (a) => a.kind], ["Checks", warningsCell], ["Made", (a) => when(a.created_utc)],
+      ["Analysis", (a) => h("a", { href: `#/results/${id}/${a.id}` }, a.label || a.id)], ["Kind", (a) => a.kind], ["Checks", warningsCell],
+      ["Calibration", (a) => (a.calibration_id ? h("a", { href: `#/calibrate/${a.calibration_id}` }, a.calibration_id) : "–")], ["Made", (a) => when(a.created_utc)],
     ], (test.analyses ?? []).toReversed(), { caption: "Newest first", empty: "None yet." }));
   }
   const title = h("h1", test.name);

@@ -44,7 +44,7 @@ export function about(screen) {
       failed.length ? h("div", h("h3", "Steps that failed"), h("ul", failed.map(([n, one]) => h("li", `Step ${n}: ${one.code}: ${one.cause} ${one.remedy}`)))) : null,
       h("h3", "Settings"),
       definitions([["kind", analysis.kind], ...Object.entries(analysis.settings ?? {}).map(([name, value]) => /** @type {const} */ ([name.replace(/_/g, " "), text(value)])),
-        ["software", analysis.software ?? "–"], ["begun", when(analysis.created_utc)], ["calibration", analysis.inputs?.calibration_sha256 ? h("code", analysis.inputs.calibration_sha256.slice(0, 16)) : "–"]]),
+        ["software", analysis.software ?? "–"], ["begun", when(analysis.created_utc)], ["calibration", analysis.inputs?.calibration_sha256 ? [analysis.calibration_id ? h("a", { href: `#/calibrate/${analysis.calibration_id}` }, analysis.calibration_id) : null, " ", h("code", analysis.inputs.calibration_sha256.slice(0, 16))] : "–"]]),
       h("h3", "Steps"),
       table([
         ["Step", (one) => one.n, { numeric: true }],

@@ -205,7 +205,10 @@ export async function measurePanel(id, test, ends, done) {
       const wanted = stepList(which.value);
       if (wanted) body_.steps = wanted;
       if (follow_.checked) body_.follow = true;
-      const { job, analysis_id: analysis } = await api.post(`/tests/${id}/analyses`, body_);
+      const { job, analysis_id: analysis } = await api.post(`/tests/${id}/analyses`, body_).catch((error) => {
+        if (error.code !== "not_calibrated") throw error;
+        throw api.problemOf({ cause: "This test has no calibration.", remedy: "Choose one at the head of this screen." });
+      });
       await done();
       follow(job, analysis).catch((error) => api.aborted(error) || notify(error));
     }, { kind: "primary" });
