@@ -24,7 +24,7 @@ from server.api.routes.calibrations import checks as calibration_checks
 from server.api.routes.calibrations import exports as calibration_exports
 from server.api.routes.rig import cameras, devices, stage
 from server.api.routes.service import jobs, session, system
-from server.api.routes.tests import channels, frame, metadata, tests, watch
+from server.api.routes.tests import channels, frame, metadata, recipes, tests, watch, workspace
 from server.api.routes.tests.trash import router as trash_router
 from server.http.access import KeyFile
 from server.workflows.calibration.guided import Guides
@@ -129,6 +129,8 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         tests,
         metadata,
         frame,
+        workspace,
+        recipes,
         watch,
         channels,
         analyses,

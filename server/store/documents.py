@@ -275,6 +275,16 @@ class WatchRecord(Document):
     last_step: int | None = None
 
 
+class RecipeRecord(Document):
+    """A recipe's file; its content is checked where it is used."""
+
+    id: str
+    name: str
+    created_utc: str | None = None
+    changed_utc: str | None = None
+    recipe: dict[str, object] = Field(default_factory=dict)
+
+
 class TrashEntry(Record, Document):
     """Something that was deleted and can be restored."""
 

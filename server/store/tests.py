@@ -172,6 +172,15 @@ class TestStore:
             document = {name: value for name, value in read_json(path).items() if name not in METADATA_NAMES}
             write_json(path, document | {"metadata": metadata})
 
+    def workspace(self, test_id: str) -> dict[str, object]:
+        """Return what is drawn and set for a test; empty where nothing is."""
+        path = self.path(test_id) / "workspace.json"
+        return read_json(path) if path.is_file() else {}
+
+    def put_workspace(self, test_id: str, document: Mapping[str, object]) -> None:
+        """Replace what is drawn and set for a test; durable when this returns."""
+        write_json(self.path(test_id) / "workspace.json", document)
+
     def is_calibrated(self, test_id: str) -> bool:
         """Return True if the test has a calibration to measure with."""
         return calibration_in(self.path(test_id)).is_file()

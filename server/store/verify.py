@@ -32,12 +32,12 @@ _KNOWN = {
     "calibration": r"(plan|target|view|review|judgement|failure|rejected)\.json|"
     r"(calibration\.json|residuals\.nc)(\.sha256)?|calibration\.checks\.json|views",
     "noise": r"(plan|frames|failure)\.json|noise\.json(\.sha256)?|frames",
-    "test": r"(test|calibration|watch)\.json|calibrations|steps|analyses|exports",
+    "test": r"(test|calibration|watch|workspace)\.json|calibrations|steps|analyses|exports",
     "step": r"step\.json|cam[12]\.tif",
     "analysis": r"(analysis|jobs|noise|summary)\.json|mask\.png|step_\d+\.(nc|nc\.sha256|json)|starts_\d+\.npz",
 }
 _WRITING_S = 1.0  # longer than a file is under way
-_FOLDERS = frozenset({"calibrations", "tests", "noise", "trash", ".exports"})
+_FOLDERS = frozenset({"calibrations", "tests", "noise", "recipes", "trash", ".exports"})
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ class _Walk:
         if document is not None:
             self.calibrations_of(path, document)
         self.strangers(path, "test")
-        self.documents(path, "watch.json")
+        self.documents(path, "watch.json", "workspace.json")
         for step in sorted((path / "steps").iterdir()) if (path / "steps").is_dir() else ():
             self.step(path.name, step)
         for analysis in self.entries(path / "analyses", "a", "analysis.json"):

@@ -32,6 +32,7 @@ from server.store.catalog import Catalog
 from server.store.folder import DataFolder
 from server.store.index import rebuild
 from server.store.noise import NoiseStore
+from server.store.recipes import RecipeStore
 from server.store.tests import TestStore
 from server.store.trash import Trash
 from server.worker.dask_cluster import ClusterExecutor
@@ -71,6 +72,7 @@ class Service:
         self.calibrations = CalibrationStore(self.folder)
         self.tests = TestStore(self.folder)
         self.noise = NoiseStore(self.folder)
+        self.recipes = RecipeStore(self.folder)
         self.trash = Trash(self.folder.root)
         self.differences: list[str] = []
         self.metrics = Metrics()
@@ -122,6 +124,7 @@ class Service:
             self.catalog.open()
             parts.callback(self.catalog.close)
             self.noise.end_unfinished()
+            self.recipes.reserve_ids()
             self.differences = rebuild(self.catalog, self.folder, self.calibrations, self.tests, self.noise)
             for line in self.differences:
                 _log.info("catalogue: %s", line)

@@ -49,19 +49,32 @@ class Region(settings.Region):
         return self
 
 
+def _none_yet() -> Any:
+    """Return nothing, in place of the region that a recipe gives."""
+    return None
+
+
 class StrainRequest(settings.StrainSettings):
     """Strain over a virtual gauge, (window - 1) spacing_px + subset_px wide."""
 
 
 class AnalysisRequest(settings.AnalysisSettings):
-    """Analysis over a test's steps."""
+    """Analysis over a test's steps; what it leaves out, a recipe that it names gives."""
 
+    model_config = ConfigDict(json_schema_extra=any_of("region", "recipe"))
+
+    recipe: Annotated[str, StringConstraints(min_length=1, max_length=120)] | None = Field(
+        None,
+        description="Id or name of a kept recipe, or `workspace`: what is drawn and set for the test. It gives what "
+        "this request leaves out.",
+        examples=["r000001-5d0a3f"],
+    )
     kind: Literal["profile", "displacement"] = Field(
         "displacement",
         description="Shape only, of each step by itself, or shape and displacement. `profile` if left out with a "
         "projected pattern, which shows no displacement.",
     )
-    region: Region = Field(description="Region of interest.")
+    region: Region = Field(default_factory=_none_yet, description="Region of interest.")
     calibration_id: Annotated[str, StringConstraints(max_length=40)] | None = Field(
         None,
         description="Calibration to measure with, of which the test keeps a copy; `latest`: the newest one accepted; "
@@ -93,11 +106,13 @@ class AnalysisRequest(settings.AnalysisSettings):
     def _follows_or_names(self) -> Self:
         if self.follow and self.steps is not None:
             raise disagreement("give steps or follow, not both")
+        if "region" not in self.model_fields_set and self.recipe is None:
+            raise ValueError("region is missing: give one, or a recipe that has one")
         return self
 
     def stored(self) -> StoredSettings:
         """Return the settings as results keep them, without the noise model."""
-        asked = self.model_dump(exclude={"kind", "label", "steps", "noise_id", "calibration_id", "follow"})
+        asked = self.model_dump(exclude={"kind", "label", "steps", "noise_id", "calibration_id", "follow", "recipe"})
         mask = asked["region"].pop("mask_png_base64")
         asked["region"]["mask"] = None if mask is None else "mask.png"
         return StoredSettings.model_validate(asked)

@@ -7,12 +7,14 @@ import base64
 from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 
-from core.errors import RegionError
+from core.errors import InputError, RegionError
 from server.api.models import AnalysisAccepted, AnalysisList, AnalysisReply, AnalysisRequest, ContinueRequest, Region
+from server.api.models.recipes import WORKSPACE, recipe_in
 from server.api.protocol.attached import Wait, job_reply
 from server.api.protocol.dependencies import AnalysisId, KeyHeader, ServiceDep, TestId, mark
 from server.api.protocol.paging import PageDep
 from server.api.protocol.problems import errors
+from server.api.routes.tests.recipes import check_against_test
 from server.base.errors import NotFoundError
 from server.base.models import Ids, JobState
 from server.jobs.idempotency import RequestMark
@@ -40,8 +42,41 @@ async def create_analysis(
 
 def _start(service: Service, test_id: str, body: AnalysisRequest, key: str | None) -> Ids:
     request = mark(f"tests/{test_id}/analyses", key, body)
-    made, _ = service.once(request.scope, key, request.body_sha256, lambda: _begin(service, test_id, body, request))
+
+    def make() -> Ids:
+        return _begin(service, test_id, _with_recipe(service, test_id, body), request)
+
+    made, _ = service.once(request.scope, key, request.body_sha256, make)
     return made
+
+
+def _with_recipe(service: Service, test_id: str, body: AnalysisRequest) -> AnalysisRequest:
+    """Return a request with what its recipe gives where it says nothing.
+
+    Raises
+    ------
+    NotFoundError
+        There is no such recipe.
+    InputError
+        ``recipe_invalid`` for one that cannot be used; ``recipe_other_size``, ``recipe_outside``.
+    """
+    if body.recipe is None:
+        return body
+    own = body.recipe == WORKSPACE
+    recipe = recipe_in(
+        service.tests.workspace(test_id) if own else service.recipes.find(body.recipe).recipe,
+        name=f"The workspace of test {test_id}" if own else f"Recipe {body.recipe}",
+    )
+    check_against_test(service, test_id, recipe)
+    stated = body.model_dump(mode="json", exclude_unset=True, exclude={"recipe"})
+    whole = {**recipe.analysis(), **stated}
+    if "region" not in whole:
+        raise InputError(
+            f"Neither the request nor recipe {body.recipe!r} has a region.",
+            code="recipe_invalid",
+            remedy="Give a region, or draw one and keep it with the recipe.",
+        )
+    return AnalysisRequest.model_validate(whole)
 
 
 async def _accepted(request: Request, service: Service, made: Ids, wait_s: float) -> AnalysisAccepted:
