@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from core.errors import InputError, StereorigError
 from core.names import CameraName
@@ -29,6 +30,7 @@ from server.report.records import (
     SummaryRecord,
     TestRecord,
 )
+from server.results.gauges.request import GaugeRequest
 from server.results.metadata import TestMetadata, parse_metadata
 from server.results.staleness import stale_results
 from server.results.steps import failed_steps
@@ -185,6 +187,7 @@ def find_source(
         for n, one in failed_steps(folder).items()
     ]
     loaded, file = _calibration(calibration, home, made, heads, doubts)
+    stated = parse_metadata(test_record.metadata, name="the metadata of the test") if metadata is None else metadata
     if loaded is not None and file is not None:
         loaded = _with_kept_checks(loaded, file, home, test_record)
     return Source(
@@ -196,14 +199,24 @@ def find_source(
         steps=steps,
         calibration=loaded,
         calibration_file=file,
-        metadata=parse_metadata(test_record.metadata, name="the metadata of the test")
-        if metadata is None
-        else metadata,
+        metadata=_with_drawn_gauges(stated, home, doubts),
         stale=stale_results(list(files.values()), list(heads.values())),
         doubts=doubts,
         warnings=[one for one in analysis_warnings(folder) if one.code != "steps_failed"],  # they are among the doubts
         camera_motion=_camera_motion(folder, list(heads)),
     )
+
+
+def _with_drawn_gauges(stated: TestMetadata, home: Path | None, doubts: list[str]) -> TestMetadata:
+    """Add the gauges that were drawn over the test's results, where the metadata name none."""
+    drawn = None if home is None else known_json(home / "workspace.json").get("gauges")
+    if stated.gauges is not None or drawn is None:
+        return stated
+    try:
+        return stated.model_copy(update={"gauges": GaugeRequest.model_validate(drawn)})
+    except ValidationError as error:
+        doubts.append(f"The gauges that were drawn cannot be read: {error.errors()[0]['msg']}.")
+        return stated
 
 
 def _camera_motion(folder: Path, numbers: list[int]) -> dict[int, CameraMotionRecord]:

@@ -11,6 +11,7 @@ import httpx
 import pytest
 
 from server.api.models.recipes import RECIPE_VERSION
+from server.cli import main
 from server.store.verify import verify
 from server.workflows.service import Service
 from tests.support.copied_tests import write_test_folder
@@ -119,10 +120,16 @@ BAD = {
 
 
 @pytest.fixture(scope="module")
-def measurable(client: httpx.Client, tmp_path_factory: pytest.TempPathFactory) -> str:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A test's folder with one step of a plate."""
+    made = tmp_path_factory.mktemp("taken") / "t000001-abcdef"
+    write_test_folder(made, 1)
+    return made
+
+
+@pytest.fixture(scope="module")
+def measurable(client: httpx.Client, folder: Path) -> str:
     """A test with a calibration and one step."""
-    folder = tmp_path_factory.mktemp("taken") / "t000001-abcdef"
-    write_test_folder(folder, 1)
     calibration = ("calibration.json", json.dumps(true_cameras(TINY)).encode())
     made = client.post(f"{API}/calibrations:import", files={"file": calibration}).json()["id"]
     test_id = new_test(client, calibration_id=made)
@@ -169,3 +176,44 @@ def test_an_analysis_takes_what_it_leaves_out_from_a_recipe(client: httpx.Client
     assert_problem(client.post(post, json={}), 422, "invalid_request")
     client.put(f"{API}/tests/{measurable}/workspace", json={"note": "no region"}).raise_for_status()
     assert_problem(client.post(post, json={"recipe": "workspace"}), 422, "recipe_invalid")
+
+
+def test_the_command_line_takes_the_same_file_and_its_options_override_it(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    recipe = {
+        **stated({"image_size_px": [160, 144]}),
+        "region": {"polygon": [[50, 50], [95, 51], [80, 92.5]], "holes": [[[60, 60], [64, 60], [64, 64]]]},
+        "settings": {
+            "subset_px": 25,
+            "spacing_px": 12,
+            "pattern": "projected",
+            "max_sigma_px": 0.2,
+            "seeds": [[80, 60]],
+        },
+    }
+    file = tmp_path / "recipe.json"
+    file.write_text(json.dumps(recipe))
+    arguments = ["measure", str(folder), "--recipe", str(file), "--out", str(tmp_path / "out")]
+    assert main([*arguments, "--subset", "21", "--interpolation", "cubic"]) == 0
+    settings = json.loads((tmp_path / "out" / "summary.json").read_text())["settings"]
+    assert (settings["subset_px"], settings["interpolation"]) == (21, "cubic")  # of the command line
+    assert (settings["spacing_px"], settings["max_sigma_px"], settings["pattern"]) == (12, 0.2, "projected")
+    assert settings["region"]["polygon"] == recipe["region"]["polygon"]
+    assert settings["region"]["holes"] == recipe["region"]["holes"]
+    assert settings["seeds"] == [[80, 60]]
+    capfd.readouterr()
+    for change, code, word in (
+        ({"version": RECIPE_VERSION + 1}, "recipe_invalid", f"version {RECIPE_VERSION + 1}"),
+        ({"image_size_px": [640, 480]}, "recipe_other_size", "640 x 480"),
+        ({"regions": []}, "recipe_invalid", "regions"),
+    ):
+        file.write_text(json.dumps({**recipe, **change}))
+        assert main([*arguments[:-1], str(tmp_path / "other")]) == 1
+        said = capfd.readouterr().err
+        assert code in said
+        assert word in said
+        assert not (tmp_path / "other").exists()
+    file.write_text("{")
+    assert main(arguments) == 1
+    assert "recipe_invalid" in capfd.readouterr().err

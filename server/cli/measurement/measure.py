@@ -28,6 +28,7 @@ from core.settings import (
 )
 from server.cli.measurement.image_lists import ImagePair, expand, pair_up, pairs_of_test_folder
 from server.cli.measurement.image_pairs import check_cameras, checked_pairs, checked_shapes, first_readable
+from server.cli.measurement.recipe import mask_of, notes_on, polygon_of, with_recipe
 from server.cli.measurement.region import check_region, check_whole, parse_rectangle
 from server.cli.measurement.sequence import MeasureJob, measure_sequence
 from server.cli.measurement.specimen import SPECIMEN_FILE, found_specimen
@@ -57,6 +58,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="points lie at X0 + i step, Y0 + j step up to X1, Y1; auto: on the specimen, found by its texture and "
         "shown in specimen.png (auto, without a mask)",
     )
+    add(
+        "--recipe",
+        metavar="FILE",
+        help="recipe of the page or the API: region and settings, where no option here gives another",
+    )
     add("--mask", metavar="PNG", help="image of camera 1's size, white where points may lie")
     add(
         "--crack",
@@ -72,38 +78,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="X0,Y0,X1,Y1,X2,Y2[,...]",
         help="a polygon inside which nothing is measured",
     )
-    add("--subset", default=str(SUBSET_PX.default), metavar="PX", help=f"subset width, odd ({SUBSET_PX.default})")
-    add(
-        "--step",
-        "--spacing",
-        default=str(SPACING_PX.default),
-        metavar="PX",
-        help=f"distance of the points ({SPACING_PX.default})",
-    )
+    add("--subset", metavar="PX", help=f"subset width, odd ({SUBSET_PX.default})")
+    add("--step", "--spacing", metavar="PX", help=f"distance of the points ({SPACING_PX.default})")
     add(
         "--patch",
         type=patch_name,
         choices=PATCH_SETTINGS,
-        default=DEFAULT_PATCH,
         help="affine, rigid: plane patches; quadratic: second-order shape and motion, about twice the noise; auto: "
         f"affine or quadratic, whichever has the smaller total error, with the reason ({DEFAULT_PATCH})",
     )
-    add(
-        "--interpolation",
-        choices=INTERPOLATIONS,
-        default=DEFAULT_INTERPOLATION,
-        help=f"spline between the pixels ({DEFAULT_INTERPOLATION})",
-    )
+    add("--interpolation", choices=INTERPOLATIONS, help=f"spline between the pixels ({DEFAULT_INTERPOLATION})")
     add(
         "--prefilter",
-        default="0",
         metavar="SD",
         help="blur all images with a Gaussian of this sd in px: less bias, more noise (0: none)",
     )
     add(
         "--max-sigma",
         type=float,
-        default=DEFAULT_MAX_SIGMA_PX,
         metavar="PX",
         help=f"reject points whose match, in depth too, has a larger standard deviation ({DEFAULT_MAX_SIGMA_PX:g})",
     )
@@ -125,17 +117,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--strain-order",
         choices=[str(order) for order in STRAIN_ORDERS],
-        default="auto",
         help="fit planes (1) or quadratics (2) over the gauge; auto: planes, but quadratics where an edge, a hole or a "
         "cut leaves points on one side and the planes' bias there outweighs their noise (auto)",
     )
-    add("--strain-tensor", choices=STRAIN_TENSORS, default="green_lagrange", help="strain tensor (green_lagrange)")
-    add(
-        "--smooth",
-        default="off",
-        metavar="WINDOW|off",
-        help="smooth displacements by a quadratic over WINDOW x WINDOW points (off)",
-    )
+    add("--strain-tensor", choices=STRAIN_TENSORS, help="strain tensor (green_lagrange)")
+    add("--smooth", metavar="WINDOW|off", help="smooth displacements by a quadratic over WINDOW x WINDOW points (off)")
     add(
         "--reference-update",
         choices=REFERENCE_UPDATES,
@@ -176,17 +162,17 @@ def _strain(args: argparse.Namespace) -> dict[str, object] | None:
     window = check_whole("--strain", str(STRAIN_WINDOW.default) if args.strain is None else args.strain, STRAIN_WINDOW)
     return {
         "window": window,
-        "order": next(order for order in STRAIN_ORDERS if str(order) == args.strain_order),
-        "tensor": args.strain_tensor,
+        "order": next(order for order in STRAIN_ORDERS if str(order) == (args.strain_order or "auto")),
+        "tensor": args.strain_tensor or "green_lagrange",
     }
 
 
 def _smoothing_window(args: argparse.Namespace) -> int | None:
-    return None if args.smooth == "off" else check_whole("--smooth", args.smooth, SMOOTHING_WINDOW)
+    return None if args.smooth in (None, "off") else check_whole("--smooth", args.smooth, SMOOTHING_WINDOW)
 
 
 def _max_sigma_px(args: argparse.Namespace) -> float:
-    value = float(args.max_sigma)
+    value = DEFAULT_MAX_SIGMA_PX if args.max_sigma is None else float(args.max_sigma)
     if not 0.0 < value <= MAX_SIGMA_PX:
         raise InputError(
             f"--max-sigma {value:g} must lie above 0 and be at most {MAX_SIGMA_PX:g}.", code="option_out_of_range"
@@ -196,7 +182,7 @@ def _max_sigma_px(args: argparse.Namespace) -> float:
 
 def _prefilter_px(args: argparse.Namespace, subset_px: int) -> float:
     try:
-        prefilter_px = float(args.prefilter)
+        prefilter_px = 0.0 if args.prefilter is None else float(args.prefilter)
     except ValueError as error:
         raise InputError(
             f"--prefilter {args.prefilter} is not a number.",
@@ -230,8 +216,10 @@ def _pairs(args: argparse.Namespace, progress: ProgressLine) -> list[ImagePair]:
 
 def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
     """Check everything that can be checked before anything is computed or written."""
-    subset = check_whole("--subset", args.subset, SUBSET_PX)
-    step = check_whole("--step", args.step, SPACING_PX)
+    given = args
+    args, recipe = with_recipe(given)
+    subset = check_whole("--subset", str(SUBSET_PX.default) if args.subset is None else args.subset, SUBSET_PX)
+    step = check_whole("--step", str(SPACING_PX.default) if args.step is None else args.step, SPACING_PX)
     rectangle = None if args.roi in (None, "auto") else parse_rectangle(args.roi)
     strain, prefilter_px = _strain(args), _prefilter_px(args, subset)
     files = _pairs(args, progress)
@@ -245,9 +233,14 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
     out = Path(args.out) if args.out or folder is None else folder / "exports" / "measure"
     first = first_readable(files) if args.projected else files[0]
     shapes = checked_shapes(first, calibration)
-    mask_file = None if args.mask is None else Path(args.mask)
+    if recipe is not None:
+        recipe.check_fits(shapes[0][1], shapes[0][0])
+        for note in notes_on(recipe):
+            progress.note(f"note: {note}")
+    polygon = polygon_of(recipe, given)
+    mask_file = mask_of(recipe, given, out) if args.mask is None else Path(args.mask)
     specimen = None
-    if args.roi == "auto" or (rectangle is None and mask_file is None):
+    if args.roi == "auto" or (rectangle is None and polygon is None and mask_file is None):
         specimen = found_specimen(first, calibration, subset, None if mask_file is None else read_mask(mask_file))
         progress.note(f"region: {specimen.text}")
         rectangle, mask_file = specimen.rectangle_px(subset), out / SPECIMEN_FILE
@@ -261,6 +254,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         seeds=args.seed,
         cracks=args.crack,
         holes=args.hole,
+        polygon=polygon,
         mask=None if specimen is None else specimen.mask,
     )
     check_positions(calibration.pair, seeds or (), (shapes[1][1], shapes[1][0]))
@@ -270,8 +264,8 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
             "region": region,
             "subset_px": subset,
             "spacing_px": step,
-            "patch": args.patch,
-            "interpolation": args.interpolation,
+            "patch": args.patch or DEFAULT_PATCH,
+            "interpolation": args.interpolation or DEFAULT_INTERPOLATION,
             "prefilter_px": prefilter_px,
             "max_sigma_px": _max_sigma_px(args),
             "keep_rejected": args.keep_rejected,

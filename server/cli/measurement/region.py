@@ -108,6 +108,7 @@ def check_region(
     seeds: Sequence[str],
     cracks: Sequence[str] = (),
     holes: Sequence[str] = (),
+    polygon: Sequence[tuple[float, float]] | None = None,
     mask: NDArray[np.bool_] | None = None,
 ) -> tuple[StoredRegion, tuple[Seed, ...] | None]:
     """Check region, mask, cracks, holes and seeds against camera 1's image; return the region, and the seeds if any.
@@ -116,6 +117,8 @@ def check_region(
     ----------
     rectangle, mask_path
         One of them, or both.
+    polygon
+        Corners, in place of the rectangle.
     mask
         The mask, where its file is still to be written.
 
@@ -132,6 +135,7 @@ def check_region(
     region = StoredRegion.model_validate(
         {
             "rectangle": rectangle,
+            "polygon": polygon,
             "cracks": [parse_line("--crack", text, 2) for text in cracks],
             "holes": [parse_line("--hole", text, 3) for text in holes],
             "mask": None if mask_path is None else str(mask_path),

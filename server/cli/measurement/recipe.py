@@ -1,0 +1,113 @@
+"""``stereorig measure --recipe FILE``: region and settings of a recipe, where the command line gives none."""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from core.errors import InputError
+from server.api.models.recipes import Recipe, recipe_in
+from server.formats.files import make_folder, write_bytes
+
+#: options whose value is text or a number, by the setting's name
+_PLAIN = {
+    "subset": "subset_px",
+    "step": "spacing_px",
+    "patch": "patch",
+    "interpolation": "interpolation",
+    "prefilter": "prefilter_px",
+    "max_sigma": "max_sigma_px",
+    "reference_update": "reference_update",
+    "smooth": "smoothing_window",
+}
+MASK_FILE = "recipe_mask.png"
+"""The recipe's mask, in the output folder."""
+
+
+def load_recipe(path: Path) -> Recipe:
+    """Read a recipe's file.
+
+    Raises
+    ------
+    InputError
+        ``recipe_invalid``; ``file_missing`` if there is none.
+    """
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(f"{path} does not exist.", code="file_missing", remedy="Check the path.") from error
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path} cannot be read as JSON: {error}.",
+            code="recipe_invalid",
+            remedy="Give a recipe's file: the page's Test screen writes one.",
+        ) from error
+    if isinstance(document, dict) and "recipe" in document and "region" not in document:
+        document = document["recipe"]  # as GET /recipes/{id} answers
+    return recipe_in(document, name=str(path))
+
+
+def with_recipe(args: argparse.Namespace) -> tuple[argparse.Namespace, Recipe | None]:
+    """Return the arguments, with the recipe's values where the command line has none; and the recipe."""
+    if args.recipe is None:
+        return args, None
+    recipe = load_recipe(Path(args.recipe))
+    filled = argparse.Namespace(**vars(args))
+    stated = recipe.settings.model_dump(mode="json", exclude_unset=True)
+    for option, name in _PLAIN.items():
+        if getattr(args, option) is None and stated.get(name) is not None:
+            setattr(filled, option, str(stated[name]) if option != "max_sigma" else float(stated[name]))
+    filled.keep_rejected = args.keep_rejected or bool(stated.get("keep_rejected"))
+    filled.projected = args.projected or stated.get("pattern") == "projected"
+    if args.strain is None and "strain" in stated:
+        strain = stated["strain"]
+        filled.strain = "off" if strain is None else None if "window" not in strain else str(strain["window"])
+        for option, name in (("strain_order", "order"), ("strain_tensor", "tensor")):
+            if getattr(args, option) is None and strain is not None and name in strain:
+                setattr(filled, option, str(strain[name]))
+    if not args.seed:
+        two = recipe.settings.seeds_cam2 or [None] * len(recipe.settings.seeds or ())
+        pairs = zip(recipe.settings.seeds or (), two, strict=True)
+        filled.seed = [_text((*one, *(other or ()))) for one, other in pairs]
+    region = recipe.region
+    if region is not None:
+        filled.crack = args.crack or [_text(v for point in line for v in point) for line in region.cracks]
+        filled.hole = args.hole or [_text(v for point in line for v in point) for line in region.holes]
+        if args.roi is None and args.mask is None and region.rectangle is not None:
+            filled.roi = _text(region.rectangle)
+    return filled, recipe
+
+
+def polygon_of(recipe: Recipe | None, args: argparse.Namespace) -> list[tuple[float, float]] | None:
+    """Return the recipe's polygon, where the command line gives no region."""
+    if recipe is None or recipe.region is None or args.roi is not None or args.mask is not None:
+        return None
+    return None if recipe.region.polygon is None else [(x, y) for x, y in recipe.region.polygon]
+
+
+def mask_of(recipe: Recipe | None, args: argparse.Namespace, out: Path) -> Path | None:
+    """Write the recipe's mask into the output folder, where the command line gives no region; return its path."""
+    if recipe is None or recipe.region is None or recipe.region.mask_png_base64 is None:
+        return None
+    if args.mask is not None or args.roi == "auto":
+        return None
+    make_folder(out)
+    write_bytes(out / MASK_FILE, base64.b64decode(recipe.region.mask_png_base64))
+    return out / MASK_FILE
+
+
+def notes_on(recipe: Recipe | None) -> Sequence[str]:
+    """Return what a recipe asks for that the command line does not have."""
+    notes = []
+    if recipe is not None and recipe.settings.kind == "profile" and recipe.settings.pattern == "surface":
+        notes.append("the recipe asks for shapes alone; displacement is measured beside them")
+    if recipe is not None and recipe.settings.noise_id is not None:
+        notes.append(f"the recipe's noise measurement {recipe.settings.noise_id} is a service's; give --noise FILE")
+    return notes
+
+
+def _text(values: Iterable[float]) -> str:
+    return ",".join(f"{float(v):.12g}" for v in values)
