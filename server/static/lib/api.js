@@ -73,9 +73,9 @@ function located(path, query = {}) {
 /**
  * @param {"GET" | "POST" | "PUT" | "PATCH" | "DELETE"} method
  * @param {string} path
- * @param {{ body?: unknown, query?: Asked, headers?: Record<string, string>, signal?: AbortSignal, making?: boolean }} [options] `making`: it creates something
+ * @param {{ body?: unknown, query?: Asked, headers?: Record<string, string>, signal?: AbortSignal, making?: boolean, keepalive?: boolean }} [options] `making`: it creates something
  */
-async function send(method, path, { body, query, headers = {}, signal, making = false } = {}) {
+async function send(method, path, { body, query, headers = {}, signal, making = false, keepalive = false } = {}) {
   const url = located(path, query);
   const sent = { ...headers };
   if (making) sent["Idempotency-Key"] = newKey();
@@ -88,7 +88,7 @@ async function send(method, path, { body, query, headers = {}, signal, making = 
   // a creating request carries its key, so it may be sent again after a broken connection
   for (let attempt = 0; ; attempt += 1) {
     try {
-      const response = await fetch(url, { method, headers: sent, body: content, signal, credentials: "same-origin" });
+      const response = await fetch(url, { method, headers: sent, body: content, signal, keepalive, credentials: "same-origin" });
       announce("up");
       return response;
     } catch (error) {
@@ -192,6 +192,20 @@ export const raw = async (path, query) => ok(await send("GET", path, { query }))
  */
 export async function getTagged(path) {
   const response = await ok(await send("GET", path));
+  return { value: await response.json(), etag: response.headers.get("ETag") };
+}
+
+/**
+ * Replace something; with the ETag of what is there now.
+ * @template {string} const P
+ * @param {P & Address<"put", P>} path
+ * @param {Body<"put", P>} body
+ * @param {Record<string, string>} headers
+ * @param {boolean} [keepalive] the page may be closed before the answer is there
+ * @returns {Promise<{ value: Reply<"put", P>, etag: string | null }>}
+ */
+export async function putTagged(path, body, headers, keepalive) {
+  const response = await ok(await send("PUT", path, { body, headers, keepalive }));
   return { value: await response.json(), etag: response.headers.get("ETag") };
 }
 

@@ -8,6 +8,7 @@ import { about, files } from "./results/about.js";
 import { camerasNote } from "./results/cameras.js";
 import { gauges } from "./results/gauges.js";
 import { frames } from "./results/frame.js";
+import { Workspace, keptDisplay } from "./results/kept.js";
 import { mark, pinned } from "./results/probe.js";
 import { interval } from "./results/uncertainty.js";
 import { stateBadge, warningsBox, warningsCell } from "./results/warnings.js";
@@ -20,7 +21,7 @@ import { h, replace, table, when, num, count, quantity, field, select, definitio
 /** @import { Interval } from "./results/uncertainty.js" */
 /** @typedef {"image" | "surface" | "compare"} Mode */
 /** @typedef {{ step: number | null, field: string | null, image: Over, mode: Mode, info: Shown | null, playing: object | null, pinned?: number }} State */
-/** @typedef {{ result: Result, state: State, map: FieldMap, scale: Scale, interval: Interval, ends: Ends, probe: HTMLElement, message: HTMLElement, readonly step: number | null,
+/** @typedef {{ result: Result, state: State, map: FieldMap, scale: Scale, interval: Interval, workspace: Workspace, ends: Ends, probe: HTMLElement, message: HTMLElement, readonly step: number | null,
  *   readonly info: Shown | null, onpick: (x: number, y: number, event: Event) => unknown, drawn: Set<() => unknown> }} Viewer shared by the parts of the screen; `drawn` is called after each change of step, field or scale */
 /** @typedef {{ root: HTMLElement, update: () => Promise<void>, close: () => void, attach?: () => void }} OtherView shown instead of the map */
 
@@ -88,7 +89,7 @@ async function list(root, testId) {
  * @param {URLSearchParams} query
  */
 async function show(root, testId, analysisId, query) {
-  const result = await Result.open(testId, analysisId);
+  const [result, workspace] = await Promise.all([Result.open(testId, analysisId), Workspace.open(testId)]);
   /** @type {Ends} */
   const ends = [];
   const asked = Number(query.get("step") ?? NaN);
@@ -101,6 +102,8 @@ async function show(root, testId, analysisId, query) {
   const map = new FieldMap("Field over the image of camera 1", (x, y, event) => screen.onpick(x, y, event));
   ends.push(() => map.close());
   const scale = new Scale(() => redraw().catch(notify));
+  ends.push(() => { workspace.close(); });
+  const display = keptDisplay(workspace, scale, state);
   const fieldChoice = h("select", { "aria-label": "Field" });
   const imageChoice = select([["reference", "reference, camera 1"], ["cam1", "this step, camera 1"], ["cam2", "this step, camera 2"]], "reference");
   const opacity = h("input", { type: "range", min: 0, max: 100, value: 75 });
@@ -120,7 +123,7 @@ async function show(root, testId, analysisId, query) {
   const play = h("button", { type: "button", "aria-pressed": "false", title: "Play through the steps", onclick: () => playing(!state.playing) }, "▶ Play");
   /** @type {Viewer} */
   const screen = {
-    result, state, map, scale, ends, probe, message, interval: /** @type {any} */ (null),
+    result, state, map, scale, workspace, ends, probe, message, interval: /** @type {any} */ (null),
     get step() { return state.step; },
     get info() { return state.info; },
     onpick: (x, y) => pick(x, y),
@@ -281,7 +284,7 @@ async function show(root, testId, analysisId, query) {
   }
   ends.push(() => other?.close());
 
-  fieldChoice.addEventListener("change", () => { state.field = fieldChoice.value; scale.forget(); refresh().catch(notify); });
+  fieldChoice.addEventListener("change", () => { state.field = fieldChoice.value; display.chosen(); refresh().catch(notify); });
   imageChoice.addEventListener("change", () => { state.image = /** @type {Over} */ (imageChoice.value); refresh().catch(notify); });
   slider.addEventListener("input", () => setStep(result.steps[Number(slider.value)]).catch(notify));
   const fade = () => { map.view.canvas.style.opacity = String(Number(opacity.value) / 100); };
@@ -307,6 +310,7 @@ async function show(root, testId, analysisId, query) {
 
   drawStatus();
   screen.drawn.add(() => mark(screen));
+  screen.drawn.add(display.keep);
   const aboutPanel = about(screen);
   const gaugePanels = gauges(screen);
   const axes = frames(screen, async () => { scale.forget(); state.pinned = undefined; replace(probe, h("p.quiet", "Click a point to see all its values.")); await refresh(); });

@@ -67,6 +67,42 @@ export class Scale {
     return [of(this.lowest, 1), of(this.highest, 99)];
   }
 
+  /** What was chosen, besides limits that were given. */
+  state() {
+    return { colours: this.map.value, levels: Math.round(Number(this.levels.value) || 0), reversed: this.reverse.checked, over: this.span.value, percentiles: this.percentiles };
+  }
+
+  /** @param {{ colours?: string, levels?: number, reversed?: boolean, over?: string, percentiles?: readonly number[] }} state */
+  restore(state) {
+    if (state.colours && [...this.map.options].some((one) => one.value === state.colours)) this.map.value = state.colours;
+    if (state.levels !== undefined) this.levels.value = String(state.levels);
+    if (state.reversed !== undefined) this.reverse.checked = state.reversed;
+    if (state.over) this.span.value = state.over;
+    if (state.percentiles) [this.lowest.value, this.highest.value] = state.percentiles.map(String);
+  }
+
+  /**
+   * Limits that were given; null: none.
+   * @returns {[number, number] | null}
+   */
+  get given() {
+    const [low, high] = [Number(this.lowGiven.value), Number(this.highGiven.value)];
+    return this.limits.value === "given" && this.lowGiven.value !== "" && high > low ? [low, high] : null;
+  }
+
+  /**
+   * Give limits.
+   * @param {number} low
+   * @param {number} high
+   */
+  give(low, high) {
+    this.limits.value = "given";
+    this.lowGiven.value = String(low);
+    this.highGiven.value = String(high);
+    this.byLimits.hidden = false;
+    this.byPercentiles.hidden = true;
+  }
+
   /** Drop given limits: those of another field do not apply. */
   forget() {
     this.lowGiven.value = "";

@@ -4,6 +4,7 @@ import { chart } from "../../widgets/plots.js";
 import { h, svg, numeric, replace, table, num, count, number, select, field, action, notify, problemText } from "../../lib/dom.js";
 import { nudge, onGrab } from "../../widgets/view.js";
 import { shownUnit } from "./analysis.js";
+import { keptGauges } from "./kept.js";
 import { budgetTable, withBudget } from "./uncertainty.js";
 /** @import { Attributes } from "#dom" */
 /** @import { Body, GaugeReadings, Model } from "#routes" */
@@ -34,6 +35,7 @@ export function gauges(screen) {
   /** @type {{ tool: Tool, line: [Spot, Spot] | null, area: Four | null, extensometers: { name: string, a: Spot, b: Spot }[], serial: number, first: Spot | null }} */
   const state = { tool: "probe", line: null, area: null, extensometers: [], serial: 0, first: null };
   const rigid = h("input", { type: "checkbox" });
+  const keep = keptGauges(screen.workspace, state, rigid);
   /** @type {(more: Partial<Request>) => Request} */
   const body = (more) => /** @type {Request} */ ({ ...more, ...(rigid.checked ? { remove_rigid: {} } : {}) });
 
@@ -195,6 +197,7 @@ export function gauges(screen) {
   }
   /** @param {Spot | null} mouse */
   function draw(mouse = null) {
+    keep();
     const { area, line } = state;
     const parts = [];
     if (inReference()) {
@@ -441,8 +444,12 @@ export function gauges(screen) {
   const root = h("div", h("label.check", rigid, "Gauges without the rigid motion of the whole field"), panels.line, panels.extensometer, panels.area);
 
   let last = "";
+  let first = true;
   screen.drawn.add(async () => {
     draw();
+    if (first && state.extensometers.length) readExtensometers().catch(notify);
+    if (first) for (const name of /** @type {const} */ (["line", "area"])) panels[name].open = Boolean(state[name]);
+    first = false;
     const now = `${screen.step} ${screen.info?.key} ${result.frame}`;
     if (now === last) return;
     last = now;

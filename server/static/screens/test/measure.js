@@ -4,11 +4,15 @@ import { View, stroke } from "../../widgets/view.js";
 import { greyOf } from "../../widgets/grey.js";
 import { stateBadge, warningsBox } from "../results/warnings.js";
 import { RegionEditor } from "../../widgets/region_editor.js";
+import { Workspace } from "../../lib/workspace.js";
+import { draw, drawn } from "./drawing.js";
+import { recipesBar } from "./recipes.js";
 import { h, replace, svg, field, number, select, action, table, badge, num, count, quantity, notify, problemText } from "../../lib/dom.js";
 
 /** @import { Ends } from "#dom" */
 /** @import { Model } from "#routes" */
-/** @typedef {Model<"AnalysisRequest">} Request */
+/** @typedef {Model<"RecipeSettings"> & { region: Model<"Region">, reference: number, steps?: number[], follow?: boolean, label: string }} Request */
+/** @typedef {Model<"Recipe">} Recipe */
 /** @typedef {Model<"TestReply">} Test */
 
 /** @type {Record<string, string>} */
@@ -24,8 +28,8 @@ export async function measurePanel(id, test, ends, done) {
   const root = h("section.panel", { "aria-label": "Region and analysis" }, h("h2", "Region and analysis"));
   const body = h("div");
   root.append(body);
-  /** @type {Awaited<ReturnType<typeof build>> | null} */
-  let built = null;
+  /** @type {ReturnType<typeof build> | null} */
+  let building = null;
 
   /** @param {Test} fresh */
   async function steps(fresh) {
@@ -34,8 +38,8 @@ export async function measurePanel(id, test, ends, done) {
       replace(body, h("p.quiet", "The region is drawn over the reference step: capture or import it first."));
       return;
     }
-    built ??= await build();
-    built.steps();
+    building ??= build();
+    (await building).steps();
   }
 
   async function build() {
@@ -156,6 +160,7 @@ export async function measurePanel(id, test, ends, done) {
     let timer;
     ends.push(() => clearTimeout(timer));
     function changed() {
+      keep();
       drawSample();
       drawGauge();
       checkSeeds();
@@ -189,6 +194,61 @@ export async function measurePanel(id, test, ends, done) {
       gauge.textContent = strain.checked ? `Virtual strain gauge: ${num((Number(window_.value) - 1) * Number(spacing.value) + Number(subset.value), 4)} px wide.` : "";
     }
     for (const input of [window_, strain]) input.addEventListener("input", drawGauge);
+
+    // kept with the test as it is drawn; taken from elsewhere
+    const workspace = await Workspace.open(id);
+    ends.push(() => { workspace.close(); });
+    let ready = false;
+    const correct = (/** @type {HTMLInputElement} */ input) => input.value !== "" && input.checkValidity();
+    /** @returns {Model<"RecipeSettings">} */
+    function settings() {
+      const before = /** @type {Model<"RecipeSettings">} */ (workspace.value.settings ?? {});
+      /** @type {Model<"RecipeSettings">} */
+      const found = {
+        kind: /** @type {Request["kind"]} */ (kind.value), patch: /** @type {Request["patch"]} */ (patch.value), interpolation: /** @type {Request["interpolation"]} */ (interpolation.value),
+        reference_update: /** @type {Request["reference_update"]} */ (update.value), noise_id: noiseChoice.value || null, ...editor.seeds(), strain: null,
+      };
+      for (const [name, input] of /** @type {const} */ ([["subset_px", subset], ["spacing_px", spacing], ["prefilter_px", prefilter], ["max_sigma_px", maxSigma]])) {
+        const value = correct(input) ? Number(input.value) : before[name]; // one that is being typed is not kept yet
+        if (value !== undefined) found[name] = value;
+      }
+      found.smoothing_window = smoothing.value === "" ? null : correct(smoothing) ? Number(smoothing.value) : before.smoothing_window ?? null;
+      if (strain.checked) found.strain = /** @type {Request["strain"]} */ ({ ...(correct(window_) ? { window: Number(window_.value) } : {}), order: order.value === "auto" ? "auto" : Number(order.value), tensor: tensor.value });
+      return found;
+    }
+    /** @returns {Recipe} */
+    const now = () => ({ image_size_px: [views[0].width, views[0].height], region: editor.region(), settings: settings(), drawing: null, ...(workspace.value.gauges ? { gauges: workspace.value.gauges } : {}), ...(workspace.value.display ? { display: workspace.value.display } : {}) });
+    function keep() {
+      if (!ready || !views[0].width) return;
+      const { gauges: _, display: __, ...own } = now();
+      workspace.change({ ...own, drawing: /** @type {Recipe["drawing"]} */ ({ shapes: drawn(editor), steps: which.value, label: label.value, follow: follow_.checked, reference: Number(reference.value) }) });
+    }
+    /** @param {Recipe} recipe */
+    function show(recipe) {
+      const set = /** @type {Partial<Request>} */ (recipe.settings ?? {});
+      for (const [name, control] of /** @type {const} */ ([["kind", kind], ["patch", patch], ["interpolation", interpolation], ["reference_update", update], ["subset_px", subset], ["spacing_px", spacing], ["prefilter_px", prefilter], ["max_sigma_px", maxSigma]])) {
+        if (set[name] !== undefined) control.value = String(set[name]);
+      }
+      if (set.smoothing_window !== undefined) smoothing.value = String(set.smoothing_window ?? "");
+      if (set.noise_id !== undefined && [...noiseChoice.options].some((one) => one.value === (set.noise_id ?? ""))) noiseChoice.value = set.noise_id ?? "";
+      if (set.strain !== undefined) strain.checked = set.strain !== null;
+      if (set.strain?.window) window_.value = String(set.strain.window);
+      if (set.strain?.order) order.value = String(set.strain.order);
+      if (set.strain?.tensor) tensor.value = set.strain.tensor;
+      draw(editor, recipe);
+      drawGauge();
+    }
+    /** @param {Recipe} recipe */
+    function take(recipe) {
+      const [w, k] = recipe.image_size_px ?? [];
+      if (w && k && views[0].width && (w !== views[0].width || k !== views[0].height)) {
+        throw api.problemOf({ cause: `It was drawn over an image of ${w} × ${k} px, camera 1's is ${views[0].width} × ${views[0].height} px.`, remedy: "Draw the region anew, or take one that was drawn over such images." });
+      }
+      show({ ...recipe, drawing: null });
+      workspace.change({ ...(recipe.gauges ? { gauges: recipe.gauges } : {}), ...(recipe.display ? { display: recipe.display } : {}) });
+    }
+    body.addEventListener("input", keep);
+    body.addEventListener("change", keep);
 
     const progress = h("div", { role: "status", "data-role": "progress" });
     const stopped = new AbortController();
@@ -250,13 +310,21 @@ export async function measurePanel(id, test, ends, done) {
           h("fieldset", h("legend", "Strain"), h("label.check", strain, "compute strain"), h("div.fields", field("Window", window_, "points", "odd"), field("Fit", order), field("Tensor", tensor)), gauge),
           h("div.fields", field("Steps", which, "", "such as 1-5, 8; empty: all"), field("Label", label)), h("label.check", follow_, "continue with each new step"),
           h("div.row", { style: { marginTop: "0.5rem" } }, start), progress)));
+    body.before(await recipesBar(id, workspace.state, { take, now }));
     editor.use("rectangle");
     editor.drawList();
     drawGauge();
+    const before = /** @type {Recipe} */ (workspace.value);
+    const form = /** @type {{ steps?: string, label?: string, follow?: boolean, reference?: number } | null | undefined} */ (before.drawing);
+    if (form) [which.value, label.value, follow_.checked] = [form.steps ?? "", form.label ?? "", Boolean(form.follow)];
+    if (before.settings || before.region || before.drawing) show(before);
+    let chosen = form?.reference;
+    ready = true;
 
     return {
       steps() {
-        const kept = reference.value;
+        const kept = String(chosen ?? reference.value);
+        chosen = undefined;
         replace(reference, (test.steps ?? []).map((one) => h("option", { value: one.n, selected: String(one.n) === kept }, `${one.n} ${one.label ?? ""}`)));
         if (reference.selectedIndex < 0) reference.selectedIndex = 0;
         showReference();
