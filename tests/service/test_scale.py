@@ -29,20 +29,22 @@ def test_the_scale_is_the_length_that_a_pixel_sees_on_the_plate(client: httpx.Cl
     sent = client.post(f"{API}/calibrations:import", files={"file": ("c.json", json.dumps(cameras))})
     test_id = new_test(client, name="plate", calibration_id=str(sent.json()["id"]))
     client.put(f"{API}/sim/scene", json={"scene": "plate", "load": 0.0}).raise_for_status()
-    client.post(f"{API}/tests/{test_id}/steps", json={}).raise_for_status()
-    reply = client.get(f"{API}/tests/{test_id}/steps/0/scale").json()
+    client.post(f"{API}/tests/{test_id}/steps", json={"label": "reference"}).raise_for_status()
+    reply = client.get(f"{API}/tests/{test_id}/scale").raise_for_status().json()
     # the plate lies in Z = 0: two points on it 1 mm apart, across camera 1's line of sight, by the rig's own camera
     camera = Camera.from_paper(**cameras["cam1"])
     axis = camera.cam_from_sys.rotation[2]
     across = np.cross(axis, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across)
     ends = camera.project(np.stack([-0.5 * across, 0.5 * across])).xy
-    assert reply["mm_per_px"] == pytest.approx(1.0 / np.linalg.norm(ends[1] - ends[0]), rel=0.01)
-    assert reply["distance_mm"] == pytest.approx(camera.cam_from_sys.apply(np.zeros(3))[2], rel=0.01)
+    # the matches' middle is not the origin: over this tilted plate, depth and with it the scale change by some percent
+    assert reply["mm_per_px"] == pytest.approx(1.0 / np.linalg.norm(ends[1] - ends[0]), rel=0.04)
+    assert reply["distance_mm"] == pytest.approx(camera.cam_from_sys.apply(np.zeros(3))[2], rel=0.04)
     assert reply["matches"] >= 12
 
 
 def test_without_a_calibration_there_is_no_scale(client: httpx.Client) -> None:
     test_id = new_test(client, name="images only")
-    client.post(f"{API}/tests/{test_id}/steps", json={}).raise_for_status()
-    assert client.get(f"{API}/tests/{test_id}/steps/0/scale").status_code == 409
+    client.post(f"{API}/tests/{test_id}/steps", json={"label": "reference"}).raise_for_status()
+    answer = client.get(f"{API}/tests/{test_id}/scale")
+    assert answer.status_code == 409, answer.text

@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict
 from typing import Annotated
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Query
 from pydantic import Field, StringConstraints
 
 from core.errors import InputError
@@ -130,17 +130,18 @@ def rate_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: Text
     )
 
 
-@router.get(
-    "/steps/{n}/scale",
-    summary="Scale of camera 1's image at the surface, before measuring",
-    responses=errors(404, 409, 422),
-)
-def show_scale(service: ServiceDep, test_id: TestId, n: StepNumber) -> ScaleReply:
+@router.get("/scale", summary="Scale of camera 1's image at the surface", responses=errors(404, 409, 422))
+def show_scale(
+    service: ServiceDep,
+    test_id: TestId,
+    step: Annotated[Whole, Query(ge=0, le=9999, description="Step whose images are looked at.")] = 0,
+) -> ScaleReply:
     """Return the length of a pixel of camera 1 on the surface, from feature matches with camera 2."""
     pair = load_calibration(service.tests.calibration_file(test_id)).pair
-    step = service.tests.verified_step(test_id, n)
+    images = service.tests.verified_step(test_id, step)
     one, two = (
-        MeasureImage(read_image(path), f"{cam} of step {n}") for cam, path in (("cam1", step.cam1), ("cam2", step.cam2))
+        MeasureImage(read_image(path), f"{cam} of step {step}")
+        for cam, path in (("cam1", images.cam1), ("cam2", images.cam2))
     )
     found = image_scale(pair, one, two)
     return ScaleReply() if found is None else ScaleReply.model_validate(asdict(found))
