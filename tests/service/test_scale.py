@@ -30,7 +30,7 @@ def test_the_scale_is_the_length_that_a_pixel_sees_on_the_plate(client: httpx.Cl
     test_id = new_test(client, name="plate", calibration_id=str(sent.json()["id"]))
     client.put(f"{API}/sim/scene", json={"scene": "plate", "load": 0.0}).raise_for_status()
     client.post(f"{API}/tests/{test_id}/steps", json={"label": "reference"}).raise_for_status()
-    reply = client.get(f"{API}/tests/{test_id}/scale").raise_for_status().json()
+    reply = client.get(f"{API}/tests/{test_id}/scale", params={"step": 0}).raise_for_status().json()
     # the plate lies in Z = 0: two points on it 1 mm apart, across camera 1's line of sight, by the rig's own camera
     camera = Camera.from_paper(**cameras["cam1"])
     axis = camera.cam_from_sys.rotation[2]

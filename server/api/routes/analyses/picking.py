@@ -134,7 +134,7 @@ def rate_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: Text
 def show_scale(
     service: ServiceDep,
     test_id: TestId,
-    step: Annotated[Whole, Query(ge=0, le=9999, description="Step whose images are looked at.")] = 0,
+    step: Annotated[int, Query(ge=0, le=9999, description="Step whose images are looked at.")] = 0,
 ) -> ScaleReply:
     """Return the length of a pixel of camera 1 on the surface, from feature matches with camera 2."""
     pair = load_calibration(service.tests.calibration_file(test_id)).pair
