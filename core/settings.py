@@ -115,8 +115,33 @@ class Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
+_FORMS = ("rectangle", "polygon", "circle")
+
+
+class Outline(Settings):
+    """A closed outline: a rectangle, a polygon or a circle, in camera 1's reference image."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "oneOf": [{"required": [form], "properties": {form: {"not": {"type": "null"}}}} for form in _FORMS]
+        }
+    )
+
+    rectangle: Rectangle | None = Field(None, description="x0, y0, x1, y1, inclusive.", examples=[[120, 100, 400, 380]])
+    polygon: list[PixelPosition] | None = Field(None, description="Corners.", min_length=3, max_length=MAX_CORNERS)
+    circle: tuple[Pixel, Pixel, Annotated[Pixel, Field(gt=0.0)]] | None = Field(
+        None, description="x and y of its centre, and its radius.", examples=[[240, 180, 60]]
+    )
+
+    @model_validator(mode="after")
+    def _one_form(self) -> Self:
+        if sum(getattr(self, form) is not None for form in _FORMS) != 1:
+            raise ValueError("give a rectangle, a polygon or a circle for each outline, and only one of them")
+        return self
+
+
 class Region(Settings):
-    """Region of interest: a rectangle or a polygon, or a mask alone; cracks and holes.
+    """Region of interest: a rectangle, a polygon or several outlines, or a mask alone; cracks and holes.
 
     No subset, neighbour or start value crosses a crack, a hole's border or the mask's black.
     """
@@ -125,6 +150,13 @@ class Region(Settings):
         None, description="x0, y0, x1, y1 in camera 1's reference image, inclusive.", examples=[[120, 100, 400, 380]]
     )
     polygon: list[PixelPosition] | None = Field(None, description="Corners.", min_length=3, max_length=MAX_CORNERS)
+    outlines: list[Outline] = Field(
+        [],
+        description="Rectangles, polygons and circles, in place of a single rectangle or polygon: points lie where any "
+        "of them is. They need not touch.",
+        max_length=MAX_CUTS,
+        examples=[[{"circle": [240, 180, 60]}, {"rectangle": [300, 120, 420, 240]}]],
+    )
     cracks: list[Annotated[list[PixelPosition], Field(min_length=2, max_length=MAX_CORNERS)]] = Field(
         [],
         description="Lines in camera 1's reference image, each the points that it goes through.",
@@ -260,11 +292,20 @@ class NoiseRecord(BaseModel):
     noise_id: str | None = Field(None, description="Id of the noise measurement; null where it came from a file.")
 
 
+class StoredOutline(Outline):
+    """An outline as stored in results."""
+
+    rectangle: tuple[float, float, float, float] | None = Field(None, description="x0, y0, x1, y1; null: another form.")
+    polygon: list[tuple[float, float]] | None = Field(None, description="Corners x, y; null: another form.")
+    circle: tuple[float, float, float] | None = Field(None, description="x, y, radius; null: another form.")
+
+
 class StoredRegion(Region):
     """A region as stored in results; checked against its image when it was made."""
 
     rectangle: tuple[float, float, float, float] | None = Field(None, description="x0, y0, x1, y1; null: none.")
     polygon: list[tuple[float, float]] | None = Field(None, description="Corners x, y; null: none.")
+    outlines: list[StoredOutline] = Field(default=[], description="Rectangles, polygons and circles, all of them.")  # type: ignore[assignment]
     cracks: list[list[tuple[float, float]]] = Field(default=[], description="Lines of points x, y along cracks.")
     holes: list[list[tuple[float, float]]] = Field(default=[], description="Polygons of corners x, y without points.")
     mask: str | None = Field(None, description="Record of the mask; null: none.")

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.field.points.result import Field
+from core.field.region.outlines import corners_px
 from core.names import BUDGET, CAMERAS
-from core.settings import CoverageFields
+from core.settings import CoverageFields, Outline
 from server.formats.results.camera_motion import MOVED_REMEDY
 from server.formats.results.uncertainty import NOT_INCLUDED, Statement
 from server.formats.version import software_version
@@ -236,24 +237,20 @@ def _reference(source: Source, measured: Measured) -> tuple[list[Picture], list[
         else:
             positions = np.empty((0, 2))
         chosen = valid if len(positions) == len(valid) else np.empty(0, dtype=bool)
-        cuts, outline = (field.cuts, _outline(source)) if cam == "cam1" else (None, None)
-        data = pictures.region(image, positions, chosen, f"{name}, step {source.reference}", cuts, outline)
+        cuts, outlines = (field.cuts, _outlines(source)) if cam == "cam1" else (None, [])
+        data = pictures.region(image, positions, chosen, f"{name}, step {source.reference}", cuts, outlines)
         caption = f"{name.capitalize()}, reference: green where a point was measured, red where not"
-        caption += ", yellow the region that was asked for" if outline is not None else ""
+        caption += ", yellow the region that was asked for" if outlines else ""
         text = f"reference image of {name} with the measured points"
         drawn.append(Picture(data, PNG, text, caption, half=False))
     return drawn, missing
 
 
-def _outline(source: Source) -> NDArray[np.float64] | None:
-    """Corners of the region that was asked for, in camera 1's reference image."""
+def _outlines(source: Source) -> list[NDArray[np.float64]]:
+    """Corners of the outlines that were asked for, in camera 1's reference image; none for a mask."""
     region = source.settings.region
-    if region.polygon:
-        return np.asarray(region.polygon, dtype=np.float64)
-    if region.rectangle is None:
-        return None
-    x0, y0, x1, y1 = region.rectangle
-    return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], dtype=np.float64)
+    given = (Outline.model_construct(**outline.model_dump()) for outline in (region, *region.outlines))
+    return [corners_px(outline) for outline in given if outline.rectangle or outline.polygon or outline.circle]
 
 
 def _fields(measured: Measured) -> list[tuple[str, list[Picture]]]:

@@ -88,7 +88,7 @@ def region(
     valid: NDArray[np.bool_],
     title: str,
     cuts: Cuts | None = None,
-    outline_px: Float | None = None,
+    outlines_px: Sequence[Float] = (),
 ) -> bytes:
     """Draw a camera's reference image with the points that were measured; PNG.
 
@@ -98,8 +98,8 @@ def region(
         (n, 2) positions of the points in the image; NaN where they have none.
     valid
         (n,) True where they were measured.
-    outline_px
-        (m, 2) corners of the region that was asked for.
+    outlines_px
+        (m, 2) corners of each outline of the region that was asked for.
     """
     rows, cols = image.shape[:2]
     shrink = max(1.0, cols / _MAX_PX)
@@ -116,8 +116,8 @@ def region(
     size = float(np.clip(80.0 / np.sqrt(max(len(positions_px), 1)), 0.5, 3.5))
     for chosen, colour in ((valid, _VALID), (~valid, _INVALID)):
         axis.plot(*positions_px[chosen].T, ".", color=colour, markersize=size, markeredgewidth=0.0)
-    if outline_px is not None:
-        closed = np.concatenate([outline_px, outline_px[:1]])
+    for outline in outlines_px:
+        closed = np.concatenate([outline, outline[:1]])
         axis.plot(closed[:, 0], closed[:, 1], "-", color="#ffb000", linewidth=1.2)
     for line in cuts.lines_px if cuts else ():
         axis.plot(line[:, 0], line[:, 1], "-", color="#ff00ff", linewidth=1.0)

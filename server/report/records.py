@@ -122,11 +122,18 @@ class SummaryRecord(Record):
     steps: list[StepSummaryRecord] = Field(default=[])
 
 
-class RegionRecord(Record):
-    """Region of the points, px of camera 1's reference image."""
+class OutlineRecord(Record):
+    """One outline of a region, px of camera 1's reference image."""
 
     rectangle: tuple[float, float, float, float] | None = None
     polygon: list[tuple[float, float]] | None = None
+    circle: tuple[float, float, float] | None = None
+
+
+class RegionRecord(OutlineRecord):
+    """Region of the points, px of camera 1's reference image."""
+
+    outlines: list[OutlineRecord] = Field(default=[])
     cracks: list[object] | None = None
     holes: list[object] | None = None
     mask: object = None

@@ -122,11 +122,14 @@ def _points(measured: Measured) -> str:
 
 def _region(settings: SettingsRecord) -> Value:
     region = settings.region
-    parts = []
-    if region.rectangle:
-        parts.append("rectangle {:g}, {:g} to {:g}, {:g} px".format(*region.rectangle))
-    if region.polygon:
-        parts.append(f"polygon of {len(region.polygon)} corners")
+    parts: list[str] = []
+    for outline in (region, *region.outlines):
+        if outline.rectangle:
+            parts.append("rectangle {:g}, {:g} to {:g}, {:g} px".format(*outline.rectangle))
+        if outline.polygon:
+            parts.append(f"polygon of {len(outline.polygon)} corners")
+        if outline.circle:
+            parts.append("circle about {:g}, {:g} px, radius {:g} px".format(*outline.circle))
     parts += [f"{len(region.cracks)} cracks"] if region.cracks else []
     parts += [f"{len(region.holes)} holes"] if region.holes else []
     parts += ["mask"] if region.mask else []

@@ -71,3 +71,22 @@ def asked(shown: Page, path: str, act: Callable[[], object], key: str = "", *lik
     with shown.expect_request(right, timeout=60_000) as info:
         act()
     return dict(json.loads(info.value.post_data or "{}"))
+
+
+def posted(shown: Page, path: str, act: Callable[[], object], wait_s: float = 0.6) -> dict[str, Any]:
+    """Return the last body that the page sends to an operation after this is done, once none has come for a while."""
+    seen: list[dict[str, Any]] = []
+
+    def note(request: Request) -> None:
+        if request.method == "POST" and request.url.endswith(path):
+            seen.append(dict(json.loads(request.post_data or "{}")))
+
+    shown.on("request", note)
+    act()
+    for _ in range(round(20 / wait_s)):
+        count = len(seen)
+        shown.wait_for_timeout(1000 * wait_s)
+        if seen and count == len(seen):
+            break
+    shown.remove_listener("request", note)
+    return seen[-1]

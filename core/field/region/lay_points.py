@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import RegionError
+from core.field.region.outlines import lay_outlines, outlines_of
 from core.field.region.region import PointGrid, check_region
 from core.settings import AnalysisSettings, Region
 
@@ -56,14 +57,13 @@ def lay_points(region: Region, spacing_px: int, mask: NDArray[np.bool_] | None) 
     RegionError
         ``region_empty``, ``cut_invalid``.
     """
-    if region.rectangle is not None:
-        grid = PointGrid.rectangle(*region.rectangle, spacing_px=spacing_px)
-    elif region.polygon is not None:
-        grid = PointGrid.polygon(np.asarray(region.polygon, dtype=np.float64), spacing_px=spacing_px)
+    outlines = outlines_of(region)
+    if outlines:
+        grid = lay_outlines(outlines, spacing_px)
     elif mask is not None:
         grid = PointGrid.mask(mask, spacing_px=spacing_px)
     else:
-        raise RegionError("The region names no rectangle, no polygon and no mask.", code="region_empty")
+        raise RegionError("The region names no outline and no mask.", code="region_empty")
     if mask is not None:
         grid = grid.within_mask(mask)
     return grid.without_holes(region.holes).with_cracks(region.cracks)

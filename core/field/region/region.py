@@ -117,6 +117,10 @@ class PointGrid:
         box = (float(cols[0]), float(rows[0]), float(cols[-1]), float(rows[-1]))
         return PointGrid.rectangle(*box, spacing_px=spacing_px).within_mask(m)
 
+    def only(self, allowed: Bool) -> PointGrid:
+        """Return the grid with these points (r, c) allowed alone."""
+        return replace(self, allowed=allowed)
+
     def within_polygon(self, vertices_px: ArrayLike) -> PointGrid:
         """Keep only the points inside a polygon (n, 2), by crossing number; the border's own points count as inside."""
         v = _vertices(vertices_px)
@@ -151,7 +155,7 @@ class PointGrid:
         grid = self
         for polygon in polygons_px:
             v = _vertices(polygon)
-            inside = replace(grid, allowed=np.ones(grid.shape, bool)).within_polygon(v).allowed
+            inside = grid.only(np.ones(grid.shape, bool)).within_polygon(v).allowed
             border = Cuts([np.concatenate([v, v[:1]])])
             grid = replace(grid, allowed=grid.allowed & ~inside)._with_cuts(border)
         return grid

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, StringConstraints, model_validator
+from pydantic.config import JsonDict
 
 from core import settings
 from core.settings import StoredSettings, disagreement
@@ -14,7 +16,7 @@ from server.api.models.systematic import SystematicTerms
 from server.api.models.tests import AnalysisEntry
 from server.api.models.warnings import AnalysisWarning
 from server.base.json_values import Nested
-from server.base.models import JobState, Label, Listing, Reply, Request, StepNumber, Switch, any_of, not_both
+from server.base.models import JobState, Label, Listing, Reply, Request, StepNumber, Switch, any_of, given
 from server.formats.gauges.readings import (
     AreaReading,
     ExtensometerReading,
@@ -25,15 +27,21 @@ from server.formats.gauges.readings import (
 )
 from server.results.gauges.request import GaugeRequest
 
+_SEVERAL: JsonDict = {"required": ["outlines"], "properties": {"outlines": {"minItems": 1}}}
+_FORMS: list[JsonDict] = [given("rectangle"), given("polygon"), _SEVERAL]
+
 
 class Region(settings.Region):
-    """Region of interest: one of rectangle and polygon, a mask if wanted, cracks and holes.
+    """Region of interest: one of rectangle, polygon and outlines, a mask if wanted, cracks and holes.
 
     No subset, neighbour or start value reaches over a crack, a hole's border or the mask's black.
     """
 
     model_config = ConfigDict(
-        json_schema_extra={**any_of("rectangle", "polygon", "mask_png_base64"), **not_both("rectangle", "polygon")}
+        json_schema_extra={
+            "anyOf": [*_FORMS, given("mask_png_base64")],
+            "not": {"anyOf": [{"allOf": list(two)} for two in combinations(_FORMS, 2)]},
+        }
     )
 
     mask_png_base64: Annotated[str, StringConstraints(max_length=20_000_000)] | None = Field(
@@ -42,10 +50,11 @@ class Region(settings.Region):
 
     @model_validator(mode="after")
     def _some_form(self) -> Self:
-        if self.rectangle is not None and self.polygon is not None:
-            raise ValueError("give a rectangle or a polygon, not both")
-        if self.rectangle is None and self.polygon is None and self.mask_png_base64 is None:
-            raise ValueError("give a rectangle, a polygon or a mask")
+        forms = sum([self.rectangle is not None, self.polygon is not None, bool(self.outlines)])
+        if forms > 1:
+            raise ValueError("give a rectangle, a polygon or outlines, not several of them")
+        if not forms and self.mask_png_base64 is None:
+            raise ValueError("give a rectangle, a polygon, outlines or a mask")
         return self
 
 

@@ -6,7 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from core.errors import FileFormatError, InputError
+from core.errors import FileFormatError, InputError, RegionError
 from core.field.prefilter import check_prefilter
 from core.settings import (
     DEFAULT_INTERPOLATION,
@@ -23,13 +23,14 @@ from core.settings import (
     STRAIN_TENSORS,
     STRAIN_WINDOW,
     SUBSET_PX,
+    Outline,
     StoredSettings,
     patch_name,
 )
 from server.cli.measurement.image_lists import ImagePair, expand, pair_up, pairs_of_test_folder
 from server.cli.measurement.image_pairs import check_cameras, checked_pairs, checked_shapes, first_readable
-from server.cli.measurement.recipe import mask_of, notes_on, polygon_of, with_recipe
-from server.cli.measurement.region import check_region, check_whole, parse_rectangle
+from server.cli.measurement.recipe import mask_of, notes_on, with_recipe
+from server.cli.measurement.region import check_region, check_whole, parse_outline
 from server.cli.measurement.sequence import MeasureJob, measure_sequence
 from server.cli.measurement.specimen import SPECIMEN_FILE, found_specimen
 from server.cli.terminal import ProgressLine
@@ -54,9 +55,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--roi",
-        metavar="X0,Y0,X1,Y1|auto",
-        help="points lie at X0 + i step, Y0 + j step up to X1, Y1; auto: on the specimen, found by its texture and "
-        "shown in specimen.png (auto, without a mask)",
+        action="append",
+        metavar="X0,Y0,X1,Y1|circle:X,Y,RADIUS|polygon:X0,Y0,...|auto",
+        help="points lie at X0 + i step, Y0 + j step up to X1, Y1, or likewise in a circle or a polygon; given several "
+        "times, in any of them; auto: on the specimen, found by its texture and shown in specimen.png (auto, without a "
+        "mask)",
     )
     add(
         "--recipe",
@@ -75,8 +78,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--hole",
         action="append",
         default=[],
-        metavar="X0,Y0,X1,Y1,X2,Y2[,...]",
-        help="a polygon inside which nothing is measured",
+        metavar="X0,Y0,X1,Y1,X2,Y2[,...]|circle:X,Y,RADIUS",
+        help="a polygon or a circle inside which nothing is measured",
     )
     add("--subset", metavar="PX", help=f"subset width, odd ({SUBSET_PX.default})")
     add("--step", "--spacing", metavar="PX", help=f"distance of the points ({SPACING_PX.default})")
@@ -220,7 +223,10 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
     args, recipe = with_recipe(given)
     subset = check_whole("--subset", str(SUBSET_PX.default) if args.subset is None else args.subset, SUBSET_PX)
     step = check_whole("--step", str(SPACING_PX.default) if args.step is None else args.step, SPACING_PX)
-    rectangle = None if args.roi in (None, "auto") else parse_rectangle(args.roi)
+    asked = args.roi or []
+    outlines = [parse_outline("--roi", text) for text in asked if text != "auto"]
+    if outlines and len(outlines) < len(asked):
+        raise RegionError("--roi auto does not go with another --roi.", remedy="Give auto alone, or leave it out.")
     strain, prefilter_px = _strain(args), _prefilter_px(args, subset)
     files = _pairs(args, progress)
     folder = None if args.folder is None else Path(args.folder)
@@ -237,16 +243,16 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         recipe.check_fits(shapes[0][1], shapes[0][0])
         for note in notes_on(recipe):
             progress.note(f"note: {note}")
-    polygon = polygon_of(recipe, given)
     mask_file = mask_of(recipe, given, out) if args.mask is None else Path(args.mask)
     specimen = None
-    if args.roi == "auto" or (rectangle is None and polygon is None and mask_file is None):
+    if not outlines and (asked or mask_file is None):
         specimen = found_specimen(first, calibration, subset, None if mask_file is None else read_mask(mask_file))
         progress.note(f"region: {specimen.text}")
-        rectangle, mask_file = specimen.rectangle_px(subset), out / SPECIMEN_FILE
+        box = Outline.model_construct(rectangle=specimen.rectangle_px(subset), polygon=None, circle=None)
+        outlines, mask_file = [box], out / SPECIMEN_FILE
     noise = None if args.noise is None else load_noise(args.noise)
     region, seeds = check_region(
-        rectangle,
+        outlines,
         image_shape=shapes[0],
         subset_px=subset,
         spacing_px=step,
@@ -254,7 +260,6 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         seeds=args.seed,
         cracks=args.crack,
         holes=args.hole,
-        polygon=polygon,
         mask=None if specimen is None else specimen.mask,
     )
     check_positions(calibration.pair, seeds or (), (shapes[1][1], shapes[1][0]))

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from core.errors import InputError
+from core.settings import Outline
 from server.api.models.recipes import Recipe, recipe_in
 from server.formats.files import make_folder, write_bytes
 
@@ -76,23 +77,17 @@ def with_recipe(args: argparse.Namespace) -> tuple[argparse.Namespace, Recipe | 
     if region is not None:
         filled.crack = args.crack or [_text(v for point in line for v in point) for line in region.cracks]
         filled.hole = args.hole or [_text(v for point in line for v in point) for line in region.holes]
-        if args.roi is None and args.mask is None and region.rectangle is not None:
-            filled.roi = _text(region.rectangle)
+        if args.roi is None and args.mask is None:
+            own = Outline.model_construct(rectangle=region.rectangle, polygon=region.polygon, circle=None)
+            filled.roi = [text for one in (own, *region.outlines) if (text := _outline_text(one))] or None
     return filled, recipe
-
-
-def polygon_of(recipe: Recipe | None, args: argparse.Namespace) -> list[tuple[float, float]] | None:
-    """Return the recipe's polygon, where the command line gives no region."""
-    if recipe is None or recipe.region is None or args.roi is not None or args.mask is not None:
-        return None
-    return None if recipe.region.polygon is None else [(x, y) for x, y in recipe.region.polygon]
 
 
 def mask_of(recipe: Recipe | None, args: argparse.Namespace, out: Path) -> Path | None:
     """Write the recipe's mask into the output folder, where the command line gives no region; return its path."""
     if recipe is None or recipe.region is None or recipe.region.mask_png_base64 is None:
         return None
-    if args.mask is not None or args.roi == "auto":
+    if args.mask is not None or args.roi == ["auto"]:
         return None
     make_folder(out)
     write_bytes(out / MASK_FILE, base64.b64decode(recipe.region.mask_png_base64))
@@ -107,6 +102,15 @@ def notes_on(recipe: Recipe | None) -> Sequence[str]:
     if recipe is not None and recipe.settings.noise_id is not None:
         notes.append(f"the recipe's noise measurement {recipe.settings.noise_id} is a service's; give --noise FILE")
     return notes
+
+
+def _outline_text(one: Outline) -> str | None:
+    """Return an outline as ``--roi`` takes it; None if it has no form."""
+    if one.rectangle is not None:
+        return _text(one.rectangle)
+    if one.polygon is not None:
+        return "polygon:" + _text(v for corner in one.polygon for v in corner)
+    return None if one.circle is None else "circle:" + _text(one.circle)
 
 
 def _text(values: Iterable[float]) -> str:

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from core.errors import InputError, RegionError
 from core.field.region.lay_points import lay_points
+from core.field.region.outlines import corners_px
 from core.field.region.region import check_region as check_points
 from core.field.seeding.seeds import Seed
-from core.settings import Range, StoredRegion
+from core.settings import Outline, Range, StoredRegion
 from server.formats.images import read_mask
 
 Rectangle = tuple[float, float, float, float]
@@ -53,6 +54,44 @@ def parse_rectangle(text: str) -> Rectangle:
             remedy="Give the upper left corner first, then the lower right one.",
         )
     return x0, y0, x1, y1
+
+
+def parse_outline(option: str, text: str) -> Outline:
+    """Read ``X0,Y0,X1,Y1``, ``circle:X,Y,RADIUS`` or ``polygon:X0,Y0,X1,Y1,X2,Y2,...``.
+
+    Raises
+    ------
+    RegionError
+        If it is none of these, or holds nothing; ``cut_invalid`` for a polygon that is none.
+    """
+    form, colon, numbers = text.partition(":")
+    if not colon:
+        return Outline.model_construct(rectangle=parse_rectangle(text), polygon=None, circle=None)
+    if form == "circle":
+        x, y, radius = _numbers(option, numbers, 3, "circle:X,Y,RADIUS")
+        if radius <= 0.0:
+            raise RegionError(f"{option} {text} holds nothing.", remedy="Give a radius above zero, in pixels.")
+        return Outline.model_construct(rectangle=None, polygon=None, circle=(x, y, radius))
+    if form == "polygon":
+        corners = [(x, y) for x, y in parse_line(option, numbers, 3)]
+        return Outline.model_construct(rectangle=None, polygon=corners, circle=None)
+    raise RegionError(
+        f"{option} {text!r} is no form that is known.",
+        remedy=f"Give {option} X0,Y0,X1,Y1, {option} circle:X,Y,RADIUS or {option} polygon:X0,Y0,X1,Y1,X2,Y2,...",
+    )
+
+
+def parse_hole(text: str) -> Line:
+    """Read a hole's corners: as an outline, or ``X0,Y0,X1,Y1,X2,Y2,...`` alone; [x, y] each.
+
+    Raises
+    ------
+    RegionError
+        As :func:`parse_outline`.
+    """
+    if ":" not in text:
+        return parse_line("--hole", text, 3)
+    return [list(corner) for corner in corners_px(parse_outline("--hole", text)).tolist()]
 
 
 def parse_line(option: str, text: str, min_points: int) -> Line:
@@ -99,7 +138,7 @@ def check_whole(option: str, text: str, allowed: Range) -> int:
 
 
 def check_region(
-    rectangle: Rectangle | None,
+    outlines: Sequence[Outline],
     *,
     image_shape: tuple[int, int],
     subset_px: int,
@@ -108,17 +147,14 @@ def check_region(
     seeds: Sequence[str],
     cracks: Sequence[str] = (),
     holes: Sequence[str] = (),
-    polygon: Sequence[tuple[float, float]] | None = None,
     mask: NDArray[np.bool_] | None = None,
 ) -> tuple[StoredRegion, tuple[Seed, ...] | None]:
     """Check region, mask, cracks, holes and seeds against camera 1's image; return the region, and the seeds if any.
 
     Parameters
     ----------
-    rectangle, mask_path
-        One of them, or both.
-    polygon
-        Corners, in place of the rectangle.
+    outlines, mask_path
+        One of them, or both; points lie in any of the outlines.
     mask
         The mask, where its file is still to be written.
 
@@ -134,17 +170,24 @@ def check_region(
         mask = read_mask(mask_path)
     region = StoredRegion.model_validate(
         {
-            "rectangle": rectangle,
-            "polygon": polygon,
+            **_given(outlines),
             "cracks": [parse_line("--crack", text, 2) for text in cracks],
-            "holes": [parse_line("--hole", text, 3) for text in holes],
+            "holes": [parse_hole(text) for text in holes],
             "mask": None if mask_path is None else str(mask_path),
         }
     )
     mask_shape = None if mask is None else (mask.shape[0], mask.shape[1])
     points = lay_points(region, spacing_px, mask)
     check_points(points, image_shape=image_shape, subset_px=subset_px, mask_shape=mask_shape)
-    return region, _seeds(seeds, rectangle or points.extent_px, mask)
+    return region, _seeds(seeds, points.extent_px, mask)
+
+
+def _given(outlines: Sequence[Outline]) -> dict[str, object]:
+    # a single rectangle or polygon is stored as it always was
+    first = outlines[0] if len(outlines) == 1 else None
+    if first is None or first.circle is not None:
+        return {"outlines": [outline.model_dump() for outline in outlines]}
+    return {"rectangle": first.rectangle, "polygon": first.polygon}
 
 
 def _seeds(texts: Sequence[str], rectangle: Rectangle, mask: NDArray[np.bool_] | None) -> tuple[Seed, ...] | None:

@@ -12,10 +12,10 @@ from PIL import Image
 
 from core.errors import FileFormatError, ImageError, InputError, RegionError
 from core.field.seeding.seeds import Seed
-from core.settings import SPACING_PX, SUBSET_PX
+from core.settings import SPACING_PX, SUBSET_PX, Outline
 from server.cli import main
 from server.cli.measurement.image_lists import expand, pair_up, pairs_of_test_folder
-from server.cli.measurement.region import check_region, check_whole, parse_rectangle
+from server.cli.measurement.region import check_region, check_whole, parse_hole, parse_outline, parse_rectangle
 from server.cli.terminal import ProgressLine, duration
 
 SHAPE = (480, 512)
@@ -93,6 +93,27 @@ def test_rois_that_say_nothing(text: str) -> None:
     assert caught.value.code == "region_unusable"
 
 
+@pytest.mark.parametrize(
+    "text", ["circle:1,2", "circle:10,10,0", "circle:a,b,c", "polygon:1,2,3,4", "square:1,2,3", "5,5,1,1"]
+)
+def test_outlines_that_say_nothing(text: str) -> None:
+    with pytest.raises(RegionError) as caught:
+        parse_outline("--roi", text)
+    assert caught.value.code in ("region_unusable", "cut_invalid")
+    assert "--roi" in str(caught.value)
+
+
+def test_outlines_of_all_forms_are_read_and_a_round_hole_lies_on_its_circle() -> None:
+    assert parse_outline("--roi", "circle:100,90,40.5").circle == (100.0, 90.0, 40.5)
+    assert parse_outline("--roi", "polygon:0,0,9,0,9,9").polygon == [(0.0, 0.0), (9.0, 0.0), (9.0, 9.0)]
+    assert parse_outline("--roi", "1,2,30,40").rectangle == (1.0, 2.0, 30.0, 40.0)
+    assert parse_hole("1,2,30,40,5,60") == [[1.0, 2.0], [30.0, 40.0], [5.0, 60.0]]
+    corners = np.array(parse_hole("circle:100,90,40"))
+    assert np.allclose(np.hypot(*(corners - (100.0, 90.0)).T), 40.0)
+    chord = np.hypot(*((corners + np.roll(corners, 1, axis=0)) / 2 - (100.0, 90.0)).T)
+    assert np.all(chord > 39.95)  # a twentieth px: far below what a match tells
+
+
 @pytest.mark.fault(40)
 @pytest.mark.parametrize(
     ("rectangle", "word"),
@@ -106,14 +127,21 @@ def test_rois_that_say_nothing(text: str) -> None:
 )
 def test_regions_that_leave_nothing(rectangle: tuple[float, float, float, float], word: str) -> None:
     with pytest.raises(RegionError, match=word):
-        check_region(rectangle, image_shape=SHAPE, subset_px=33, spacing_px=10, mask_path=None, seeds=[])
+        check_region(
+            [Outline.model_construct(rectangle=rectangle)],
+            image_shape=SHAPE,
+            subset_px=33,
+            spacing_px=10,
+            mask_path=None,
+            seeds=[],
+        )
 
 
 def test_a_mask_must_fit_and_leave_points(tmp_path: Path) -> None:
     def check(mask: np.ndarray) -> None:
         Image.fromarray(mask).save(tmp_path / "mask.png")
         check_region(
-            (100.0, 100.0, 300.0, 300.0),
+            [Outline(rectangle=(100.0, 100.0, 300.0, 300.0))],
             image_shape=SHAPE,
             subset_px=33,
             spacing_px=10,
@@ -154,7 +182,7 @@ def test_seeds_must_lie_in_the_region_and_on_white(tmp_path: Path, seed: str, co
     Image.fromarray(mask).save(tmp_path / "mask.png")
     with pytest.raises(RegionError) as caught:
         check_region(
-            (100.0, 100.0, 300.0, 300.0),
+            [Outline(rectangle=(100.0, 100.0, 300.0, 300.0))],
             image_shape=SHAPE,
             subset_px=33,
             spacing_px=10,
@@ -166,7 +194,7 @@ def test_seeds_must_lie_in_the_region_and_on_white(tmp_path: Path, seed: str, co
 
 def test_seeds_come_as_points() -> None:
     _, seeds = check_region(
-        (100.0, 100.0, 300.0, 300.0),
+        [Outline(rectangle=(100.0, 100.0, 300.0, 300.0))],
         image_shape=SHAPE,
         subset_px=33,
         spacing_px=10,
@@ -178,7 +206,7 @@ def test_seeds_come_as_points() -> None:
 
 def test_a_seed_may_say_where_camera_2_sees_it() -> None:
     _, seeds = check_region(
-        (100.0, 100.0, 300.0, 250.0),
+        [Outline(rectangle=(100.0, 100.0, 300.0, 250.0))],
         image_shape=SHAPE,
         subset_px=33,
         spacing_px=10,
@@ -188,7 +216,7 @@ def test_a_seed_may_say_where_camera_2_sees_it() -> None:
     assert seeds == (Seed((150.0, 160.5), (151.25, 158.0)), Seed((200.0, 210.0)))
     with pytest.raises(RegionError, match="has 3 numbers") as refused:
         check_region(
-            (100.0, 100.0, 300.0, 250.0),
+            [Outline(rectangle=(100.0, 100.0, 300.0, 250.0))],
             image_shape=SHAPE,
             subset_px=33,
             spacing_px=10,

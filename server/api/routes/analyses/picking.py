@@ -6,11 +6,13 @@ import math
 from dataclasses import asdict
 from typing import Annotated
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Query
 from pydantic import Field, StringConstraints
 
 from core.errors import InputError
+from core.field.points.images import MeasureImage
 from core.field.region.lay_points import make_grid
+from core.field.seeding.image_scale import image_scale
 from core.field.seeding.seeds import Seed
 from core.settings import SPACING_PX, SUBSET_PX, AnalysisSettings, Pixel, Real, SpacingPx, SubsetPx, Whole
 from server.api.models import Region, Reply, Request
@@ -92,6 +94,16 @@ class SeedsReply(Reply):
     seeds: list[SeedPosition] = Field(description="One each.")
 
 
+class ScaleReply(Reply):
+    """Scale of camera 1's image at the surface; null where too few features match."""
+
+    mm_per_px: float | None = Field(
+        None, description="Across the line of sight, at the matches' median depth.", examples=[0.0169]
+    )
+    distance_mm: float | None = Field(None, description="That depth from camera 1.", examples=[301.2])
+    matches: int = Field(0, description="Matches that it comes from.", examples=[412])
+
+
 @router.post(
     "/steps/{n}/texture", summary="Speckle quality of a region for a subset size", responses=errors(404, 409, 422)
 )
@@ -116,6 +128,23 @@ def rate_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: Text
     return TextureReply.model_validate(
         asdict(speckle_quality(pixels, full_scale, grid.xy_px[grid.allowed], body.subset_px, noise))
     )
+
+
+@router.get("/scale", summary="Scale of camera 1's image at the surface", responses=errors(404, 409, 422))
+def show_scale(
+    service: ServiceDep,
+    test_id: TestId,
+    step: Annotated[int, Query(ge=0, le=9999, description="Step whose images are looked at.")] = 0,
+) -> ScaleReply:
+    """Return the length of a pixel of camera 1 on the surface, from feature matches with camera 2."""
+    pair = load_calibration(service.tests.calibration_file(test_id)).pair
+    images = service.tests.verified_step(test_id, step)
+    one, two = (
+        MeasureImage(read_image(path), f"{cam} of step {step}")
+        for cam, path in (("cam1", images.cam1), ("cam2", images.cam2))
+    )
+    found = image_scale(pair, one, two)
+    return ScaleReply() if found is None else ScaleReply.model_validate(asdict(found))
 
 
 @router.post("/seeds:check", summary="Possible positions of seeds in camera 2", responses=errors(404, 409, 422))

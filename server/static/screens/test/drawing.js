@@ -1,20 +1,10 @@
 // What the region editor holds, as it is kept with a test and as a recipe has it.
 /** @import { Model } from "#routes" */
 /** @import { RegionEditor } from "../../widgets/region_editor.js" */
+/** @import { Shape, Spot, State } from "../../widgets/region/shapes.js" */
 /** @typedef {Model<"Recipe">} Recipe */
-/** @typedef {{ [name: string]: unknown }} Shapes */
-
-const copied = (/** @type {unknown} */ value) => JSON.parse(JSON.stringify(value));
-
-/**
- * What is drawn now, shapes without an outline about them too.
- * @param {RegionEditor} editor
- * @returns {Shapes}
- */
-export function drawn(editor) {
-  const { state } = /** @type {{ state: any }} */ (/** @type {unknown} */ (editor));
-  return copied(typeof state === "function" ? state.call(editor) : state);
-}
+/** @typedef {{ rectangle?: [number, number, number, number] | null, polygon?: Spot[] | null, circle?: [number, number, number] | null }} Outline */
+/** @typedef {Outline & { outlines?: Outline[], holes?: Spot[][], cracks?: Spot[][], mask_png_base64?: string | null }} Region what a schema of alternatives leaves open */
 
 /**
  * Draw what was kept, or a recipe's region and seeds where the drawing was not kept; one step back undoes it.
@@ -22,28 +12,35 @@ export function drawn(editor) {
  * @param {Recipe} recipe
  */
 export function draw(editor, recipe) {
-  const now = drawn(editor);
-  const kept = /** @type {{ shapes?: Shapes } | null | undefined} */ (recipe.drawing)?.shapes;
+  const now = editor.state();
+  const kept = /** @type {{ shapes?: State } | null | undefined} */ (recipe.drawing)?.shapes;
   const fits = kept && Object.keys(now).every((name) => name in kept);
-  const wanted = fits ? copied(kept) : shapesOf(recipe, "outlines" in now);
+  const wanted = fits ? structuredClone(kept) : shapesOf(recipe);
   editor.change((state) => Object.assign(state, wanted));
 }
 
 /**
  * @param {Recipe} recipe
- * @param {boolean} several the editor holds several outlines
- * @returns {Shapes}
+ * @returns {State}
  */
-function shapesOf({ region, settings }, several) {
-  const found = /** @type {any} */ (region ?? {});
-  const shape = (/** @type {any} */ one) => (one.rectangle
-    ? { form: "rectangle", points: [[one.rectangle[0], one.rectangle[1]], [one.rectangle[2], one.rectangle[3]]] }
-    : one.circle ? { form: "circle", points: [[one.circle[0], one.circle[1]], [one.circle[0] + one.circle[2], one.circle[1]]] } : { form: "polygon", points: one.polygon });
-  const outlines = [...(found.rectangle || found.polygon ? [found] : []), ...(found.outlines ?? [])].map(shape);
+function shapesOf({ region, settings }) {
+  const { holes, cracks, mask_png_base64, outlines, ...own } = /** @type {Region} */ (region ?? {});
   const seeds = (settings?.seeds ?? []).map((one, k) => ({ one, two: settings?.seeds_cam2?.[k] ?? null }));
-  const both = copied({ cracks: found.cracks ?? [], seeds });
-  const holes = copied(found.holes ?? []);
-  return several
-    ? { ...both, outlines, holes: holes.map((/** @type {unknown} */ points) => ({ form: "polygon", points })), mask: found.mask_png_base64 ?? null }
-    : { ...both, outline: outlines[0] ?? null, holes };
+  return structuredClone({
+    outlines: [...(own.rectangle || own.polygon ? [own] : []), ...(outlines ?? [])].map(shape),
+    holes: (holes ?? []).map((polygon) => shape({ polygon })),
+    cracks: cracks ?? [],
+    seeds,
+    mask: mask_png_base64 ?? null,
+  });
+}
+
+/**
+ * @param {Outline} outline
+ * @returns {Shape}
+ */
+function shape({ rectangle, polygon, circle }) {
+  if (rectangle) return { form: "rectangle", points: [[rectangle[0], rectangle[1]], [rectangle[2], rectangle[3]]] };
+  if (circle) return { form: "circle", points: [[circle[0], circle[1]], [circle[0] + circle[2], circle[1]]] };
+  return { form: "polygon", points: polygon ?? [] };
 }

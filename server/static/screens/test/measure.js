@@ -5,8 +5,9 @@ import { greyOf } from "../../widgets/grey.js";
 import { stateBadge, warningsBox } from "../results/warnings.js";
 import { RegionEditor } from "../../widgets/region_editor.js";
 import { Workspace } from "../../lib/workspace.js";
-import { draw, drawn } from "./drawing.js";
+import { draw } from "./drawing.js";
 import { recipesBar } from "./recipes.js";
+import { gaugePx, gaugeText } from "../../widgets/region/gauge.js";
 import { h, replace, svg, field, number, select, action, table, badge, num, count, quantity, notify, problemText } from "../../lib/dom.js";
 
 /** @import { Ends } from "#dom" */
@@ -66,6 +67,7 @@ export async function measurePanel(id, test, ends, done) {
       if (n === shownStep) return;
       shownStep = n;
       views.forEach((view, k) => view.show(api.address(`/tests/${id}/steps/${n}/cam${k + 1}/preview`)));
+      readScale();
       changed();
     }
     reference.addEventListener("change", showReference);
@@ -115,10 +117,7 @@ export async function measurePanel(id, test, ends, done) {
       found.textContent = "";
       const answer = await api.post(`/tests/${id}/region:find`, { reference: Number(reference.value), subset_px: Number(subset.value) });
       const region = /** @type {{ polygon: [number, number][], holes?: [number, number][][] }} */ (answer.region);
-      editor.change((state) => {
-        state.outline = { form: "polygon", points: region.polygon };
-        state.holes = region.holes ?? [];
-      });
+      editor.change((state) => Object.assign(state, { outlines: [{ form: "polygon", points: region.polygon }], holes: (region.holes ?? []).map((points) => ({ form: "polygon", points })), mask: null }));
       found.textContent = `Found: ${answer.text}. Correct it by its corners.`;
     });
 
@@ -190,8 +189,20 @@ export async function measurePanel(id, test, ends, done) {
     const follow_ = h("input", { type: "checkbox" });
     const label = h("input", { type: "text", maxlength: 300 });
     const gauge = h("small.hint");
+    const gaugeWarning = h("p.problem", { role: "status", "data-role": "gauge-warning", hidden: true });
+    /** @type {number | null} */
+    let mmPerPx = null;
+    async function readScale() {
+      const step = Number(reference.value);
+      const scale = test.calibration_id ? await api.get(`/tests/${id}/scale`, { step }).catch(() => null) : null;
+      if (step === Number(reference.value)) mmPerPx = scale?.mm_per_px ?? null;
+      drawGauge();
+    }
     function drawGauge() {
-      gauge.textContent = strain.checked ? `Virtual strain gauge: ${num((Number(window_.value) - 1) * Number(spacing.value) + Number(subset.value), 4)} px wide.` : "";
+      const { text, warning } = strain.checked ? gaugeText(gaugePx(Number(window_.value), Number(spacing.value), Number(subset.value)), mmPerPx, editor.width()) : { text: "", warning: "" };
+      gauge.textContent = text;
+      gaugeWarning.textContent = warning;
+      gaugeWarning.hidden = !warning;
     }
     for (const input of [window_, strain]) input.addEventListener("input", drawGauge);
 
@@ -221,7 +232,7 @@ export async function measurePanel(id, test, ends, done) {
     function keep() {
       if (!ready || !views[0].width) return;
       const { gauges: _, display: __, ...own } = now();
-      workspace.change({ ...own, drawing: /** @type {Recipe["drawing"]} */ ({ shapes: drawn(editor), steps: which.value, label: label.value, follow: follow_.checked, reference: Number(reference.value) }) });
+      workspace.change({ ...own, drawing: /** @type {Recipe["drawing"]} */ ({ shapes: editor.state(), steps: which.value, label: label.value, follow: follow_.checked, reference: Number(reference.value) }) });
     }
     /** @param {Recipe} recipe */
     function show(recipe) {
@@ -294,7 +305,7 @@ export async function measurePanel(id, test, ends, done) {
     }
 
     replace(body,
-      h("div.row", h("label", { for: "reference-step" }, "Reference step"), Object.assign(reference, { id: "reference-step" }), editor.bar), editor.hint,
+      h("div.row", h("label", { for: "reference-step" }, "Reference step"), Object.assign(reference, { id: "reference-step" }), editor.bar), editor.more, editor.hint,
       h("div.grid.two.views", { style: { marginTop: "0.5rem" } }, views.map((view, k) => h("div", h("h3", `cam${k + 1}`), view.root))),
       h("div.grid.two", { style: { marginTop: "var(--gap)" } },
         h("div",
@@ -307,7 +318,7 @@ export async function measurePanel(id, test, ends, done) {
           h("fieldset", h("legend", "Correlation"),
             h("div.fields", field("Measure", kind), field("Shape function", patch), field("Interpolation", interpolation), field("Prefilter, sd", prefilter, "px", "0: none"), field("Largest sigma of a match", maxSigma, "px", "points beyond it are rejected"), field("Noise", noiseChoice),
               field("Reference is updated", update), field("Smoothing window", smoothing, "points", "odd; empty: none"))),
-          h("fieldset", h("legend", "Strain"), h("label.check", strain, "compute strain"), h("div.fields", field("Window", window_, "points", "odd"), field("Fit", order), field("Tensor", tensor)), gauge),
+          h("fieldset", h("legend", "Strain"), h("label.check", strain, "compute strain"), h("div.fields", field("Window", window_, "points", "odd"), field("Fit", order), field("Tensor", tensor)), gauge, gaugeWarning),
           h("div.fields", field("Steps", which, "", "such as 1-5, 8; empty: all"), field("Label", label)), h("label.check", follow_, "continue with each new step"),
           h("div.row", { style: { marginTop: "0.5rem" } }, start), progress)));
     body.before(await recipesBar(id, workspace.state, { take, now }));
