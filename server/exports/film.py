@@ -8,12 +8,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial import cKDTree
 
 from core.errors import InputError, StorageError
 from server.exports.pictures import picture_of
+from server.formats.figures.axes import COLOURS
 from server.formats.figures.colours import colour_map
 from server.formats.figures.figure import Frames, Picture, Scale, scale_of
 from server.formats.figures.options import FigureStyle
@@ -130,10 +132,11 @@ def write_gif(
 
 
 def _palette(pixels: NDArray[np.uint8], style: FigureStyle, opacity: float) -> NDArray[np.uint8]:
-    """Return (n, 3) a palette for all frames: colours of the bar, evenly, which are few pixels, and the picture's own."""
+    """Return (n, 3) a palette for all frames: what has few pixels, bar and axes, and the picture's own colours."""
     levels = np.linspace(0.0, 1.0, _OF_THE_BAR)
     map_ = colour_map(style.colours, style.levels, reverse=style.reverse)(levels)[:, :3]
-    bar = np.unique(np.rint(255.0 * (opacity * map_ + 1.0 - opacity)).astype(np.uint8), axis=0)
+    rare = np.concatenate([opacity * map_ + 1.0 - opacity, [to_rgb(one) for one in COLOURS.values()]])
+    bar = np.unique(np.rint(255.0 * rare).astype(np.uint8), axis=0)
     own = Image.fromarray(pixels).quantize(_COLOURS - len(bar), method=Image.Quantize.MEDIANCUT)
     return np.concatenate([bar, np.array(own.getpalette(), dtype=np.uint8).reshape(-1, 3)])[:_COLOURS]
 

@@ -12,7 +12,7 @@ from matplotlib.transforms import ScaledTranslation
 from core.arrays import Float
 
 _LONG_PT, _MIDDLE_PT = 14.0, 27.0
-_COLOURS = {"X": "#c0392b", "Y": "#1e8449"}
+COLOURS = {"X": "#c0392b", "Y": "#1e8449", "Z": "#1f5fa8"}
 Directions = tuple[tuple[float, float], tuple[float, float]]
 
 
@@ -69,10 +69,10 @@ def draw_axes(axis: Any, directions: Directions) -> list[Any]:
         tip = (_MIDDLE_PT + _LONG_PT * dx, _MIDDLE_PT - _LONG_PT * dy)
         size = max(float(np.hypot(dx, dy)), 1e-9)
         beside = (tip[0] + 5.0 * dx / size, tip[1] - 5.0 * dy / size)
-        drawn += [text(name, xytext=beside, color=_COLOURS[name]), _line(axis, middle, tip, _COLOURS[name])]
-    drawn.append(text("\u2297" if away else "\u2299", xytext=middle, color="#1f5fa8"))
+        drawn += [text(name, xytext=beside, color=COLOURS[name]), _line(axis, middle, tip, COLOURS[name])]
+    drawn.append(text("\u2297" if away else "\u2299", xytext=middle, color=COLOURS["Z"]))
     aside = (_MIDDLE_PT - 5.5 * (xx + yx), _MIDDLE_PT + 5.5 * (xy + yy))
-    drawn.append(text("Z", xytext=aside, fontsize=6, color="#1f5fa8"))
+    drawn.append(text("Z", xytext=aside, fontsize=6, color=COLOURS["Z"]))
     return drawn
 
 
