@@ -146,7 +146,7 @@ def _with_palette(pixels: NDArray[np.uint8], palette: NDArray[np.uint8]) -> Imag
     packed = pixels.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
     colours, where = np.unique(packed, return_inverse=True)
     apart = np.stack([colours >> 16, colours >> 8 & 255, colours & 255], axis=-1)
-    nearest = cKDTree(palette).query(apart)[1].astype(np.uint8)
+    nearest: NDArray[np.uint8] = np.asarray(cKDTree(palette).query(apart)[1], dtype=np.uint8)
     made = Image.fromarray(nearest[where].reshape(pixels.shape[:2]), mode="P")
     made.putpalette(palette.ravel().tolist())
     return made
