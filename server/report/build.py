@@ -180,7 +180,12 @@ def the_test(source: Source, measured: Measured) -> list[Item]:
 
     def stated(name: str, label: str, value: str | None) -> Item:
         known = Value(value, None, "as stated") if value else None
-        return Item(f"test.{name}", label, (known,), f"{name} of PUT /tests/{{id}}/metadata or metadata.toml")
+        return Item(
+            f"test.{name}",
+            label,
+            (known,),
+            f"{name}, in the form Metadata of the test's screen (PUT /tests/{{id}}/metadata, or metadata.toml)",
+        )
 
     taken = None
     if times:
@@ -264,8 +269,8 @@ def _fields(measured: Measured) -> list[tuple[str, list[Picture]]]:
     if not measured.shown:
         drawn.append(_status(reference, "the reference"))
     return [
-        ("", drawn),
         *((f"Step {shown.n}: {shown.why}", _maps(shown, measured.statement)) for shown in measured.shown),
+        ("The reference", drawn),
     ]
 
 
