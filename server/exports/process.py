@@ -22,6 +22,7 @@ from server.worker.executor import TaskFuture
 FOLDER = ".exports"
 _MAX_WAITING = 4
 _REST_AFTER_S = 60.0
+_KEPT_FILES = 8  # of exports that were jobs
 
 
 def export_task(folder: str, files: list[str], request: ExportRequest, out: str) -> str:
@@ -50,6 +51,7 @@ class ExportProcess:
         self._waiting = 0
         self._rest: threading.Timer | None = None
         self._closed = False
+        self._kept: dict[str, Path] = {}  # by job, the oldest first
 
     def clear(self) -> None:
         """Remove files that a kill left."""
@@ -59,6 +61,32 @@ class ExportProcess:
         """Make a folder for one export; the caller removes it."""
         self._folder.mkdir(exist_ok=True)
         return Path(tempfile.mkdtemp(dir=self._folder))
+
+    def keep(self, job_id: str, file: Path) -> Path:
+        """Keep a job's file until eight later ones are kept, or the service ends; return where it lies then."""
+        home = self._folder / "kept" / job_id
+        home.mkdir(parents=True, exist_ok=True)
+        kept = file.rename(home / file.name)
+        with self._lock:
+            self._kept[job_id] = kept
+            gone = [self._kept.pop(old) for old in list(self._kept)[:-_KEPT_FILES]]
+        for path in gone:
+            shutil.rmtree(path.parent, ignore_errors=True)
+        return kept
+
+    def kept(self, job_id: str) -> Path | None:
+        """Return the file that is kept for a job; None if there is none, or none any more."""
+        with self._lock:
+            return self._kept.get(job_id)
+
+    def check_room(self) -> None:
+        """Refuse an export that would be refused by :meth:`run`."""
+        with self._lock:
+            self._check_room()
+
+    def _check_room(self) -> None:
+        if self._closed or self._waiting >= _MAX_WAITING:
+            raise QueueFullError(f"{self._waiting} exports are being made.", code="exports_waiting")
 
     def submit(self, folder: Path, files: list[Path], request: ExportRequest, out: Path) -> TaskFuture:
         """Begin an export, see :func:`export_task`; raises as :meth:`run`."""
@@ -73,8 +101,7 @@ class ExportProcess:
             ``exports_waiting`` if four are on their way.
         """
         with self._lock:
-            if self._closed or self._waiting >= _MAX_WAITING:
-                raise QueueFullError(f"{self._waiting} exports are being made.", code="exports_waiting")
+            self._check_room()
             if self._rest is not None:
                 self._rest.cancel()
                 self._rest = None

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 from core.errors import InputError
 from core.settings import Coverage, CoverageFields
-from server.formats.figure_options import FigureStyle
+from server.formats.figures.options import FigureStyle
 
 ExportFormat = Literal["nc", "csv", "vtu", "mat", "h5", "png", "svg", "gif", "mp4"]
 FORMATS: tuple[ExportFormat, ...] = get_args(ExportFormat)
@@ -55,6 +55,13 @@ class ExportRequest:
     over_image: bool = False
     fps: float = 2.0
     coverage: CoverageFields = field(default_factory=lambda: Coverage.model_validate({}))
+
+    @property
+    def drawn_variables(self) -> Sequence[str] | None:
+        """Variables that are read; None: all. One picture shows ``w_mm`` or ``z_mm`` where none are named."""
+        if self.variables is None and self.format in ("png", "svg", "gif", "mp4"):
+            return ("w_mm",)
+        return self.variables
 
 
 def steps_in(text: str) -> list[int]:

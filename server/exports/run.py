@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Literal
 
 from core.errors import InputError
+from server.exports.film import check_fps, frames, write_gif, write_mp4
 from server.exports.matlab import write_mat
-from server.exports.pictures import check_fps, frames, image_of, picture_of, write_figure, write_gif, write_mp4
+from server.exports.pictures import image_of, picture_of, write_figure
 from server.exports.request import ExportRequest
 from server.exports.stacked import scalars_of, write_stacked
 from server.exports.table import write_table
@@ -26,6 +27,7 @@ from server.results.channels import has_more, rising
 from server.results.provenance import provenance
 from server.results.steps import Source, chosen, columns_of, each, read_step, require_known, variables_of, with_coverage
 from server.results.uncertainty import in_file
+from server.worker.process import current_task
 
 _PACKED = (".nc", ".png", ".gif", ".mp4", ".mat", ".h5")
 
@@ -71,7 +73,7 @@ def export(source: Source, request: ExportRequest, out: Path) -> Iterator[Path]:
 
 def export_packed(source: Source, request: ExportRequest, folder: Path) -> Path:
     """Write an export into a folder as one file: its only one, or a ZIP of several; return its path."""
-    made = export(source, request, folder)
+    made = _watched(export(source, request, folder), source, request)
     first = next(made)
     second = next(made, None)
     if second is None:
@@ -83,6 +85,19 @@ def export_packed(source: Source, request: ExportRequest, folder: Path) -> Path:
             archive.write(path, path.name, compress_type=packing)
             path.unlink()
     return packed
+
+
+def _watched(made: Iterator[Path], source: Source, request: ExportRequest) -> Iterator[Path]:
+    """Report each file of an export to the task that makes it, and end with it; a film reports its frames itself."""
+    task, film = current_task(), request.format in ("gif", "mp4")
+    expected = len(chosen(source, request.steps)) * (
+        len(request.variables or [""]) if request.format in ("png", "svg") else 1
+    )
+    for k, path in enumerate(made, 1):
+        task.check()
+        if not film:
+            task.progress("writing", min(k, expected), expected)
+        yield path
 
 
 def _path(out: Path, source: Source, n: int, suffix: str) -> Path:
@@ -147,7 +162,8 @@ def _drawn(source: Source, files: Sequence[Path], request: ExportRequest, out: P
             drawn = frames(source, request.steps, name, request.style, image)
             if request.format == "gif":
                 first = read_step(files[0], [])
-                write_gif(path, drawn, request.fps, json.dumps(provenance(first, source), sort_keys=True))
+                comment = json.dumps(provenance(first, source), sort_keys=True)
+                write_gif(path, drawn, request.fps, comment, request.style, over_image=request.over_image)
             else:
                 write_mp4(path, drawn, request.fps)
             yield path

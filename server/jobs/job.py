@@ -22,9 +22,12 @@ ACTIVE: tuple[State, ...] = ("queued", "running", "cancelling")
 
 @dataclass(frozen=True)
 class Phase:
-    """One phase of a job: its lane and its function; what ``run`` returns is merged into the job's result."""
+    """One phase of a job: its lane and its function; what ``run`` returns is merged into the job's result.
 
-    lane: Literal["hardware", "compute"]
+    What runs ``beside`` the lanes waits for neither: its work is done in another process.
+    """
+
+    lane: Literal["hardware", "compute", "beside"]
     run: Callable[[Job], Mapping[str, object] | None]
 
 

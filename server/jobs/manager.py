@@ -1,9 +1,9 @@
 """Jobs: anything that takes longer than a request.
 
 A job goes through phases, each on a lane: ``hardware`` (exclusive, never queued) or ``compute`` (queued, bounded, one
-at a time). Its states are ``queued running cancelling succeeded failed cancelled interrupted``. A job is in the
-catalogue before it is acknowledged; what was not finished when the service ended reads ``interrupted`` after the next
-start.
+at a time); or it has one phase ``beside`` both. Its states are ``queued running cancelling succeeded failed cancelled
+interrupted``. A job is in the catalogue before it is acknowledged; what was not finished when the service ended reads
+``interrupted`` after the next start.
 """
 
 from __future__ import annotations
@@ -127,6 +127,8 @@ class JobManager:
         self._hub.publish("job", job.document().plain())
         if token is not None:
             self._hardware.start(lambda: self._run_hardware(job, token))
+        elif phases[0].lane == "beside":
+            threading.Thread(target=self._run_beside, args=(job,), name=f"beside-{job.id}", daemon=True).start()
         else:
             self._enqueue(job)
         return job
@@ -298,6 +300,11 @@ class JobManager:
             self._enqueue(job)
         else:
             self._end(job, "succeeded", None)
+
+    def _run_beside(self, job: Job) -> None:
+        with about(job_id=job.id):
+            if self._run_phase(job, 0):
+                self._end(job, "succeeded", None)
 
     def _run_compute(self) -> None:
         while True:

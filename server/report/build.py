@@ -101,7 +101,7 @@ def make_report(source: Source, coverage: CoverageFields | None = None) -> Repor
     if not measured.loaded:
         missing.append(Missing("Load of the steps", "give load_n with each step"))
     if source.metadata.gauges is None and len(measured.steps) > 1:
-        remedy = "name extensometers, points, areas or lines in `gauges` of the metadata"
+        remedy = "draw extensometers, points, areas or lines on the Results screen, or name them in `gauges` of the metadata"
         missing.append(Missing("Gauges", remedy))
     made = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
     page, policy = render(
@@ -181,7 +181,12 @@ def the_test(source: Source, measured: Measured) -> list[Item]:
 
     def stated(name: str, label: str, value: str | None) -> Item:
         known = Value(value, None, "as stated") if value else None
-        return Item(f"test.{name}", label, (known,), f"{name} of PUT /tests/{{id}}/metadata or metadata.toml")
+        return Item(
+            f"test.{name}",
+            label,
+            (known,),
+            f"{name}, in the form Metadata of the test's screen (PUT /tests/{{id}}/metadata, or metadata.toml)",
+        )
 
     taken = None
     if times:
@@ -261,8 +266,8 @@ def _fields(measured: Measured) -> list[tuple[str, list[Picture]]]:
     if not measured.shown:
         drawn.append(_status(reference, "the reference"))
     return [
-        ("", drawn),
         *((f"Step {shown.n}: {shown.why}", _maps(shown, measured.statement)) for shown in measured.shown),
+        ("The reference", drawn),
     ]
 
 

@@ -17,7 +17,7 @@ from server.report.records import CameraRecord
 from server.report.source import Source
 from server.report.steps import Measured
 
-_METADATA_SOURCE = "PUT /tests/{id}/metadata or metadata.toml"
+_METADATA_SOURCE = "the form Metadata of the test's screen (PUT /tests/{id}/metadata, or metadata.toml)"
 _RIG_FILE = f"the rig file or {_METADATA_SOURCE}"
 _IN_FILE = "as stated (test or rig file)"
 _BY_SERVICE = "is recorded when the service captures"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from server.results.gauges.readings import read_gauges
 #: a gauge's values in every step, or the reason why there are none
 _Readings = Sequence[tuple[Mapping[str, Number], str]]
 _EXTENSOMETER = ("elongation_mm", "strain")
+_FOLLOWS = 0.9  # correlation of the mean motion with what drives it
 
 
 @dataclass(frozen=True)
@@ -54,22 +55,56 @@ class Gauges:
 
 @dataclass(frozen=True)
 class _Axis:
-    """Abscissa of the curves: time since the reference, or the step's number."""
+    """Abscissa of the curves: what drives the test, else time since the reference, else the step's number."""
 
     positions: list[float]
     label: str
+    name: str = ""  # of what drives the test
+    as_given: bool = False
 
     @staticmethod
     def of(steps: Sequence[StepFigures]) -> _Axis:
+        return _driving(steps) or _Axis.in_time(steps)
+
+    @staticmethod
+    def in_time(steps: Sequence[StepFigures]) -> _Axis:
+        """Return the time since the reference, or the steps' numbers."""
         times = [s.seconds for s in steps]
         known = [t for t in times if t is not None]
         if len(known) == len(times) and len(set(known)) == len(known) and np.isfinite(known).all():
             return _Axis(known, "time since the reference, s")
         return _Axis([float(s.n) for s in steps], "step")
 
+    def only(self, chosen: Sequence[StepFigures], of: Sequence[StepFigures]) -> _Axis:
+        """Return the same abscissa of some of the steps."""
+        numbers = {s.n for s in chosen}
+        return replace(self, positions=[x for x, s in zip(self.positions, of, strict=True) if s.n in numbers])
+
     def draw(self, lines: Lines, y_label: str, title: str, *, text: str, caption: str) -> Picture:
-        data = course(self.positions, lines, x_label=self.label, y_label=y_label, title=title)
-        return Picture(data, SVG, f"{text} over the steps", caption)
+        against = f" against {self.name}" if self.name else ""
+        data = course(self.positions, lines, x_label=self.label, y_label=y_label, title=title, as_given=self.as_given)
+        return Picture(data, SVG, f"{text} over the steps", f"{caption}{against}")
+
+
+def _driving(steps: Sequence[StepFigures]) -> _Axis | None:
+    """Return the load or the channel that the motion follows; None where nothing recorded in every step does."""
+    spans = [[span.mean for span in (s.summary.displacement_mm or {}).values() if span] for s in steps]
+    moved = np.array([float(np.linalg.norm(means)) if means else 0.0 for means in spans])
+    if len(steps) < 3 or not np.ptp(moved):
+        return None
+    names = sorted({name for s in steps for name in s.channels})
+    recorded = {"load": [s.load_n for s in steps], **{name: [s.channels.get(name) for s in steps] for name in names}}
+    found = []
+    for name, values in recorded.items():
+        known = np.array([np.nan if v is None else v for v in values])
+        if np.isfinite(known).all() and np.ptp(known):
+            found.append((abs(float(np.corrcoef(np.abs(known - known[0]), moved)[0, 1])), name, known))
+    # a load that is recorded says more than a temperature that happens to rise with it
+    name, positions = next(((name, known) for follows, name, known in found if follows >= _FOLLOWS), ("", None))
+    if positions is None:
+        return None
+    label = "load, N" if name == "load" else _with_unit(name)
+    return _Axis(positions.tolist(), label, name, as_given=True)
 
 
 def courses(measured: Measured) -> list[Picture] | None:
@@ -77,34 +112,39 @@ def courses(measured: Measured) -> list[Picture] | None:
     steps = measured.steps
     if len(steps) < 2:
         return None
-    axis = _Axis.of(steps)
+    axis, time = _Axis.of(steps), _Axis.in_time(steps)
     drawn = []
     if measured.loaded:
         lines: Lines = {"load": ([s.load_n for s in steps], None)}
-        drawn.append(axis.draw(lines, "load, N", "Load", text="load", caption="Load as recorded with the steps"))
+        drawn.append(time.draw(lines, "load, N", "Load", text="load", caption="Load as recorded with the steps"))
     for name in measured.channels:
         lines = {name: ([s.channels.get(name) for s in steps], None)}
         label = _with_unit(name)
-        drawn.append(axis.draw(lines, label, name, text=name, caption=f"{name} as recorded with the steps"))
+        drawn.append(time.draw(lines, label, name, text=name, caption=f"{name} as recorded with the steps"))
 
-    def over(chosen: Sequence[StepFigures]) -> _Axis:
-        numbers = {s.n for s in chosen}
-        return _Axis([x for x, s in zip(axis.positions, steps, strict=True) if s.n in numbers], axis.label)
-
+    # displacement and strain are relative to the reference, where they are zero
+    moving = [s for s in steps if s.summary.displacement_mm or s.n == measured.reference_step]
     if measured.moved:
         lines = {}
         for component in ("u", "v", "w"):
-            spans = [(s.summary.displacement_mm or {})[component] for s in measured.moved]
-            lines[component.upper()] = ([None if t is None else 1e3 * t.mean for t in spans], None)
+            spans = [(s.summary.displacement_mm or {}).get(component) for s in moving]
+            zeros = [0.0 if s.n == measured.reference_step else None for s in moving]
+            lines[component.upper()] = (
+                [zero if t is None else 1e3 * t.mean for t, zero in zip(spans, zeros, strict=True)],
+                None,
+            )
         title, caption = "Displacement, mean over the points", "Mean of U, V, W over all valid points"
         label = f"mean displacement, {UM}"
-        drawn.append(over(measured.moved).draw(lines, label, title, text="mean displacement", caption=caption))
+        drawn.append(axis.only(moving, steps).draw(lines, label, title, text="mean displacement", caption=caption))
     strained = {s.n: s.strain for s in steps if s.strain is not None and s.strain.points}
     if strained:
-        lines = {e: ([strain.mean_microstrain[e] for strain in strained.values()], None) for e in STRAINS}
+        chosen = [s for s in steps if s.n in strained or s.n == measured.reference_step]
+        means = [None if s.n not in strained else strained[s.n].mean_microstrain for s in chosen]
+        lines = {e: ([0.0 if mean is None else mean[e] for mean in means], None) for e in STRAINS}
         title, caption = "Strain, mean over the points", "Mean of the strains over all points that have it"
-        chosen = [s for s in steps if s.n in strained]
-        drawn.append(over(chosen).draw(lines, "mean strain, microstrain", title, text="mean strain", caption=caption))
+        drawn.append(
+            axis.only(chosen, steps).draw(lines, "mean strain, microstrain", title, text="mean strain", caption=caption)
+        )
     return drawn
 
 
@@ -122,14 +162,16 @@ def gauges(source: Source, measured: Measured) -> Gauges | None:
     if not steps:
         return Gauges([], problems, [])
     figures = {s.n: s for s in measured.steps}
-    axis = _Axis.of([figures[s.n] for s in steps])
+    read_ = [figures[s.n] for s in steps]
+    axis = _Axis.of(measured.steps).only(read_, measured.steps)
+    at_rest = [s.n == measured.reference_step for s in read_]
     curves: list[Picture] = []
     tables = []
     for k, extensometer in enumerate(steps[0].extensometers):
         read: _Readings = [(s.extensometers[k].values, s.extensometers[k].missing) for s in steps]
         title = f"Extensometer {extensometer.name}"
         tables.append(_table(extensometer.name, title, _EXTENSOMETER, steps, read))
-        curves += _curves(title, _EXTENSOMETER[-1:], [values for values, _ in read], axis, measured.statement)
+        curves += _curves(title, _EXTENSOMETER[-1:], [values for values, _ in read], axis, at_rest, measured.statement)
         curves += _against_loads(
             title, [figures[s.n] for s in steps], [values for values, _ in read], measured.statement
         )
@@ -143,7 +185,7 @@ def gauges(source: Source, measured: Measured) -> Gauges | None:
         last = read[-1][0]
         tables.append(_table(name, f"{kind} {name}", list(last), steps, read))
         moved = [n for n in last if n in ("u_mm", "v_mm", "w_mm")]
-        curves += _curves(f"{kind} {name}", moved, [values for values, _ in read], axis, measured.statement)
+        curves += _curves(f"{kind} {name}", moved, [values for values, _ in read], axis, at_rest, measured.statement)
     for line in steps[-1].lines:
         curves += _line(line, steps[-1].n)
     return Gauges(curves, problems, tables, gauge_budgets(steps[-1], measured.statement), steps[-1].n)
@@ -208,7 +250,12 @@ def _value(number: Number | None, missing: str) -> Value:
 
 
 def _curves(
-    title: str, wanted: Sequence[str], read: Sequence[Mapping[str, Number]], axis: _Axis, statement: Statement
+    title: str,
+    wanted: Sequence[str],
+    read: Sequence[Mapping[str, Number]],
+    axis: _Axis,
+    at_rest: Sequence[bool],
+    statement: Statement,
 ) -> list[Picture]:
     if not wanted:
         return []
@@ -216,7 +263,10 @@ def _curves(
     lines: Lines = {}
     for n in wanted:
         numbers = [values.get(n) for values in read]
-        value = [None if v is None or v.value is None else factor * v.value for v in numbers]
+        value = [
+            (0.0 if rest else None) if v is None or v.value is None else factor * v.value
+            for v, rest in zip(numbers, at_rest, strict=True)
+        ]
         sigma = [None if v is None or v.sigma is None else statement.k * factor * v.sigma for v in numbers]
         lines[n.removesuffix("_mm")] = (value, sigma)
     caption = f"{title}; bars are \u00b1 {statement.text}"

@@ -18,9 +18,9 @@ from core.field.points.result import Field
 from core.field.region.cuts import Cuts
 from core.status import PointStatus
 from core.strain import StrainField
-from server.formats.figure import Picture, draw
-from server.formats.figure_axes import directions_of
-from server.formats.figure_options import FigureStyle
+from server.formats.figures.axes import directions_of, scale_of_image
+from server.formats.figures.figure import Picture, draw
+from server.formats.figures.options import FigureStyle
 
 #: by name, values and their standard deviations
 Lines = dict[str, tuple[Sequence[float | None], Sequence[float | None] | None]]
@@ -59,8 +59,10 @@ def field_map(
     """Draw a length or strain over the points; PNG."""
     factor, units = unit or unit_for(values, strain=strain)
     shown = np.where(field.valid, factor * values, np.nan)
-    axes = directions_of(field.x_px, field.y_px, field.xyz_mm[..., 0], field.xyz_mm[..., 1])
-    picture = Picture(shown, field.x_px, field.y_px, name, units, title, cuts=field.cuts, axes=axes)
+    places = (field.x_px, field.y_px, field.xyz_mm[..., 0], field.xyz_mm[..., 1])
+    scale = scale_of_image(*places)
+    axes = directions_of(*places)
+    picture = Picture(shown, field.x_px, field.y_px, name, units, title, cuts=field.cuts, axes=axes, px_per_mm=scale)
     return _cropped(draw(picture, _HALF, "png"))
 
 

@@ -152,6 +152,13 @@ class Measured:
         return [s for s in self.steps if s.summary.displacement_mm]
 
     @property
+    def reference_step(self) -> int | None:
+        """Number of the step that displacements are relative to; None for shapes alone."""
+        if not self.moved:
+            return None
+        return next((s.n for s in self.steps if not s.summary.displacement_mm), None)
+
+    @property
     def camera_moved(self) -> list[StepFigures]:
         """Steps in which a camera is seen to have moved."""
         return [s for s in self.steps if s.camera_motion is not None and s.camera_motion.camera_moved]

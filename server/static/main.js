@@ -21,6 +21,7 @@ const bar = part("bar");
 /** @type {Leave | null} */
 let leave = null;
 let visit = 0;
+let shown = ""; // the screen
 
 /** "#/test/t000001-52d4a7?step=3" -> {screen, path, query} */
 function route() {
@@ -38,6 +39,10 @@ async function open() {
     else link.removeAttribute("aria-current");
   }
   document.title = `${SCREENS[here.screen][0]} · stereorig`;
+  // what was said or asked on another screen does not belong to this one
+  if (here.screen !== shown) for (const old of part("notices").querySelectorAll(".notice.bad")) old.remove();
+  for (const dialog of document.querySelectorAll("dialog[open]:not([data-stays])")) /** @type {HTMLDialogElement} */ (dialog).dispatchEvent(new Event("cancel", { cancelable: true }));
+  shown = here.screen;
   leave?.();
   leave = null;
   replace(main, h("p.quiet", "Loading …"));
@@ -175,7 +180,7 @@ async function askForKey() {
   asking = true;
   const input = h("input", { type: "password", autocomplete: "current-password", required: true });
   const problem = h("div");
-  const dialog = h("dialog", { "aria-label": "Log in" },
+  const dialog = h("dialog", { "aria-label": "Log in", "data-stays": true },
     h("form", { method: "dialog", onsubmit: async (event) => {
       event.preventDefault();
       try {

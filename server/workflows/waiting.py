@@ -17,7 +17,11 @@ def run_task(
     executor: TaskExecutor, job: Job, function: Callable[..., Any], *args: Any, progress: Progress | None = None
 ) -> Any:
     """Run ``function(*args)`` outside; progress goes to the job, the job's cancellation to the task."""
-    future = executor.submit(function, *args)
+    return result_of(executor.submit(function, *args), job, progress)
+
+
+def result_of(future: TaskFuture, job: Job, progress: Progress | None = None) -> Any:
+    """Wait for a task that was begun for a job; progress goes to the job, the job's cancellation to the task."""
     future.on_progress = progress or job.progress
     with job.waiting(future.request_stop):
         while True:

@@ -270,7 +270,7 @@ def export_opens(shown: Page, client: httpx.Client, test_id: str) -> None:
     shown.get_by_text("Export and report").click()
     files = {}
     for form in ("nc", "csv"):
-        shown.get_by_label("format", exact=True).select_option(form)
+        shown.get_by_label("Form", exact=True).select_option(form)
         with shown.expect_download(timeout=SLOW) as saved:
             shown.get_by_role("button", name="Save the file").click()
         assert saved.value.suggested_filename.endswith(f".{form}")

@@ -518,7 +518,8 @@ def test_settings_checks_and_files(page: Watched, bench: Bench) -> None:
     with at.expect_download() as saved:
         at.get_by_role("button", name="Save the file").click()
     assert read_head(saved.value.path()).frame.startswith("aligned by plane, X along camera 1's image rows")
-    at.get_by_label("frame", exact=True).fill("system")
+    at.get_by_label("Axes", exact=True).select_option("system")
+    drawn(at, "2 w_mm reference")
     with at.expect_download() as saved:
         at.get_by_role("button", name="Save the file").click()
     assert saved.value.suggested_filename.endswith(".nc")
@@ -610,4 +611,80 @@ def test_a_failed_check_stands_at_the_head_of_the_results_and_in_the_lists(page:
     assert [one["code"] for one in entry["warnings"]] == ["epipolar_check_failed", "low_coverage"]
     report = bench.client.get(f"{bench.path(doubtful)}/report").text
     assert report.index('data-warning="epipolar_check_failed"') < report.index('class="boxes"')
+    page.sound()
+
+
+def test_what_is_shown_is_what_is_saved(page: Watched, bench: Bench) -> None:
+    at = shown(page, bench, name="exx")
+    panel = at.locator('[data-role="files"]')
+    at.get_by_text("Export and report").click()
+    for label, value in (("Colours", "diverging"), ("Limits", "given")):
+        at.get_by_label(label, exact=True).select_option(value)
+    for label, text in (("Lower limit", "-300"), ("Upper limit", "300"), ("Levels", "6")):
+        at.get_by_label(label, exact=True).fill(text)
+        at.get_by_label(label, exact=True).press("Tab")
+    said = panel.locator('[data-role="seen"]')
+    expect(said).to_contain_text("blue to brown from \N{MINUS SIGN}300 to 300 µm/m, 6 levels")
+    expect(said).to_contain_text("axes of the specimen")
+    colours = at.evaluate(
+        "() => { const bar = document.querySelector('.colourbar canvas');"
+        " return [...bar.getContext('2d').getImageData(0, 0, bar.width, 1).data] }"
+    )
+    bar = np.array(colours).reshape(-1, 4)[::43, :3][:6]
+    panel.get_by_label("over the reference image").uncheck()
+    with at.expect_download() as saved:
+        panel.get_by_role("button", name="Save as PNG").click()
+    pixels = picture(saved.value.path().read_bytes()).reshape(-1, 3).astype(int)
+    for colour in bar[[0, 5]]:  # the bar's ends, as the page has them
+        assert (np.abs(pixels - colour).max(axis=1) <= 2).sum() > 500
+    with at.expect_download() as saved:
+        panel.get_by_role("button", name="Save as SVG").click()
+    text = saved.value.path().read_text()
+    for words in ("plate &lt;b&gt;&amp;", "step 2", "µm/m", ">\N{MINUS SIGN}300<", ">300<", "aligned by plane", " mm<"):
+        assert words in text, words
+    panel.get_by_label("Film as", exact=True).select_option("gif")
+    panel.get_by_label("Width", exact=True).fill("300")
+    with at.expect_download() as saved:
+        panel.get_by_role("button", name="Make the film").click()
+    with Image.open(saved.value.path()) as film:
+        assert (film.width, film.n_frames) == (300, 2)  # type: ignore[attr-defined]
+    expect(panel.locator('[data-role="export-course"]')).to_contain_text("Saved as")
+    panel.get_by_label("Width", exact=True).fill("30")
+    panel.get_by_role("button", name="Save as PNG").click()
+    expect(at.get_by_role("alert").filter(has_text="200 to 4,000 px wide")).to_be_visible()
+    page.sound()
+
+
+def test_a_plot_is_saved_as_numbers_and_as_pictures_and_starts_at_the_reference(page: Watched, bench: Bench) -> None:
+    at = shown(page, bench)
+    given(at, ENDS, (80, 90, 160, 90))
+    at.locator("details", has=at.get_by_label(ENDS[0])).get_by_role("button", name="Use").click()
+    wait_for_chart(at, "extensometer-chart", "a.x.length === 3 && a.x[2] === 6.89")  # against what drives the test
+    got = answer_of(at, "extensometer-chart")
+    assert (got["x"][0], got["value"][0]) == (0, [0])  # the reference is zero, not missing
+    chart = at.locator('[data-role="extensometer-chart"]')
+    with at.expect_download() as saved:
+        chart.get_by_role("button", name="Save as CSV").click()
+    said, head, *lines = saved.value.path().read_text().splitlines()
+    assert "k = 1" in said
+    assert head == "stroke (mm),strain (µm/m),u of e1 (µm/m)"
+    table = np.array([[float(v) for v in line.split(",")] for line in lines])
+    np.testing.assert_allclose(table[:, 1], [1e6 * v[0] for v in got["value"]], rtol=1e-12)
+    np.testing.assert_allclose(table[1:, 2], [1e6 * s[0] for s in got["sigma"][1:]], rtol=1e-12)
+    with at.expect_download() as saved:
+        chart.get_by_role("button", name="Save as PNG").click()
+    assert picture(saved.value.path().read_bytes()).shape == (960, 1800, 3)
+    with at.expect_download() as saved:
+        chart.get_by_role("button", name="Save as SVG").click()
+    drawing = saved.value.path().read_text()
+    for words in ("stroke (mm)", "strain (µm/m)", "e1", "k = 1"):
+        assert words in drawing
+    # wide enough to read
+    box, panel = chart.bounding_box(), at.locator("details", has=at.get_by_label(ENDS[0])).bounding_box()
+    assert box is not None
+    assert panel is not None
+    assert box["width"] > 0.9 * panel["width"]
+    given(at, ("Area left", "Area top", "Area right", "Area bottom"), (90, 90, 150, 140))
+    at.locator("details", has=at.get_by_label("Area left")).get_by_role("button", name="Use").click()
+    expect(at.locator('[data-role="area-chart"] canvas')).to_be_visible()
     page.sound()

@@ -187,3 +187,26 @@ def test_gauges_come_as_a_table_and_for_matlab(client: httpx.Client, url: str) -
     assert set(w) <= set(values)
     assert any(len(m) for m in found["gauges"]["missing"])  # the second lies at a failed point
     assert found["about"]["frame"].startswith("sys: X_sys")
+
+
+def test_a_film_as_a_job_has_progress_and_a_file_and_can_be_cancelled(client: httpx.Client, url: str) -> None:
+    asked = {"format": "gif", "width_px": 300, "colours": "diverging", "levels": 6, "limits": "-0.2,0.2"}
+    begun = client.post(f"{url}s", params=asked)
+    assert begun.status_code == 202, begun.text
+    job = begun.json()["job"]
+    assert (job["kind"], job["subject"]["analysis_id"]) == ("export", url.split("/")[-2])
+    early = client.get(f"/api/v1/jobs/{job['id']}/file")
+    ended = client.get(f"/api/v1/jobs/{job['id']}", params={"wait": 60}).json()
+    assert ended["state"] == "succeeded", ended
+    assert (ended["progress"]["done"], ended["progress"]["total"]) == (2, 2)  # the reference has no displacement
+    made = client.get(f"/api/v1/jobs/{job['id']}/file")
+    assert made.content == client.get(url, params=asked).content
+    assert len(made.content) == ended["result"]["bytes"]
+    if early.status_code != 200:
+        assert (early.status_code, early.json()["code"]) == (404, "not_found")
+    other = client.post(f"{url}s", params={"format": "gif", "width_px": 4000}).json()["job"]
+    stopped = client.post(f"/api/v1/jobs/{other['id']}:cancel", params={"wait": 30}).json()
+    assert stopped["state"] == "cancelled"
+    assert client.get(f"/api/v1/jobs/{other['id']}/file").status_code == 404
+    refused = client.post(f"{url}s", params={"format": "csv", "step": 9})
+    assert (refused.status_code, refused.json()["code"]) == (404, "not_found")

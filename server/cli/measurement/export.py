@@ -13,9 +13,10 @@ from server.cli.measurement.coverage import add_coverage, coverage_from
 from server.exports.request import FORMATS, ExportRequest, steps_in
 from server.exports.run import export
 from server.exports.source import find_source
-from server.formats.figure_options import COLOURS, FigureStyle
+from server.formats.figures.options import COLOURS, MAX_LEVELS, FigureStyle
 from server.formats.files import make_folder
 from server.results.gauges.framed import FRAME_HELP, asked_at, in_frame
+from server.results.gauges.frames import part_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,6 +49,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--limits", metavar="LOW,HIGH", help="ends of the colour scale, in the variable's unit")
     add("--percentiles", metavar="LOW,HIGH", default="1,99", help="else of the values, where the scale ends (1,99)")
     add("--colours", choices=COLOURS, default="viridis", help="colour map (viridis)")
+    add("--levels", type=int, default=0, metavar="N", help=f"bands of one colour, up to {MAX_LEVELS} (0: smooth)")
+    add("--reverse", action="store_true", help="the colour map from its other end")
+    add("--opacity", type=float, default=0.75, metavar="N", help="of the map over the image, up to 1 (0.75)")
     add("--width", type=int, default=900, metavar="PX", help="of figures and films (900)")
     add("--over-image", action="store_true", help="draw over camera 1's reference image")
     add("--image", type=Path, metavar="FILE", help="camera 1's reference image, where it lies elsewhere now")
@@ -62,6 +66,9 @@ def run(args: argparse.Namespace) -> int:
         percentiles=_pair("--percentiles", args.percentiles),
         colours=args.colours,
         width_px=args.width,
+        opacity=args.opacity,
+        levels=args.levels,
+        reverse=args.reverse,
     )
     request = ExportRequest(
         format=args.format,
@@ -81,7 +88,9 @@ def run(args: argparse.Namespace) -> int:
     count = 0
     with tempfile.TemporaryDirectory() as folder:
         files = [Path(path) for path in source.files]
-        framed = in_frame(files, asked_at(args.frame, files[0].parent), Path(folder) / "frame")
+        drawn = request.drawn_variables
+        strain = drawn is None or any(part_of(name) == "strain" for name in drawn)
+        framed = in_frame(files, asked_at(args.frame, files[0].parent), Path(folder) / "frame", strain=strain)
         for path in export(replace(source, files=framed), request, args.out):
             print(path)
             count += 1

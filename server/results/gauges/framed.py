@@ -45,10 +45,11 @@ def asked_at(text: str | None, folder: Path) -> Alignment | None:
     return frame_asked(text, frame_of_test(kept if isinstance(kept, dict) else None))
 
 
-def in_frame(files: Sequence[Path], asked: Alignment | None, out: Path) -> list[Path]:
+def in_frame(files: Sequence[Path], asked: Alignment | None, out: Path, *, strain: bool = True) -> list[Path]:
     """Return result files in a frame, written into a folder; they themselves for the system frame.
 
-    The frame is laid through the reference of the measurement, where its result lies beside them.
+    The frame is laid through the reference of the measurement, where its result lies beside them. Without ``strain``
+    that is not made anew: for who reads none of it.
 
     Raises
     ------
@@ -60,4 +61,4 @@ def in_frame(files: Sequence[Path], asked: Alignment | None, out: Path) -> list[
     n = read_head(files[-1]).reference_step
     reference = None if n is None else files[-1].parent / f"step_{n:04d}.nc"
     before = [reference] if reference is not None and reference.is_file() and reference not in files else []
-    return write_framed([*before, *files], asked, out)[len(before) :]
+    return write_framed([*before, *files], asked, out, strain=strain)[len(before) :]

@@ -323,7 +323,7 @@ export function notify(what, kind = "") {
   while (notices.children.length > 4) notices.firstElementChild?.remove();
   /** @returns {unknown} */
   const fade = () => (box.contains(document.activeElement) ? setTimeout(fade, 2000) : box.remove());
-  if (!problem) setTimeout(fade, 6000);
+  setTimeout(fade, problem ? 30_000 : 6000); // an error is read for longer, but does not lie over the page for ever
   return box;
 }
 

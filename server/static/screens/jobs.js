@@ -2,10 +2,26 @@
 import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
 import { stateBadge, warningsBox } from "./results/warnings.js";
-import { h, replace, action, badge, definitions, num, quantity, table, when, problemText, STATE_KIND } from "../lib/dom.js";
+import { h, replace, action, badge, count, definitions, num, quantity, table, when, problemText, STATE_KIND } from "../lib/dom.js";
 
 /** @import { Model } from "#routes" */
 /** @typedef {Model<"JobReply">} Job */
+
+/**
+ * A duration in the units that people use: 0.4 s, 12 s, 29 min 31 s, 3 h 5 min, 2 d 4 h.
+ * @param {number | null | undefined} seconds
+ */
+export function duration(seconds) {
+  if (seconds === null || seconds === undefined || !Number.isFinite(seconds)) return "–";
+  if (seconds < 9.95) return `${Number(seconds.toFixed(1))}\u00a0s`;
+  const whole = Math.round(seconds);
+  const parts = /** @type {[number, string][]} */ ([[Math.floor(whole / 86400), "d"], [Math.floor(whole / 3600) % 24, "h"], [Math.floor(whole / 60) % 60, "min"], [whole % 60, "s"]]);
+  const first = parts.findIndex(([n]) => n > 0);
+  return parts.slice(first, first + 2).filter(([n]) => n > 0).map(([n, unit]) => `${n}\u00a0${unit}`).join(" ");
+}
+
+/** @param {number | null} n */
+const times = (n) => (n === null ? "–" : n === 1 ? "once" : n === 2 ? "twice" : `${count(n)} times`);
 
 /** @param {HTMLElement} root */
 export async function open(root) {
@@ -15,6 +31,14 @@ export async function open(root) {
   /** @type {Map<string, Job>} */
   const jobs = new Map();
   let chosen = "";
+  /** @type {Map<string, string>} names of the tests that jobs are for */
+  const names = new Map();
+  async function nameTests() {
+    const wanted = [...new Set([...jobs.values()].map((job) => job.subject?.test_id).filter((id) => typeof id === "string"))].filter((id) => !names.has(id));
+    for (const id of wanted) names.set(id, ""); // asked once
+    await Promise.all(wanted.map((id) => api.get(`/tests/${id}`).then((test) => { names.set(id, test.name); }, () => {})));
+    if (wanted.length) draw();
+  }
   /** @type {Map<string, { key: string, line: string }[]>} lines of each job */
   const log = new Map();
 
@@ -34,11 +58,19 @@ export async function open(root) {
     replace(list, table([
       ["Job", (job) => h("button.plain", { type: "button", onclick: () => { chosen = job.id; show(); } }, h("code", job.id))],
       ["Kind", (job) => job.kind],
+      ["For", subject],
       ["State", state],
       ["Progress", (job) => progress(job)],
       ["Begun", (job) => when(job.started_utc ?? job.created_utc)],
       ["Cancel", (job) => (["queued", "running"].includes(job.state) ? cancel(job) : null), { unseen: true }],
     ], rows, { caption: "Jobs, newest first", onrow: (job) => { chosen = job.id; show(); }, empty: "No job has run yet." }));
+  }
+
+  /** What a job is for, with the name that people gave it. @param {Job} job */
+  function subject(job) {
+    const { test_id: test, analysis_id: analysis, calibration_id: calibration } = /** @type {Record<string, string | undefined>} */ (job.subject ?? {});
+    if (test) return h("a", { href: analysis ? `#/results/${test}/${analysis}` : `#/test/${test}` }, names.get(test) || test);
+    return calibration ? h("a", { href: `#/calibrate/${calibration}` }, "calibration") : "–";
   }
 
   /** @param {Job} job */
@@ -48,9 +80,9 @@ export async function open(root) {
   /** @param {Job} job */
   function progress(job) {
     const { phase: stage, done, total, eta_s: eta } = job.progress ?? {};
-    if (["succeeded", "failed", "cancelled", "interrupted"].includes(job.state)) return job.finished_utc && job.started_utc ? quantity((Date.parse(job.finished_utc) - Date.parse(job.started_utc)) / 1000, "s", 3) : "";
+    if (["succeeded", "failed", "cancelled", "interrupted"].includes(job.state)) return job.finished_utc && job.started_utc ? duration((Date.parse(job.finished_utc) - Date.parse(job.started_utc)) / 1000) : "";
     return h("div", h("progress", { value: total ? done : null, max: total || 1, "aria-label": `Progress of ${job.kind}` }),
-      h("small", `${stage ?? ""} ${total ? `${num(100 * done / total, 3)} %` : ""}${eta ? `, ${num(eta, 2)} s left` : ""}`));
+      h("small", `${stage ?? ""} ${total ? `${num(100 * done / total, 3)} %` : ""}${eta ? `, ${duration(eta)} left` : ""}`));
   }
 
   /** @param {Job} job */
@@ -85,6 +117,7 @@ export async function open(root) {
     jobs.set(job.id, { ...jobs.get(job.id), ...job });
     note(job);
     draw();
+    nameTests();
     if (job.id === chosen) show();
   }
 
@@ -94,6 +127,7 @@ export async function open(root) {
       if (!log.has(job.id)) note(job);
     }
     draw();
+    nameTests();
   }
 
   async function system() {
@@ -105,9 +139,9 @@ export async function open(root) {
       const ready = value("stereorig_ready") === 1;
       replace(health, h("div.spread", h("h2", "System"), badge(ready ? "ready" : "not ready", ready ? "good" : "warn")),
         ready ? null : action("Show the cause", () => api.get("/readyz")),
-        definitions([["version", well.version], ["uptime", quantity(well.uptime_s, "s", 6)], ["rig", badge(well.rig, STATE_KIND[well.rig])], ["compute worker", badge(well.worker, STATE_KIND[well.worker])],
-          ["free on the disk", free === null ? "–" : quantity(free / 2 ** 30, "GiB", 4)], ["jobs active", num(value("stereorig_jobs_active"), 4)], ["analyses waiting", num(value("stereorig_compute_queue"), 4)],
-          ["starts of the worker", value("stereorig_worker_starts_total") === null ? "–" : `${value("stereorig_worker_starts_total")}`]]),
+        definitions([["version", well.version], ["uptime", duration(well.uptime_s)], ["rig", badge(well.rig, STATE_KIND[well.rig])], ["compute worker", badge(well.worker, STATE_KIND[well.worker])],
+          ["free on the disk", free === null ? "–" : quantity(free / 2 ** 30, "GiB", 4)], ["jobs running or waiting", count(value("stereorig_jobs_active"))], ["analyses waiting", count(value("stereorig_compute_queue"))],
+          ["compute worker started", times(value("stereorig_worker_starts_total"))]]),
         h("p", h("a", { href: `${api.BASE}/metrics` }, "All figures"), " · ", h("a", { href: "/docs" }, "HTTP API")));
     } catch (error) {
       replace(health, h("h2", "System"), problemText(error));

@@ -207,12 +207,12 @@ function camera(cam, first, ends) {
     ]).children]);
     const bins = stats.histogram.map((_, i) => i);
     if (!histogram && histogramBox.clientWidth) {
-      histogram = await chart(histogramBox, { x: "grey level (8 bit)", y: "pixels", height: 130, bars: true, series: [{ label: "pixels" }], data: [bins, stats.histogram], label: `Histogram of ${cam}` });
+      histogram = await chart(histogramBox, { x: "grey level (8 bit)", y: "pixels", height: 130, bars: true, files: false, series: [{ label: "pixels" }], data: [bins, stats.histogram], label: `Histogram of ${cam}` });
     } else histogram?.set([bins, stats.histogram]);
     /** @type {[number[], (number | null)[], (number | null)[]]} */
     const courseData = [course.map((p) => p[0]), course.map((p) => p[1]), course.map((p) => (p[1] !== null && p[1] === highest ? p[1] : null))];
     if (!focus && focusBox.clientWidth && course.length > 1) {
-      focus = await chart(focusBox, { x: "time (s)", y: "focus", height: 130, series: [{ label: "focus" }, { label: "highest", edge: true, dots: true }], data: courseData, label: `Recent history of the focus figure of ${cam}` });
+      focus = await chart(focusBox, { x: "time (s)", y: "focus", height: 130, files: false, series: [{ label: "focus" }, { label: "highest", edge: true, dots: true }], data: courseData, label: `Recent history of the focus figure of ${cam}` });
     } else focus?.set(courseData);
     rounds += 1;
     if (overlayChoice.value && rounds % 2 === 0) layOver().catch(() => {});

@@ -1,5 +1,6 @@
 // Line plots: uPlot with this page's colours, loaded when the first one is drawn.
 import { num, tick, h } from "../lib/dom.js";
+import { colourOf, plotButtons, valueText } from "./plot_files.js";
 
 /** @import uPlot from "uplot" */
 
@@ -29,8 +30,6 @@ function wide(plot, values, index, cycle) {
   return Math.max(50, Math.ceil(axis.ticks.size + axis.gap + plot.ctx.measureText(longest).width / (window.devicePixelRatio || 1) + 4));
 }
 
-const COLOURS = ["#1f83b4", "#e07b00", "#29a37a", "#b5486e", "#7a6bd0", "#8a7a2d"];
-
 /** The page's colours for an axis, as they are now. */
 function axes() {
   const css = getComputedStyle(document.documentElement);
@@ -52,14 +51,16 @@ function axes() {
  * @param {object} options
  * @param {string} options.x name and unit of the abscissa
  * @param {string} options.y name and unit of the ordinate
- * @param {{label: string, points?: boolean, dots?: boolean, edge?: boolean, colour?: number}[]} options.series `edge`: of a band, without a line of its own
+ * @param {import("./plot_files.js").Series[]} options.series `edge`: of a band, without a line of its own; `u`: half width of the band, shown with the value under the mouse
  * @param {boolean|boolean[]} [options.bars] whether (which of) the series are bars
  * @param {number} [options.height]
  * @param {uPlot.AlignedData} options.data
  * @param {string} [options.label] name of the plot for screen readers
+ * @param {boolean} [options.files] whether it can be saved as CSV, PNG and SVG
+ * @param {string} [options.said] what its band is; goes into the files
  * @param {number[][]} [options.bands] pairs of series (counted from 1) between which the ground is shaded
  */
-export async function chart(box, { x, y, series, height = 200, data, bars = false, bands = [], label }) {
+export async function chart(box, { x, y, series, height = 200, data, bars = false, bands = [], label, files = true, said = "" }) {
   const Plot = await uplot();
   const isBar = (/** @type {number} */ index) => (Array.isArray(bars) ? bars[index] : bars);
   /** @returns {uPlot.Options} */
@@ -70,20 +71,20 @@ export async function chart(box, { x, y, series, height = 200, data, bars = fals
       height,
       scales: { x: { time: false } },
       axes: [{ ...axis(x), size: 34 }, { ...axis(y), size: wide }],
-      legend: { show: series.filter((one) => !one.edge).length > 1, live: true },
+      legend: { show: files || series.filter((one) => !one.edge).length > 1, live: true },
       cursor: { y: false },
       series: [
         { label: x, value: (_, v) => num(v, 5) },
         ...series.map((one, index) => {
-          const colour = COLOURS[(one.colour ?? index) % COLOURS.length];
+          const colour = colourOf(one, index);
           return {
             label: one.label, class: one.edge ? "edge" : undefined, stroke: colour, width: one.points || one.edge ? 0 : 1.5, points: { show: Boolean(one.points || one.dots), size: 5 },
-            value: (/** @type {uPlot} */ _, /** @type {number | null} */ v) => num(v, 5), spanGaps: false, paths: isBar(index) ? Plot.paths.bars?.({ size: [1, 100] }) : undefined,
+            value: (/** @type {uPlot} */ _, /** @type {number | null} */ v, /** @type {number} */ __, /** @type {number | null} */ at) => valueText(v, at === null ? null : one.u?.[at]), spanGaps: false, paths: isBar(index) ? Plot.paths.bars?.({ size: [1, 100] }) : undefined,
             fill: isBar(index) ? `${colour}99` : undefined,
           };
         }),
       ],
-      bands: bands.map(([high, low]) => ({ series: [high, low], fill: `${COLOURS[(series[high - 1].colour ?? 0) % COLOURS.length]}40` })),
+      bands: bands.map(([high, low]) => ({ series: [high, low], fill: `${colourOf(series[high - 1], high - 1)}40` })),
     };
   };
   box.replaceChildren();
@@ -91,11 +92,14 @@ export async function chart(box, { x, y, series, height = 200, data, bars = fals
   box.setAttribute("role", "img");
   box.setAttribute("aria-label", label ?? `${y} over ${x}`);
   let now = data;
-  let plot = new Plot(options(), now, box);
+  const drawn = h("div");
+  box.append(drawn);
+  if (files) box.append(plotButtons(() => ({ x, y, series, data: now, bars, bands, label, said })));
+  let plot = new Plot(options(), now, drawn);
   // a canvas keeps the colours that it was drawn with
   const recolour = () => {
     plot.destroy();
-    plot = new Plot(options(), now, box);
+    plot = new Plot(options(), now, drawn);
   };
   const system = matchMedia("(prefers-color-scheme: dark)");
   window.addEventListener("themechange", recolour);

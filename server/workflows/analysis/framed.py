@@ -90,13 +90,32 @@ def result_in(
 
 
 def results_in_frame(
-    service: Service, test_id: str, files: Sequence[Path], frame: str | None, folder: Path
+    service: Service,
+    test_id: str,
+    files: Sequence[Path],
+    frame: str | None,
+    folder: Path,
+    *,
+    variables: Sequence[str] | None = None,
 ) -> list[Path]:
-    """Return result files in a frame, written into a folder; the stored ones for the system frame."""
+    """Return result files in a frame, written into a folder; the stored ones for the system frame.
+
+    Parameters
+    ----------
+    variables
+        Those that are read of them: strain is not made anew for others. None: all.
+    """
     asked = asked_of(service, test_id, frame)
     if asked is None:
         return list(files)
-    return in_frame(files, asked, folder)
+    name = variable_of_frame(variables)
+    return in_frame(files, asked, folder, strain=name is None or part_of(name) == "strain")
+
+
+def variable_of_frame(variables: Sequence[str] | None) -> str | None:
+    """Return the one of several variables for which most has to be made anew in another frame; None: all of them."""
+    order = ("none", "field", "strain")
+    return None if variables is None else max(variables, key=lambda name: order.index(part_of(name)))
 
 
 def _reference(service: Service, test_id: str, analysis_id: str, numbers: Sequence[int]) -> list[Path]:

@@ -25,7 +25,7 @@ from server.exports.matlab import matlab_name
 from server.exports.request import ExportRequest
 from server.exports.run import export, export_packed
 from server.exports.source import find_source
-from server.formats.figure_options import FigureStyle
+from server.formats.figures.options import FigureStyle
 from server.formats.version import software_version
 from server.results.steps import Source
 from tests.support.export_results import (
@@ -298,7 +298,7 @@ def test_an_svg_says_in_words_what_it_shows(source: Source, tmp_path: Path) -> N
     for words in (
         "step 2 (Stufe 2 µ), load 251 N",
         "Green-Lagrange strain",
-        "dimensionless",
+        "µm/m",  # as the page shows strain
         "subset 21 px",
         CALIBRATION[:12],
         "stereorig 9.8.7",

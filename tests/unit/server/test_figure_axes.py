@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from server.formats.figure import Picture, draw_pixels
-from server.formats.figure_axes import directions_of
-from server.formats.figure_options import FigureStyle
+from server.formats.figures.axes import directions_of
+from server.formats.figures.figure import Picture, draw_pixels
+from server.formats.figures.options import FigureStyle
 
 X_PX, Y_PX = np.meshgrid(np.arange(50.0, 200.0, 10.0), np.arange(40.0, 160.0, 10.0))
 

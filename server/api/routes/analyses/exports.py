@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,15 +15,17 @@ from fastapi.responses import FileResponse, Response, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
 from core.errors import Cancelled
+from server.api.models import Accepted
 from server.api.protocol.dependencies import AnalysisId, CoverageDep, FrameText, ServiceDep, TestId
 from server.api.protocol.problems import errors
 from server.base.errors import NotFoundError
 from server.exports.request import MEDIA_TYPES, ExportFormat, ExportRequest, steps_in
-from server.formats.figure_options import COLOURS, WIDTHS_PX, FigureStyle
+from server.formats.figures.options import COLOURS, MAX_LEVELS, WIDTHS_PX, FigureStyle
 from server.results.channels import has_more
 from server.worker.executor import TaskFuture
 from server.workflows.analysis import start as analysis_start
 from server.workflows.analysis.framed import results_in_frame
+from server.workflows.export_job import start_export
 from server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
@@ -54,6 +57,9 @@ def _drawn(
         str, Query(max_length=40, pattern=_PAIR, description="Else the percentiles of the values where it ends.")
     ] = "1,99",
     colours: Annotated[str, Query(pattern=f"^({'|'.join(COLOURS)})$", description="Colour map.")] = "viridis",
+    levels: Annotated[int, Query(ge=0, le=MAX_LEVELS, description="Bands of one colour; 0: smooth.")] = 0,
+    reverse: Annotated[bool, Query(description="The colour map from its other end.")] = False,
+    opacity: Annotated[float, Query(gt=0.0, le=1.0, description="Of the map over the image.")] = 0.75,
     width_px: Annotated[int, Query(ge=WIDTHS_PX[0], le=WIDTHS_PX[1], description="Width of the picture.")] = 900,
     over_image: Annotated[bool, Query(description="Draw over camera 1's reference image.")] = False,
     fps: Annotated[float, Query(ge=0.1, le=60.0, description="Steps a second in a film.")] = 2.0,
@@ -63,6 +69,9 @@ def _drawn(
         percentiles=_pair(percentiles),
         colours=colours,
         width_px=width_px,
+        opacity=opacity,
+        levels=levels,
+        reverse=reverse,
     )
     return _Drawn(style, over_image, fps)
 
@@ -75,23 +84,16 @@ def _pair(text: str) -> tuple[float, float]:
     return low, high
 
 
-@router.get(
-    "/export",
-    summary="Results in the forms that other programs read",
-    response_class=FileResponse,
-    responses=errors(404, 409, 422, 503, 507)
-    | {
-        200: {
-            "description": "The file; several are one ZIP archive.",
-            "content": {media.split(";")[0]: {} for media in MEDIA_TYPES.values()},
-        }
-    },
-)
-async def export(
-    request: Request,
-    service: ServiceDep,
-    test_id: TestId,
-    analysis_id: AnalysisId,
+@dataclass(frozen=True)
+class _Asked:
+    """An export that was asked for."""
+
+    request: ExportRequest
+    steps: list[int] | None
+    frame: str | None
+
+
+def _asked(
     drawn: Annotated[_Drawn, Depends(_drawn)],
     coverage: CoverageDep,
     format: Annotated[  # noqa: A002
@@ -121,6 +123,30 @@ async def export(
         ),
     ] = None,
     frame: FrameText = None,
+) -> _Asked:
+    wanted = [step] if step is not None else None if steps is None else steps_in(steps)
+    names = None if variables is None else variables.split(",")
+    request = ExportRequest(format, None, names, drawn.style, drawn.over_image, drawn.fps, coverage)
+    return _Asked(request, wanted, frame)
+
+
+AskedDep = Annotated[_Asked, Depends(_asked)]
+
+
+@router.get(
+    "/export",
+    summary="Results in the forms that other programs read",
+    response_class=FileResponse,
+    responses=errors(404, 409, 422, 503, 507)
+    | {
+        200: {
+            "description": "The file; several are one ZIP archive.",
+            "content": {media.split(";")[0]: {} for media in MEDIA_TYPES.values()},
+        }
+    },
+)
+async def export(
+    request: Request, service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, asked: AskedDep
 ) -> Response:
     """Answer with the file once it is made; several files are one ZIP archive.
 
@@ -128,27 +154,44 @@ async def export(
     docs/reference/exports.md describes each. With k or coverage `expanded_NAME` stands beside `sigma_NAME`. The
     header X-Stale lists what is gone or was replaced since the analysis. A client that goes away ends its export.
     """
-    wanted = [step] if step is not None else None if steps is None else steps_in(steps)
-    files, headers = await run_in_threadpool(_prepared, service, test_id, analysis_id, wanted)
-    as_stored = variables is None and coverage.factor == 1.0 and frame in (None, "system")
-    if format == "nc" and len(files) == 1 and as_stored and not await run_in_threadpool(has_more, files[0]):
+    wanted, frame = asked.request, asked.frame
+    files, headers = await run_in_threadpool(_prepared, service, test_id, analysis_id, asked.steps)
+    as_stored = wanted.variables is None and wanted.coverage.factor == 1.0 and frame in (None, "system")
+    if wanted.format == "nc" and len(files) == 1 and as_stored and not await run_in_threadpool(has_more, files[0]):
         return FileResponse(
             files[0], media_type=MEDIA_TYPES["nc"], headers=headers, filename=f"{test_id}_{analysis_id}_{files[0].name}"
         )
-    names = None if variables is None else variables.split(",")
-    export_request = ExportRequest(format, None, names, drawn.style, drawn.over_image, drawn.fps, coverage)
     folder = await run_in_threadpool(service.exports.new_folder)
     try:
         home = files[0].parent
-        files = await run_in_threadpool(results_in_frame, service, test_id, files, frame, folder / "frame")
-        made = Path(await _made(request, service, home, files, export_request, folder))
+        framed = functools.partial(results_in_frame, variables=wanted.drawn_variables)
+        files = await run_in_threadpool(framed, service, test_id, files, frame, folder / "frame")
+        made = Path(await _made(request, service, home, files, wanted, folder))
         file = made.open("rb")
     finally:
         # the opened file stays until it is sent, whatever becomes of the client or the service
         await run_in_threadpool(shutil.rmtree, folder, ignore_errors=True)
-    media = "application/zip" if made.suffix == ".zip" else MEDIA_TYPES[format]
     headers |= {"Content-Disposition": f'attachment; filename="{made.name}"', "Content-Length": str(file.seek(0, 2))}
-    return StreamingResponse(_chunks(file), media_type=media, headers=headers)
+    return StreamingResponse(_chunks(file), media_type=media_type_of(made), headers=headers)
+
+
+@router.post("/exports", summary="Begin an export as a job", status_code=202, responses=errors(404, 409, 422, 503, 507))
+def begin_export(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, asked: AskedDep) -> Accepted:
+    """Begin what `GET .../export` does with the same parameters, as a job with progress that can be cancelled.
+
+    Meant for films and for many steps. `GET /jobs/{job_id}/file` answers with the file once the job has succeeded; it
+    is kept until eight later exports are, or the service ends.
+    """
+    files, _ = _prepared(service, test_id, analysis_id, asked.steps)
+    service.require_room()
+    job = start_export(service, test_id, analysis_id, files, asked.request, asked.frame)
+    return Accepted.model_validate({"job": job.document().plain()})
+
+
+def media_type_of(made: Path) -> str:
+    """Return the media type of an export's file."""
+    form = made.suffix.removeprefix(".")
+    return next((media for name, media in MEDIA_TYPES.items() if name == form), "application/zip")
 
 
 def _prepared(

@@ -7,6 +7,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Request
 from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import FileResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from server.api.models import JobList, JobReply
@@ -15,6 +16,7 @@ from server.api.protocol.dependencies import JobId, ServiceDep
 from server.api.protocol.paging import ShortPageDep
 from server.api.protocol.problems import errors
 from server.api.routes.service.system import EventStream, LastEventId
+from server.base.errors import NotFoundError
 from server.jobs.events import Event
 from server.jobs.job import FINAL
 from server.store.documents import JobRecord
@@ -49,6 +51,23 @@ async def cancel_job(request: Request, service: ServiceDep, job_id: JobId, wait:
         await waited(request, service, job_id, wait)
         cancelled = service.jobs.document(job_id)
     return JobReply.model_validate(cancelled.plain())
+
+
+@router.get(
+    "/{job_id}/file",
+    summary="What an export made",
+    response_class=FileResponse,
+    responses=errors(404, 422) | {200: {"description": "The file.", "content": {"application/octet-stream": {}}}},
+)
+def job_file(service: ServiceDep, job_id: JobId) -> FileResponse:
+    """Answer with the file of an export that was a job; of other jobs there is none."""
+    state = service.jobs.document(job_id).state
+    kept = service.exports.kept(job_id)
+    if kept is None:
+        raise NotFoundError(
+            f"Job {job_id} ({state}) has no file, or has none any more.", remedy="Wait for its end, or export again."
+        )
+    return FileResponse(kept, filename=kept.name)
 
 
 @router.get(

@@ -203,7 +203,7 @@ export async function compare(screen) {
     for (const v of values) bins[Math.min(Math.floor((v - min) / width), BINS - 1)] += 1;
     const x = bins.map((_, k) => min + (k + 0.5) * width);
     const normal = sigma ? x.map((v) => (s.count * width * Math.exp(-0.5 * ((v - mean) / sigma) ** 2)) / (sigma * Math.sqrt(2 * Math.PI))) : null;
-    plot = await chart(histogramBox, { x: `difference${info.unit ? ` (${info.unit})` : ""}`, y: "points", height: 220, bars: [true, false], series: [{ label: "points" }, ...(normal ? [{ label: "normal distribution of the reported σ" }] : [])],
+    plot = await chart(histogramBox, { x: `difference${info.unit ? ` (${info.unit})` : ""}`, y: "points", height: 300, bars: [true, false], series: [{ label: "points" }, ...(normal ? [{ label: "normal distribution of the reported σ" }] : [])],
       data: [x, bins, ...(normal ? [normal] : [])], label: "Histogram of the difference" });
   }
 

@@ -5,9 +5,10 @@ import { h, svg, numeric, replace, table, num, count, number, select, field, act
 import { nudge, onGrab } from "../../widgets/view.js";
 import { shownUnit } from "./analysis.js";
 import { keptGauges } from "./kept.js";
+import { abscissas, areaChart, isRelative } from "./histories.js";
 import { budgetTable, withBudget } from "./uncertainty.js";
 /** @import { Attributes } from "#dom" */
-/** @import { Body, GaugeReadings, Model } from "#routes" */
+/** @import { Body, GaugeReadings } from "#routes" */
 /** @import { Viewer } from "../results.js" */
 /** @typedef {[x: number, y: number]} Spot */
 /** @typedef {[x0: number, y0: number, x1: number, y1: number]} Four */
@@ -306,14 +307,15 @@ export function gauges(screen) {
       along.value === "mm" && !whole ? "; the distance in mm is unknown where points are missing, so it is given in px" : "", errors.some((v) => v !== null) ? `; the band is ± ${interval.symbol}: ${interval.text}` : "; no standard uncertainty is known"),
       budgetTable(rms(budget), unit, factor, lacking ?? ""));
     lineChart.dataset.answer = JSON.stringify({ x, value, sigma });
-    await plot("line", lineChart, { x: inMm ? "distance (mm)" : "distance (px)", y: `${screen.info?.text ?? name}${unit ? ` (${unit})` : ""}`, height: 230,
-      series: [{ label: name }, { label: `+ ${interval.symbol}`, edge: true }, { label: `− ${interval.symbol}`, edge: true }], bands: [[2, 3]], data: [x, values, band(1), band(-1)], label: `${name} along the line` });
+    await plot("line", lineChart, { x: inMm ? "distance (mm)" : "distance (px)", y: `${screen.info?.text ?? name}${unit ? ` (${unit})` : ""}`, height: 320, said: interval.text,
+      series: [{ label: name, u: errors }, { label: `+ ${interval.symbol}`, edge: true }, { label: `− ${interval.symbol}`, edge: true }], bands: [[2, 3]], data: [x, values, band(1), band(-1)], label: `${name} along the line` });
   }
 
   const extChart = h("div", { "data-role": "extensometer-chart" });
   const extTable = h("div");
   const what = select(EXTENSOMETER, "strain");
-  const over = select([["n", "step number"]], "n");
+  const against = abscissas(result);
+  const over = against.choice;
   what.addEventListener("change", () => drawExtensometers().catch(notify));
   over.addEventListener("change", () => drawExtensometers().catch(notify));
   async function readExtensometers() {
@@ -327,50 +329,21 @@ export function gauges(screen) {
     }
     if (!answers.extensometer) replace(extTable, h("p.quiet", "Reading …"));
     answers.extensometer = (await api.post(`${result.path}/gauges`, body({ extensometers: state.extensometers.map((one) => ({ name: one.name, a_px: one.a, b_px: one.b })) }), { frame: result.frame })).steps;
-    await abscissas();
+    await against.fill();
     await drawExtensometers();
-  }
-  /** @type {Map<number, Partial<Model<"StepReply">>>} */
-  const channels = new Map(); // step -> its document, for channels
-  async function abscissas() {
-    const listed = result.test.steps ?? [];
-    const found = [["n", "step number"]];
-    if (listed.some((one) => one.captured_utc)) found.push(["time", "time (s)"]);
-    if (listed.some((one) => one.load_n !== null && one.load_n !== undefined)) found.push(["load", "load (N)"]);
-    const wanted = result.steps.filter((n) => !channels.has(n));
-    // channels are in the steps' own documents; a few at a time
-    for (let k = 0; k < wanted.length; k += 8) {
-      await Promise.all(wanted.slice(k, k + 8).map(async (n) => channels.set(n, await api.get(`/tests/${result.testId}/steps/${n}`).catch(() => ({})))));
-    }
-    const names = new Set([...channels.values()].flatMap((one) => Object.keys(one.channels ?? {})));
-    for (const name of names) found.push([`channel:${name}`, name]);
-    if (listed.some((one) => Number.isFinite(parseFloat(one.label ?? "")))) found.push(["label", "number in the label"]);
-    const before = over.value;
-    replace(over, found.map(([value, text]) => h("option", { value, selected: value === before }, text)));
-  }
-  /**
-   * @param {number} n
-   * @returns {number | null}
-   */
-  function abscissa(n) {
-    const listed = (/** @type {number} */ n) => (result.test.steps ?? []).find((one) => one.n === n);
-    const step = listed(n);
-    const time = (/** @type {typeof step} */ one) => Date.parse(one?.timestamp_utc ?? one?.captured_utc ?? "");
-    if (over.value === "n") return n;
-    if (over.value === "time") return (time(step) - time(listed(result.reference))) / 1000;
-    if (over.value === "load") return step?.load_n ?? null;
-    if (over.value === "label") return Number.isFinite(parseFloat(step?.label ?? "")) ? parseFloat(step?.label ?? "") : null;
-    return channels.get(n)?.channels?.[over.value.slice(8)] ?? null;
   }
   async function drawExtensometers() {
     if (!answers.extensometer) return;
     const name = what.value;
     const steps = answers.extensometer.filter((one) => !one.problem);
-    const rows = steps.map((one) => ({ n: one.n, label: one.label, x: abscissa(one.n) ?? NaN, each: one.extensometers ?? [] })).filter((one) => Number.isFinite(one.x)).sort((p, q) => p.x - q.x);
+    const start = isRelative(name) ? result.reference : null; // where it is zero, though nothing was measured there
+    const label = (result.test.steps ?? []).find((one) => one.n === start)?.label ?? "";
+    const rows = [...(start === null || steps.some((one) => one.n === start) ? [] : [{ n: start, label, extensometers: [] }]), ...steps]
+      .map((one) => ({ n: one.n, label: one.label, x: against.at(one.n) ?? NaN, each: one.extensometers ?? [] })).filter((one) => Number.isFinite(one.x)).sort((p, q) => p.x - q.x);
     const strain = name.endsWith("strain");
     const factor = strain ? 1e6 : 1;
     /** @typedef {typeof rows[number]} Row */
-    const of = (/** @type {Row} */ one, /** @type {number} */ k, /** @type {"value" | "sigma"} */ part) => one.each[k]?.values[name]?.[part] ?? null;
+    const of = (/** @type {Row} */ one, /** @type {number} */ k, /** @type {"value" | "sigma"} */ part) => one.each[k]?.values[name]?.[part] ?? (one.n === start ? 0 : null);
     /** @type {Parameters<typeof chart>[1]["series"]} */
     const series = [];
     /** @type {number[][]} */
@@ -382,33 +355,37 @@ export function gauges(screen) {
       const sigma = rows.map((one) => of(one, k, "sigma")).map((v) => (v === null ? null : v * factor * interval.factor));
       const at = data.length;
       data.push(value, beside(value, sigma, 1), beside(value, sigma, -1));
-      series.push({ label: gauge.name, colour: k, dots: true }, ...["+", "−"].map((sign) => ({ label: `${gauge.name} ${sign} ${interval.symbol}`, edge: true, colour: k })));
+      series.push({ label: gauge.name, colour: k, dots: true, u: sigma }, ...["+", "−"].map((sign) => ({ label: `${gauge.name} ${sign} ${interval.symbol}`, edge: true, colour: k })));
       bands.push([at + 1, at + 2]);
     });
     extChart.dataset.answer = JSON.stringify({ x: data[0], value: rows.map((one) => state.extensometers.map((_, k) => of(one, k, "value"))), sigma: rows.map((one) => state.extensometers.map((_, k) => of(one, k, "sigma"))) });
     const unit = strain ? "µm/m" : "mm";
-    await plot("extensometer", extChart, { x: over.selectedOptions[0].text, y: `${what.selectedOptions[0].text.replace(" (mm)", "")} (${unit})`, height: 250, series, bands, data, label: `${name} of the extensometers` });
+    await plot("extensometer", extChart, { x: against.text, y: `${what.selectedOptions[0].text.replace(" (mm)", "")} (${unit})`, height: 320, said: interval.text, series, bands, data, label: `${name} of the extensometers` });
     const valueText = (/** @type {Row} */ one, /** @type {number} */ k) => {
       const [v, s] = [of(one, k, "value"), of(one, k, "sigma")];
       if (v === null) return one.each[k]?.missing?.replace(/_/g, " ") || "–";
       if (s === null) return num(v * factor, 5);
-      const { budget, not_included: lacking } = one.each[k].values[name];
+      const { budget, not_included: lacking } = one.each[k]?.values[name] ?? {};
       return withBudget(`${num(v * factor, 5)} ± ${num(s * factor * interval.factor, 2)}`, budgetTable(budget, unit, factor, lacking ?? ""));
     };
     replace(extTable, table([
-      ["Step", (one) => one.n], ["Label", (one) => one.label], ...(over.value === "n" ? [] : [numeric(over.selectedOptions[0].text, (/** @type {Row} */ one) => num(one.x, 6))]),
+      ["Step", (one) => one.n], ["Label", (one) => one.label], ...(over.value === "n" ? [] : [numeric(against.text, (/** @type {Row} */ one) => num(one.x, 6))]),
       ...state.extensometers.map((gauge, k) => numeric(`${gauge.name} (${unit})`, (/** @type {Row} */ one) => valueText(one, k))),
     ], rows, { caption: `± ${interval.text}` }),
     h("div.row", state.extensometers.map((gauge) => h("button", { type: "button", onclick: () => { state.extensometers = state.extensometers.filter((one) => one !== gauge); changed("extensometer"); } }, `Remove ${gauge.name}`))));
   }
 
   const areaBox = h("div", { "data-role": "area" });
+  const areaPlot = h("div", { "data-role": "area-chart" });
+  const areaAgainst = abscissas(result);
+  areaAgainst.choice.addEventListener("change", () => { if (answers.area) drawArea(answers.area.name, answers.area.steps); });
   async function readArea() {
     if (!state.area || !screen.info) return;
     if (screen.info.component !== null) return void replace(areaBox, h("p.quiet", "An area needs a scalar field; choose another field."));
     const { name } = screen.info;
     if (!areaBox.firstChild) replace(areaBox, h("p.quiet", "Reading …"));
     const answer = await api.post(`${result.path}/gauges`, body({ areas: [{ rectangle_px: state.area }], variables: [name] }), { frame: result.frame });
+    await areaAgainst.fill();
     drawArea(name, answer.steps);
   }
   /**
@@ -425,6 +402,9 @@ export function gauges(screen) {
       if (!v || v.mean_sigma === null) return "–";
       return withBudget(num(v.mean_sigma * factor * interval.factor, 2), budgetTable(v.mean_budget, unit, factor, v.not_included ?? ""));
     };
+    plots.area?.close();
+    plots.area = null;
+    areaChart(areaPlot, { result, against: areaAgainst, name, unit, factor, interval, steps }).then((made) => { plots.area?.close(); plots.area = made; }, notify);
     areaBox.dataset.answer = JSON.stringify(steps.map((one) => one.areas?.[0]?.values[name] ?? null));
     replace(areaBox, table([
       ["Step", (one) => one.n], ["Label", (one) => one.label], ["Mean", (one) => cell(one, "mean"), { numeric: true }], [`± ${interval.symbol}`, uncertain, { numeric: true }],
@@ -435,11 +415,11 @@ export function gauges(screen) {
 
   interval.changed.add(() => Promise.all([drawLine(), drawExtensometers(), answers.area && drawArea(answers.area.name, answers.area.steps)]));
   rigid.addEventListener("change", () => { for (const read of [readLine, readArea, readExtensometers]) read().catch(notify); });
-  const clear = (/** @type {"line" | "area"} */ tool) => h("button", { type: "button", onclick: () => { state[tool] = null; if (tool === "line") { answers.line = null; plots.line?.close(); plots.line = null; lineChart.replaceChildren(); lineText.replaceChildren(); } else { answers.area = null; areaBox.replaceChildren(); } draw(); } }, "Clear");
+  const clear = (/** @type {"line" | "area"} */ tool) => h("button", { type: "button", onclick: () => { state[tool] = null; if (tool === "line") { answers.line = null; plots.line?.close(); plots.line = null; lineChart.replaceChildren(); lineText.replaceChildren(); } else { answers.area = null; plots.area?.close(); plots.area = null; areaPlot.replaceChildren(); areaBox.replaceChildren(); } draw(); } }, "Clear");
   const panels = {
     line: h("details.panel", h("summary", "Line"), h("p.quiet", "Choose the tool Line above the picture and drag, or give its ends."), lineInputs.row, h("div.row", field("Along", along), clear("line")), lineText, lineChart),
     extensometer: h("details.panel", h("summary", "Extensometers"), h("p.quiet", "Choose the tool Extensometer and click its two ends, or give them."), extInputs.row, h("div.row", field("Show", what), field("Against", over)), extChart, extTable),
-    area: h("details.panel", h("summary", "Area"), h("p.quiet", "Choose the tool Area and drag a rectangle, or give its corners."), h("div.row", areaInputs.row, clear("area")), areaBox),
+    area: h("details.panel", h("summary", "Area"), h("p.quiet", "Choose the tool Area and drag a rectangle, or give its corners."), h("div.row", areaInputs.row, field("Area against", areaAgainst.choice), clear("area")), areaPlot, areaBox),
   };
   const root = h("div", h("label.check", rigid, "Gauges without the rigid motion of the whole field"), panels.line, panels.extensometer, panels.area);
 

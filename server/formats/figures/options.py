@@ -8,8 +8,9 @@ import numpy as np
 
 from core.errors import InputError
 
-COLOURS = ("viridis", "cividis", "turbo", "coolwarm", "gray")
+COLOURS = ("viridis", "cividis", "turbo", "coolwarm", "gray", "diverging", "grey")
 WIDTHS_PX = (200, 4000)
+MAX_LEVELS = 64
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,10 @@ class FigureStyle:
         Of the picture.
     opacity
         Of the map over the camera's image.
+    levels
+        Number of bands of one colour; 0: smooth.
+    reverse
+        True: the first colour belongs to the largest values.
     dots_per_inch
         Resolution; the larger, the larger are lettering and lines.
 
@@ -42,6 +47,8 @@ class FigureStyle:
     colours: str = "viridis"
     width_px: int = 900
     opacity: float = 0.75
+    levels: int = 0
+    reverse: bool = False
     dots_per_inch: int = 100
 
     def __post_init__(self) -> None:
@@ -56,6 +63,8 @@ class FigureStyle:
             wrong = f"a width of {self.width_px} px is not between {WIDTHS_PX[0]} and {WIDTHS_PX[1]}"
         elif not 0.0 < self.opacity <= 1.0:
             wrong = f"an opacity of {self.opacity:g} is not above 0 and at most 1"
+        elif not 0 <= self.levels <= MAX_LEVELS:
+            wrong = f"{self.levels} bands of colour are not between 0 and {MAX_LEVELS}"
         elif not 50 <= self.dots_per_inch <= 600:
             wrong = f"{self.dots_per_inch} dots an inch are not between 50 and 600"
         if wrong is not None:

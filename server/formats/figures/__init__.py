@@ -1,0 +1,1 @@
+"""Fields as pictures: colours, the map between its points, axes and scale, the figure around it."""

@@ -1,0 +1,158 @@
+// Export: the picture as it is shown, a film of it, the numbers for other programs, the report.
+import * as api from "../../lib/api.js";
+import { h, replace, action, badge, field, number, select, notify, tick } from "../../lib/dom.js";
+import { saveAs } from "../../widgets/plot_files.js";
+import { shownUnit } from "./analysis.js";
+
+/** @import { Viewer } from "../results.js" */
+/** @import { Model } from "#routes" */
+/** @typedef {Record<string, string | number | boolean>} Asked parameters of the API's export */
+
+/** @type {[form: string, text: string][]} */
+const NUMBERS = [["nc", "NetCDF, as measured"], ["csv", "table (CSV)"], ["vtu", "ParaView (VTU, PVD)"], ["mat", "MATLAB"], ["h5", "HDF5, all steps stacked"]];
+const FILMS = [["mp4", "MP4"], ["gif", "GIF"]];
+const ACTIVE = ["queued", "running", "cancelling"];
+/** @type {Record<string, string>} */
+const PHASES = { waiting: "waiting", reading: "reading the steps", drawing: "drawing", writing: "writing" };
+const MAPS = /** @type {const} */ ({ viridis: "viridis", cividis: "cividis", diverging: "blue to brown", grey: "grey" });
+
+/**
+ * The export's parameters that say what the view shows: field, colours, limits, image and axes.
+ * @param {Viewer} screen
+ * @param {boolean} over over the reference image
+ * @returns {Asked | null} null where the view shows no single field
+ */
+export function seen(screen, over) {
+  const { info, scale, map, result } = screen;
+  if (!info || info.component !== null) return null;
+  /** @type {Asked} */
+  const asked = { variables: info.name, frame: result.frame, over_image: over };
+  if (scale.flags) return asked;
+  const factor = /** @type {{ factor?: number }} */ (info).factor ?? shownUnit(info.name, "").factor;
+  const opacity = Number(map.view.canvas.style.opacity || 1);
+  return { ...asked, limits: `${scale.low / factor},${scale.high / factor}`, colours: scale.name, levels: Math.min(Math.max(Math.round(Number(scale.levels.value) || 0), 0), 64),
+    reverse: scale.reverse.checked, opacity: Math.min(Math.max(opacity, 0.05), 1) };
+}
+
+/**
+ * Pictures, films, files and the report of an analysis.
+ * @param {Viewer} screen
+ */
+export function files(screen) {
+  const { result } = screen;
+  const root = h("details.panel", { "data-role": "files" }, h("summary", "Export and report"));
+  const what = h("p", { "data-role": "seen", role: "status" });
+  const over = h("input", { type: "checkbox", checked: true });
+  const width = number(1200, { min: 200, max: 4000, step: 1 });
+  const film = select(FILMS, "mp4");
+  const pace = number(2, { min: 0.1, max: 60 });
+  const form = select(NUMBERS, "nc");
+  const which = select([["one", "the step shown"], ["all", "all steps"]], "one");
+  const fields_ = select([["all", "all"], ["seen", "the one shown"]], "all");
+  const course = h("div", { "data-role": "export-course", role: "status" });
+
+  function tell() {
+    const { info, scale } = screen;
+    const asked = seen(screen, over.checked);
+    if (!asked || !info || screen.step === null) {
+      what.textContent = "Choose a field with one number a point to save its picture or film.";
+      return;
+    }
+    const unit = scale.unit ? ` ${scale.unit}` : "";
+    what.textContent = `${info.text}, ${result.stepText(screen.step)}${scale.flags ? "" : `; ${MAPS[scale.name]} from ${tick(Number(scale.low.toPrecision(4)))} to ${tick(Number(scale.high.toPrecision(4)))}${unit}${Number(scale.levels.value) > 1 ? `, ${asked.levels} levels` : ""}`}; `
+      + `axes of the ${result.frame === "system" ? "calibration" : "specimen"}; ${over.checked ? "over the reference image" : "without an image"}.`;
+  }
+  over.addEventListener("change", tell);
+
+  /** Numbers of the picture, checked before anything is sent. */
+  function size() {
+    const v = Number(width.value);
+    if (!Number.isInteger(v) || v < 200 || v > 4000) throw new Error("A picture is 200 to 4,000 px wide; give a whole number under Width.");
+    return v;
+  }
+
+  /** @param {string} format */
+  async function picture(format) {
+    const asked = seen(screen, over.checked);
+    if (!asked || screen.step === null) throw new Error("Choose a field with one number a point: its picture can be saved.");
+    await direct({ ...asked, format, step: screen.step, width_px: size() });
+  }
+
+  /** A file that the service makes at once. @param {Asked} asked */
+  async function direct(asked) {
+    const answer = await api.raw(`${result.path}/export`, asked);
+    const named = /filename\*?=(?:UTF-8'')?"?([^";]+)"?/.exec(answer.headers.get("Content-Disposition") ?? "");
+    const stale = answer.headers.get("X-Stale");
+    saveAs(await answer.blob(), named ? decodeURIComponent(named[1]) : `${result.testId}_${result.analysisId}.${asked.format}`);
+    if (stale) notify(`The file is saved, but out of date: ${stale}`, "warn");
+  }
+
+  /** A file that takes a while: a job with its course, its file fetched at the end. @param {Asked} asked */
+  async function slowly(asked) {
+    const begun = await api.post(`${result.path}/exports`, undefined, /** @type {any} */ (asked));
+    const { id } = begun.job;
+    const bar = h("progress", { "aria-label": "Progress of the export" });
+    const text = h("span");
+    const stop = action("Cancel", () => api.post(`/jobs/${id}:cancel`), { kind: "danger" });
+    replace(course, h("div.row", badge("exporting", "busy"), text, stop), bar);
+    const job = await api.finished(id, { onprogress: (/** @type {Model<"JobReply">} */ now) => {
+      const { phase, done, total } = now.progress ?? {};
+      if (total) Object.assign(bar, { max: total, value: done ?? 0 });
+      else bar.removeAttribute("value");
+      text.textContent = ACTIVE.includes(now.state) ? `${PHASES[phase ?? ""] ?? phase ?? ""}${total ? ` ${done} of ${total}` : ""}` : "";
+    } });
+    if (job.state === "cancelled") return void replace(course, h("p.quiet", "The export was cancelled; nothing was saved."));
+    if (job.state !== "succeeded") {
+      course.replaceChildren();
+      throw api.jobProblem(job);
+    }
+    const name = String(job.result?.file ?? "export");
+    saveAs(api.address(`/jobs/${id}/file`), name);
+    replace(course, h("p.quiet", "Saved as ", h("a", { href: api.address(`/jobs/${id}/file`), download: name }, name), "."));
+  }
+
+  async function makeFilm() {
+    const asked = seen(screen, over.checked);
+    if (!asked) throw new Error("Choose a field with one number a point: a film shows it over the steps.");
+    const fps = Number(pace.value);
+    if (!(fps >= 0.1 && fps <= 60)) throw new Error("A film shows 0.1 to 60 steps a second; correct Steps a second.");
+    await slowly({ ...asked, format: film.value, fps, width_px: size() });
+  }
+
+  async function saveNumbers() {
+    const { factor } = screen.interval;
+    /** @type {Asked} */
+    const asked = { format: form.value, frame: result.frame };
+    if (fields_.value === "seen" && screen.info && form.value !== "nc") asked.variables = screen.info.name;
+    if (factor !== 1 && form.value !== "nc") asked.coverage = 0.95;
+    if (which.value === "one" && screen.step !== null) await direct({ ...asked, step: screen.step });
+    else await slowly(asked);
+  }
+
+  /** The report in a tab of its own. It is computed on request, which takes a while: a message states so. */
+  function report() {
+    const address = () => api.address(`${result.path}/report`, { frame: result.frame });
+    const note = h("p.quiet", { role: "status" }, "One HTML page with all results, to file or print.");
+    const announce = (/** @type {MouseEvent} */ event) => {
+      /** @type {HTMLAnchorElement} */ (event.currentTarget).href = address();
+      note.textContent = "The report is computed from the steps' files: some seconds, longer for many steps. It is shown when it is complete.";
+    };
+    return h("div", h("h3", "Report"), h("div.row", h("a.button", { href: address(), target: "_blank", rel: "noopener", onclick: announce }, "Open the report"),
+      h("a.button", { href: address(), download: `${result.testId}_${result.analysisId}_report.html`, onclick: announce }, "Save the report")), note);
+  }
+
+  const asStored = () => {
+    const stored = form.value === "nc";
+    fields_.disabled = stored;
+    fields_.title = stored ? "NetCDF files hold all fields" : "";
+  };
+  form.addEventListener("change", asStored);
+  asStored();
+  root.append(h("h3", "The picture that is shown"), what,
+    h("div.row", field("Width", width, "px"), h("label.check", over, "over the reference image"), action("Save as PNG", () => picture("png"), { "data-role": "save-png" }), action("Save as SVG", () => picture("svg"))),
+    h("h3", "A film of it over the steps"), h("div.row", field("Film as", film), field("Steps a second", pace), action("Make the film", makeFilm)), course,
+    h("h3", "Numbers for other programs"), h("div.row", field("Form", form), field("Steps", which), field("Fields", fields_), action("Save the file", saveNumbers, { kind: "primary" })), report());
+  root.addEventListener("toggle", tell);
+  screen.drawn.add(tell);
+  return root;
+}
