@@ -24,10 +24,11 @@ _COARSE_PX = 1.0  # features are found to 0.7 px: above it they say more than su
 
 
 def check_live(task: LiveCheckTask) -> dict[str, Any]:
-    """Return ``level`` (``ok``, ``warning``, ``failed``, ``no_texture``), ``offset_px``, ``own_px``, ``points``, ``text``.
+    """Return the offset from the epipolar lines: ``level``, ``offset_px``, ``own_px``, ``points``, ``text``.
 
-    A surface is measured as a test's reference would be, on a coarse grid over the whole image. Where the cameras
-    turned so far that nothing matches, the offset is that of features, to some tenths of a pixel.
+    ``level`` is ``ok``, ``warning``, ``failed`` or ``no_texture``. A surface is measured as a test's reference would
+    be, on a coarse grid over the whole image. Where the cameras turned so far that nothing matches, the offset is that
+    of features, to some tenths of a pixel.
     """
     loaded = load_calibration(task.calibration)
     images = [MeasureImage(task.pixels[k], f"camera {k + 1}'s live image") for k in range(2)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import httpx
 import numpy as np
@@ -106,3 +105,27 @@ def test_the_accepted_calibration_is_held_against_the_live_pair(client: httpx.Cl
     away = check()
     assert away["level"] == "off_zero"
     assert "dZ = +1.000 mm" in str(away["text"])
+
+
+def test_the_geometry_of_a_calibrated_rig_is_that_of_its_cameras(client: httpx.Client) -> None:
+    cameras = true_cameras(SMALL)
+    sent = json.dumps(cameras | {"image_size_px": {"cam1": [256, 240], "cam2": [256, 240]}})
+    made = client.post(f"{API}/calibrations:import", files={"file": ("c.json", sent)}).json()["id"]
+    found = client.get(f"{API}/calibrations/{made}/geometry").json()
+    # the rotation of Eq. (1): the optical axis and the pinhole in the system frame, from the parameters by hand
+    axes, centres = [], []
+    for cam in ("cam1", "cam2"):
+        p = cameras[cam]
+        a, b, g = (p[n] for n in ("alpha_rad", "beta_rad", "gamma_rad"))
+        turn_z = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
+        turn_x = np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
+        turn_y = np.array([[np.cos(g), 0, np.sin(g)], [0, 1, 0], [-np.sin(g), 0, np.cos(g)]])
+        rotation = turn_x @ turn_y @ turn_z
+        axes.append(rotation[2])
+        centres.append(-rotation.T @ np.array([p["x0_mm"], p["y0_mm"], p["z0_mm"]]))
+    assert found["stereo_angle_deg"] == pytest.approx(np.degrees(np.arccos(axes[0] @ axes[1])), rel=0.02)
+    assert found["baseline_mm"] == pytest.approx(np.linalg.norm(centres[0] - centres[1]), rel=0.02)
+    for cam in ("cam1", "cam2"):
+        # a plane that the camera sees at an angle: its width is at least that of a frontal one
+        frontal = 256 / cameras[cam]["phd_px"] * cameras[cam]["z0_mm"]
+        assert frontal * 0.98 < found["cameras"][cam]["field_of_view_mm"][0] < frontal * 1.2

@@ -5,6 +5,9 @@ import { h } from "./dom.js";
 /** @typedef {() => boolean} Rule says what is wrong with a field beside it; true if nothing is */
 
 let told = 0;
+let pressed = false;
+window.addEventListener("pointerdown", () => { pressed = true; }, true);
+for (const end of ["pointerup", "pointercancel"]) window.addEventListener(end, () => { pressed = false; }, true);
 
 /**
  * Put an error beside a control; an empty text takes it away.
@@ -45,7 +48,8 @@ export function rule(control, wrong) {
     tell(control, text);
     return !text;
   };
-  control.addEventListener("change", check);
+  // a press that leaves the field is a click on something: an error that came meanwhile would push that away from under it
+  control.addEventListener("change", () => (pressed ? window.addEventListener("pointerup", () => setTimeout(check), { once: true }) : check()));
   control.addEventListener("input", () => control.getAttribute("aria-invalid") === "true" && check());
   return check;
 }

@@ -52,7 +52,7 @@ def test_any_response_that_grows_with_the_exposure_is_brought_to_the_level(
 
 def test_light_that_does_not_suffice_is_refused_at_the_longest_exposure() -> None:
     asked, picture = sensor(lambda ms: 1e-5 * ms)
-    with pytest.raises(StateError, match="reach 1.2 % of full scale; 80 % are wanted") as caught:
+    with pytest.raises(StateError, match=r"reach 1\.2 % of full scale; 80 % are wanted") as caught:
         search_exposure("cam2", picture, 10.0, (0.01, 1000.0), 0.8)
     assert caught.value.code == "light_too_weak"
     assert asked[-1] == 1000.0

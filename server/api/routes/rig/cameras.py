@@ -126,7 +126,7 @@ def patch_camera(
 )
 def expose(service: ServiceDep, cam: Camera, body: ExposureRequest | None = None) -> ExposureFound:
     """Bring the picture's brightest parts to a level, without saturation; the old exposure stays where none does."""
-    wanted = body or ExposureRequest()  # type: ignore[call-arg]  # every field has a default
+    wanted = body or ExposureRequest()
     with service.hardware.hold(f"the search for {cam}'s exposure"):
         taken, found = set_exposure(service, cam, wanted.level, wanted.shortest_ms, wanted.longest_ms)
     return ExposureFound.model_validate(
