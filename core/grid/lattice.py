@@ -92,10 +92,11 @@ def find_lattice(picture: LinePicture, found: Directions) -> Lattice:
                 best, best_seen = lattice, seen
     if best is None:
         raise not_found(
-            f"no two families of lines: {max_counts[0]} and {max_counts[1]} parallel lines at best, among"
-            f" structures {picture.clearness:.3g} times as deep as the noise or deeper",
+            "no grid is seen: nowhere do two sets of parallel lines cross (at best "
+            f"{max_counts[0]} and {max_counts[1]} lines were found)",
             found_a=max_counts[0],
             found_b=max_counts[1],
+            clearness=picture.clearness,
         )
     return best
 

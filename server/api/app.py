@@ -22,12 +22,13 @@ from server.api.routes.analyses import analyses, exports, gauges, picking, previ
 from server.api.routes.calibrations import calibrations, guide, noise, repair, review
 from server.api.routes.calibrations import checks as calibration_checks
 from server.api.routes.calibrations import exports as calibration_exports
-from server.api.routes.rig import cameras, devices, stage
+from server.api.routes.rig import cameras, devices, live_check, stage
 from server.api.routes.service import jobs, session, system
 from server.api.routes.tests import channels, frame, metadata, recipes, tests, watch, workspace
 from server.api.routes.tests.trash import router as trash_router
 from server.http.access import KeyFile
 from server.workflows.calibration.guided import Guides
+from server.workflows.live_check import LiveChecks
 from server.workflows.service import Service
 from server.workflows.watch import Watches
 
@@ -84,6 +85,7 @@ def create_app(
     app.state.sessions = sessions
     app.state.watches = Watches(service)
     app.state.guides = Guides(service)
+    app.state.live_checks = LiveChecks(service)
     app.state.view_limiter = CapacityLimiter(4)
     app.add_api_route("/healthz", system.healthz, include_in_schema=False)
     app.add_api_route("/readyz", system.readyz, include_in_schema=False)
@@ -118,6 +120,7 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         session,
         cameras,
         devices,
+        live_check,
         stage,
         noise,
         calibrations,

@@ -83,6 +83,23 @@ def geometry(
     centred = points - points.mean(axis=0)
     normal = np.linalg.svd(centred, full_matrices=False)[2][2]
     middle = middle - ((middle - points.mean(axis=0)) @ normal) * normal  # onto the plane
+    return geometry_at(pair, middle, normal, sizes)
+
+
+def geometry_at(
+    pair: StereoPair, middle: Float, normal: Float, sizes: tuple[tuple[int, int] | None, tuple[int, int] | None]
+) -> Geometry | None:
+    """Return the geometry before a plane; None where a camera does not see it.
+
+    Parameters
+    ----------
+    pair
+        The calibrated cameras.
+    middle, normal
+        (3,) a point of the plane, mm, and its normal, in the system frame.
+    sizes
+        Width and height of both cameras' images.
+    """
     directions_mm = [camera.centre_sys_mm - middle for camera in (pair.cam1, pair.cam2)]
     directions = [s / np.linalg.norm(s) for s in directions_mm]
     views: dict[str, View] = {}

@@ -1,6 +1,7 @@
 // The shell: bar with the stop button, screens by address, messages about connection and key.
 import * as api from "./lib/api.js";
 import * as events from "./lib/events.js";
+import { goTo, path as guidedPath } from "./widgets/path.js";
 import { h, replace, notify, badge, num, field, part, problemText, ask, modal } from "./lib/dom.js";
 
 /** @typedef {() => void} Leave */
@@ -34,10 +35,9 @@ async function open() {
   const here = route();
   visit += 1;
   const mine = visit;
-  for (const link of /** @type {NodeListOf<HTMLElement>} */ (bar.querySelectorAll("nav a"))) {
-    if (link.dataset.screen === here.screen) link.setAttribute("aria-current", "page");
-    else link.removeAttribute("aria-current");
-  }
+  guide.moved(here);
+  if (here.screen === "jobs") jobsLink.setAttribute("aria-current", "page");
+  else jobsLink.removeAttribute("aria-current");
   document.title = `${SCREENS[here.screen][0]} · stereorig`;
   // what was said or asked on another screen does not belong to this one
   if (here.screen !== shown) for (const old of part("notices").querySelectorAll(".notice.bad")) old.remove();
@@ -58,6 +58,7 @@ async function open() {
     leave = ended;
     replace(main, root);
     root.dispatchEvent(new Event("shown"));
+    if (here.screen === "test") goTo(here.query.get("at") ?? "");
   } catch (error) {
     if (mine === visit) replace(main, h("div.panel", h("h1", SCREENS[here.screen][0]), problemText(error)));
   }
@@ -75,14 +76,18 @@ async function stop() {
   }
 }
 
+const jobsLink = h("a", { href: "#/jobs", "data-screen": "jobs" }, SCREENS.jobs[0]);
+const guide = guidedPath(jobsLink);
 const stopButton = h("button.stop", { type: "button", id: "stop", onclick: stop, title: "Stop every axis at once (Esc, twice)" }, "STOP");
 const stageText = h("span", { id: "bar-stage", title: "Stage position" });
 const jobText = h("a", { href: "#/jobs", id: "bar-job", hidden: true });
 const person = h("span");
 const lost = h("div.banner", { hidden: true, role: "alert" });
 
+const dark = matchMedia("(prefers-color-scheme: dark)");
 function theme() {
-  const order = ["", "light", "dark"];
+  // the first press always changes what is seen; the third goes back to the system's colours
+  const order = dark.matches ? ["", "light", "dark"] : ["", "dark", "light"];
   const now = document.documentElement.dataset.theme ?? "";
   const next = order[(order.indexOf(now) + 1) % 3];
   if (next) document.documentElement.dataset.theme = next;
@@ -97,7 +102,7 @@ function drawBar() {
   replace(
     bar,
     h("a.brand", { href: "#/rig" }, h("img", { src: "/static/icon.svg", alt: "", width: 24, height: 24 }), "stereorig"),
-    h("nav", { "aria-label": "Screens" }, Object.entries(SCREENS).map(([name, [text]]) => h("a", { href: `#/${name}`, "data-screen": name }, text))),
+    guide.root,
     h("div.status", jobText, stageText, person, h("a", { href: "/docs", title: "The HTTP API" }, "API"), keysButton, themeButton),
     stopButton,
     lost,

@@ -209,6 +209,22 @@ class LookTask:
 
 
 @dataclass(frozen=True)
+class LiveCheckTask:
+    """The check of a calibration by one live pair.
+
+    Parameters
+    ----------
+    calibration
+        File of the calibration.
+    pixels
+        Images of camera 1 and camera 2.
+    """
+
+    calibration: Path
+    pixels: tuple[Any, Any]
+
+
+@dataclass(frozen=True)
 class GuideTask:
     """A guided acquisition.
 
@@ -251,6 +267,12 @@ def find_in_pair(task: LookTask) -> dict[str, int]:
     """Find the target in both images; raises as the fit would. Returns the number of points found by camera."""
     found: dict[str, int] = _heavy("server.compute.guide_session").find_in_pair(task)
     return found
+
+
+def check_live(task: LiveCheckTask) -> dict[str, Any]:
+    """Say how far a live pair's points lie off their epipolar lines."""
+    seen: dict[str, Any] = _heavy("server.compute.live_check").check_live(task)
+    return seen
 
 
 def look_at_pair(task: GuideTask, pixels: dict[str, Any], serial: int) -> dict[str, Any]:

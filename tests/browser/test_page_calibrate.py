@@ -51,7 +51,18 @@ def test_foreseen_run_and_seen(page: Watched, client: httpx.Client) -> None:
     assert float(cell.inner_text().split()[0]) == pytest.approx(z_um, rel=0.01)
     shown.get_by_label("Fitted positions").fill("0, 0.05")
     expect(expected).to_contain_text("would be refused", timeout=SLOW)
+    # what cannot be is said beside its field, and not sent
+    fields = {name: shown.locator(".field", has=shown.get_by_label(name)) for name in ("Fitted", "Held-out")}
+    for text, told in (("0, x", "“x” is no number"), ("0, 50", "50\u00a0mm is beyond it"), ("0", "there is one")):
+        shown.get_by_label("Fitted positions").fill(text)
+        expect(fields["Fitted"].get_by_role("alert")).to_contain_text(told)
+        begin(shown)
+        expect(shown.get_by_label("Fitted positions")).to_be_focused()
     shown.get_by_label("Fitted positions").fill("0, 5")
+    expect(fields["Fitted"].get_by_role("alert")).to_have_count(0)
+    shown.get_by_label("Held-out positions").fill("5")
+    expect(fields["Held-out"].get_by_role("alert")).to_contain_text("is a fitted position too")
+    assert client.get(f"{API}/calibrations").json()["calibrations"] == []
     shown.get_by_label("Held-out positions").fill("2")
     shown.get_by_label("Frames averaged").fill("4")
     shown.get_by_label("Label", exact=True).first.fill("morning")
@@ -146,7 +157,18 @@ def test_what_a_verdict_refused_is_shown_with_its_reasons(
 
     monkeypatch.setattr(world, "expose", leant_on)
     shown = page.open("#/calibrate")
+    # what cannot be is said beside its field, and not sent
+    fields = {name: shown.locator(".field", has=shown.get_by_label(name)) for name in ("Fitted", "Held-out")}
+    for text, told in (("0, x", "“x” is no number"), ("0, 50", "50\u00a0mm is beyond it"), ("0", "there is one")):
+        shown.get_by_label("Fitted positions").fill(text)
+        expect(fields["Fitted"].get_by_role("alert")).to_contain_text(told)
+        begin(shown)
+        expect(shown.get_by_label("Fitted positions")).to_be_focused()
     shown.get_by_label("Fitted positions").fill("0, 5")
+    expect(fields["Fitted"].get_by_role("alert")).to_have_count(0)
+    shown.get_by_label("Held-out positions").fill("5")
+    expect(fields["Held-out"].get_by_role("alert")).to_contain_text("is a fitted position too")
+    assert client.get(f"{API}/calibrations").json()["calibrations"] == []
     shown.get_by_label("Held-out positions").fill("2")
     begin(shown)
     progress = shown.locator('[data-role="progress"]')
@@ -225,7 +247,11 @@ def test_import_compare_accept_discard(page: Watched, client: httpx.Client, tmp_
     dialog.get_by_role("button", name="Close").click()
 
     shown.get_by_role("button", name="Accept", exact=True).click()
-    expect(shown.get_by_role("region", name="Verdict")).to_contain_text("accepted")
+    verdict = shown.get_by_role("region", name="Verdict")
+    expect(verdict.locator(".badge").first).to_have_text("accepted")
+    expect(verdict.get_by_role("link", name="Make a test")).to_have_attribute("href", "#/test?new")
+    geometry = client.get(f"{API}/calibrations/{other}/geometry").json()
+    expect(verdict).to_contain_text(f"{geometry['stereo_angle_deg']:.2f}")
     assert client.get(f"{API}/calibrations/{other}").json()["review"]["decision"] == "accepted"
     # a new test measures with it unless another one is chosen
     shown.get_by_role("link", name="Test", exact=True).click()

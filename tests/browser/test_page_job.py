@@ -109,9 +109,14 @@ def capture(shown: Page, label: str, load_n: float) -> Locator:
 
 
 def open_test(shown: Page) -> None:
-    go(shown, "Test", "Tests")
-    shown.get_by_role("link", name="Pressure test").first.click()
-    expect(shown.get_by_role("heading", level=1, name="Pressure test")).to_be_visible()
+    """Go back to the test: the path leads to the one last open, in a fresh browser to the list."""
+    shown.get_by_role("navigation", name="Screens").get_by_role("link", name="Test", exact=True).click()
+    listed = shown.get_by_role("link", name="Pressure test").first
+    heading = shown.get_by_role("heading", level=1, name="Pressure test")
+    expect(listed.or_(heading).first).to_be_visible()
+    if listed.is_visible():
+        listed.click()
+    expect(heading).to_be_visible()
 
 
 def deflection_mm(x: Any, y: Any, pressure_kpa: float) -> Any:
@@ -337,7 +342,7 @@ def test_a_calibration_that_is_refused(page: Watched, client: httpx.Client, made
     panel = shown.locator("section.panel", has=shown.get_by_role("heading", name=refused["id"]))
     expect(panel).to_contain_text(problem["cause"])
     expect(panel.get_by_role("button", name="Accept")).to_have_count(0)
-    go(shown, "Test", "Tests")
+    page.open("#/test")
     choice = shown.get_by_label("Calibration", exact=True)
     expect(choice).to_have_value(made.calibration_id)
     assert refused["id"] not in [option.get_attribute("value") for option in choice.locator("option").all()]

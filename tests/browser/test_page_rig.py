@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import httpx
+import numpy as np
 import pytest
 from playwright.sync_api import Browser, expect
 
+from server.formats.images import decode
 from server.http.access import KeyFile
 from server.workflows.service import Service
 from tests.support.page_bench import Watched, watched
-from tests.support.service_rig import served
+from tests.support.service_rig import served, true_cameras
+from tests.support.tiny_rig import TINY
 
 pytestmark = pytest.mark.timeout(180)
 
@@ -66,13 +70,92 @@ def test_settings_are_set_and_what_the_camera_took_is_told(page: Watched, client
     box.get_by_role("button", name="Set").click()
     expect(box.get_by_text("The camera applied 12.50 ms")).to_be_visible()
     assert client.get("/api/v1/cameras/cam2").json()["settings"]["exposure_ms"] == 12.5
+    # beyond the camera's range: said beside the field, and nothing is sent
     box.get_by_label("Exposure").fill("5000")
     box.get_by_role("button", name="Set").click()
-    # cause and remedy as the API gives them
-    notice = shown.get_by_role("alert").filter(has_text="5000")
-    expect(notice).to_be_visible()
-    page.sound(409, 422)
+    field = box.locator(".field", has=shown.get_by_label("Exposure"))
+    expect(field.get_by_role("alert")).to_have_text("Give 0.01 to 1000\u00a0ms, not 5000\u00a0ms.")
+    expect(box.get_by_label("Exposure")).to_be_focused()
+    expect(box.get_by_label("Exposure")).to_have_attribute("aria-invalid", "true")
+    assert client.get("/api/v1/cameras/cam2").json()["settings"]["exposure_ms"] == 12.5
+    box.get_by_label("Exposure").fill("10")
+    expect(field.get_by_role("alert")).to_have_count(0)
+    page.sound()
     client.patch("/api/v1/cameras/cam2", json={"exposure_ms": 10.0}).raise_for_status()
+
+
+def test_the_exposure_is_searched_and_light_that_does_not_suffice_is_told_beside_it(
+    page: Watched, client: httpx.Client
+) -> None:
+    client.put("/api/v1/sim/scene", json={"scene": "plate"}).raise_for_status()
+    client.patch("/api/v1/cameras/cam2", json={"exposure_ms": 0.5}).raise_for_status()
+    shown = page.open()
+    box = shown.get_by_role("region", name="cam2", exact=True)
+    box.get_by_role("button", name="Auto exposure").click()
+    expect(box.get_by_text("% of full scale, none saturated")).to_be_visible()
+    taken = client.get("/api/v1/cameras/cam2").json()["settings"]["exposure_ms"]
+    expect(box.get_by_label("Exposure")).to_have_value(str(taken))
+    frame = decode(client.get("/api/v1/cameras/cam2/frame").content, name="cam2").pixels
+    assert np.sort(frame.ravel())[-frame.size // 1000] == pytest.approx(0.8 * 255, rel=0.05)
+    # less light than the longest exposure that is allowed can make up for
+    client.put("/api/v1/sim/scene", json={"scene": "grid"}).raise_for_status()
+    client.patch("/api/v1/cameras/cam2", json={"exposure_ms": 10.0}).raise_for_status()
+    shown.route("**/cameras/cam2:expose", lambda route: route.continue_(post_data='{"longest_ms": 0.02}'))
+    box.get_by_role("button", name="Auto exposure").click()
+    field = box.locator(".field", has=shown.get_by_label("Exposure"))
+    expect(field.get_by_role("alert")).to_contain_text("Take the cap off the lens")
+    assert client.get("/api/v1/cameras/cam2").json()["settings"]["exposure_ms"] == 10.0
+    page.sound(409)
+
+
+def test_the_focus_figure_keeps_its_peak_and_says_how_far_it_is_from_it(page: Watched, client: httpx.Client) -> None:
+    client.put("/api/v1/sim/scene", json={"scene": "plate"}).raise_for_status()
+    shown = page.open()
+    box = shown.get_by_role("region", name="cam1", exact=True)
+    reading = box.locator('[data-role="focus"]')
+    expect(reading).to_contain_text("at the peak", timeout=15_000)
+    # the lens is capped: little but noise is seen, and the peak stays what it was
+    client.patch("/api/v1/cameras/cam1", json={"exposure_ms": 0.01}).raise_for_status()
+    expect(box.get_by_text("little but noise is seen")).to_be_visible(timeout=15_000)
+    expect(reading).to_contain_text("no figure")
+    client.patch("/api/v1/cameras/cam1", json={"exposure_ms": 10.0}).raise_for_status()
+    expect(reading).to_contain_text("at the peak", timeout=15_000)
+    page.sound()
+
+
+def test_the_picture_fills_its_frame(page: Watched) -> None:
+    shown = page.open()
+    frame = shown.locator(".view .frame").first.bounding_box()
+    picture = shown.get_by_alt_text("Live view of cam1", exact=True).bounding_box()
+    assert frame is not None
+    assert picture is not None
+    assert picture["width"] * picture["height"] > 0.97 * frame["width"] * frame["height"]
+    histogram = shown.get_by_role("img", name="Histogram of cam1").bounding_box()
+    assert histogram is not None
+    assert histogram["width"] > 500
+    assert histogram["height"] > 180
+
+
+def test_a_moved_camera_is_told_while_it_is_looked_at(page: Watched, client: httpx.Client) -> None:
+    api = "/api/v1"
+    client.put(f"{api}/sim/scene", json={"scene": "plate"}).raise_for_status()
+    shown = page.open()
+    check = shown.locator('[data-role="live-check"]')
+    expect(check).to_contain_text("None has been accepted yet.")
+    expect(check.get_by_role("link", name="Calibrate")).to_have_attribute("href", "#/calibrate")
+    cameras = json.dumps(true_cameras(TINY))
+    made = client.post(f"{api}/calibrations:import", files={"file": ("c.json", cameras)}).json()["id"]
+    client.put(f"{api}/calibrations/{made}/review", json={"decision": "accepted"}).raise_for_status()
+    page.open("#/jobs")
+    page.open()
+    expect(check).to_contain_text("as calibrated", timeout=120_000)
+    # five hundredths of a degree over 3600 px of pinhole distance: three pixels
+    bump = {"bump_cam2": [0.05, 0, 0, 0, 0, 0]}
+    client.put(f"{api}/sim/scene", json={"scene": "plate", "params": bump}).raise_for_status()
+    expect(check).to_contain_text("cameras have moved", timeout=30_000)
+    expect(check.get_by_role("link", name="Calibrate again")).to_be_visible()
+    client.put(f"{api}/sim/scene", json={"scene": "plate", "params": {"bump_cam2": [0] * 6}}).raise_for_status()
+    page.sound(409)
 
 
 def test_overlays_lie_over_the_image(page: Watched) -> None:

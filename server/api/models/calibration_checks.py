@@ -7,6 +7,7 @@ from typing import Annotated, Self
 from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
 from core.calibration.checks.distance import MARK_SIGMA_PX
+from core.names import CameraName
 from core.settings import Pixel, Real
 from server.base.models import Reply, Request, StepNumber, one_of
 from server.config.rig_file import TargetSection
@@ -143,6 +144,30 @@ class AspectReply(Reply):
     tilt_effect: float = Field(description="The most by which the tilts change the aspect ratio.")
     standoff_known: bool = Field(description="True if the tilt is an angle and no bound.")
     text: str = Field(description="The finding in a sentence.")
+
+
+class CameraGeometry(Reply):
+    """A calibrated camera before the target's plane."""
+
+    focal_length_mm: float | None = Field(
+        description="Distance of pinhole and sensor; null: the rig file does not state the width of a pixel."
+    )
+    standoff_mm: float = Field(description="From the pinhole along the optical axis to the plane.")
+    field_of_view_mm: tuple[float, float] | None = Field(
+        description="Width and height of the part of the plane in the image; null: image size not known."
+    )
+    scale_mm_per_px: tuple[float, float] = Field(description="On the plane, along the rows and down the columns.")
+
+
+class GeometryReply(Reply):
+    """Geometry of a calibrated rig."""
+
+    stereo_angle_deg: float = Field(description="Between the optical axes.")
+    baseline_mm: float = Field(description="Between the pinholes.")
+    cameras: dict[CameraName, CameraGeometry] | None = Field(
+        description="Before the plane Z = 0 at its origin, the target's of a calibration made here; null where a "
+        "camera does not see it."
+    )
 
 
 class KeptCheck(Reply):

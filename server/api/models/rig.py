@@ -12,6 +12,7 @@ from drivers.acquisition.pairing import PairingAccount
 from drivers.cameras.protocol import FrameCounters
 from server.base.models import AxisValues, Number, Reply, Reported, Request, any_of, one_of
 from server.rig.description import CameraReply, CameraSettingsReply, StageMessage
+from server.workflows.exposure import LEVEL, LEVEL_HIGH, LEVEL_LOW
 
 
 class SettingsPatch(Request):
@@ -27,6 +28,34 @@ class SettingsPatch(Request):
         max_length=100,
         examples=[{"BlackLevel": 4.0}],
     )
+
+
+class ExposureRequest(Request):
+    """Search for a camera's exposure."""
+
+    level: Annotated[Real, Field(ge=LEVEL_LOW, le=LEVEL_HIGH)] = Field(
+        LEVEL,
+        description="Level of the brightest parts of the picture, over full scale; the brightest thousandth of its "
+        "pixels is left out.",
+    )
+    shortest_ms: Annotated[Real, Field(gt=0.0, le=60000.0)] | None = Field(
+        None, description="Shortest exposure that may be set; the camera's own if left out."
+    )
+    longest_ms: Annotated[Real, Field(gt=0.0, le=60000.0)] | None = Field(
+        None,
+        description="Longest exposure that may be set; the camera's own, and nine tenths of the period of a "
+        "free-running camera, if left out.",
+    )
+
+
+class ExposureFound(Reply):
+    """An exposure that was searched for and set."""
+
+    name: CameraName = Field(description="Which camera.")
+    settings: CameraSettingsReply = Field(description="Every setting, as read back.")
+    level: float = Field(description="Level of the brightest parts of the picture with it, over full scale.")
+    saturated_share: float = Field(description="Share of pixels at full scale with it.")
+    pictures: int = Field(description="Number of pictures that the search took.")
 
 
 class MoveRequest(Request):
@@ -185,6 +214,21 @@ class CameraStats(Reply):
     sequence: int = Field(description="Number of the newest frame.")
     quality: FrameQuality = Field(description="The newest frame.")
     histogram: list[int] = Field(description="Pixels at each of 256 grey levels, the upper 8 bits of deeper images.")
+
+
+class LiveCheckReply(Reply):
+    """The accepted calibration, held against the live pair."""
+
+    calibration_id: str = Field(description="The newest accepted calibration.")
+    level: Literal["ok", "warning", "failed", "no_texture", "off_zero", "busy"] = Field(
+        description="`ok`, `warning` or `failed` as of a measured field (`epipolar_check`). Not checked: `no_texture`, "
+        "`off_zero` (a stage is off the calibrated place) and `busy` (a job runs)."
+    )
+    offset_px: float | None = Field(description="How far points lie off their epipolar lines; null: not checked.")
+    own_px: float | None = Field(description="The calibration's own offset at most; null: not known.")
+    points: int = Field(description="Points that were matched; 0 where the offset is that of features, or none.")
+    text: str = Field(description="The finding in a sentence.")
+    checked_utc: str = Field(description="Time of the check.")
 
 
 class StageMessages(Reply):

@@ -3,21 +3,20 @@ import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
 import { comparedInSpace, distanceCheck } from "./calibrate/checks.js";
 import { guidePanel } from "./calibrate/guide.js";
+import { geometryOf, statusBadge } from "./calibrate/summary.js";
 import { calibrationViews } from "./calibrate/views.js";
-import { h, numeric, pen, replace, field, number, select, action, table, definitions, badge, num, count, quantity, when, notify, problemText, ask, STATE_KIND } from "../lib/dom.js";
+import { allRight, numberWithin, numbersWithin, rule } from "../lib/fields.js";
+import { wayBackNote } from "../widgets/way_back.js";
+import { h, numeric, pen, replace, field, number, select, action, table, definitions, badge, num, count, quantity, when, notify, problemText, ask } from "../lib/dom.js";
 
 /** @import { Here } from "../main.js" */
 /** @import { Ends, Part } from "#dom" */
-/** @import { Body, Model, Reply } from "#routes" */
+/** @import { Model, Reply } from "#routes" */
 /** @typedef {Model<"CalibrationReply">} Calibration */
 /** @typedef {Reply<"get", "/calibrations">["calibrations"]} Entries */
 /** @typedef {Model<"ExpectReply">} Expected */
 /** @typedef {{ nodes: Part, close: () => void }} Panels */
 
-/** @type {Record<string, string>} */
-const LEVEL = { good: "good", warning: "warn", failed: "bad" };
-/** @type {Record<string, string>} */
-const DECISION = { accepted: "good", discarded: "bad" };
 const NAMES = ["phd_px", "cx_px", "cy_px", "kappa_per_px2", "alpha_rad", "beta_rad", "gamma_rad", "x0_mm", "y0_mm", "z0_mm"];
 /** @type {Record<string, string>} */
 const PHASES = { target: "looking for the target", views: "taking views", grid: "finding the target", calibration: "adjusting" };
@@ -64,19 +63,13 @@ export async function open(root, { path }) {
     drawList();
   }
 
-  /** @param {Entries[number]} one */
-  function levelBadge(one) {
-    const level = /** @type {string | undefined} */ (one.verdict?.level);
-    return badge(level ?? one.state, LEVEL[level ?? ""] ?? STATE_KIND[one.state] ?? "");
-  }
-
   function drawList() {
     const compared = new Set(ticked(list));
     replace(list, table([
       ["Compare", (one) => h("input", { type: "checkbox", value: one.id, checked: compared.has(one.id), disabled: one.state !== "complete", "aria-label": `Compare ${one.id}` }), { unseen: true }],
       ["Calibration", (one) => h("a", { href: `#/calibrate/${one.id}`, "aria-current": one.id === chosen ? "true" : null }, one.label || one.id)],
       ["Made", (one) => when(one.created_utc)],
-      ["Verdict", (one) => [levelBadge(one), " ", one.decision ? badge(one.decision, DECISION[one.decision]) : null]],
+      ["State", (one) => statusBadge({ state: one.state, decision: one.decision, level: /** @type {string | undefined} */ (one.verdict?.level) })],
     ], entries, { caption: "Calibrations, newest first", empty: "No calibration yet: run one, or import one." }));
   }
 
@@ -109,7 +102,7 @@ export async function open(root, { path }) {
   async function one(document_) {
     const { id, plan } = document_;
     const heading = h("div.spread", h("h2", plan.label || "Calibration", " ", h("code", id)),
-      h("span.row", badge(document_.state, STATE_KIND[document_.state]), document_.review ? badge(document_.review.decision, DECISION[document_.review.decision]) : null));
+      statusBadge({ state: document_.state, decision: document_.review?.decision, level: document_.verdict?.level }));
     const decide = h("div.row", decisions(document_, async () => { await refresh(); await show(true); }, async () => {
       chosen = undefined;
       await refresh();
@@ -120,7 +113,7 @@ export async function open(root, { path }) {
     // one with the verdict failed is shown like any other: its residuals show the cause
     if (document_.state !== "complete" && !document_.verdict) {
       return { nodes: h("section.panel", heading,
-        wayBack(problem), problem ? problemText(api.problemOf(problem)) : h("p.quiet", "Not complete yet; the progress is shown above, or under Jobs."),
+        problem ? problemText(api.problemOf(problem)) : h("p.quiet", "Not complete yet; the progress is shown above, or under Jobs."),
         document_.state === "unfinished" ? null : decide, viewsOf(document_)), close: () => {} };
     }
     /** @type {Reply<"get", "/calibrations/{calibration_id}/residuals">["views"] | null} */
@@ -133,7 +126,7 @@ export async function open(root, { path }) {
     const made = calibrationViews(document_, /** @type {import("./calibrate/views.js").Found[] | null} */ (residuals));
     return {
       nodes: [
-        h("section.panel", { "aria-label": "Verdict" }, heading, verdict(document_), decide),
+        h("section.panel", { "aria-label": "Verdict" }, heading, verdict(document_), await geometryOf(document_), decide),
         made ? h("section.panel", { "aria-label": "Views" }, h("h2", "Views"), made.root) : null,
         h("div.grid.tables", { style: { marginTop: "var(--gap)" } },
           h("section.panel", h("h2", "Checks"), measures(document_), viewTable(document_), document_.state === "complete" ? distanceCheck(document_) : null),
@@ -152,10 +145,10 @@ export async function open(root, { path }) {
   }
 
   ends.push(events.on("calibration", () => { refresh().then(() => show()).catch(notify); }));
-  const running = run(rig, ends, async (id) => { chosen = id; await refresh(); await show(); });
+  await refresh();
+  const running = run(rig, ends, async (id) => { chosen = id; await refresh(); await show(); }, !chosen && !entries.some((one) => one.state === "complete"));
   const guided = guidePanel(rig, ends, async (id) => { chosen = id; await refresh(); await show(true); });
   const compare = action("Compare the two chosen", () => comparison(list));
-  await refresh();
   await show();
   replace(root, h("h1", "Calibrate"),
     h("div.grid.side", h("div.grid", rig.calibration_plan?.moves === "free" ? null : running, guided, shown),
@@ -164,22 +157,13 @@ export async function open(root, { path }) {
 }
 
 /**
- * Button that takes the stage back to the calibrated place, where a calibration left it elsewhere.
- * @param {Calibration["problem"]} problem
- */
-function wayBack(problem) {
-  const back = /** @type {{ text: string, move: Body<"post", "/stage/moves"> } | undefined} */ (problem?.context?.way_back);
-  if (!back) return null;
-  return h("div.problem", h("p", h("strong", back.text.split(":")[0]), "."), action("Go back to dZ = 0", () => api.post("/stage/moves", back.move)));
-}
-
-/**
  * The plan, its expected uncertainty, and its run.
  * @param {Model<"RigReply">} rig
  * @param {Ends} ends
  * @param {(id: string) => Promise<unknown>} done
+ * @param {boolean} first without a calibration that is shown below: all is shown of what this one would bring
  */
-function run(rig, ends, done) {
+function run(rig, ends, done, first) {
   const usual = rig.calibration_plan ?? {};
   const list_ = (/** @type {number[] | null | undefined} */ values) => (values ?? []).map((value) => String(value)).join(", ");
   const positions = h("input", { type: "text", value: list_(usual.positions_mm), inputmode: "decimal", autocomplete: "off" });
@@ -192,6 +176,31 @@ function run(rig, ends, done) {
   const expected = h("div", { role: "status", "data-role": "expected" });
   const progress = h("div", { role: "status", "data-role": "progress" });
   const start = action("Calibrate", begin, { kind: "primary" });
+  const note = wayBackNote();
+  note.update();
+  ends.push(events.on("stage", () => { note.update(); }), events.on("job", (job) => !["queued", "running", "cancelling"].includes(job.state) && note.update()));
+  const zero = Object.fromEntries((rig.stage.axes ?? []).map((axis) => [axis.axis, axis]));
+  // dZ of a camera is its axis' way from zero, forward or backward
+  const reach = CAMERAS.map((cam) => {
+    const { stage_axis: axisOf, stage_sign: sign } = rig.cameras[cam].nominal;
+    const axis = axisOf === undefined ? undefined : zero[axisOf];
+    return axis?.limits ? [axis.limits.low_mm, axis.limits.high_mm].map((mm) => (mm - axis.zero_mm) * (sign ?? 1)).toSorted((a, b) => a - b) : [-Infinity, Infinity];
+  });
+  const span = { low: Math.max(...reach.map(([low]) => low)), high: Math.min(...reach.map(([, high]) => high)), unit: "mm" };
+  const rules = /** @type {[HTMLInputElement, import("../lib/fields.js").Rule][]} */ ([
+    [positions, rule(positions, numbersWithin({ ...span, least: 2 }))],
+    [held, rule(held, (text) => numbersWithin(span)(text) || shared(text))],
+    [frames, rule(frames, numberWithin({ low: 1, high: 256, whole: true, what: "A number of frames" }))],
+  ]);
+  const assumed = /** @type {[HTMLInputElement, import("../lib/fields.js").Rule][]} */ ([
+    [noise, rule(noise, numberWithin({ low: 0.0001, high: 10, unit: "px", what: "A noise" }))], [roll, rule(roll, numberWithin({ low: -180, high: 180, unit: "°", what: "An angle" }))],
+  ]);
+  const list = (/** @type {string} */ text) => text.split(/[\s;,]+/).filter(Boolean).map(Number);
+  /** @param {string} text of the held-out positions */
+  function shared(text) {
+    const both = list(text).find((mm) => list(positions.value).includes(mm));
+    return both === undefined ? "" : `${both}\u00a0mm is a fitted position too: what checks the fit must not be in it.`;
+  }
 
   /**
    * @param {HTMLInputElement} input
@@ -209,12 +218,14 @@ function run(rig, ends, done) {
   async function estimate() {
     asked += 1;
     const mine = asked;
+    if (![...rules, ...assumed].map(([, check]) => check()).every(Boolean)) return replace(expected, h("p.quiet", "Correct the fields that are marked."));
     try {
       const estimated = await api.post("/calibrations:expect", { ...plan(), roll_deg: Number(roll.value), noise_px: Number(noise.value) });
       if (mine === asked) replace(expected, expectedUncertainty(estimated));
     } catch (error) {
       if (mine === asked) replace(expected, problemText(error));
     }
+    return undefined;
   }
   /** @type {number | undefined} */
   let timer;
@@ -223,6 +234,7 @@ function run(rig, ends, done) {
   estimate();
 
   async function begin() {
+    if (!allRight(rules)) return;
     const { job, calibration_id: id } = await api.post("/calibrations", { ...plan(), frames: Number(frames.value), label: label.value });
     await follow(job, id);
   }
@@ -245,7 +257,7 @@ function run(rig, ends, done) {
         text.textContent = now.state === "queued" ? "waiting" : `${PHASES[stage ?? ""] ?? stage ?? ""} ${total ? `${ready} of ${total}` : ""}`;
       } });
       replace(progress, ended.state === "succeeded"
-        ? h("p", badge("succeeded", "good"), " ", verdictOf(ended))
+        ? h("p", verdictOf(ended), " It is shown below.")
         : ended.state === "cancelled" ? h("p", badge("cancelled", "warn"), " The axes were stopped; no calibration was computed from the views.") : problemText(api.jobProblem(ended)));
       if (id) await done(id);
     } catch (error) {
@@ -266,9 +278,9 @@ function run(rig, ends, done) {
     h("div.fields",
       field("Fitted positions", positions, "mm", "dZ, away from the target"), field("Held-out positions", held, "mm", "for an independent check"),
       field("Frames averaged", frames), field("Localiser", localiser), field("Label", label)),
-    h("details", { open: true }, h("summary", "Expected uncertainty"),
+    h("details", { open: first }, h("summary", "Expected uncertainty"),
       h("div.fields", field("Assumed noise of an intersection", noise, "px"), field("Rotation of the grid", roll, "°", "in the images; 45 for a grid on its corner")), expected),
-    h("div.row", start), progress);
+    h("div.row", start), progress, note.root);
 }
 
 /** @param {Model<"RigReply">["target"]} target */
@@ -309,7 +321,7 @@ function verdict(document_) {
   const { verdict: v, uncertainty: u, checks } = document_;
   if (!v) return h("p.quiet", `Imported${document_.plan.source_name ? ` from ${document_.plan.source_name}` : ""}: it has no verdict.`);
   return [
-    h("p", badge(v.level, LEVEL[v.level])), h("ul", (v.reasons ?? []).map((text) => h("li", text))),
+    h("ul", (v.reasons ?? []).map((text) => h("li", text))),
     document_.problem ? h("p", document_.problem.remedy, " ", h("code.quiet", document_.problem.code)) : null,
     u ? definitions([["shape", `${um(u.shape_rms_mm)} rms, expected from this calibration alone`], ["Z at the middle, at the corners", `${um(u.centre_z_mm)}, ${um(u.corner_z_mm)}`], ["common scale", quantity(100 * u.scale, "%", 2)]]) : null,
     checks?.made ? h("details", h("summary", "Checks made and not made"), h("ul", checks.made.map((check) => h("li", badge(check.made ? "checked" : "not checked", check.made ? "good" : "warn"), " ", check.text)))) : null,
@@ -332,6 +344,7 @@ function decisions(document_, changed, gone) {
       const note = h("input", { type: "text", maxlength: 300 });
       if (await ask("Discard this calibration?", h("div", h("p", "No new test can be made with it. It stays on disk, and the decision can be withdrawn."), field("Reason", note)), [["Cancel", null], ["Discard", "yes"]])) await put("discarded", note.value);
     }, { kind: "danger" }) : null,
+    state === "complete" && now === "accepted" ? h("a.button.primary", { href: "#/test?new" }, "Make a test") : null,
     now ? action("Withdraw the decision", () => put(null)) : null,
     action("Delete …", async () => {
       if (await ask("Delete this calibration?", h("p", "It is moved to the trash; tests made with it keep their own copy."), [["Cancel", null], ["Delete", "yes"]])) {

@@ -66,7 +66,8 @@ async function list(root, testId) {
           ["Checks", warningsCell],
           ["Begun", (one) => when(one.created_utc)],
         ], (whole.analyses ?? []).toReversed(), { caption: "Analyses of this test, newest first", empty: "This test has not been measured yet.",
-          onrow: (one) => { location.hash = `#/results/${test.id}/${one.id}`; } }));
+          onrow: (one) => { location.hash = `#/results/${test.id}/${one.id}`; } }),
+        whole.analyses?.length ? null : h("a.button", { href: `#/test/${test.id}?at=region` }, "Measure it"));
     } catch (error) {
       replace(detail, problemText(error));
     }

@@ -3,6 +3,9 @@ import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
 import { View } from "../widgets/view.js";
 import { chart } from "../widgets/plots.js";
+import { allRight, numberWithin, rule, tell } from "../lib/fields.js";
+import { focusCourse } from "./rig/focus.js";
+import { liveCheck } from "./rig/live_check.js";
 import { h, replace, field, number, select, action, definitions, badge, num, count, quantity, notify, problemText, STATE_KIND } from "../lib/dom.js";
 
 /** @import { Ends } from "#dom" */
@@ -12,7 +15,21 @@ import { h, replace, field, number, select, action, definitions, badge, num, cou
 /** @typedef {Awaited<ReturnType<typeof chart>>} Chart */
 
 const CAMERAS = ["cam1", "cam2"];
-const COURSE = 120; // samples of the focus figure that are kept
+const RATE_OVER_MS = 4000; // a rate over less jumps with the moment of its reading
+
+/** Rate of a count over the last seconds; null until there are two, and after it began anew. */
+function rateOf() {
+  /** @type {{ at: number, counted: number }[]} */
+  let past = [];
+  return (/** @type {number} */ counted) => {
+    const at = performance.now();
+    const last = past.at(-1);
+    if (last && counted < last.counted) past = [];
+    past.push({ at, counted });
+    while (past.length > 2 && at - past[1].at > RATE_OVER_MS) past.shift();
+    return at - past[0].at < 0.4 * RATE_OVER_MS ? null : (1000 * (counted - past[0].counted)) / (at - past[0].at);
+  };
+}
 
 /** @param {HTMLElement} root */
 export async function open(root) {
@@ -25,12 +42,12 @@ export async function open(root) {
   const again = reconnect(); // one button: it must not be drawn again while it is pressed
   replace(root,
     h("div.spread", h("h1", rig.name || "Rig"), state),
+    liveCheck(ends),
     h("div.grid.two.views", cameras.map((one) => one.root)),
     h("div.grid.side", { style: { marginTop: "var(--gap)" } }, stage(ends), h("section.panel", h("h2", "Pairs"), pair, rig.sim ? scene(rig) : null)),
   );
 
-  /** @type {{ at: number, paired: number } | null} */
-  let last = null;
+  const pairRate = rateOf();
   async function update() {
     if (document.hidden) return;
     try {
@@ -41,14 +58,13 @@ export async function open(root) {
       const stats = await Promise.all(cameras.map((one) => one.update(now.cameras[one.cam])));
       const figures = stats.find(Boolean)?.pairs;
       if (figures) {
-        const rate = last && figures.paired >= last.paired ? (1000 * (figures.paired - last.paired)) / (performance.now() - last.at) : null;
+        const rate = pairRate(figures.paired);
         replace(pair, [...definitions([
           ["paired", count(figures.paired)],
           ["pairs per second", num(rate, 3)],
           ["max. skew", quantity(now.max_skew_ms, "ms", 3)],
           ["unpaired", count(figures.unpaired)], ["dropped", count(figures.dropped)], ["incomplete", count(figures.incomplete)], ["refused", count(figures.refused)],
         ]).children]);
-        last = { at: performance.now(), paired: figures.paired };
       }
     } catch (error) {
       replace(state, badge("unknown", "warn"));
@@ -85,6 +101,7 @@ function camera(cam, first, ends) {
     },
   });
   view.size(size[0], size[1]);
+  view.root.style.setProperty("--aspect", String(size[0] && size[1] ? size[0] / size[1] : 4 / 3));
   const overlay = h("img", { alt: "", hidden: true });
   view.content.insertBefore(overlay, view.svg);
   const overlayChoice = select([["", "no overlay"], ["saturation", "saturated pixels"], ["texture", "texture quality"]], "", { "aria-label": `Overlay of ${cam}` });
@@ -112,6 +129,9 @@ function camera(cam, first, ends) {
     setTimeout(() => !dark && document.contains(view.root) && start(), 2000);
   });
   start();
+  let waiting = false; // for a picture of a new scene: an old one must not pass for it
+  /** @type {number | null} */
+  let seen = null; // number of a frame that may be the last of the old scene
   // the browser keeps the last picture of a stream that ended, without an event: an old picture must not pass for a live one
   let dark = false;
   let severed = false;
@@ -128,6 +148,7 @@ function camera(cam, first, ends) {
     // both are exposed together: without one there are no pictures of the other
     events.on("camera", (event) => (event.state === "lost" ? lose(event.problem?.cause ?? `${event.camera} is lost.`) : regain(true))),
     events.on("job", (job) => job.kind === "reconnect" && job.state === "succeeded" && regain(true)),
+    events.on("scene", () => { waiting = true; seen = null; focus.forget(); view.blank("Waiting for the first picture of the new scene …"); }),
     events.on("lost", () => { severed = true; }),
     events.on("open", () => { regain(severed); severed = false; }),
   );
@@ -136,35 +157,46 @@ function camera(cam, first, ends) {
   const quality = h("span");
   const trouble = h("div", { role: "alert" });
   const histogramBox = h("div");
-  const focusBox = h("div");
-  /** @type {[number, number | null][]} time and focus */
-  const course = [];
+  const focus = focusCourse(cam);
+  const frameRate = rateOf();
   /** @type {Chart | null} */
   let histogram = null;
-  /** @type {Chart | null} */
-  let focus = null;
   /** @type {number | null} */
   let began = null;
 
   const exposure = number(first.settings?.exposure_ms, { min: 0, ...limits(first.device?.exposure_range_ms) });
   const gain = number(first.settings?.gain_db, limits(first.device?.gain_range_db));
-  const taken = h("p.quiet", { role: "status" });
+  const rules = [withinOf(exposure, first.device?.exposure_range_ms, "ms"), withinOf(gain, first.device?.gain_range_db, "dB")];
+  const taken = h("p.quiet.taken", { role: "status" });
+  /** @param {{ exposure_ms?: number | null, gain_db?: number | null }} settings */
+  function applied(settings, more = "") {
+    exposure.value = String(settings.exposure_ms ?? "");
+    gain.value = String(settings.gain_db ?? "");
+    taken.textContent = `The camera applied ${quantity(settings.exposure_ms, "ms")} and ${quantity(settings.gain_db, "dB")}${more}.`;
+    focus.forget();
+  }
   const set = action("Set", async () => {
+    if (!allRight(rules)) return;
     /** @type {Model<"SettingsPatch">} */
     const changes = {};
     if (exposure.value !== "") changes.exposure_ms = Number(exposure.value);
     if (gain.value !== "") changes.gain_db = Number(gain.value);
-    const answer = await api.patch(`/cameras/${cam}`, changes);
-    exposure.value = String(answer.settings.exposure_ms ?? "");
-    gain.value = String(answer.settings.gain_db ?? "");
-    taken.textContent = `The camera applied ${quantity(answer.settings.exposure_ms, "ms")} and ${quantity(answer.settings.gain_db, "dB")}.`;
+    applied((await api.patch(`/cameras/${cam}`, changes)).settings);
   }, { kind: "primary" });
+  const search = action("Auto exposure", async () => {
+    tell(exposure, "");
+    try {
+      const found = await api.post(`/cameras/${cam}:expose`, {});
+      applied(found.settings, `: the brightest parts are at ${num(100 * found.level, 3)} % of full scale, ${found.saturated_share ? `${num(100 * found.saturated_share, 2)} %` : "none"} saturated`);
+    } catch (error) {
+      if (!(error instanceof api.Problem && (error.code?.startsWith("light_") || error.code === "exposure_not_settable"))) throw error;
+      tell(exposure, `${error.message} ${error.remedy ?? ""}`);
+    }
+  }, { title: "Search for the exposure that brings the brightest parts of the picture to 80 % of full scale" });
   for (const input of [exposure, gain]) input.addEventListener("keydown", (event) => event.key === "Enter" && set.click());
 
-  ends.push(() => { view.close(); histogram?.close(); focus?.close(); if (shownOverlay) URL.revokeObjectURL(shownOverlay); });
+  ends.push(() => { view.close(); histogram?.close(); focus.close(); if (shownOverlay) URL.revokeObjectURL(shownOverlay); });
 
-  /** @type {{ delivered: number, at: number } | null} */
-  let counted = null;
   let rounds = 0;
   /** @param {Rig["cameras"][string]} now */
   async function update(now) {
@@ -177,7 +209,6 @@ function camera(cam, first, ends) {
       lose(now.fault.cause);
       replace(quality, badge("lost", "bad"));
       replace(figures);
-      counted = null;
       return null;
     }
     let stats;
@@ -193,27 +224,23 @@ function camera(cam, first, ends) {
     const q = stats.quality;
     began ??= performance.now();
     const at = (performance.now() - began) / 1000;
-    course.push([at, q.focus ?? null]);
-    if (course.length > COURSE) course.shift();
-    const highest = Math.max(...course.map((p) => p[1] ?? 0));
+    if (waiting) {
+      if (seen === null || stats.sequence === seen) seen ??= stats.sequence;
+      else {
+        waiting = false;
+        regain(true);
+      }
+    } else focus.add(at, q.focus ?? null).catch(notify);
     replace(quality, badge(q.code, STATE_KIND[q.code] ?? "warn"));
-    // after a change of settings a camera counts from zero
-    const rate = counted && stats.frames.delivered >= counted.delivered ? (stats.frames.delivered - counted.delivered) / ((performance.now() - counted.at) / 1000) : null;
-    counted = { delivered: stats.frames.delivered, at: performance.now() };
     replace(figures, [...definitions([
-      ["frame rate", quantity(rate, "Hz", 3)], ["mean grey", num(q.mean_grey, 4)], ["saturated", quantity(100 * q.saturated_share, "%", 3)],
-      ["texture", quantity(q.texture_grey_per_px, "grey/px", 3)], ["focus figure", q.focus === null || q.focus === undefined ? "– (little but noise is seen)" : `${num(q.focus, 3)} (highest ${num(highest, 3)})`],
+      ["frame rate", quantity(frameRate(stats.frames.delivered), "Hz", 3)], ["mean grey", num(q.mean_grey, 4)], ["saturated", quantity(100 * q.saturated_share, "%", 3)],
+      ["texture", quantity(q.texture_grey_per_px, "grey/px", 3)], ["focus figure", q.focus === null || q.focus === undefined ? "– (little but noise is seen)" : num(q.focus, 3)],
       ["dropped", count(stats.frames.dropped)], ["incomplete", count(stats.frames.incomplete)],
     ]).children]);
     const bins = stats.histogram.map((_, i) => i);
     if (!histogram && histogramBox.clientWidth) {
-      histogram = await chart(histogramBox, { x: "grey level (8 bit)", y: "pixels", height: 130, bars: true, files: false, series: [{ label: "pixels" }], data: [bins, stats.histogram], label: `Histogram of ${cam}` });
+      histogram = await chart(histogramBox, { x: "grey level (8 bit)", y: "pixels", height: 190, bars: true, files: false, series: [{ label: "pixels" }], data: [bins, stats.histogram], label: `Histogram of ${cam}` });
     } else histogram?.set([bins, stats.histogram]);
-    /** @type {[number[], (number | null)[], (number | null)[]]} */
-    const courseData = [course.map((p) => p[0]), course.map((p) => p[1]), course.map((p) => (p[1] !== null && p[1] === highest ? p[1] : null))];
-    if (!focus && focusBox.clientWidth && course.length > 1) {
-      focus = await chart(focusBox, { x: "time (s)", y: "focus", height: 130, files: false, series: [{ label: "focus" }, { label: "highest", edge: true, dots: true }], data: courseData, label: `Recent history of the focus figure of ${cam}` });
-    } else focus?.set(courseData);
     rounds += 1;
     if (overlayChoice.value && rounds % 2 === 0) layOver().catch(() => {});
     return stats;
@@ -223,12 +250,12 @@ function camera(cam, first, ends) {
   const device = first.device ?? {};
   const box = h("section.panel", { "aria-label": cam },
     h("div.spread", h("h2", cam, " ", h("span.quiet", [device.model, device.serial].filter(Boolean).join(" · "))), quality),
-    trouble, view.root,
-    h("div.fields", { style: { marginTop: "0.5rem" } },
-      field("Exposure", exposure, "ms", range(device.exposure_range_ms, "ms")), field("Gain", gain, "dB", range(device.gain_range_db, "dB")),
-      h("div.field", h("span.quiet", "\u00a0"), set)),
-    taken,
-    h("div.grid.two", h("div", figures), h("div", histogramBox, focusBox)));
+    trouble,
+    h("div.shot", view.root, h("div", figures,
+      h("div.fields", { style: { marginTop: "0.5rem" } },
+        field("Exposure", exposure, "ms", range(device.exposure_range_ms, "ms")), field("Gain", gain, "dB", range(device.gain_range_db, "dB"))),
+      h("div.row", set, search), taken)),
+    h("h3", "Grey levels"), histogramBox, h("h3", "Focus"), focus.root);
   return { cam, root: box, update };
 }
 
@@ -236,10 +263,20 @@ function camera(cam, first, ends) {
 const limits = (/** @type {Span} */ pair) => (pair ? { min: pair[0], max: pair[1] } : {});
 const range = (/** @type {Span} */ pair, /** @type {string} */ name) => (pair ? `${num(pair[0], 3)} to ${num(pair[1], 4)} ${name}` : "");
 
+/**
+ * Rule of a number within a range of the device.
+ * @param {HTMLInputElement} input
+ * @param {Span} pair
+ * @param {string} unit
+ * @returns {[HTMLInputElement, import("../lib/fields.js").Rule]}
+ */
+const withinOf = (input, pair, unit) => [input, rule(input, numberWithin({ low: pair?.[0], high: pair?.[1], unit, required: false }))];
+
 /** @param {Ends} ends */
 function stage(ends) {
   const rows = h("div");
   const step = number(1, { min: 0.001, "aria-label": "Step of the jog buttons" });
+  const stepRight = rule(step, numberWithin({ above: 0, unit: "mm", what: "A step" }));
   /** @type {Axes} */
   let axes = [];
 
@@ -254,9 +291,10 @@ function stage(ends) {
   function draw() {
     replace(rows, axes.map((axis) => {
       const target = number(null, { min: axis.limits?.low_mm, max: axis.limits?.high_mm, placeholder: num(axis.position_mm, 5) });
-      const go = action("Go", () => run(api.post("/stage/moves", { positions_mm: { [axis.axis]: Number(target.value) } })));
+      const within = rule(target, numberWithin({ low: axis.limits?.low_mm, high: axis.limits?.high_mm, unit: "mm", what: "A position" }));
+      const go = action("Go", async () => { if (allRight([[target, within]])) await run(api.post("/stage/moves", { positions_mm: { [axis.axis]: Number(target.value) } })); });
       target.addEventListener("keydown", (event) => event.key === "Enter" && go.click());
-      const jog = (/** @type {1 | -1} */ sign) => action(sign < 0 ? "◂ −" : "+ ▸", () => run(api.post("/stage/moves", { by_mm: { [axis.axis]: sign * Number(step.value) } })), { "aria-label": `Jog axis ${axis.axis} ${sign < 0 ? "backward" : "forward"}` });
+      const jog = (/** @type {1 | -1} */ sign) => action(sign < 0 ? "◂ −" : "+ ▸", async () => { if (allRight([[step, stepRight]])) await run(api.post("/stage/moves", { by_mm: { [axis.axis]: sign * Number(step.value) } })); }, { "aria-label": `Jog axis ${axis.axis} ${sign < 0 ? "backward" : "forward"}` });
       return h("fieldset", { "data-axis": axis.axis },
         h("legend", `Axis ${axis.axis}${axis.cameras?.length ? ` · ${axis.cameras.join(", ")}` : ""}`),
         h("div.row", h("strong", { "data-role": "position" }, quantity(axis.position_mm, "mm", 6)), h("span", { "data-role": "state" }, stateBadge(axis)),
@@ -301,7 +339,8 @@ function stage(ends) {
 function scene(rig) {
   const which = select(["grid", "steel", "plate", "panel", "block", "strip", "sphere", "line_grid", "checkerboard", "charuco", "circles", "circles_asymmetric"].map((s) => [s, s]), rig.scene?.scene);
   const load = number(rig.scene?.load ?? 0);
+  const loadRight = rule(load, numberWithin({ what: "A load" }));
   return h("details", h("summary", "Simulated scene"),
     field("Scene", which), field("Load", load, "", "kPa for plate, kN for panel, per cent for strip, share of the motion for block"),
-    action("Show the scene", () => api.put("/sim/scene", { scene: /** @type {Model<"SceneRequest">["scene"]} */ (which.value), load: Number(load.value) })));
+    action("Show the scene", async () => allRight([[load, loadRight]]) && api.put("/sim/scene", { scene: /** @type {Model<"SceneRequest">["scene"]} */ (which.value), load: Number(load.value) })));
 }

@@ -5,6 +5,7 @@ import { stepsPanel } from "./test/steps.js";
 import { metadataPanel } from "./test/metadata.js";
 import { measurePanel } from "./test/measure.js";
 import { warningsCell } from "./results/warnings.js";
+import { allRight, rule } from "../lib/fields.js";
 import { h, replace, field, select, action, table, when, notify, problemText } from "../lib/dom.js";
 
 /** @import { Here } from "../main.js" */
@@ -40,11 +41,10 @@ async function all(root) {
   const specimen = h("input", { type: "text", maxlength: 300 });
   const notes = h("textarea", { rows: 2, maxlength: 20000 });
   const calibration = await calibrationChoice();
+  const named = rule(name, (text) => (text ? "" : "The test has no name. Give it one; it can be changed later."));
+  const uncalibrated = calibration.value ? null : h("div.caution", { role: "status" }, h("p", "No calibration can be used yet: images can be taken, and measured once there is one."), h("a.button", { href: "#/calibrate" }, "Calibrate first"));
   const make = action("Make the test", async () => {
-    if (!name.value.trim()) {
-      name.focus();
-      throw api.problemOf({ cause: "The test has no name.", remedy: "Give it one; it can be changed later." });
-    }
+    if (!allRight([[name, named]])) return;
     const made = await api.post("/tests", { name: name.value.trim(), specimen: specimen.value, notes: notes.value, calibration_id: calibration.value || null });
     location.hash = `#/test/${made.id}`;
   }, { kind: "primary" });
@@ -59,7 +59,7 @@ async function all(root) {
   }
   await refresh();
   replace(root, h("h1", "Tests"), h("div.grid.side", h("section.panel", list),
-    h("section.panel", { "aria-label": "New test" }, h("h2", "New test"), field("Name", name), field("Specimen", specimen), field("Calibration", calibration, "", "The test keeps its own copy."), field("Notes", notes), make)));
+    h("section.panel", { "aria-label": "New test" }, h("h2", "New test"), field("Name", name), field("Specimen", specimen), field("Calibration", calibration, "", "The test keeps its own copy."), field("Notes", notes), uncalibrated, make)));
   return events.on("test", () => refresh().catch(notify));
 }
 
@@ -121,7 +121,7 @@ async function one(root, id) {
     ], (test.analyses ?? []).toReversed(), { caption: "Newest first", empty: "None yet." }));
   }
   const title = h("h1", test.name);
-  const steps = stepsPanel(id, test, ends, async () => { test = await api.get(`/tests/${id}`); return test; });
+  const steps = await stepsPanel(id, test, ends, async () => { test = await api.get(`/tests/${id}`); return test; });
   const measure = await measurePanel(id, test, ends, async () => { test = await api.get(`/tests/${id}`); drawAnalyses(); });
   steps.onchange((/** @type {typeof test} */ fresh) => { test = fresh; measure.steps(fresh); });
   drawHead();

@@ -58,9 +58,10 @@ function axes() {
  * @param {string} [options.label] name of the plot for screen readers
  * @param {boolean} [options.files] whether it can be saved as CSV, PNG and SVG
  * @param {string} [options.said] what its band is; goes into the files
+ * @param {() => [number, number]} [options.range] of the ordinate, asked at each drawing; that of the data if left out
  * @param {number[][]} [options.bands] pairs of series (counted from 1) between which the ground is shaded
  */
-export async function chart(box, { x, y, series, height = 200, data, bars = false, bands = [], label, files = true, said = "" }) {
+export async function chart(box, { x, y, series, height = 200, data, bars = false, bands = [], label, files = true, said = "", range }) {
   const Plot = await uplot();
   const isBar = (/** @type {number} */ index) => (Array.isArray(bars) ? bars[index] : bars);
   /** @returns {uPlot.Options} */
@@ -69,7 +70,7 @@ export async function chart(box, { x, y, series, height = 200, data, bars = fals
     return {
       width: Math.max(box.clientWidth, 200),
       height,
-      scales: { x: { time: false } },
+      scales: { x: { time: false }, ...(range ? { y: { range: () => range() } } : {}) },
       axes: [{ ...axis(x), size: 34 }, { ...axis(y), size: wide }],
       legend: { show: files || series.filter((one) => !one.edge).length > 1, live: true },
       cursor: { y: false },

@@ -7,14 +7,23 @@ from typing import Annotated
 import numpy as np
 from fastapi import APIRouter, File, Form, Query, UploadFile
 
+from core.cameras.lens import OpenCVLens, SeidelLens
 from core.errors import InputError
-from server.api.models.calibration_checks import AspectReply, ComparisonReply, DistanceReply, DistanceRequest
+from core.names import CAMERAS, CameraName
+from server.api.models.calibration_checks import (
+    AspectReply,
+    ComparisonReply,
+    DistanceReply,
+    DistanceRequest,
+    GeometryReply,
+)
 from server.api.protocol.dependencies import CalibrationId, ServiceDep
 from server.api.protocol.problems import errors
 from server.api.routes.calibrations.calibrations import complete
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from server.formats.calibrations.target_toml import target_of
 from server.formats.images import decode_image, read_image
+from server.report.geometry import geometry_at
 from server.results.calibration_checks import (
     KNOWN_DISTANCE,
     NamedImage,
@@ -32,6 +41,38 @@ router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 
 def _loaded(service: Service, calibration_id: str) -> LoadedCalibration:
     return load_calibration(complete(service, calibration_id) / "calibration.json")
+
+
+@router.get(
+    "/{calibration_id}/geometry",
+    summary="Stereo angle, baseline, focal length, field of view",
+    responses=errors(404, 409, 422),
+)
+def get_geometry(service: ServiceDep, calibration_id: CalibrationId) -> GeometryReply:
+    """Return the geometry of the calibrated cameras, before the plane of the target."""
+    loaded = _loaded(service, calibration_id)
+    pair, sizes = loaded.pair, (loaded.image_size1_px, loaded.image_size2_px)
+    found = geometry_at(pair, np.zeros(3), np.array([0.0, 0.0, 1.0]), sizes)
+    pitch_um = {cam: service.config.camera(cam).pixel_um for cam in CAMERAS}
+
+    def seen(cam: CameraName) -> dict[str, object]:
+        assert found is not None
+        view, um, lens = found.views[cam], pitch_um[cam], (pair.cam1 if cam == "cam1" else pair.cam2).lens
+        phd_px = lens.phd_px if isinstance(lens, SeidelLens) else lens.fx_px if isinstance(lens, OpenCVLens) else None
+        return {
+            "focal_length_mm": None if um is None or phd_px is None else 1e-3 * um * phd_px,
+            "standoff_mm": view.standoff_mm,
+            "field_of_view_mm": view.field_of_view_mm,
+            "scale_mm_per_px": view.scale_mm_per_px,
+        }
+
+    return GeometryReply.model_validate(
+        {
+            "stereo_angle_deg": float(np.degrees(pair.stereo_angle_rad)),
+            "baseline_mm": pair.baseline_mm,
+            "cameras": None if found is None else {cam: seen(cam) for cam in CAMERAS},
+        }
+    )
 
 
 @router.post(

@@ -24,6 +24,8 @@ from server.api.models import (
     CameraSet,
     CamerasReply,
     CameraStats,
+    ExposureFound,
+    ExposureRequest,
     RigReply,
     SceneReply,
     SceneRequest,
@@ -38,6 +40,7 @@ from server.formats.images import encode_tiff
 from server.jobs.job import Job, Phase
 from server.results.images.quality import image_quality
 from server.workflows.calibration.guided import GUIDED_PURPOSE
+from server.workflows.exposure import set_exposure
 from server.workflows.service import Service
 
 router = APIRouter(tags=["rig"])
@@ -116,6 +119,25 @@ def patch_camera(
         taken = service.rig.configure(cam, CameraSettings(**body.model_dump()))
         response.headers["ETag"] = etag_of(service.rig.describe_camera(cam))
     return CameraSet.model_validate({"name": cam, "settings": asdict(taken)})
+
+
+@router.post(
+    "/cameras/{cam}:expose", summary="Search for a camera's exposure, and set it", responses=errors(409, 422, 503)
+)
+def expose(service: ServiceDep, cam: Camera, body: ExposureRequest | None = None) -> ExposureFound:
+    """Bring the picture's brightest parts to a level, without saturation; the old exposure stays where none does."""
+    wanted = body or ExposureRequest()
+    with service.hardware.hold(f"the search for {cam}'s exposure"):
+        taken, found = set_exposure(service, cam, wanted.level, wanted.shortest_ms, wanted.longest_ms)
+    return ExposureFound.model_validate(
+        {
+            "name": cam,
+            "settings": asdict(taken),
+            "level": found.brightness.level,
+            "saturated_share": found.brightness.saturated_share,
+            "pictures": found.pictures,
+        }
+    )
 
 
 @router.get(

@@ -1,5 +1,8 @@
 // A test's steps: capture with load and channels, quality of the pair, thumbnails, import of existing pairs.
 import * as api from "../../lib/api.js";
+import { livePanel } from "./live.js";
+import { allRight, numberWithin, rule } from "../../lib/fields.js";
+import { backToZero } from "../../widgets/way_back.js";
 import { h, replace, field, number, action, table, badge, num, quantity, when, notify, problemText, ask } from "../../lib/dom.js";
 
 /** @import { Ends } from "#dom" */
@@ -18,7 +21,7 @@ const WORDS = { ok: "good", dark: "too dark", blurred: "blurred", low_texture: "
  * @param {Ends} ends
  * @param {() => Promise<Test>} reread
  */
-export function stepsPanel(id, test, ends, reread) {
+export async function stepsPanel(id, test, ends, reread) {
   const thumbs = h("div.thumbs", { "data-role": "thumbnails", style: { maxHeight: "22rem", overflow: "auto" }, tabindex: 0, role: "region", "aria-label": "Thumbnails" });
   const detail = h("div", { role: "status", "data-role": "quality" });
   /** @type {number | null} */
@@ -35,7 +38,7 @@ export function stepsPanel(id, test, ends, reread) {
   function draw() {
     const steps = test.steps ?? [];
     if (!steps.length) {
-      replace(thumbs, h("p.quiet", "No steps yet. The first one is the reference."));
+      replace(thumbs, h("p.quiet", "No steps yet. The first one is the reference: capture it with the specimen unloaded, or import pairs."));
       return;
     }
     replace(thumbs, steps.map((step) => h("figure", { "data-step": step.n },
@@ -71,13 +74,26 @@ export function stepsPanel(id, test, ends, reread) {
             await refresh();
           }
         }))),
-      (step.warnings ?? []).map((warning) => h("div.caution.bad", { role: "alert", "data-role": "step-warning" }, h("p", warning))),
+      (step.warnings ?? []).map((warning) => h("div.caution.bad", { role: "alert", "data-role": "step-warning" }, h("p", warning.replace(/ POST .*$/, "")), step.quality?.code === "cameras_off_zero" ? backToZero(() => live.look()) : null)),
+      fieldOf(step),
       h("p.quiet", [when(step.captured_utc), step.load_n !== null && step.load_n !== undefined ? `load ${quantity(step.load_n, "N", 6)}` : null, channels || null, step.skew_ms !== null && step.skew_ms !== undefined ? `skew ${quantity(step.skew_ms, "ms", 3)}${quality.max_skew_ms ? ` of ${quantity(quality.max_skew_ms, "ms", 3)} allowed` : ""}` : null, (step.frames ?? 1) > 1 ? `${step.frames} frames averaged` : null].filter(Boolean).join(" · ")),
       table([["Figure", (row) => row[0], { unseen: true }], ["cam1", (row) => (quality.cam1 ? row[1](quality.cam1) : "–"), { numeric: true }], ["cam2", (row) => (quality.cam2 ? row[1](quality.cam2) : "–"), { numeric: true }]], rows, { caption: "Quality of the pair" }));
   }
 
+  /**
+   * The step's field, or what has to be done to have it.
+   * @param {Step} step
+   */
+  function fieldOf(step) {
+    if (!test.calibration_id) return null;
+    const newest = (test.analyses ?? []).at(-1);
+    if (newest) return h("p", h("a.button", { href: `#/results/${id}/${newest.id}?step=${step.n}` }, "Show its field"));
+    return (test.steps ?? []).length ? h("p", h("a.button", { href: `#/test/${id}?at=region` }, "Draw the region and measure")) : null;
+  }
+
+  const live = await livePanel(ends); // before anything is shown: it would push the region away from under a drawing hand
   const root = h("section.panel", { "aria-label": "Steps" }, h("h2", "Steps"),
-    h("div.grid.side", h("div", thumbs, detail, importPairs(id, refresh, ends)), capture(id, async (step) => { chosen = step.n; drawDetail(step); await refresh(); }, ends, refresh)));
+    h("div.grid.side", h("div", live.root, thumbs, detail, importPairs(id, refresh, ends)), capture(id, async (step) => { chosen = step.n; drawDetail(step); await refresh(); }, ends, refresh)));
   draw();
   return { root, refresh, onchange: (/** @type {typeof changed} */ listener) => { changed = listener; } };
 }
@@ -99,7 +115,12 @@ function capture(id, done, ends, refresh) {
   const stopped = new AbortController();
   ends.push(() => stopped.abort());
 
+  const rules = /** @type {[HTMLInputElement, import("../../lib/fields.js").Rule][]} */ ([
+    [load, rule(load, numberWithin({ required: false, what: "A load" }))], [frames, rule(frames, numberWithin({ low: 1, high: 256, whole: true, what: "A number of frames" }))],
+    [channels, rule(channels, channelsWrong)], [count, rule(count, numberWithin({ low: 1, high: 10000, whole: true, what: "A number of steps" }))], [interval, rule(interval, numberWithin({ low: 0, unit: "ms", what: "An interval" }))],
+  ]);
   const take = action("Capture", async () => {
+    if (!allRight(rules)) return undefined;
     /** @type {Model<"StepRequest">} */
     const body = { label: label.value, channels: parseChannels(channels.value), frames: Number(frames.value) };
     if (load.value !== "") body.load_n = Number(load.value);
@@ -116,6 +137,19 @@ function capture(id, done, ends, refresh) {
   return h("div", { role: "group", "aria-label": "Capture" }, h("h3", "Capture a step"),
     h("div.fields", field("Label", label), field("Load", load, "N"), field("Frames averaged", frames)), field("Channels", channels, "", "name = number, between commas"),
     h("details", h("summary", "A burst"), h("div.fields", field("Steps", count), field("Interval", interval, "ms"))), h("div.row", take), progress);
+}
+
+/**
+ * What is wrong with a text of channels; empty: nothing.
+ * @param {string} text
+ */
+function channelsWrong(text) {
+  try {
+    parseChannels(text);
+    return "";
+  } catch (error) {
+    return error instanceof api.Problem ? `${error.message} ${error.remedy}` : String(error);
+  }
 }
 
 /**

@@ -1,0 +1,26 @@
+"""Check of the accepted calibration by the live pair."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request
+from fastapi.concurrency import run_in_threadpool
+
+from server.api.models import LiveCheckReply
+from server.api.protocol.problems import errors
+from server.workflows.live_check import LiveChecks
+
+router = APIRouter(tags=["rig"])
+
+
+@router.get(
+    "/rig/calibration-check",
+    summary="How far the cameras have moved since the calibration, by the live pair",
+    responses=errors(409, 422, 503),
+)
+async def check_calibration(request: Request) -> LiveCheckReply:
+    """Match the live pair, and hold its points against the newest accepted calibration's epipolar lines.
+
+    It takes a second or more, and is not made while a job runs or a stage stands off the calibrated place.
+    """
+    checks: LiveChecks = request.app.state.live_checks
+    return LiveCheckReply.model_validate(await run_in_threadpool(checks))

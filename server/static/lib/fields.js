@@ -1,0 +1,104 @@
+// Errors of fields, each beside its own control, in the user's words, before anything is sent.
+import { h } from "./dom.js";
+
+/** @typedef {HTMLInputElement | HTMLSelectElement | HTMLTextAreaElement} Entry */
+/** @typedef {() => boolean} Rule says what is wrong with a field beside it; true if nothing is */
+
+let told = 0;
+let pressed = false;
+window.addEventListener("pointerdown", () => { pressed = true; }, true);
+for (const end of ["pointerup", "pointercancel"]) window.addEventListener(end, () => { pressed = false; }, true);
+
+/**
+ * Put an error beside a control; an empty text takes it away.
+ * @param {Entry} control
+ * @param {string} text
+ */
+export function tell(control, text) {
+  const place = control.closest(".field") ?? control.closest(".row") ?? control.parentElement;
+  const described = (control.getAttribute("aria-describedby") ?? "").split(" ").filter(Boolean);
+  const known = described.map((id) => document.getElementById(id) ?? place?.querySelector(`#${CSS.escape(id)}`)).find((node) => node?.classList.contains("error"));
+  if (!text) {
+    if (!known) return;
+    known.remove();
+    control.removeAttribute("aria-invalid");
+    control.setAttribute("aria-describedby", described.filter((id) => id !== known.id).join(" "));
+    return;
+  }
+  control.setAttribute("aria-invalid", "true");
+  if (known) {
+    if (known.textContent !== text) known.textContent = text;
+    return;
+  }
+  told += 1;
+  const box = h("small.error", { id: `error${told}`, role: "alert" }, text);
+  place?.append(box);
+  control.setAttribute("aria-describedby", [...described, box.id].join(" "));
+}
+
+/**
+ * A rule of a field: said when the field is left or sent, taken back as soon as it is put right.
+ * @param {Entry} control
+ * @param {(text: string) => string} wrong what is wrong with its text; empty: nothing
+ * @returns {Rule}
+ */
+export function rule(control, wrong) {
+  const check = () => {
+    const text = control instanceof HTMLInputElement && control.validity.badInput ? "This is no number. Write it with a point, such as 12.5." : wrong(control.value.trim());
+    tell(control, text);
+    return !text;
+  };
+  // a press that leaves the field is a click on something: an error that came meanwhile would push that away from under it
+  control.addEventListener("change", () => (pressed ? window.addEventListener("pointerup", () => setTimeout(check), { once: true }) : check()));
+  control.addEventListener("input", () => control.getAttribute("aria-invalid") === "true" && check());
+  return check;
+}
+
+/**
+ * Check every field; the first that is wrong has the focus.
+ * @param {readonly [Entry, Rule][]} rules
+ */
+export function allRight(rules) {
+  const wrong = rules.filter(([, check]) => !check());
+  wrong[0]?.[0].focus();
+  return !wrong.length;
+}
+
+/**
+ * What is wrong with a number's text, of these limits; empty: nothing.
+ * @param {{ low?: number | null, high?: number | null, unit?: string, whole?: boolean, required?: boolean, above?: number, what?: string }} limits
+ * @returns {(text: string) => string}
+ */
+export function numberWithin({ low = null, high = null, unit = "", whole = false, required = true, above, what = "A number" }) {
+  const shown = (/** @type {number} */ value) => `${String(value).replace("-", "−")}${unit ? `\u00a0${unit}` : ""}`;
+  return (text) => {
+    if (!text) return required ? `${what} is needed here.` : "";
+    const value = Number(text);
+    if (!Number.isFinite(value)) return "This is no number. Write it with a point, such as 12.5.";
+    if (whole && !Number.isInteger(value)) return `Give a whole number, not ${text}.`;
+    if (above !== undefined && value <= above) return `Give more than ${shown(above)}, not ${shown(value)}.`;
+    if ((low !== null && value < low) || (high !== null && value > high)) {
+      if (low === null) return `Give ${shown(/** @type {number} */ (high))} at most, not ${shown(value)}.`;
+      if (high === null) return `Give ${shown(low)} at least, not ${shown(value)}.`;
+      return `Give ${low} to ${shown(high)}, not ${shown(value)}.`;
+    }
+    return "";
+  };
+}
+
+/**
+ * What is wrong with a list of numbers; empty: nothing.
+ * @param {{ low?: number, high?: number, least?: number, unit: string }} limits
+ * @returns {(text: string) => string}
+ */
+export function numbersWithin({ low = -Infinity, high = Infinity, least = 0, unit }) {
+  return (text) => {
+    const parts = text.split(/[\s;,]+/).filter(Boolean);
+    const wrong = parts.find((part) => !Number.isFinite(Number(part)));
+    if (wrong !== undefined) return `“${wrong}” is no number. Write ${unit} with a point, between commas: 0, 2.5, 5.`;
+    const beyond = parts.map(Number).find((value) => value < low || value > high);
+    if (beyond !== undefined) return `The stage goes from ${low} to ${high}\u00a0${unit}; ${beyond}\u00a0${unit} is beyond it.`;
+    const different = new Set(parts.map(Number)).size;
+    return different < least ? `Give ${least} different positions or more; ${different === 1 ? "there is one" : "there is none"}.` : "";
+  };
+}

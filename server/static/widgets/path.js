@@ -1,0 +1,128 @@
+// The way through the page: seven steps in its bar, each a link to its screen, with a tick once it is done.
+import * as api from "../lib/api.js";
+import * as events from "../lib/events.js";
+import { h } from "../lib/dom.js";
+
+/** @import { Here } from "../main.js" */
+/** @typedef {"rig" | "calibrate" | "test" | "capture" | "region" | "measure" | "results"} Name */
+/** @typedef {{ rig: boolean, calibrated: boolean, test: string | null, steps: number, region: boolean, measured: boolean, seen: boolean }} Done */
+
+const KEPT = "test.open";
+const SEEN = "results.seen";
+const PAUSE_MS = 400; // events come in bursts
+
+/** @type {readonly [Name, string, string][]} name, text, and what its tick says */
+const STEPS = [
+  ["rig", "Rig", "cameras and stage are ready"], ["calibrate", "Calibrate", "a calibration is accepted"], ["test", "Test", "a test is open"],
+  ["capture", "Capture", "the reference and a step are captured"], ["region", "Region", "a region is drawn"], ["measure", "Measure", "the test is measured"], ["results", "Results", "results were looked at"],
+];
+/** Where a part of the test's screen is. @type {Record<string, string>} */
+const PLACES = { capture: '[aria-label="Capture"]', region: '[aria-label="Region and analysis"]', measure: '[data-role="progress"]' };
+
+/** The test that was open last, in this browser. */
+export const lastTest = () => localStorage.getItem(KEPT);
+
+/**
+ * Remember the test that is open, and that its results were seen.
+ * @param {string} screen
+ * @param {string | undefined} id
+ */
+function remember(screen, id) {
+  if (!id || (screen !== "test" && screen !== "results")) return;
+  localStorage.setItem(KEPT, id);
+  if (screen === "results") localStorage.setItem(SEEN, id);
+}
+
+/** @returns {Promise<Done>} */
+async function look() {
+  const [rig, { calibrations }, { tests }] = await Promise.all([api.get("/rig"), api.get("/calibrations", { accepted: true }), api.get("/tests")]);
+  const id = lastTest();
+  const known = id && tests.some((one) => one.id === id) ? id : null;
+  if (id && !known) localStorage.removeItem(KEPT);
+  const test = known ? await api.get(`/tests/${known}`) : null;
+  const measured = Boolean(test?.analyses?.length);
+  return {
+    rig: rig.connected && !rig.fault && !Object.values(rig.cameras).some((one) => one.fault), calibrated: calibrations.length > 0, test: known,
+    steps: test ? test.steps?.length ?? 0 : 0, region: measured, measured, seen: measured && localStorage.getItem(SEEN) === known,
+  };
+}
+
+/** Bring a part of the test's screen into view once it is drawn. */
+export function goTo(at = "") {
+  const place = PLACES[at];
+  if (!place) return;
+  /** @param {number} left tries */
+  const go = (left) => {
+    const node = document.querySelector(`[data-screen="test"] ${place}`);
+    if (node) node.scrollIntoView({ block: at === "measure" ? "center" : "start" });
+    else if (left) setTimeout(() => go(left - 1), 100);
+  };
+  go(20);
+}
+
+/** @param {HTMLElement} others links that follow the steps */
+export function path(others) {
+  /** @type {Map<Name, HTMLAnchorElement>} */
+  const links = new Map(STEPS.map(([name, text], index) => [name, h("a", { href: `#/${name}`, "data-screen": name },
+    h("span.tick", { "aria-hidden": "true" }, String(index + 1)), h("span.word", text))]));
+  /** @type {Here | null} */
+  let here = null;
+  /** @type {Done | null} */
+  let done = null;
+
+  function draw() {
+    const current = here?.screen === "test" && here.path.length ? here.query.get("at") ?? "test" : here?.screen;
+    const test = done?.test ?? lastTest();
+    const ticks = { rig: done?.rig, calibrate: done?.calibrated, test: Boolean(done?.test), capture: (done?.steps ?? 0) > 1, region: done?.region, measure: done?.measured, results: done?.seen };
+    const within = test ? `#/test/${encodeURIComponent(test)}` : "#/test";
+    const to = { rig: "#/rig", calibrate: "#/calibrate", test: within, results: test && done?.measured ? `#/results/${encodeURIComponent(test)}` : "#/results" };
+    STEPS.forEach(([name, , why], index) => {
+      const link = /** @type {HTMLAnchorElement} */ (links.get(name));
+      link.href = name in to ? to[/** @type {keyof typeof to} */ (name)] : test ? `${within}?at=${name}` : "#/test";
+      link.classList.toggle("done", Boolean(ticks[name]));
+      link.title = `${ticks[name] ? "Done" : "Not yet"}: ${why}`;
+      /** @type {HTMLElement} */ (link.firstElementChild).textContent = ticks[name] ? "✓" : String(index + 1);
+      if (name === current) link.setAttribute("aria-current", "page");
+      else link.removeAttribute("aria-current");
+    });
+  }
+
+  /** @type {number | undefined} */
+  let later;
+  function refresh() {
+    clearTimeout(later);
+    later = setTimeout(async () => {
+      try {
+        done = await look();
+        draw();
+      } catch {
+        // the shell says that the service is silent; the ticks stay
+      }
+    }, PAUSE_MS);
+  }
+  for (const name of /** @type {const} */ (["calibration", "test", "step", "camera"])) events.on(name, refresh);
+  events.on("job", (job) => !["queued", "running", "cancelling"].includes(job.state) && refresh());
+
+  const root = h("nav", { "aria-label": "Screens" }, h("ol.path", [...links.values()].map((link) => h("li", link))), others);
+  // a part of the screen that is open is only brought into view: nothing drawn on it is lost
+  root.addEventListener("click", (event) => {
+    const link = /** @type {Element} */ (event.target).closest("a");
+    if (!link || here?.screen !== "test") return;
+    const [address, query] = link.hash.split("?");
+    if (!here.path.length || address !== location.hash.split("?")[0]) return;
+    event.preventDefault();
+    history.replaceState(null, "", link.hash);
+    here = { ...here, query: new URLSearchParams(query ?? "") };
+    draw();
+    if (query) goTo(here.query.get("at") ?? "");
+    else window.scrollTo({ top: 0 });
+  });
+  /** @param {Here} now */
+  const moved = (now) => {
+    here = now;
+    remember(now.screen, now.path[0]);
+    draw();
+    refresh();
+  };
+  return { root, moved };
+}

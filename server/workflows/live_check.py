@@ -1,0 +1,78 @@
+"""Check of the accepted calibration by the live pair, for an operator at the rig; nothing is kept."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from core.errors import MeasurementError, StateError
+from server.rig.cameras import CapturedPair
+from server.rig.shared import SharedReading
+from server.store.folder import now_utc
+from server.worker.tasks import LiveCheckTask, check_live
+from server.workflows.calibration.review import newest_accepted
+from server.workflows.calibration.sequence import way_back
+from server.workflows.service import Service
+
+_PAIR_S = 5.0
+_PATIENCE_S = 30.0
+
+
+class LiveChecks:
+    """The live checks of one service; who asks while one is made shares the next."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+        self._shared = SharedReading(self._check)
+
+    def __call__(self) -> dict[str, Any]:
+        """Return the check of the newest accepted calibration by a live pair.
+
+        Its ``level`` is ``off_zero`` where a stage stands elsewhere, ``busy`` while jobs compute: then nothing was
+        checked.
+
+        Raises
+        ------
+        StateError
+            ``no_calibration_accepted``, ``camera_busy``.
+        CameraError
+            What the cameras bring up.
+        """
+        return self._shared()
+
+    def _check(self) -> dict[str, Any]:
+        service = self._service
+        calibration_id = newest_accepted(service)
+        unchecked = {"calibration_id": calibration_id, "offset_px": None, "own_px": None, "points": 0}
+        if service.config.calibration.moves != "target" and (back := way_back(service)) is not None:
+            text = str(back["text"]).split(":")[0] + ": the calibration holds at dZ = 0"
+            return {**unchecked, "level": "off_zero", "text": text, "checked_utc": now_utc()}
+        if service.jobs.active_count() or not service.worker.ready.is_set():
+            text = "a job is running, or the computation starts; the check goes on after it"
+            return {**unchecked, "level": "busy", "text": text, "checked_utc": now_utc()}
+        pixels = self._pair().pixels
+        file = service.calibrations.path(calibration_id) / "calibration.json"
+        task = LiveCheckTask(file, (pixels["cam1"], pixels["cam2"]))
+        try:
+            running = service.worker.submit(check_live, task)
+            seen = running.result(timeout=_PATIENCE_S)
+        except TimeoutError:
+            running.request_stop()
+            seen = {"level": "busy", "text": "the computation took too long"}
+        except MeasurementError as error:
+            seen = {"level": "no_texture", "text": error.cause}
+        return {**unchecked, **seen, "checked_utc": now_utc()}
+
+    def _pair(self) -> CapturedPair:
+        """Take a pair as a live view does: without the hold, and given up where none comes."""
+        given_up = time.monotonic() + _PAIR_S
+
+        def check() -> None:
+            if time.monotonic() > given_up:
+                raise StateError(
+                    "No pair of live frames has come.",
+                    code="camera_busy",
+                    remedy="Check that the trigger reaches both cameras, or ask again once they are free.",
+                )
+
+        return self._service.rig.pair.capture(1, check)
