@@ -2,7 +2,7 @@
 
 Beside a hole or behind an outline before a plain background a subset matches by the part that lies on the surface. Its
 centre, which the result is for, may lie where there is no surface: in a plain area, as wide as a subset's centre, that
-holds points without a match.
+holds points without a match. A coarse texture has such areas of its own, amid the field: what is wider tells.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ _NOISE = 4.0  # variances of the noise: what a plain centre shows at most
 _TEXTURE = 0.02  # of the subset's variance
 _WINDOW_PX = 5  # of the variance about a pixel
 _RIM_PX = _WINDOW_PX // 2 + 2  # by which the plain area seems smaller than it is
+_OWN, _OWN_POINTS = 1e-3, 4  # share and number of points amid the field, beyond which plain areas are the texture's own
 
 
 def centre_px(subset_px: int) -> int:
@@ -61,7 +62,16 @@ def reject_blank_centres(
     noise = np.nan_to_num(points.noise) ** 2 + 1.0 / 12.0  # rounding's, too
     plain = (centre_texture < _NOISE * noise) & (centre_texture < _TEXTURE * texture)
     level = float(np.median(noise[points.ok])) if points.ok.any() else 0.0
-    inside = _in_plain_areas(image, _NOISE * level, centre_px(subset_px), xy_px, points.ok)
+    amid = points.ok & ~beside
+    if _of_the_texture(plain, amid):
+        plain[:] = False
+    inside = np.zeros_like(plain)
+    for width in range(centre_px(subset_px), subset_px + 1, 2):
+        inside, holds_open = _in_plain_areas(image, _NOISE * level, width, xy_px, points.ok)
+        if not _of_the_texture(inside, amid):
+            inside &= holds_open
+            break
+        inside[:] = False
     bad: Bool = points.ok & beside & (plain | inside)
     points.reject(bad, PointStatus.LOW_TEXTURE)
     return int(bad.sum())
@@ -73,8 +83,12 @@ def _beside_gaps(ok: Bool, shape: tuple[int, int], reach: float) -> Bool:
     return np.asarray(cv2.dilate(gaps, np.ones((side, side), np.uint8)).ravel() > 0)
 
 
-def _in_plain_areas(image: Float32, variance: float, width_px: int, xy_px: Float, ok: Bool) -> Bool:
-    """Return (n,) True in areas of at least ``width_px`` without texture that hold points without a match."""
+def _of_the_texture(plain: Bool, amid: Bool) -> bool:
+    return int((plain & amid).sum()) > max(_OWN * int(amid.sum()), _OWN_POINTS)
+
+
+def _in_plain_areas(image: Float32, variance: float, width_px: int, xy_px: Float, ok: Bool) -> tuple[Bool, Bool]:
+    """Return (n,) True in areas of at least ``width_px`` without texture, and (n,) where these hold open points."""
     window = (_WINDOW_PX, _WINDOW_PX)
     about = image - np.float32(image.mean())
     scatter = cv2.blur(about * about, window) - cv2.blur(about, window) ** 2
@@ -86,4 +100,4 @@ def _in_plain_areas(image: Float32, variance: float, width_px: int, xy_px: Float
     rows, cols = image.shape
     x, y = (np.clip(np.rint(xy_px[:, k]), 0, last - 1).astype(int) for k, last in ((0, cols), (1, rows)))
     own = areas[y, x]
-    return np.asarray((own > 0) & np.isin(own, own[~ok]))
+    return np.asarray(own > 0), np.isin(own, own[~ok])

@@ -75,14 +75,13 @@ def reject_straddling(
     index = np.flatnonzero((edges | _suspects(fitter, points, shape, texture, spacing_px)) & points.ok)
     if len(index) == 0:
         return 0
-    least = np.where(edges, _EDGE_SIGMAS, _PART_SIGMAS)
     usual = _usual_factors(fitter, points, xy_px, max(noise_factor, 1.0))
     rejected = 0
     for start in range(0, len(index), _AT_ONCE):
         raise_if_cancelled(cancel)
         some = index[start : start + _AT_ONCE]
         bad = np.zeros(len(points.status), bool)
-        bad[some] = _pulled(fitter, points, some, xy_px, rays, least[some], usual)
+        bad[some] = _pulled(fitter, points, some, xy_px, rays, edges[some], usual)
         points.reject(bad, PointStatus.NEIGHBOUR_MISMATCH)
         rejected += int(bad.sum())
     return rejected
@@ -132,9 +131,10 @@ def _usual_factors(fitter: Fitter, points: PointFits, xy_px: Float, least: float
 
 
 def _pulled(
-    fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, rays: Float, least: Float, usual: Float
+    fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, rays: Float, edges: Bool, usual: Float
 ) -> Bool:
     """Return (m,) True where a part of the subset is off by too much; what others change goes into the covariance."""
+    least = np.where(edges, _EDGE_SIGMAS, _PART_SIGMAS)
     found, visible = subset_residuals(fitter, points, index, xy_px)
     degree = 2 if fitter.terms == 6 else 1
     pulls = [pull_of_parts(one, visible, degree) for one in found]
@@ -150,8 +150,13 @@ def _pulled(
         correlated = np.clip((sd / pull.sigma_px[:, direction]) ** 2, noise_factor, most)
         shift = _change(pull, direction, before)
         sure, far = pull.significance[:, direction] / least, np.abs(shift) > _FAR_SIGMAS * sd
-        shift = np.where((sure > np.sqrt(correlated)) | ((sure > np.sqrt(noise_factor)) & far), shift, 0.0)
-        bad |= np.abs(shift) > np.maximum(_OFF_SIGMAS * sd, _OFF_PX)
+        counts = (sure > np.sqrt(correlated)) | ((sure > np.sqrt(noise_factor)) & far)
+        bad |= counts & (np.abs(shift) > np.maximum(_OFF_SIGMAS * sd, _OFF_PX))
+        # beside an edge a pull is to be expected: where all residuals are correlated it is doubtful, which is said
+        doubtful = edges & (sure > 1.0) & ~counts
+        if unknown < points.covariance.shape[-1] - 1:  # the offset is no part of a position
+            bad |= doubtful & ~(np.hypot(sd, shift) < fitter.options.max_sigma_px)
+        shift = np.where(counts | doubtful, shift, 0.0)
         points.covariance[index, unknown, unknown] += (shift / unit[:, unknown]) ** 2
     points.epipolar_sigma_px[index] = np.sqrt(points.covariance[index, -1, -1])
     for pull in pulls[-2:]:
