@@ -152,9 +152,9 @@ def _pulled(
         sure, far = pull.significance[:, direction] / least, np.abs(shift) > _FAR_SIGMAS * sd
         counts = (sure > np.sqrt(correlated)) | ((sure > np.sqrt(noise_factor)) & far)
         bad |= counts & (np.abs(shift) > np.maximum(_OFF_SIGMAS * sd, _OFF_PX))
-        # beside an edge a pull is to be expected: where all residuals are correlated it is doubtful, which is said
-        doubtful = edges & (sure > 1.0) & ~counts
-        if unknown < points.covariance.shape[-1] - 1:  # the offset is no part of a position
+        # beside a shape's edge a pull is expected: where all residuals are correlated it is doubtful, and is said
+        doubtful = edges & (sure > 1.0) & ~counts & (len(pulls) == 1)
+        if unknown == 0:  # the offset is no part of a position
             bad |= doubtful & ~(np.hypot(sd, shift) < fitter.options.max_sigma_px)
         shift = np.where(counts | doubtful, shift, 0.0)
         points.covariance[index, unknown, unknown] += (shift / unit[:, unknown]) ** 2
