@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from core.arrays import Bool, Float, Float32
 from core.field.points.fitter import PointFits
@@ -20,7 +21,8 @@ _NOISE = 4.0  # variances of the noise: what a plain centre shows at most
 _TEXTURE = 0.02  # of the subset's variance
 _WINDOW_PX = 5  # of the variance about a pixel
 _RIM_PX = _WINDOW_PX // 2 + 2  # by which the plain area seems smaller than it is
-_OWN, _OWN_POINTS = 1e-3, 4  # share and number of points amid the field, beyond which plain areas are the texture's own
+_OWN = 0.25  # share of the places amid the field with plain areas, beyond which these are the texture's own
+_PLACE = 2.0  # subsets
 
 
 def centre_px(subset_px: int) -> int:
@@ -63,15 +65,12 @@ def reject_blank_centres(
     plain = (centre_texture < _NOISE * noise) & (centre_texture < _TEXTURE * texture)
     level = float(np.median(noise[points.ok])) if points.ok.any() else 0.0
     amid = points.ok & ~beside
-    if _of_the_texture(plain, amid):
-        plain[:] = False
-    inside = np.zeros_like(plain)
     for width in range(centre_px(subset_px), subset_px + 1, 2):
-        inside, holds_open = _in_plain_areas(image, _NOISE * level, width, xy_px, points.ok)
-        if not _of_the_texture(inside, amid):
-            inside &= holds_open
+        area = _plain_areas(image, _NOISE * level, width, xy_px)
+        inside = (area > 0) & np.isin(area, area[~points.ok])
+        if not _of_the_texture((area > 0)[amid], xy_px[amid] / (_PLACE * subset_px)):
             break
-        inside[:] = False
+        plain[:] = inside[:] = False
     bad: Bool = points.ok & beside & (plain | inside)
     points.reject(bad, PointStatus.LOW_TEXTURE)
     return int(bad.sum())
@@ -83,12 +82,14 @@ def _beside_gaps(ok: Bool, shape: tuple[int, int], reach: float) -> Bool:
     return np.asarray(cv2.dilate(gaps, np.ones((side, side), np.uint8)).ravel() > 0)
 
 
-def _of_the_texture(plain: Bool, amid: Bool) -> bool:
-    return int((plain & amid).sum()) > max(_OWN * int(amid.sum()), _OWN_POINTS)
+def _of_the_texture(plain: Bool, place: Float) -> bool:
+    """Return True if plain areas lie at so many of the places (n, 2), which count in ones, that they are no holes."""
+    with_plain, every = (len(np.unique(np.floor(p), axis=0)) for p in (place[plain], place))
+    return with_plain > _OWN * every
 
 
-def _in_plain_areas(image: Float32, variance: float, width_px: int, xy_px: Float, ok: Bool) -> tuple[Bool, Bool]:
-    """Return (n,) True in areas of at least ``width_px`` without texture, and (n,) where these hold open points."""
+def _plain_areas(image: Float32, variance: float, width_px: int, xy_px: Float) -> NDArray[np.int32]:
+    """Return (n,) the area of at least ``width_px`` without texture that each point lies in, 0: in none."""
     window = (_WINDOW_PX, _WINDOW_PX)
     about = image - np.float32(image.mean())
     scatter = cv2.blur(about * about, window) - cv2.blur(about, window) ** 2
@@ -99,5 +100,4 @@ def _in_plain_areas(image: Float32, variance: float, width_px: int, xy_px: Float
     areas = cv2.connectedComponents(cv2.dilate(wide, np.ones((rim, rim), np.uint8)))[1]
     rows, cols = image.shape
     x, y = (np.clip(np.rint(xy_px[:, k]), 0, last - 1).astype(int) for k, last in ((0, cols), (1, rows)))
-    own = areas[y, x]
-    return np.asarray(own > 0), np.isin(own, own[~ok])
+    return np.asarray(areas[y, x], dtype=np.int32)
