@@ -2,13 +2,14 @@
 
 Beside a hole or behind an outline before a plain background a subset matches by the part that lies on the surface. Its
 centre, which the result is for, may lie where there is no surface: in a plain area, as wide as a subset's centre, that
-holds points without a match.
+holds points without a match. A coarse texture has such areas of its own, amid the field: what is wider tells.
 """
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from core.arrays import Bool, Float, Float32
 from core.field.points.fitter import PointFits
@@ -20,6 +21,8 @@ _NOISE = 4.0  # variances of the noise: what a plain centre shows at most
 _TEXTURE = 0.02  # of the subset's variance
 _WINDOW_PX = 5  # of the variance about a pixel
 _RIM_PX = _WINDOW_PX // 2 + 2  # by which the plain area seems smaller than it is
+_OWN = 0.25  # share of the places amid the field with plain areas, beyond which these are the texture's own
+_PLACE = 2.0  # subsets
 
 
 def centre_px(subset_px: int) -> int:
@@ -61,7 +64,13 @@ def reject_blank_centres(
     noise = np.nan_to_num(points.noise) ** 2 + 1.0 / 12.0  # rounding's, too
     plain = (centre_texture < _NOISE * noise) & (centre_texture < _TEXTURE * texture)
     level = float(np.median(noise[points.ok])) if points.ok.any() else 0.0
-    inside = _in_plain_areas(image, _NOISE * level, centre_px(subset_px), xy_px, points.ok)
+    amid = points.ok & ~beside
+    for width in range(centre_px(subset_px), subset_px + 1, 2):
+        area = _plain_areas(image, _NOISE * level, width, xy_px)
+        inside = (area > 0) & np.isin(area, area[~points.ok])
+        if not _of_the_texture((area > 0)[amid], xy_px[amid] / (_PLACE * subset_px)):
+            break
+        plain[:] = inside[:] = False
     bad: Bool = points.ok & beside & (plain | inside)
     points.reject(bad, PointStatus.LOW_TEXTURE)
     return int(bad.sum())
@@ -73,8 +82,14 @@ def _beside_gaps(ok: Bool, shape: tuple[int, int], reach: float) -> Bool:
     return np.asarray(cv2.dilate(gaps, np.ones((side, side), np.uint8)).ravel() > 0)
 
 
-def _in_plain_areas(image: Float32, variance: float, width_px: int, xy_px: Float, ok: Bool) -> Bool:
-    """Return (n,) True in areas of at least ``width_px`` without texture that hold points without a match."""
+def _of_the_texture(plain: Bool, place: Float) -> bool:
+    """Return True if plain areas lie at so many of the places (n, 2), which count in ones, that they are no holes."""
+    with_plain, every = (len(np.unique(np.floor(p), axis=0)) for p in (place[plain], place))
+    return with_plain > _OWN * every
+
+
+def _plain_areas(image: Float32, variance: float, width_px: int, xy_px: Float) -> NDArray[np.int32]:
+    """Return (n,) the area of at least ``width_px`` without texture that each point lies in, 0: in none."""
     window = (_WINDOW_PX, _WINDOW_PX)
     about = image - np.float32(image.mean())
     scatter = cv2.blur(about * about, window) - cv2.blur(about, window) ** 2
@@ -85,5 +100,4 @@ def _in_plain_areas(image: Float32, variance: float, width_px: int, xy_px: Float
     areas = cv2.connectedComponents(cv2.dilate(wide, np.ones((rim, rim), np.uint8)))[1]
     rows, cols = image.shape
     x, y = (np.clip(np.rint(xy_px[:, k]), 0, last - 1).astype(int) for k, last in ((0, cols), (1, rows)))
-    own = areas[y, x]
-    return np.asarray((own > 0) & np.isin(own, own[~ok]))
+    return np.asarray(areas[y, x], dtype=np.int32)

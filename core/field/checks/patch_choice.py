@@ -15,6 +15,7 @@ import numpy as np
 
 from core.arrays import Float
 from core.field.checks.plane_error import PlaneError
+from core.field.checks.residual_test import AS_NOISE, residual_factors
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.patch import PatchChoice, UsedPatch, format_length
 from core.matching.geometry import covariance_xyz, covariance_xyzuvw, motion_geometry, shape_geometry
@@ -94,6 +95,7 @@ def choose_patch(fitter: Fitter, points: PointFits, xy_px: Float, estimate: Plan
         return _simple(plane, f"{plane}: quadratic patches do not converge on {share} of the points tried", len(index))
     kept = np.flatnonzero(good)
     a, b = flat.take(kept), curved.take(kept)
+    _count_residuals(curved_fitter, a, b, xy[kept])
     return decide(*_compared(fitter, xy[kept], a, b), plane=plane)
 
 
@@ -162,6 +164,17 @@ def _compared(fitter: Fitter, xy: Float, a: PointFits, b: PointFits) -> tuple[Fl
 
     (one, cov_one), (two, cov_two) = values_of(a), values_of(b)
     return two - one, np.trace(cov_one, axis1=1, axis2=2), np.trace(cov_two, axis1=1, axis2=2)
+
+
+def _count_residuals(curved_fitter: Fitter, a: PointFits, b: PointFits, xy_px: Float) -> None:
+    """Raise the variances of both patches to what the residuals of the curved one show, where these are not noise.
+
+    What blur or the view take from the texture is noise of both results, and no curvature.
+    """
+    factor = residual_factors(curved_fitter, b, xy_px)
+    root = np.sqrt(np.where(factor > AS_NOISE[1], factor, 1.0))
+    for points in (a, b):
+        points.covariance *= root[:, None] * root[None, :]
 
 
 def _simple(plane: UsedPatch, reason: str, sample: int) -> PatchChoice:

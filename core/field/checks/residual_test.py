@@ -27,7 +27,7 @@ from core.status import PointStatus
 _SAMPLE = 256
 _MIN_POINTS = 30  # of a sample that stands for a field
 _MEDIAN_OF_MEAN = 0.95  # of a variance estimated from some twenty independent blocks
-_AS_NOISE = (0.8, 1.25)  # ratio of a sample's variance to the reported one: within, nothing is corrected
+AS_NOISE = (0.8, 1.25)  # ratio of a sample's variance to the reported one: within, nothing is corrected
 _MAX_DISAGREEMENT = 2.2  # 90 % quantile over median of white noise's own estimates is 1.5 (33 px) to 1.8 (15 px)
 _UNUSUAL = 1.5  # residual energy over the field's median
 _MOSTLY_NOT_NOISE = 2.0  # ratio of a sample's variance to the reported one: more than half of it is not noise
@@ -111,7 +111,7 @@ def residual_test(
     correction = np.ones(q)
     if len(own) >= _MIN_POINTS:
         factor = np.median(own, axis=0) / _MEDIAN_OF_MEAN
-        correction = np.where((factor > _AS_NOISE[0]) & (factor < _AS_NOISE[1]), 1.0, factor)
+        correction = np.where((factor > AS_NOISE[0]) & (factor < AS_NOISE[1]), 1.0, factor)
         if fitter.ref1.blur is not None:  # its noise is correlated over more than a block
             correction = np.maximum(correction, 1.0)
         # variances below the reported ones in all points, as of a shape from less noisy images, are no disagreement
@@ -152,6 +152,22 @@ def residual_test(
         few = len(alone) == len(ok) and rejected > _NEARLY_ALL * len(alone)
         rejected += _reject_far(fitter, points, left, xy_px, 0.0 if few else max_sigma_px)
     return TestedResiduals(factor=factor, one_by_one=len(alone), rejected=rejected)
+
+
+def residual_factors(fitter: Fitter, points: PointFits, xy_px: Float) -> Float:
+    """Return (q,) the usual ratio of the variances that residuals show to the reported ones; NaN of too few points.
+
+    Parameters
+    ----------
+    fitter, points
+        The matcher, and a sample of (n,) valid points.
+    xy_px
+        (n, 2) px of camera 1.
+    """
+    own = _robust(fitter, points, np.arange(len(xy_px)), xy_px).ratio
+    if len(own) < _MIN_POINTS:
+        return np.full(points.covariance.shape[-1], np.nan)
+    return np.asarray(np.median(own, axis=0) / _MEDIAN_OF_MEAN)
 
 
 class _Robust(NamedTuple):
@@ -298,14 +314,15 @@ def _sigma_px(
 ) -> tuple[Float, Float]:
     """(m,) standard deviations, px: of the position in camera 1's current image, and of what determines the depth.
 
-    The latter, in camera 2: of a shape along and across the epipolar line, of a motion that of its part along the
-    depth. Residuals that camera 2 shows at both times do not count there: they are the shape's, which was tested.
+    The latter, in camera 2, along the epipolar line; of a motion that of its part along the depth. The offset across
+    the line is no part of a position, and how it scatters is tested against its neighbours. Residuals that camera 2
+    shows at both times do not count in a motion: they are the shape's, which was tested.
     """
     rays = fitter.pair.cam1.rays_cam(xy_px[index]).xyz_mm
     w, sd = points.w[index, 0], np.sqrt(_diagonal(points.covariance[index])) if sd is None else sd
     per_px = depth_per_px(fitter.pair, rays, w)
     if sd.shape[1] == 2:
-        return np.zeros(len(index)), np.maximum(sd[:, 0] / per_px, sd[:, -1])
+        return np.zeros(len(index)), sd[:, 0] / per_px
     z = points.G[index, 2, 0]  # of the current point, times w
     px = np.sqrt(np.abs(np.linalg.det(fitter.pair.cam1.lens.image_jacobian(rays[:, :2]))))
     return np.maximum(sd[:, 1], sd[:, 2]) * px / z, sd[:, 3] * w / z**2 / per_px

@@ -15,7 +15,7 @@ from core.arrays import Bool
 from core.field.growth.check import check, grow_field
 from core.field.growth.state import FieldInputs, GrowthState
 from core.field.points.fitter import PointFits
-from core.field.seeding.local_search import depth_range, search_shapes
+from core.field.seeding.local_search import deeper_range, depth_range, search_shapes
 from core.field.seeding.predicted import predicted_motion, seen_elsewhere
 from core.progress import raise_if_cancelled
 from core.status import PointStatus
@@ -115,8 +115,9 @@ def _search(inputs: FieldInputs, state: GrowthState, index: NDArray[np.intp]) ->
     low = max(min(_CHANCE_ZNCC, 1.0 - _FIELD_SHARE * float(np.median(left))), inputs.options.min_zncc)
     if state.fitter.comparisons == 3:
         return predicted_motion(state.fitter, points, inputs.xy_px, inputs.rays, index, inputs.known_w, min_zncc=low)
-    within = depth_range(inputs.pair, inputs.rays[valid], points.w[valid, 0])
-    return search_shapes(state.fitter, inputs.xy_px[index], within, min_zncc=low)
+    seen = inputs.rays[valid], points.w[valid, 0]
+    within, deeper = depth_range(inputs.pair, *seen), deeper_range(inputs.pair, *seen)
+    return search_shapes(state.fitter, inputs.xy_px[index], within, min_zncc=low, deeper=deeper)
 
 
 def _near(inputs: FieldInputs, label: NDArray[np.int32], matched: Bool) -> Bool:

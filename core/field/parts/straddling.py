@@ -16,18 +16,15 @@ from numpy.typing import NDArray
 from core.arrays import Bool, Float
 from core.field.checks.block_median import block_medians, reach_of
 from core.field.checks.lost_correlation import SIGMAS_OF_QUARTER, SIGMAS_OF_TENTH
+from core.field.parts.beside_edges import beside_edges
 from core.field.parts.subset_parts import Pull, pull_of_parts
 from core.field.parts.subset_residuals import subset_residuals
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.starts import depth_per_px
 from core.progress import CancelToken, raise_if_cancelled
-from core.robust import MAD_TO_SIGMA, spread_indices
+from core.robust import spread_indices
 from core.status import PointStatus
 
-_FLOOR_PX = 0.05
-_SIGMAS = 8.0
-_PAIRS = 1000  # for the scatter of the pairs of one offset
-_MIN_PAIRS = 12
 _FEW = 12
 _WIDER = 3
 _LOUDER = 4.5  # robust standard deviations of the residuals' energy about a point
@@ -74,18 +71,17 @@ def reject_straddling(
     cancel
         Stops the work.
     """
-    edges = _beside_edges(fitter, points, shape, rays, spacing_px)
+    edges = beside_edges(fitter, points, shape, rays, spacing_px)
     index = np.flatnonzero((edges | _suspects(fitter, points, shape, texture, spacing_px)) & points.ok)
     if len(index) == 0:
         return 0
-    least = np.where(edges, _EDGE_SIGMAS, _PART_SIGMAS)
     usual = _usual_factors(fitter, points, xy_px, max(noise_factor, 1.0))
     rejected = 0
     for start in range(0, len(index), _AT_ONCE):
         raise_if_cancelled(cancel)
         some = index[start : start + _AT_ONCE]
         bad = np.zeros(len(points.status), bool)
-        bad[some] = _pulled(fitter, points, some, xy_px, rays, least[some], usual)
+        bad[some] = _pulled(fitter, points, some, xy_px, rays, edges[some], usual)
         points.reject(bad, PointStatus.NEIGHBOUR_MISMATCH)
         rejected += int(bad.sum())
     return rejected
@@ -117,68 +113,6 @@ def _suspects(fitter: Fitter, points: PointFits, shape: tuple[int, int], texture
     return np.asarray(out)
 
 
-def _beside_edges(fitter: Fitter, points: PointFits, shape: tuple[int, int], rays: Float, spacing_px: float) -> Bool:
-    """Return (n,) True within a subset of where the shape or the motion between two points is not that of one surface.
-
-    On a surface that bends evenly what changes between two points changes by the mean of their slopes.
-    """
-    rows, cols = shape
-    flagged = np.zeros(shape, np.uint8)
-    valid = np.flatnonzero(points.ok)
-    if len(valid) < _MIN_PAIRS:
-        return flagged.ravel() > 0
-    ray = rays[:, :2].reshape(rows, cols, 2)
-    quantities = [_per_px(values, scale, valid, shape) for values, scale in _quantities(fitter, points, rays, valid)]
-    subset = fitter.options.subset_px
-    for reach in sorted({max(1, round(f * subset / spacing_px)) for f in (0.5, 1.0)}):
-        for dr, dc in ((0, reach), (reach, 0), (reach, reach), (reach, -reach))[: 4 if fitter.comparisons == 1 else 2]:
-            if dr >= rows or abs(dc) >= cols:
-                continue
-            here = (slice(0, rows - dr), slice(max(-dc, 0), cols - max(dc, 0)))
-            there = (slice(dr, rows), slice(max(dc, 0), cols + min(dc, 0)))
-            step = ray[there] - ray[here]
-            for level, slope, per_px in quantities:
-                mean = 0.5 * (slope[there] + slope[here])
-                off = (level[there] - level[here] - (mean * step).sum(axis=-1)) / per_px[here]
-                known = off.ravel()[spread_indices(off.size, _PAIRS)]
-                known = known[np.isfinite(known)]
-                if len(known) < _MIN_PAIRS:
-                    continue
-                middle = float(np.median(known))
-                sigma = MAD_TO_SIGMA * float(np.median(np.abs(known - middle)))
-                with np.errstate(invalid="ignore"):
-                    r, c = np.nonzero(np.abs(off - middle) > _FLOOR_PX + _SIGMAS * sigma)
-                flagged[r + (dr + 1) // 2, c + max(-dc, 0) + dc // 2] = 1
-    if not flagged.any():
-        return flagged.ravel() > 0
-    width = 2 * int(np.ceil(subset / spacing_px)) + 1
-    return np.asarray(cv2.dilate(flagged, np.ones((width, width), np.uint8))).ravel() > 0
-
-
-def _quantities(fitter: Fitter, points: PointFits, rays: Float, valid: NDArray[np.intp]) -> list[tuple[Float, Float]]:
-    """Value and slopes (m, 3) of what must be smooth, and what a pixel of camera 2's or 1's image is of it (m,)."""
-    w = points.w[valid]
-    per_px = depth_per_px(fitter.pair, rays[valid], w[:, 0])
-    if fitter.comparisons == 1:
-        return [(w[:, :3], per_px)]
-    G = points.G[valid]
-    depth = G[:, 2, 0]
-    one_px = 1.0 / np.sqrt(np.abs(np.linalg.det(fitter.pair.cam1.lens.image_jacobian(rays[valid, :2]))))
-    place = [(G[:, k, :3] - (G[:, k, :1] / depth[:, None]) * G[:, 2, :3]) / depth[:, None] for k in (0, 1)]
-    for k in (0, 1):
-        place[k][:, 0] = G[:, k, 0] / depth
-    now = w[:, :3] / depth[:, None] - (w[:, :1] / depth[:, None] ** 2) * G[:, 2, :3]
-    now[:, 0] = w[:, 0] / depth
-    return [(place[0], one_px), (place[1], one_px), (now, per_px / depth)]
-
-
-def _per_px(values: Float, scale: Float, valid: NDArray[np.intp], shape: tuple[int, int]) -> tuple[Float, Float, Float]:
-    out = np.full((shape[0] * shape[1], 4), np.nan)
-    out[valid, :3], out[valid, 3] = values, scale
-    grid = out.reshape(*shape, 4)
-    return grid[..., 0], grid[..., 1:3], grid[..., 3]
-
-
 def _usual_factors(fitter: Fitter, points: PointFits, xy_px: Float, least: float) -> Float:
     """(o, 2) variance of what parts change at usual points over that by white noise, by comparison and direction.
 
@@ -197,9 +131,10 @@ def _usual_factors(fitter: Fitter, points: PointFits, xy_px: Float, least: float
 
 
 def _pulled(
-    fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, rays: Float, least: Float, usual: Float
+    fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, rays: Float, edges: Bool, usual: Float
 ) -> Bool:
     """Return (m,) True where a part of the subset is off by too much; what others change goes into the covariance."""
+    least = np.where(edges, _EDGE_SIGMAS, _PART_SIGMAS)
     found, visible = subset_residuals(fitter, points, index, xy_px)
     degree = 2 if fitter.terms == 6 else 1
     pulls = [pull_of_parts(one, visible, degree) for one in found]
@@ -215,8 +150,13 @@ def _pulled(
         correlated = np.clip((sd / pull.sigma_px[:, direction]) ** 2, noise_factor, most)
         shift = _change(pull, direction, before)
         sure, far = pull.significance[:, direction] / least, np.abs(shift) > _FAR_SIGMAS * sd
-        shift = np.where((sure > np.sqrt(correlated)) | ((sure > np.sqrt(noise_factor)) & far), shift, 0.0)
-        bad |= np.abs(shift) > np.maximum(_OFF_SIGMAS * sd, _OFF_PX)
+        counts = (sure > np.sqrt(correlated)) | ((sure > np.sqrt(noise_factor)) & far)
+        bad |= counts & (np.abs(shift) > np.maximum(_OFF_SIGMAS * sd, _OFF_PX))
+        # beside a shape's edge a pull is expected: where all residuals are correlated it is doubtful, and is said
+        doubtful = edges & (sure > 1.0) & ~counts & (len(pulls) == 1)
+        if unknown == 0:  # the offset is no part of a position
+            bad |= doubtful & ~(np.hypot(sd, shift) < fitter.options.max_sigma_px)
+        shift = np.where(counts | doubtful, shift, 0.0)
         points.covariance[index, unknown, unknown] += (shift / unit[:, unknown]) ** 2
     points.epipolar_sigma_px[index] = np.sqrt(points.covariance[index, -1, -1])
     for pull in pulls[-2:]:

@@ -19,9 +19,11 @@ from core.field.seeding.epipolar_search import distinct, normalise, sample, tilt
 
 _BEYOND = 0.5  # of the range of depths, on either side
 _BEYOND_PX = 24.0
+_AS_DEEP_AS_WIDE = 0.5  # of the field's width to either side: where a part is looked for that nothing has shown yet
 _MAX_DEPTHS = 600
 _TILT_RAD = 1.05
 _TILT_STEP_RAD = (0.22, 0.52)
+_STEEPEST_RAD = 1.19  # of what both cameras of a pair with a usual angle still see
 _TILT_PX = 2.2  # of disparity at the subset's edge: half a step is refined
 _CANDIDATES = 4
 _SAMPLES = 11  # per side
@@ -46,6 +48,14 @@ def depth_range(pair: StereoPair, rays: Float, w0: Float) -> DepthRange:
     return DepthRange(max(low - more, 0.2 * low), high + more)
 
 
+def deeper_range(pair: StereoPair, rays: Float, w0: Float) -> DepthRange:
+    """Return the range of inverse depths of a specimen that is as deep as the field's points show it to be wide."""
+    low, high = float(w0.min()), float(w0.max())
+    half = min(_AS_DEEP_AS_WIDE * float(np.ptp(rays[:, :2], axis=0).max()), 0.5)
+    most = 0.5 * (_MAX_DEPTHS * _STEP_PX * float(np.median(depth_per_px(pair, rays, w0))) - (high - low))
+    return DepthRange(max(low / (1.0 + half), low - most), min(high / (1.0 - half), high + most))
+
+
 def tilts(between_rad: float, subset_px: int) -> Float:
     """Return (m, 3) unit normals, as :func:`core.field.seeding.epipolar_search.tilted` takes them.
 
@@ -63,6 +73,24 @@ def tilts(between_rad: float, subset_px: int) -> Float:
     return np.array(out)
 
 
+def steep_tilts(between_rad: float, subset_px: int) -> Float:
+    """Return (m, 3) unit normals of faces steeper than those of :func:`tilts`, up to 68 degrees.
+
+    Disparity changes over a subset as the tangent of the tilt, so that is what is stepped.
+    """
+    per_unit = max(subset_px // 2 * 2.0 * np.tan(0.5 * between_rad), 1e-3)
+    step = float(np.clip(_TILT_PX / per_unit, *_TILT_STEP_RAD))
+    tilt = np.arange(step, _TILT_RAD + 1e-9, step)[-1]
+    out: list[tuple[float, float, float]] = []
+    for slope in np.arange(np.tan(tilt) + step, np.tan(_STEEPEST_RAD) + 0.5 * step, step):
+        turn = 2.0 * np.pi * np.arange(np.ceil(2.0 * np.pi * slope / step)) / np.ceil(2.0 * np.pi * slope / step)
+        flat = 1.0 / np.hypot(1.0, slope)
+        out += list(
+            zip(flat * slope * np.sin(turn), flat * slope * np.cos(turn), np.full(len(turn), flat), strict=True)
+        )
+    return np.array(out)
+
+
 def pair_angle(pair: StereoPair, xy_px: Float, w0: float) -> float:
     """Return the median angle between both cameras' views of points (n, 2) at an inverse depth, rad."""
     point = pair.cam1.rays_cam(xy_px).xyz_mm / w0
@@ -71,7 +99,9 @@ def pair_angle(pair: StereoPair, xy_px: Float, w0: float) -> float:
     return float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
-def search_shapes(fitter: Fitter, xy_px: Float, within: DepthRange, *, min_zncc: float) -> PointFits:
+def search_shapes(
+    fitter: Fitter, xy_px: Float, within: DepthRange, *, min_zncc: float, deeper: DepthRange | None = None
+) -> PointFits:
     """Find the shapes of points (n, 2) by search along their epipolar lines; NOT_SEEDED where none is clearly best.
 
     Parameters
@@ -84,6 +114,8 @@ def search_shapes(fitter: Fitter, xy_px: Float, within: DepthRange, *, min_zncc:
         Depths that are searched.
     min_zncc
         Correlation below which a match that no neighbour supports is taken for chance.
+    deeper
+        Depths that are searched where there is nothing at the first ones, not by steep tilts either.
     """
     shape, n = fitter.shape_only(), len(xy_px)
     out = shape.empty(n)
@@ -93,13 +125,24 @@ def search_shapes(fitter: Fitter, xy_px: Float, within: DepthRange, *, min_zncc:
         np.asarray(cv2.GaussianBlur(image.pixels, (0, 0), 1.0), np.float32) for image in (fitter.ref1, fitter.ref2)
     )
     middle = pair_angle(fitter.pair, xy_px, 0.5 * (within.low + within.high))
-    normals = tilts(middle, fitter.options.subset_px)
-    starts, owners = [], []
-    for i in range(n):
-        w = _matches(fitter.pair, smooth1, smooth2, xy_px[i], within, normals, fitter.options.subset_px)
-        starts.append(w)
-        owners.append(np.full(len(w), i))
-    w, owner = np.concatenate(starts), np.concatenate(owners)
+    usual, steep = (f(middle, fitter.options.subset_px) for f in (tilts, steep_tilts))
+    for depths, normals in ((within, usual), (within, steep), (deeper, usual)):
+        left = np.flatnonzero(~out.ok)
+        if depths is None or len(left) == 0:
+            continue
+        found = _search_tilts(shape, smooth1, smooth2, xy_px[left], depths, normals, min_zncc)
+        out.put(left[found.ok], found.take(np.flatnonzero(found.ok)))
+    return out
+
+
+def _search_tilts(
+    shape: Fitter, smooth1: Float32, smooth2: Float32, xy_px: Float, within: DepthRange, normals: Float, min_zncc: float
+) -> PointFits:
+    out = shape.empty(len(xy_px))
+    starts = [_matches(shape.pair, smooth1, smooth2, xy, within, normals, shape.options.subset_px) for xy in xy_px] or [
+        np.zeros((0, 3))
+    ]
+    w, owner = np.concatenate(starts), np.repeat(np.arange(len(xy_px)), [len(s) for s in starts[: len(xy_px)]])
     if len(w) == 0:
         return out
     fits = shape.fit(xy_px[owner], w, None)

@@ -1,0 +1,95 @@
+"""Points beside an edge: within a subset of where the shape or the motion bends or jumps between two points."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arrays import Bool, Float
+from core.field.points.fitter import Fitter, PointFits
+from core.field.points.starts import depth_per_px
+from core.robust import MAD_TO_SIGMA, spread_indices
+
+_FLOOR_PX = 0.05
+_SIGMAS = 8.0
+_PAIRS = 1000  # for the scatter of the pairs of one offset
+_MIN_PAIRS = 12
+
+
+def beside_edges(fitter: Fitter, points: PointFits, shape: tuple[int, int], rays: Float, spacing_px: float) -> Bool:
+    """Return (n,) True within a subset of where the shape or the motion between two points is not that of one surface.
+
+    On a surface that bends evenly what changes between two points changes by the mean of their slopes.
+
+    Parameters
+    ----------
+    fitter, points
+        The matcher, and n = rows x columns points with their results.
+    shape
+        Rows and columns.
+    rays
+        (n, 3) normalised.
+    spacing_px
+        Distance of neighbouring points.
+
+    Returns
+    -------
+    Bool
+        (n,).
+    """
+    rows, cols = shape
+    flagged = np.zeros(shape, np.uint8)
+    valid = np.flatnonzero(points.ok)
+    if len(valid) < _MIN_PAIRS:
+        return flagged.ravel() > 0
+    ray = rays[:, :2].reshape(rows, cols, 2)
+    quantities = [_per_px(values, scale, valid, shape) for values, scale in _quantities(fitter, points, rays, valid)]
+    subset = fitter.options.subset_px
+    for reach in sorted({max(1, round(f * subset / spacing_px)) for f in (0.5, 1.0)}):
+        for dr, dc in ((0, reach), (reach, 0), (reach, reach), (reach, -reach))[: 4 if fitter.comparisons == 1 else 2]:
+            if dr >= rows or abs(dc) >= cols:
+                continue
+            here = (slice(0, rows - dr), slice(max(-dc, 0), cols - max(dc, 0)))
+            there = (slice(dr, rows), slice(max(dc, 0), cols + min(dc, 0)))
+            step = ray[there] - ray[here]
+            for level, slope, per_px in quantities:
+                mean = 0.5 * (slope[there] + slope[here])
+                off = (level[there] - level[here] - (mean * step).sum(axis=-1)) / per_px[here]
+                known = off.ravel()[spread_indices(off.size, _PAIRS)]
+                known = known[np.isfinite(known)]
+                if len(known) < _MIN_PAIRS:
+                    continue
+                middle = float(np.median(known))
+                sigma = MAD_TO_SIGMA * float(np.median(np.abs(known - middle)))
+                with np.errstate(invalid="ignore"):
+                    r, c = np.nonzero(np.abs(off - middle) > _FLOOR_PX + _SIGMAS * sigma)
+                flagged[r + (dr + 1) // 2, c + max(-dc, 0) + dc // 2] = 1
+    if not flagged.any():
+        return flagged.ravel() > 0
+    width = 2 * int(np.ceil(subset / spacing_px)) + 1
+    return np.asarray(cv2.dilate(flagged, np.ones((width, width), np.uint8))).ravel() > 0
+
+
+def _quantities(fitter: Fitter, points: PointFits, rays: Float, valid: NDArray[np.intp]) -> list[tuple[Float, Float]]:
+    """Value and slopes (m, 3) of what must be smooth, and what a pixel of camera 2's or 1's image is of it (m,)."""
+    w = points.w[valid]
+    per_px = depth_per_px(fitter.pair, rays[valid], w[:, 0])
+    if fitter.comparisons == 1:
+        return [(w[:, :3], per_px)]
+    G = points.G[valid]
+    depth = G[:, 2, 0]
+    one_px = 1.0 / np.sqrt(np.abs(np.linalg.det(fitter.pair.cam1.lens.image_jacobian(rays[valid, :2]))))
+    place = [(G[:, k, :3] - (G[:, k, :1] / depth[:, None]) * G[:, 2, :3]) / depth[:, None] for k in (0, 1)]
+    for k in (0, 1):
+        place[k][:, 0] = G[:, k, 0] / depth
+    now = w[:, :3] / depth[:, None] - (w[:, :1] / depth[:, None] ** 2) * G[:, 2, :3]
+    now[:, 0] = w[:, 0] / depth
+    return [(place[0], one_px), (place[1], one_px), (now, per_px / depth)]
+
+
+def _per_px(values: Float, scale: Float, valid: NDArray[np.intp], shape: tuple[int, int]) -> tuple[Float, Float, Float]:
+    out = np.full((shape[0] * shape[1], 4), np.nan)
+    out[valid, :3], out[valid, 3] = values, scale
+    grid = out.reshape(*shape, 4)
+    return grid[..., 0], grid[..., 1:3], grid[..., 3]
