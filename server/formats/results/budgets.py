@@ -10,7 +10,7 @@ import numpy as np
 from core.arrays import Bool, Float
 from core.common.factor import Causes
 from core.field.points.result import Field
-from core.names import BUDGET, BudgetName
+from core.names import BUDGET, BudgetName, Cause
 from core.strain import StrainField
 from server.formats.results.layout import COVARIANCE_NAMES
 
@@ -67,10 +67,12 @@ def field_budgets(field: Field, points: Bool) -> dict[str, PointBudget]:
         frozen = own  # a position's noise is the reference pair's
     elif field.frozen is not None:
         frozen = np.concatenate([own[:, :3], _diagonal(field.frozen)[points]], axis=1)
-    common = None if field.common is None else field.common[points]
+    squares = _squares(field.common, field.causes)
     return {
         name: _budget(
-            own[:, k], None if frozen is None else frozen[:, k], None if common is None else common[:, k], field.causes
+            own[:, k],
+            None if frozen is None else frozen[:, k],
+            {cause: square[..., k][points] for cause, square in squares.items()},
         )
         for k, name in enumerate(COVARIANCE_NAMES[: own.shape[-1]])
     }
@@ -90,13 +92,12 @@ def strain_budgets(field: Field, strain: StrainField, points: Bool) -> dict[str,
     """
     own = _diagonal(strain.covariance)[points]
     share = reference_share(field)
-    common = None if strain.common is None else strain.common[points]
+    squares = _squares(strain.common, field.causes)
     return {
         name: _budget(
             own[:, k],
             None if share is None else share[points] * own[:, k],
-            None if common is None else common[:, k],
-            field.causes,
+            {cause: square[..., k][points] for cause, square in squares.items()},
         )
         for k, name in enumerate(STRAIN_NAMES)
     }
@@ -116,12 +117,17 @@ def _diagonal(covariance: Float) -> Float:
     return np.asarray(np.diagonal(covariance, axis1=-2, axis2=-1))
 
 
-def _budget(own: Float, frozen: Float | None, common: Float | None, causes: Causes | None) -> PointBudget:
+def _squares(common: Float | None, causes: Causes | None) -> Mapping[Cause, Float]:
+    """Variances (r, c, m) by cause; none where the common factor (r, c, m, k) is not known."""
+    if common is None:
+        return {}
+    return (Causes.untold(common.shape[-1]) if causes is None else causes).squares(common)
+
+
+def _budget(own: Float, frozen: Float | None, common: Mapping[Cause, Float]) -> PointBudget:
     known: dict[BudgetName, Float] = {"matching": own if frozen is None else own - frozen}
     if frozen is not None:
         known["reference"] = np.minimum(frozen, own)
-    if common is not None:
-        told = Causes.untold(common.shape[-1]) if causes is None else causes
-        for cause, square in told.squares(common).items():
-            known[cause] = square
+    for cause, square in common.items():
+        known[cause] = square
     return PointBudget({name: np.sqrt(np.maximum(known[name], 0.0)) for name in BUDGET if name in known})
