@@ -23,7 +23,7 @@ class CommonParts:
 
     What depends on the reference's points alone is kept from field to field.
 
-    Parameters
+    Attributes
     ----------
     pair
         The cameras.
