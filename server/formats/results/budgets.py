@@ -12,6 +12,7 @@ from core.common.factor import Causes
 from core.field.points.result import Field
 from core.names import BUDGET, BudgetName, Cause
 from core.strain import StrainField
+from core.strain.reference import reference_share
 from server.formats.results.layout import COVARIANCE_NAMES
 
 STRAIN_NAMES = ("exx", "eyy", "exy")
@@ -79,7 +80,7 @@ def field_budgets(field: Field, points: Bool) -> dict[str, PointBudget]:
 
 
 def strain_budgets(field: Field, strain: StrainField, points: Bool) -> dict[str, PointBudget]:
-    """Return the budgets of exx, eyy and exy; the reference has the share in them that it has in the displacements.
+    """Return the budgets of exx, eyy and exy; the reference's share goes the strain's own way.
 
     Parameters
     ----------
@@ -91,26 +92,16 @@ def strain_budgets(field: Field, strain: StrainField, points: Bool) -> dict[str,
         (r, c) True at the points that are asked for.
     """
     own = _diagonal(strain.covariance)[points]
-    share = reference_share(field)
+    share = reference_share(field, strain)
     squares = _squares(strain.common, field.causes)
     return {
         name: _budget(
             own[:, k],
-            None if share is None else share[points] * own[:, k],
+            None if share is None else share[points][:, k] * own[:, k],
             {cause: square[..., k][points] for cause, square in squares.items()},
         )
         for k, name in enumerate(STRAIN_NAMES)
     }
-
-
-def reference_share(field: Field) -> Float | None:
-    """Return the reference pair's share (r, c) of the displacement's own variance; None where it is not told apart."""
-    if field.frozen is None:
-        return None
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(
-            np.einsum("rcii->rc", field.frozen[..., :2, :2]) / np.einsum("rcii->rc", field.covariance[..., 3:5, 3:5])
-        )
 
 
 def _diagonal(covariance: Float) -> Float:

@@ -24,6 +24,7 @@ from core.gauge.reading import Reading, reading_of
 from core.gauge.rigid import RigidMotion, rigid_motion, without_rigid_motion
 from core.gauge.sampling import Samples, sample
 from core.names import BUDGET
+from core.strain.reference import reference_share
 from core.strain.result import StrainField
 from server.formats.files import sha256_of
 from server.formats.gauges.readings import (
@@ -41,7 +42,6 @@ from server.formats.gauges.readings import (
     StepReadings,
 )
 from server.formats.gauges.stated import stated
-from server.formats.results.budgets import reference_share
 from server.formats.results.folder import number_of
 from server.formats.results.layout import COVARIANCE_NAMES
 from server.formats.results.reading import ResultHead, read_field, read_head
@@ -339,13 +339,13 @@ def _at_positions(
 def _of_strain(
     variables: Variables, strain: StrainField, axis: int, positions: Samples, sigma: Float
 ) -> tuple[list[Budget], Float, Float | None]:
-    """Budgets of a strain at positions, common parts and factors; the reference has its share in u and v."""
+    """Budgets of a strain at positions, common parts and factors."""
     common = None if strain.common is None else positions.of(strain.common[..., axis, :])
     part = np.full(len(sigma), np.nan) if common is None else np.linalg.norm(common, axis=-1)
     own = np.maximum(sigma**2 - np.nan_to_num(part) ** 2, 0.0)
     field = variables.field
-    at_points = reference_share(field)
-    share = None if at_points is None else positions.of(np.where(field.valid, at_points, np.nan))
+    at_points = reference_share(variables.measured, strain)
+    share = None if at_points is None else positions.of(at_points[..., axis])
     budgets = [
         budget_of(
             float(own[i]),
