@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from core.field.points.result import Field
 from core.strain import StrainOptions, surface_strain
-from core.strain.options import StrainTensor
+from core.settings import StrainTensor
 from core.strain.reference import reference_share
 from tests.support.gauge_field import make_field
 
@@ -28,7 +28,7 @@ def turned_field() -> Field:
     field = make_field(lambda x: x @ F.T, shape=plane, growing=False, rows=60, cols=60)
     C = 1e-2 * field.covariance
     root = np.linalg.cholesky(C[..., 3:, 3:])
-    frozen = root @ np.diag([0.8, 0.3, 0.1]) @ np.swapaxes(root, -1, -2)
+    frozen = np.asarray(root @ np.diag([0.8, 0.3, 0.1]) @ np.swapaxes(root, -1, -2), dtype=np.float64)
     normal = np.array([-0.6, 0.4, 1.0]) / np.linalg.norm([-0.6, 0.4, 1.0])
     # positions and displacements without correlation, so that both parts can be drawn
     C[..., :3, 3:] = C[..., 3:, :3] = 0.0
