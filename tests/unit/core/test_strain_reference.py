@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from core.field.points.result import Field
-from core.strain import StrainOptions, surface_strain
 from core.settings import StrainTensor
+from core.strain import StrainOptions, surface_strain
 from core.strain.reference import reference_share
 from tests.support.gauge_field import make_field
 
