@@ -10,10 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
-from core.arrays import Float
+from core.arrays import Bool, Float
+from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
 from core.names import CAMERAS
 
@@ -21,6 +24,7 @@ from core.names import CAMERAS
 WEIGHTS = np.eye(3) - 0.25
 _MATCH_WEIGHTS = np.kron(WEIGHTS, np.eye(2))
 _AT_ONCE = 1024
+Index = slice | Bool | NDArray[np.int64]
 _NOISE = np.kron(np.eye(3) + 1.0, np.eye(2))
 
 
@@ -49,15 +53,108 @@ def measured_derivatives(
 
 
 @dataclass(frozen=True, eq=False)
-class Estimator:
-    """The measurement's estimator about n points: what it makes of small shifts of the images.
+class ReferenceView:
+    """How both cameras see n points at the reference: the same in all steps of a test.
 
     Attributes
     ----------
     pair
         The cameras.
-    points_mm, displaced_mm
-        (n, 3) points at the reference and now, system frame; None of a shape.
+    points_mm
+        (n, 3) points at the reference, system frame.
+    ray
+        (n, 3) unit vectors from camera 1 to them.
+    by_point1, by_point2
+        (n, 2, 3) of the images over the points, px/mm.
+    along, across
+        (n, 2) unit vectors along and across the epipolar line in camera 2.
+    px_per_mm
+        (n,) what a mm along the ray is there.
+    """
+
+    pair: StereoPair
+    points_mm: Float
+    ray: Float
+    by_point1: Float
+    by_point2: Float
+    along: Float
+    across: Float
+    px_per_mm: Float
+
+    @staticmethod
+    def of(pair: StereoPair, points_mm: Float) -> ReferenceView:
+        """Return that of points."""
+        A1, A2 = pair.cam1.point_jacobian(points_mm), pair.cam2.point_jacobian(points_mm)
+        ray = points_mm - pair.cam1.centre_sys_mm
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        along = (A2 @ ray[..., None])[..., 0]
+        length = np.linalg.norm(along, axis=1)
+        along /= length[:, None]
+        return ReferenceView(
+            pair, points_mm, ray, A1, A2, along, np.stack([-along[:, 1], along[:, 0]], axis=-1), length
+        )
+
+    def at(self, some: Index) -> ReferenceView:
+        """Return that of some of the points, with what is known of them."""
+        names = ("ray", "by_point1", "by_point2", "along", "across", "px_per_mm")
+        part = ReferenceView(self.pair, self.points_mm[some], *(getattr(self, name)[some] for name in names))
+        for name in ("beside", "seen", "by_image", "_by_normalised"):
+            if name in self.__dict__:
+                part.__dict__[name] = self.__dict__[name][some]
+        if "by_parameters" in self.__dict__:
+            part.__dict__["by_parameters"] = tuple(values[some] for values in self.by_parameters)
+        return part
+
+    @cached_property
+    def beside(self) -> Float:
+        """(n, 3, 2) of the points over camera 1's predicted images: these put them beside the ray."""
+        return -_pseudoinverse(self.by_point1)
+
+    @cached_property
+    def seen(self) -> Float:
+        """(n, 2, 4) of camera 2's image over the predicted images of both, points being put beside the ray."""
+        eye = np.broadcast_to(np.eye(2), (len(self.ray), 2, 2))
+        return np.concatenate([self.by_point2 @ self.beside, eye], axis=2)
+
+    @cached_property
+    def by_image(self) -> Float:
+        """(n, 3, 4) of X, Y, Z over the images that the cameras' parameters predict, mm/px.
+
+        Camera 1's equations hold exactly; camera 2's then put the point along the ray.
+        """
+        depth = -(self.along[:, None, :] @ self.seen) / self.px_per_mm[:, None, None]
+        out = self.ray[..., None] * depth
+        out[..., :2] += self.beside
+        return np.asarray(out)
+
+    @cached_property
+    def by_parameters(self) -> tuple[Float, Float]:
+        """(n, 2, p) of either camera's images over its parameters."""
+        return self.pair.cam1.parameter_jacobian(self.points_mm), self.pair.cam2.parameter_jacobian(self.points_mm)
+
+    @cached_property
+    def _by_normalised(self) -> Float:
+        return _by_normalised(self.pair.cam2, self.points_mm)
+
+    def carried(self, displaced_mm: Float) -> Float:
+        """Return (n, 2) the unit offset across the epipolar line as the same shift of camera 2's normalised image.
+
+        In px at the current positions (n, 3).
+        """
+        normalised = np.linalg.solve(self._by_normalised, self.across[..., None])
+        return np.asarray((_by_normalised(self.pair.cam2, displaced_mm) @ normalised)[..., 0])
+
+
+@dataclass(frozen=True, eq=False)
+class Estimator:
+    """The measurement's estimator about n points: what it makes of small shifts of the images.
+
+    Attributes
+    ----------
+    reference
+        How the cameras see the points at the reference.
+    displaced_mm
+        (n, 3) their current positions, system frame; None of a shape.
     by_image
         (n, 3, 4) of X, Y, Z, or (n, 6, 8) of X, Y, Z, U, V, W over the images that the cameras' parameters predict:
         x, y of camera 1 and 2 at the reference, then now. mm/px.
@@ -65,82 +162,97 @@ class Estimator:
         (n, 3, 6) of U, V, W over the shifts that the three comparisons find, mm/px; None of a shape.
     """
 
-    pair: StereoPair
-    points_mm: Float
+    reference: ReferenceView
     displaced_mm: Float | None
     by_image: Float
     by_match: Float | None
 
     @staticmethod
-    def at(pair: StereoPair, points_mm: Float, displaced_mm: Float | None = None) -> Estimator:
-        """Return the estimator at points."""
+    def at(
+        pair: StereoPair, points_mm: Float, displaced_mm: Float | None = None, reference: ReferenceView | None = None
+    ) -> Estimator:
+        """Return the estimator at points; ``reference`` is theirs, if it is known."""
+        seen = ReferenceView.of(pair, points_mm) if reference is None else reference
         n = len(points_mm)
-        A1, A2 = pair.cam1.point_jacobian(points_mm), pair.cam2.point_jacobian(points_mm)
-        ray = points_mm - pair.cam1.centre_sys_mm
-        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-        along = (A2 @ ray[..., None])[..., 0]
-        length = np.linalg.norm(along, axis=1)
-        along /= length[:, None]
-        # camera 1's equations hold exactly: its images put the point beside the ray, and camera 2's then along it
-        beside = -_pseudoinverse(A1)
-        seen = np.concatenate([A2 @ beside, np.broadcast_to(np.eye(2), (n, 2, 2))], axis=2)  # (n, 2, 4) of camera 2
-        depth = -(along[:, None, :] @ seen) / length[:, None, None]
-        first = ray[..., None] * depth
-        first[..., :2] += beside
         if displaced_mm is None:
-            return Estimator(pair, points_mm, None, first, None)
+            return Estimator(seen, None, seen.by_image, None)
         # unknowns depth along camera 1's ray, offset, current X Y Z; comparisons camera 2 at t0, camera 1 and 2 at t
-        across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
         A = np.zeros((n, 6, 5))
-        A[:, :2, 0], A[:, :2, 1] = along * length[:, None], across
+        A[:, :2, 0], A[:, :2, 1] = seen.along * seen.px_per_mm[:, None], seen.across
         A[:, 2:4, 2:], A[:, 4:, 2:] = pair.cam1.point_jacobian(displaced_mm), pair.cam2.point_jacobian(displaced_mm)
-        A[:, 4:, 1] = carried_offset(pair, points_mm, displaced_mm, across)
+        A[:, 4:, 1] = seen.carried(displaced_mm)
         At = np.swapaxes(A, 1, 2) @ _MATCH_WEIGHTS
         gain = np.linalg.solve(At @ A, At)
-        by_match = np.asarray(gain[:, 2:] - ray[..., None] * gain[:, :1], dtype=np.float64)
+        by_match = np.asarray(gain[:, 2:] - seen.ray[..., None] * gain[:, :1], dtype=np.float64)
         whole = np.zeros((n, 6, 8))
-        whole[:, :3, :4] = first
-        whole[:, 3:, :4] = -by_match[:, :, :2] @ seen
-        whole[:, 3:, :2] -= beside
+        whole[:, :3, :4] = seen.by_image
+        whole[:, 3:, :4] = -by_match[:, :, :2] @ seen.seen
+        whole[:, 3:, :2] -= seen.beside
         whole[:, 3:, 4:] = -by_match[:, :, 2:]
-        return Estimator(pair, points_mm, displaced_mm, whole, by_match)
+        return Estimator(seen, displaced_mm, whole, by_match)
 
-    def through(self, names: Sequence[str], directions: Float) -> Float:
-        """Return derivatives (n, 3 or 6, k) along directions (len(names), k) of the parameters by name."""
-        states = [self.points_mm] if self.displaced_mm is None else [self.points_mm, self.displaced_mm]
-        n, k = len(self.points_mm), directions.shape[1]
-        out = np.empty((n, self.by_image.shape[1], k))
-        images = np.empty((min(n, _AT_ONCE), 4 * len(states), k))
+    def through(self, names: Sequence[str], directions: Float, some: slice = slice(None)) -> Float:
+        """Return derivatives (n, 3 or 6, k) along directions (len(names), k) of the parameters by name.
+
+        ``some`` takes a part of the points.
+        """
+        by_image = self.by_image[some]
+        now = None if self.displaced_mm is None else self.displaced_mm[some]
+        n, m, _ = by_image.shape
+        cameras = (self.reference.pair.cam1, self.reference.pair.cam2)
+        own = np.concatenate(
+            [_own_part(camera, prefix, names, directions) for prefix, camera in zip(CAMERAS, cameras, strict=True)]
+        )
+        before = [by_parameters[some] for by_parameters in self.reference.by_parameters]
+        out = np.empty((n, m, directions.shape[1]))
         for first in range(0, n, _AT_ONCE):  # what stays in the processor's cache
             part = slice(first, first + _AT_ONCE)
-            here = images[: min(n - first, _AT_ONCE)]
-            for i, points in enumerate(states):
-                image_shifts(self.pair, points[part], names, directions, out=here[:, 4 * i : 4 * i + 4])
-            np.matmul(self.by_image[part], here, out=out[part])
+            rows, parts = by_image[part], []
+            for c, camera in enumerate(cameras):
+                by_own = rows[:, :, 2 * c : 2 * c + 2] @ before[c][part]
+                if now is not None:
+                    by_own += rows[:, :, 4 + 2 * c : 6 + 2 * c] @ camera.parameter_jacobian(now[part])
+                parts.append(by_own)
+            np.matmul(np.concatenate(parts, axis=2), own, out=out[part])
         return out
 
-    def new_noise_share(self) -> Float:
-        """Return the share of the noise of U, V, W that is new at t, as a factor T (n, 3, 3).
+    def new_noise(self, own: Float) -> Float:
+        """Return the part (n, 3, 3) of the noise of U, V, W that is new at t, of its covariance (n, 3, 3).
 
-        Of a covariance C with the lower triangle L, L L' = C, the part L T T' L' is new. All else is the reference
-        pair's noise, in all steps alike: the reference subset's is in all three comparisons, that of camera 2's match
-        at t0 in the first.
+        ``own`` is its lower triangle L, L L' the covariance. All else is the reference pair's noise, in all steps
+        alike: the reference subset's is in all three comparisons, that of camera 2's match at t0 in the first.
         """
         assert self.by_match is not None
         every = self.by_match @ _NOISE @ np.swapaxes(self.by_match, 1, 2)
-        return np.asarray(np.linalg.solve(np.linalg.cholesky(every), self.by_match[:, :, 2:]))
+        root: Float = np.asarray(np.linalg.cholesky(every), dtype=np.float64)
+        new = own @ inverse_of_lower(root) @ self.by_match[:, :, 2:]
+        return np.asarray(new @ np.swapaxes(new, 1, 2))
 
 
-def image_shifts(pair: StereoPair, points_mm: Float, names: Sequence[str], directions: Float, *, out: Float) -> None:
-    """Put shifts (n, 4, k) of the images x1 y1 x2 y2 by directions (len(names), k) of the parameters into ``out``."""
-    for c, (prefix, camera) in enumerate(zip(CAMERAS, (pair.cam1, pair.cam2), strict=True)):
-        known = camera.parameter_names
-        own = np.zeros((len(known), directions.shape[1]))
-        for k, name in enumerate(names):
-            if name.startswith(f"{prefix}."):
-                own[known.index(name.removeprefix(f"{prefix}."))] += directions[k]
-        jacobian = camera.parameter_jacobian(points_mm)
-        out[:, 2 * c : 2 * c + 2] = (jacobian.reshape(-1, len(known)) @ own).reshape(-1, 2, own.shape[1])
+def inverse_of_lower(L: Float) -> Float:
+    """Return the inverses (n, 3, 3) of lower triangles (n, 3, 3)."""
+    out = np.zeros_like(L)
+    for k in range(3):
+        out[:, k, k] = 1.0 / L[:, k, k]
+    out[:, 1, 0] = -L[:, 1, 0] * out[:, 0, 0] * out[:, 1, 1]
+    out[:, 2, 1] = -L[:, 2, 1] * out[:, 1, 1] * out[:, 2, 2]
+    out[:, 2, 0] = -(L[:, 2, 0] * out[:, 0, 0] + L[:, 2, 1] * out[:, 1, 0]) * out[:, 2, 2]
+    return out
+
+
+def _own_part(camera: Camera, prefix: str, names: Sequence[str], directions: Float) -> Float:
+    """(p, k) of directions (len(names), k) in one camera's parameters, in their order."""
+    known = camera.parameter_names
+    own = np.zeros((len(known), directions.shape[1]))
+    for k, name in enumerate(names):
+        if name.startswith(f"{prefix}."):
+            own[known.index(name.removeprefix(f"{prefix}."))] += directions[k]
+    return own
+
+
+def _by_normalised(camera: Camera, points_mm: Float) -> Float:
+    p = camera.cam_from_sys.apply(points_mm)
+    return camera.lens.image_jacobian(p[:, :2] / p[:, 2:])
 
 
 def _pseudoinverse(A: Float) -> Float:
@@ -150,14 +262,3 @@ def _pseudoinverse(A: Float) -> Float:
     a, b, c = G[:, 0, 0], G[:, 0, 1], G[:, 1, 1]
     inverse = np.stack([c, -b, -b, a], axis=-1).reshape(-1, 2, 2) / (a * c - b * b)[:, None, None]
     return np.asarray(At @ inverse)
-
-
-def carried_offset(pair: StereoPair, points_mm: Float, displaced_mm: Float, across: Float) -> Float:
-    """Return (n, 2) the same shift of the normalised image, in px at the current position."""
-
-    def lens_jacobian(points: Float) -> Float:
-        p = pair.cam2.cam_from_sys.apply(points)
-        return pair.cam2.lens.image_jacobian(p[:, :2] / p[:, 2:])
-
-    normalised = np.linalg.solve(lens_jacobian(points_mm), across[..., None])
-    return np.asarray((lens_jacobian(displaced_mm) @ normalised)[..., 0])

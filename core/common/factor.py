@@ -55,8 +55,12 @@ class Causes:
 
     def squares(self, factor: Float) -> dict[Cause, Float]:
         """Return by cause the variance (...) of a factor's rows (..., k)."""
-        names = np.array(self.columns, dtype=object)
-        return {cause: (factor[..., names == cause] ** 2).sum(axis=-1) for cause in self.told}
+        out = {}
+        for cause in self.told:
+            first = self.columns.index(cause) if cause in self.columns else 0
+            own = factor[..., first : first + self.columns.count(cause)]  # columns are grouped by cause
+            out[cause] = np.einsum("...k,...k->...", own, own)
+        return out
 
     def aligned(self, factor: Float, other: Causes) -> Float:
         """Return a factor (..., k) with the columns of both, zero where it has none: (..., q), see :func:`joined`."""
@@ -248,10 +252,7 @@ def factor_of(
     at = Estimator.at(source.pair, points_mm, displaced_mm) if estimator is None else estimator
     # which columns: the factor changes slowly from point to point
     some = slice(None, None, max(len(points_mm) // _SAMPLE, 1))
-    now = None if displaced_mm is None else displaced_mm[some]
-    by_match = None if at.by_match is None else at.by_match[some]
-    sampled = Estimator(source.pair, points_mm[some], now, at.by_image[some], by_match)
-    kept = fewest_columns(sampled.through(source.names, L), causes)
+    kept = fewest_columns(at.through(source.names, L, some), causes)
     values = at.through(source.names, L[:, kept])
     return Factor(rounded(values, own_mm), Causes(tuple(causes.columns[k] for k in kept), causes.told))
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from core.arrays import Float
 from core.cameras.stereo import StereoPair
-from core.common.derivatives import WEIGHTS, carried_offset
+from core.common.derivatives import WEIGHTS, ReferenceView
 from core.matching.geometry import tangent_frames
 
 
@@ -67,15 +67,11 @@ def match_gain(
     """
     n = len(points_mm)
     tangents = tangent_frames(normals_sys)[..., :2]
-    A1, A2 = pair.cam1.point_jacobian(points_mm), pair.cam2.point_jacobian(points_mm)
-    laid = np.linalg.inv(A1 @ tangents)
+    seen = ReferenceView.of(pair, points_mm)
+    ray, across, A2 = seen.ray, seen.across, seen.by_point2
+    laid = np.linalg.inv(seen.by_point1 @ tangents)
     first = A2 @ tangents @ laid
     back = np.linalg.inv(first)
-    ray = points_mm - pair.cam1.centre_sys_mm
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    along = (A2 @ ray[..., None])[..., 0]
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
     depth, sideways = (back @ A2 @ ray[..., None])[..., 0], (back @ across[..., None])[..., 0]
     solved = np.linalg.inv(np.stack([depth, sideways], axis=-1))  # of depth and offset over the shift
     alone = ray[..., None] * solved[:, :1]
@@ -86,7 +82,7 @@ def match_gain(
     now1, now2 = pair.cam1.point_jacobian(displaced_mm), pair.cam2.point_jacobian(displaced_mm)
     maps = [now1 @ moved @ laid, now2 @ moved @ laid]
     inverse = [np.linalg.inv(m) for m in maps]
-    across_now = carried_offset(pair, points_mm, displaced_mm, across)
+    across_now = seen.carried(displaced_mm)
     # unknowns depth along camera 1's ray, offset, current X Y Z; all equations in px of camera 1's reference image
     A = np.zeros((n, 6, 5))
     A[:, :2, 0], A[:, :2, 1] = depth, sideways

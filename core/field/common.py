@@ -2,54 +2,89 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.common.budget import budget_of
-from core.common.derivatives import Estimator
+from core.common.derivatives import Estimator, ReferenceView
 from core.common.factor import ParameterCovariance, factor_of
 from core.field.points.result import Field
 
 _FIRM = 1e-12  # of the variance: smoothed noise may have no variance in a direction
 
 
-def with_common_parts(field: Field, source: ParameterCovariance | None, pair: StereoPair) -> Field:
-    """Return the field with what is common in its uncertainty, to all its points and to all steps of a test.
+@dataclass(eq=False)
+class CommonParts:
+    """What is common in the uncertainty of the fields of one test.
 
-    It gets the common factor of its points, none where the calibration's covariance is not known, and the part of the
-    displacement's noise that is the reference pair's, none for later references.
+    What depends on the reference's points alone is kept from field to field.
 
-    Parameters
+    Attributes
     ----------
-    field
-        In the system frame, as it is shown: smoothed or not. Smoothing reproduces what varies slowly over its window.
-    source
-        Covariance of the cameras' parameters.
     pair
         The cameras.
-
-    Raises
-    ------
-    CalibrationInputError
-        ``covariance_not_positive``.
+    source
+        Covariance of their parameters; None where it is not known.
     """
-    valid = field.valid
-    points = field.xyz_mm[valid]
-    now = None if field.uvw_mm is None else points + field.uvw_mm[valid]
-    own = field.covariance[valid]
-    at = Estimator.at(pair, points, now)
-    common, causes, frozen = None, None, None
-    if source is not None:
-        middle = np.sqrt(np.median(np.diagonal(own, axis1=1, axis2=2), axis=0)) if len(own) else None
-        found = factor_of(source, points, now, own_mm=middle, estimator=at)
-        causes = found.causes
-        common = _spread(found.values, valid)
-    if now is not None and field.references is None:
-        frozen = _spread(_frozen(own[:, 3:, 3:], at), valid)
-    return replace(field, common=common, causes=causes, frozen=frozen)
+
+    pair: StereoPair
+    source: ParameterCovariance | None
+
+    def __post_init__(self) -> None:
+        self._known: tuple[NDArray[np.int64], ReferenceView] | None = None
+
+    def of(self, field: Field) -> Field:
+        """Return the field with what is common in its uncertainty, to all its points and to all steps of a test.
+
+        It gets the common factor of its points, none where the calibration's covariance is not known, and the part of
+        the displacement's noise that is the reference pair's, none for later references.
+
+        Parameters
+        ----------
+        field
+            In the system frame, as it is shown: smoothed or not. Smoothing reproduces what varies slowly over its
+            window.
+
+        Raises
+        ------
+        CalibrationInputError
+            ``covariance_not_positive``.
+        """
+        valid = field.valid
+        view = self._view(field.xyz_mm[valid], valid)
+        now = None if field.uvw_mm is None else view.points_mm + field.uvw_mm[valid]
+        own = field.covariance[valid]
+        at = Estimator.at(self.pair, view.points_mm, now, view)
+        common, causes, frozen = None, None, None
+        if self.source is not None:
+            middle = np.sqrt(np.median(np.diagonal(own, axis1=1, axis2=2), axis=0)) if len(own) else None
+            found = factor_of(self.source, view.points_mm, now, own_mm=middle, estimator=at)
+            causes = found.causes
+            common = _spread(found.values, valid)
+        if now is not None and field.references is None:
+            frozen = _spread(_frozen(own[:, 3:, 3:], at), valid)
+        return replace(field, common=common, causes=causes, frozen=frozen)
+
+    def _view(self, points: Float, valid: Bool) -> ReferenceView:
+        """The reference's view of a field's valid points: a step's are the reference's own, but for those it lost."""
+        if self._known is not None and self._known[0].shape == valid.shape:
+            place, view = self._known
+            index = place[valid]
+            if (index >= 0).all() and np.array_equal(view.points_mm[index], points):
+                return view if len(index) == len(view.ray) else view.at(index)
+        place = np.full(valid.shape, -1, np.int64)
+        place[valid] = np.arange(len(points))
+        self._known = place, ReferenceView.of(self.pair, points)
+        return self._known[1]
+
+
+def with_common_parts(field: Field, source: ParameterCovariance | None, pair: StereoPair) -> Field:
+    """Return one field with what is common in its uncertainty: see :meth:`CommonParts.of`."""
+    return CommonParts(pair, source).of(field)
 
 
 def _spread(values: Float, valid: Bool) -> Float:
@@ -72,8 +107,7 @@ def _frozen(own: Float, at: Estimator) -> Float:
         upper = np.linalg.qr(np.sqrt(np.maximum(value, 0.0))[:, :, None] * np.swapaxes(vector, 1, 2), mode="r")
         sign = np.where(np.diagonal(upper, axis1=1, axis2=2) < 0.0, -1.0, 1.0)
         root = np.swapaxes(upper, 1, 2) * sign[:, None, :]
-    new = root @ at.new_noise_share()
-    return np.asarray(own - new @ np.swapaxes(new, 1, 2))
+    return np.asarray(own - at.new_noise(root))
 
 
 def notes_of(field: Field) -> tuple[str, ...]:

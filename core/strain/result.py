@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,7 +83,7 @@ class StrainField:
         """(r, c) True where there is a strain."""
         return np.asarray(self.status == StrainStatus.OK)
 
-    @property
+    @cached_property
     def total_covariance(self) -> Float:
         """(r, c, 3, 3) of exx, eyy, exy: own and common."""
         if self.common is None:

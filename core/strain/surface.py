@@ -72,7 +72,9 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
     if field.common is not None:
         common = np.full((*field.shape, 3, field.common.shape[-1]), np.nan)
         # slopes hold the points' own rounding: finer digits would be noise
-        common[good] = rounded(_common_part(field, slopes, surface, options), fine=2.0 * FINE)
+        part = _common_part(field, slopes, surface, options)
+        typical = np.sqrt(np.median(covariance[good][:, range(3), range(3)], axis=0)) if good.any() else None
+        common[good] = rounded(part, typical, fine=2.0 * FINE)
     spacing_px = _step(field)
     # of smoothed displacements it begins with the width of the smoothing
     gauge_px = (options.window - 1) * spacing_px + shared.reach_px
@@ -95,9 +97,14 @@ def _common_part(field: Field, slopes: Slopes, surface: OnSurface, options: Stra
     """(n, 3, k) common factor of the strain: that of the points through the windows' weights."""
     assert field.common is not None
     k, good = field.common.shape[-1], slopes.status == StrainStatus.OK
-    moved = slopes_of(field.common.reshape(*field.shape, 6 * k), field.valid, slopes, options.window // 2)[good]
-    by_slope = strain_slopes(surface.frame, surface.gradient, options.tensor, surface.per_mm, surface.strain)
-    return np.asarray(np.einsum("niab,nbka->nik", by_slope, moved.reshape(-1, 6, k, 2), optimize=True))
+    by_slope = np.zeros((*field.shape, 3, 12), np.float32)
+    by_slope[good] = strain_slopes(
+        surface.frame, surface.gradient, options.tensor, surface.per_mm, surface.strain
+    ).reshape(-1, 3, 12)
+    out = np.empty((*field.shape, 3, k))
+    for at, moved in slopes_of(field.common.reshape(*field.shape, 6 * k), field.valid, slopes, options.window // 2):
+        out[at] = by_slope[at] @ moved.reshape(*moved.shape[:-2], 12, k)
+    return np.asarray(out[good])
 
 
 def surface_slopes(

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from core.errors import FileFormatError, MeasurementError, SeedError
 from core.field.checks.extrapolated import mark_extrapolated
-from core.field.common import with_common_parts
+from core.field.common import CommonParts
 from core.field.points.images import MeasureImage, check_calibrated_size
 from core.field.points.result import Field
 from core.field.region.lay_points import make_grid
@@ -108,7 +108,7 @@ class SequenceMeasurement:
         self.steps: dict[int, StepImages] = {}
         self._models = (None, None) if self.noise is None else self.noise.models
         self._volume = volume_of(self.calibration)
-        self._parameters = parameter_covariance(self.calibration)
+        self._common = CommonParts(self.calibration.pair, parameter_covariance(self.calibration))
         self._rbe_px = rbe_of(self.calibration)
         self._fields: dict[int, Field] = {}
         self._last_images: tuple[int, Pair] | None = None
@@ -251,7 +251,7 @@ class SequenceMeasurement:
         began = time.perf_counter()
         subset_px = self.settings.subset_px
         shown = smoothed_step(result, self.settings.smoothing_window, subset_px=subset_px)
-        shown = with_common_parts(mark_extrapolated(shown, self._volume), self._parameters, self.calibration.pair)
+        shown = self._common.of(mark_extrapolated(shown, self._volume))
         strain = strain_of_step(shown, StrainOptions.of(self.settings.strain), subset_px=subset_px)
         path = self.file_of(step.n)
         terms = self._terms.pop(step.n, None)

@@ -132,8 +132,7 @@ def test_noise_of_the_reference_pair_is_the_same_in_two_steps_and_cancels_in_the
     own = [a.by_match[0] @ N @ a.by_match[0].T for a in at]  # type: ignore[index]
     new = []
     for a, C in zip(at, own, strict=True):
-        factor = np.linalg.cholesky(C) @ a.new_noise_share()[0]
-        new.append(factor @ factor.T)
+        new.append(a.new_noise(np.linalg.cholesky(C)[None])[0])
     # 4,000 draws know a standard deviation to 1.1 %
     for k in range(2):
         np.testing.assert_allclose(got[k].std(axis=0), np.sqrt(np.diag(own[k])), rtol=0.04)

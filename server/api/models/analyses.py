@@ -19,6 +19,7 @@ from server.base.json_values import Nested
 from server.base.models import JobState, Label, Listing, Reply, Request, StepNumber, Switch, any_of, given
 from server.formats.gauges.readings import (
     AreaReading,
+    DifferenceReading,
     ExtensometerReading,
     FrameReading,
     LineReading,
@@ -298,6 +299,9 @@ class GaugeStep(Reply):
     areas: list[AreaReading] = Field(default_factory=list, description="Statistics, with the mean's uncertainty.")
     not_told: list[str] = Field(
         default_factory=list, description="What the budgets do not tell apart, and what they do not include."
+    )
+    differences: list[DifferenceReading] = Field(
+        default_factory=list, description="From the step of `difference_from`; empty in that step itself."
     )
     problem: JobProblem | None = Field(None, description="Problem that left the step without readings.")
 

@@ -97,6 +97,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--robust", action="store_true", help="let no outlier draw the rigid motion")
     add("--step", action="append", default=[], type=int, metavar="N", help="read this step only; repeatable (all)")
+    add(
+        "--difference-from",
+        type=int,
+        metavar="N",
+        help="also take the readings of step N from those of each step: what both share of the uncertainty cancels",
+    )
     add_coverage(parser)
     add(
         "--field-out",
@@ -149,6 +155,7 @@ def _request(args: argparse.Namespace, frame: Alignment | None) -> GaugeRequest:
         "areas": [_named("--area", t, _area, None) for t in args.area],
         "variables": args.variable or None,
         "steps": args.step or None,
+        "difference_from": args.difference_from,
         **coverage_from(args).model_dump(exclude_none=True),
     }
     if args.remove_rigid is not None:
@@ -260,6 +267,11 @@ def report(readings: GaugeReadings) -> list[str]:
         lines.append(f"area {area.name}, mean of {area.valid} of {area.points} points in the first step read")
         areas = [(s, s.areas[k]) for s in steps]
         lines += _table([(s, {n: v.mean_number for n, v in a.values.items()}, a.missing) for s, a in areas])
+    for kind, name in dict.fromkeys((one.kind, one.gauge) for s in steps for one in s.differences):
+        lines.append(f"{kind} {name}, less step {readings.settings['difference_from']}")
+        lines += _table(
+            [(s, one.values, "") for s in steps for one in s.differences if (one.kind, one.gauge) == (kind, name)]
+        )
     for k, line in enumerate(steps[0].lines):
         lines.append(f"line {line.name}, {len(line.x_px)} positions")
         lines += [_line_summary(s.n, s.lines[k]) for s in steps]

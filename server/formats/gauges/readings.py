@@ -173,6 +173,15 @@ class RigidMotionReading:
 
 
 @dataclass(frozen=True)
+class DifferenceReading:
+    """What a gauge reads in a step less what it reads in another; what both steps share has cancelled."""
+
+    gauge: Annotated[str | None, Field(description="Name of the gauge.")]
+    kind: Annotated[str, Field(description="`point`, `extensometer` or `area`, whose means are taken.")]
+    values: Annotated[Mapping[str, Number], Field(description="Differences by variable.")]
+
+
+@dataclass(frozen=True)
 class Problem:
     """Reason why a step has no readings."""
 
@@ -189,6 +198,8 @@ class StepReadings:
     ----------
     not_told
         What the budgets do not tell apart, and what they do not include.
+    differences
+        From the step that was asked for; empty where none was, and in that step itself.
     """
 
     n: int
@@ -204,6 +215,7 @@ class StepReadings:
     lines: Sequence[LineReading] = ()
     areas: Sequence[AreaReading] = ()
     not_told: Sequence[str] = ()
+    differences: Sequence[DifferenceReading] = ()
 
     def document(self) -> dict[str, object]:
         """Return it as plain values."""

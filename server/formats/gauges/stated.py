@@ -31,6 +31,7 @@ def stated(step: StepReadings, statement: Statement) -> StepReadings:
         points=[replace(g, values=each(g.values)) for g in step.points],
         extensometers=[replace(g, values=each(g.values)) for g in step.extensometers],
         lines=[replace(g, values={n: along(v) for n, v in g.values.items()}) for g in step.lines],
+        differences=[replace(g, values=each(g.values)) for g in step.differences],
         areas=[replace(g, values={n: over(v) for n, v in g.values.items()}) for g in step.areas],
     )
 

@@ -73,9 +73,14 @@ def gauges_csv(readings: GaugeReadings) -> bytes:
 
 
 def table_rows(readings: GaugeReadings) -> Iterator[Row]:
-    """Yield every number of every step."""
+    """Yield every number of every step; differences from step n have ``:since_step_<n>`` behind the quantity."""
+    since = readings.settings.get("difference_from")
     for step in readings.steps:
         yield from _of_step(step)
+        head = Row(step.n, step.label, step.load_n, time_s=step.time_s, channels=step.channels)
+        for one in step.differences:
+            values = {f"{quantity}:since_step_{since}": number for quantity, number in one.values.items()}
+            yield from _rows(replace(head, gauge=one.gauge, kind=one.kind), values, "")
 
 
 def _of_step(step: StepReadings) -> Iterator[Row]:

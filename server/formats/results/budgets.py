@@ -10,8 +10,9 @@ import numpy as np
 from core.arrays import Bool, Float
 from core.common.factor import Causes
 from core.field.points.result import Field
-from core.names import BUDGET, BudgetName
+from core.names import BUDGET, BudgetName, Cause
 from core.strain import StrainField
+from core.strain.reference import reference_share
 from server.formats.results.layout import COVARIANCE_NAMES
 
 STRAIN_NAMES = ("exx", "eyy", "exy")
@@ -67,17 +68,19 @@ def field_budgets(field: Field, points: Bool) -> dict[str, PointBudget]:
         frozen = own  # a position's noise is the reference pair's
     elif field.frozen is not None:
         frozen = np.concatenate([own[:, :3], _diagonal(field.frozen)[points]], axis=1)
-    common = None if field.common is None else field.common[points]
+    squares = _squares(field.common, field.causes)
     return {
         name: _budget(
-            own[:, k], None if frozen is None else frozen[:, k], None if common is None else common[:, k], field.causes
+            own[:, k],
+            None if frozen is None else frozen[:, k],
+            {cause: square[..., k][points] for cause, square in squares.items()},
         )
         for k, name in enumerate(COVARIANCE_NAMES[: own.shape[-1]])
     }
 
 
 def strain_budgets(field: Field, strain: StrainField, points: Bool) -> dict[str, PointBudget]:
-    """Return the budgets of exx, eyy and exy; the reference has the share in them that it has in the displacements.
+    """Return the budgets of exx, eyy and exy; the reference's share goes the strain's own way.
 
     Parameters
     ----------
@@ -89,39 +92,33 @@ def strain_budgets(field: Field, strain: StrainField, points: Bool) -> dict[str,
         (r, c) True at the points that are asked for.
     """
     own = _diagonal(strain.covariance)[points]
-    share = reference_share(field)
-    common = None if strain.common is None else strain.common[points]
+    share = reference_share(field, strain)
+    squares = _squares(strain.common, field.causes)
     return {
         name: _budget(
             own[:, k],
-            None if share is None else share[points] * own[:, k],
-            None if common is None else common[:, k],
-            field.causes,
+            None if share is None else share[points][:, k] * own[:, k],
+            {cause: square[..., k][points] for cause, square in squares.items()},
         )
         for k, name in enumerate(STRAIN_NAMES)
     }
-
-
-def reference_share(field: Field) -> Float | None:
-    """Return the reference pair's share (r, c) of the displacement's own variance; None where it is not told apart."""
-    if field.frozen is None:
-        return None
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(
-            np.einsum("rcii->rc", field.frozen[..., :2, :2]) / np.einsum("rcii->rc", field.covariance[..., 3:5, 3:5])
-        )
 
 
 def _diagonal(covariance: Float) -> Float:
     return np.asarray(np.diagonal(covariance, axis1=-2, axis2=-1))
 
 
-def _budget(own: Float, frozen: Float | None, common: Float | None, causes: Causes | None) -> PointBudget:
+def _squares(common: Float | None, causes: Causes | None) -> Mapping[Cause, Float]:
+    """Variances (r, c, m) by cause; none where the common factor (r, c, m, k) is not known."""
+    if common is None:
+        return {}
+    return (Causes.untold(common.shape[-1]) if causes is None else causes).squares(common)
+
+
+def _budget(own: Float, frozen: Float | None, common: Mapping[Cause, Float]) -> PointBudget:
     known: dict[BudgetName, Float] = {"matching": own if frozen is None else own - frozen}
     if frozen is not None:
         known["reference"] = np.minimum(frozen, own)
-    if common is not None:
-        told = Causes.untold(common.shape[-1]) if causes is None else causes
-        for cause, square in told.squares(common).items():
-            known[cause] = square
+    for cause, square in common.items():
+        known[cause] = square
     return PointBudget({name: np.sqrt(np.maximum(known[name], 0.0)) for name in BUDGET if name in known})

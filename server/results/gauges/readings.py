@@ -24,6 +24,7 @@ from core.gauge.reading import Reading, reading_of
 from core.gauge.rigid import RigidMotion, rigid_motion, without_rigid_motion
 from core.gauge.sampling import Samples, sample
 from core.names import BUDGET
+from core.strain.reference import reference_share
 from core.strain.result import StrainField
 from server.formats.calibrations.in_test import calibration_id_in
 from server.formats.files import sha256_of
@@ -42,15 +43,16 @@ from server.formats.gauges.readings import (
     StepReadings,
 )
 from server.formats.gauges.stated import stated
-from server.formats.results.budgets import reference_share
 from server.formats.results.folder import number_of
 from server.formats.results.layout import COVARIANCE_NAMES
 from server.formats.results.reading import ResultHead, read_field, read_head
 from server.formats.results.uncertainty import Included, Statement, read_included
 from server.formats.version import software_version
 from server.results.channels import recorded_with
+from server.results.gauges.differences import Kept, with_differences
 from server.results.gauges.fields import FieldWriter
 from server.results.gauges.frames import lay, text_of
+from server.results.gauges.numbers import finite, number, plain
 from server.results.gauges.request import ExtensometerGauge, GaugeRequest, LineGauge, PointGauge
 from server.results.gauges.variables import STRAIN_NAMES, Variables, component_of
 from server.results.images.projected_pattern import check_gauges
@@ -112,7 +114,7 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
     MeasurementError
         ``too_few_points`` to align.
     """
-    chosen = _chosen(files, request.steps)
+    chosen = _chosen(files, request.steps, request.difference_from)
     alignment: Alignment | None = None
     first: ResultHead | None = None
     grid: tuple[Float, Float] | None = None
@@ -120,6 +122,7 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
     moved_by: set[str] = set()
     found: set[str] = set()
     positions: _Positions = {}
+    kept: list[list[Kept]] = []
     numbers = 0
     for path in chosen:
         step = _read(path)
@@ -141,11 +144,18 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
             )
         heads.append(step.head)
         included.append(step.included)
-        readings = _read_step(step, alignment, request, positions, found, fields)
-        steps.append(stated(readings, Statement(step.included, request)))
+        kept.append([])
+        steps.append(_read_step(step, alignment, request, positions, found, kept[-1], fields))
     for name in request.variables or ():
         if name not in found and any(s.problem is None for s in steps):
             read_variable(chosen[-1], name)  # the error names those that there are
+    if request.difference_from is not None:
+        steps = with_differences(steps, kept, request.difference_from)
+    steps = [
+        stated(step, Statement(one, request))
+        for step, one in zip(steps, included, strict=True)
+        if request.steps is None or step.n in request.steps
+    ]
     assert first is not None
     stale = stale_results(chosen, heads)
     frame = first.frame
@@ -176,7 +186,7 @@ def _calibration(path: Path, head: ResultHead) -> dict[str, str | None]:
     return {"id": calibration_id_in(test, sha256), "sha256": sha256}
 
 
-def _chosen(files: Sequence[Path], wanted: Sequence[int] | None) -> list[Path]:
+def _chosen(files: Sequence[Path], wanted: Sequence[int] | None, base: int | None) -> list[Path]:
     if not files:
         raise StateError(
             "There is no result file yet.",
@@ -184,7 +194,7 @@ def _chosen(files: Sequence[Path], wanted: Sequence[int] | None) -> list[Path]:
             remedy="Measure first; a step's result can be read once the step is finished.",
         )
     there = {number_of(path): path for path in files}
-    numbers = sorted(there) if wanted is None else sorted(set(wanted))
+    numbers = sorted({*(there if wanted is None else wanted), *(() if base is None else (base,))})
     missing = [n for n in numbers if n not in there]
     if missing:
         raise InputError(
@@ -259,6 +269,7 @@ def _read_step(
     request: GaugeRequest,
     positions: _Positions,
     found: set[str],
+    kept: list[Kept],
     fields: FieldWriter | None,
 ) -> StepReadings:
     field = measured = step.field if alignment is None else aligned(step.field, alignment)
@@ -280,15 +291,18 @@ def _read_step(
     found.update(names)
     return step.reading(
         rigid_motion=taken_out,
-        points=[_point(variables, names, p.name, *positions[p.name]) for p in request.points],
-        extensometers=[_extensometer(variables, e.name, *positions[e.name]) for e in request.extensometers],
+        points=[_point(variables, kept, names, p.name, *positions[p.name]) for p in request.points],
+        extensometers=[_extensometer(variables, kept, e.name, *positions[e.name]) for e in request.extensometers],
         lines=[_line(variables, names, line) for line in request.lines],
-        areas=[_area(variables, names, a.name, a.corners()) for a in request.areas],
+        areas=[_area(variables, kept, names, a.name, a.corners()) for a in request.areas],
         not_told=notes_of(field),
     )
 
 
-def _at_positions(variables: Variables, names: Sequence[str], positions: Samples) -> dict[str, Numbers]:
+def _at_positions(
+    variables: Variables, names: Sequence[str], positions: Samples, first: dict[str, Reading] | None = None
+) -> dict[str, Numbers]:
+    """Read variables at positions; ``first`` takes the readings at the first one."""
     own = np.arange(len(positions.xy_px))
     variance = np.diagonal(positions.covariance(variables.shared, own, own), axis1=-2, axis2=-1)
     at_reference = positions.reference_alone()
@@ -311,6 +325,7 @@ def _at_positions(variables: Variables, names: Sequence[str], positions: Samples
             s = np.full(len(own), np.nan)
         part = np.full(len(own), np.nan) if k is None else np.sqrt(of_calibration[:, k])
         budgets: Sequence[Budget] = [UNKNOWN] * len(own)
+        rows = None if common is None or k is None else common[:, k]
         if k is not None:
             budgets = [
                 budget_of(
@@ -322,22 +337,25 @@ def _at_positions(variables: Variables, names: Sequence[str], positions: Samples
                 for i in own
             ]
         elif name in STRAIN_NAMES and variables.strain is not None:
-            budgets, part = _of_strain(variables, variables.strain, STRAIN_NAMES.index(name), positions, s)
+            budgets, part, rows = _of_strain(variables, variables.strain, STRAIN_NAMES.index(name), positions, s)
         values = positions.of(variable.values)
+        if first is not None:
+            row = None if rows is None else rows[0]
+            first[name] = Reading(float(values[0]), float(s[0]), float(part[0]), budgets[0], row, causes)
         out[name] = Numbers(_list(values), _list(s), variable.units, _list(part), _by_part(budgets))
     return out
 
 
 def _of_strain(
     variables: Variables, strain: StrainField, axis: int, positions: Samples, sigma: Float
-) -> tuple[list[Budget], Float]:
-    """Budgets of a strain at positions, and the common parts; the reference has the share that it has in u and v."""
+) -> tuple[list[Budget], Float, Float | None]:
+    """Budgets of a strain at positions, common parts and factors."""
     common = None if strain.common is None else positions.of(strain.common[..., axis, :])
     part = np.full(len(sigma), np.nan) if common is None else np.linalg.norm(common, axis=-1)
     own = np.maximum(sigma**2 - np.nan_to_num(part) ** 2, 0.0)
     field = variables.field
-    at_points = reference_share(field)
-    share = None if at_points is None else positions.of(np.where(field.valid, at_points, np.nan))
+    at_points = reference_share(variables.measured, strain)
+    share = None if at_points is None else positions.of(at_points[..., axis])
     budgets = [
         budget_of(
             float(own[i]),
@@ -347,7 +365,7 @@ def _of_strain(
         )
         for i in range(len(own))
     ]
-    return budgets, np.asarray(part)
+    return budgets, np.asarray(part), common
 
 
 def _by_part(budgets: Sequence[Budget]) -> dict[str, list[float | None]] | None:
@@ -362,9 +380,13 @@ def _at(budget: Mapping[str, Sequence[float | None]] | None, i: int) -> dict[str
     return {name: value for name, value in found.items() if value is not None} or None
 
 
-def _point(variables: Variables, names: Sequence[str], name: str | None, xy: tuple[float, float]) -> PointReading:
+def _point(
+    variables: Variables, kept: list[Kept], names: Sequence[str], name: str | None, xy: tuple[float, float]
+) -> PointReading:
     positions = sample(variables.field, [xy])
-    found = _at_positions(variables, names, positions)
+    rows: dict[str, Reading] = {}
+    found = _at_positions(variables, names, positions, rows)
+    kept += [Kept(name, "point", n, found[n].units, reading) for n, reading in rows.items()]
     values = {
         n: Number(
             reading.value[0], reading.sigma[0], reading.units, reading.sigma_calibration[0], _at(reading.budget, 0)
@@ -388,18 +410,21 @@ def _line(variables: Variables, names: Sequence[str], line: LineGauge) -> LineRe
 
 
 def _extensometer(
-    variables: Variables, name: str | None, a: tuple[float, float], b: tuple[float, float]
+    variables: Variables, kept: list[Kept], name: str | None, a: tuple[float, float], b: tuple[float, float]
 ) -> ExtensometerReading:
     got = extensometer(variables.field, a, b, shared=variables.shared)
     readings: dict[str, Reading] = {n: getattr(got, n) for n in _EXTENSOMETER_UNITS}
-    values = {
-        n: _number(r.value, r.sigma, _EXTENSOMETER_UNITS[n], r.sigma_calibration, r.budget) for n, r in readings.items()
-    }
+    values = {n: number(r, _EXTENSOMETER_UNITS[n]) for n, r in readings.items()}
+    kept += [Kept(name, "extensometer", n, _EXTENSOMETER_UNITS[n], r) for n, r in readings.items()]
     return ExtensometerReading(name, a, b, got.missing, values)
 
 
 def _area(
-    variables: Variables, names: Sequence[str], name: str | None, corners: list[tuple[float, float]] | None
+    variables: Variables,
+    kept: list[Kept],
+    names: Sequence[str],
+    name: str | None,
+    corners: list[tuple[float, float]] | None,
 ) -> AreaReading:
     field = variables.field
     inside = points_within(field, corners)
@@ -430,17 +455,18 @@ def _area(
                 of_strain.causes,
             )
             got = replace(got, mean_sigma=mean.sigma, mean_sigma_calibration=mean.sigma_calibration, mean_reading=mean)
+        kept.append(Kept(name, "area", n, variable.units, got.mean_reading))
         values[n] = AreaStatistics(
             units=variable.units,
             count=got.count,
-            mean=_finite(got.mean),
-            mean_sigma=_finite(got.mean_sigma),
-            sd=_finite(got.sd),
-            rms=_finite(got.rms),
-            min=_finite(got.minimum),
-            max=_finite(got.maximum),
-            mean_sigma_calibration=_finite(got.mean_sigma_calibration),
-            mean_budget=_plain(got.mean_reading.budget),
+            mean=finite(got.mean),
+            mean_sigma=finite(got.mean_sigma),
+            sd=finite(got.sd),
+            rms=finite(got.rms),
+            min=finite(got.minimum),
+            max=finite(got.maximum),
+            mean_sigma_calibration=finite(got.mean_sigma_calibration),
+            mean_budget=plain(got.mean_reading.budget),
         )
     valid = int((inside & field.valid).sum())
     missing = "" if valid else "no valid point in the area"
@@ -468,7 +494,10 @@ def _motion_reading(motion: RigidMotion) -> RigidMotionReading:
     units = [unit for _, unit in _MOTION for _ in range(3)]
     numbers = zip(names, found, sigma, units, motion.sigma_common, motion.budgets, strict=True)
     return RigidMotionReading(
-        values={name: _number(value, s, unit, part, budget) for name, value, s, unit, part, budget in numbers},
+        values={
+            name: number(Reading(float(value), float(s), float(part), budget), unit)
+            for name, value, s, unit, part, budget in numbers
+        },
         centre_mm=motion.centre_mm.tolist(),
         covariance=motion.covariance.tolist(),
         points=motion.points,
@@ -477,17 +506,5 @@ def _motion_reading(motion: RigidMotion) -> RigidMotionReading:
     )
 
 
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
 def _list(values: Float) -> list[float | None]:
-    return [_finite(v) for v in values]
-
-
-def _number(value: float, sigma: float, units: str, sigma_calibration: float, budget: Budget) -> Number:
-    return Number(_finite(value), _finite(sigma), units, _finite(sigma_calibration), _plain(budget))
-
-
-def _plain(budget: Budget) -> dict[str, float] | None:
-    return dict(budget.document()) or None
+    return [finite(v) for v in values]

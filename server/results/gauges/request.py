@@ -194,6 +194,12 @@ class GaugeRequest(CoverageFields, Request):
     steps: Annotated[list[StepNumber], Field(min_length=1, max_length=10_000)] | None = Field(
         None, description="Steps to read; all if left out."
     )
+    difference_from: StepNumber | None = Field(
+        None,
+        description="Step whose readings of points, extensometers and areas' means are also taken from those of each "
+        "other step: what both share of the uncertainty cancels. null: no differences.",
+        examples=[1],
+    )
 
     @model_validator(mode="after")
     def _something_named_once(self) -> Self:

@@ -1,0 +1,78 @@
+"""What of a strain's noise is the reference pair's: the same in all steps of a test."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from core.arrays import Bool, Float
+from core.field.points.result import Field
+from core.matching.geometry import tangent_frames
+from core.strain.result import StrainField
+from core.strain.tensors import strain_covariance
+
+
+def reference_share(field: Field, strain: StrainField) -> Float | None:
+    """Return the reference pair's share (r, c, 3) of the own variance of exx, eyy, exy.
+
+    Parameters
+    ----------
+    field
+        What the strain was made of.
+    strain
+        Of the same points.
+
+    Returns
+    -------
+    Float
+        NaN where there is no strain; None where the reference's noise is not told apart.
+
+    Notes
+    -----
+    A strain takes the points' noise along the tangents where they have gone, and what the motion makes of that of the
+    positions: both parts of the noise go the strain's own way, with the same weights of the window.
+    """
+    frozen = field.frozen_covariance
+    if frozen is None or not field.has_motion:
+        return None
+    good = strain.valid & field.valid
+    frame = tangent_frames(field.normal_sys[good])[..., :2]
+    gradient = _moved(field, good, frame) - frame
+    per_mm = np.linalg.inv(np.swapaxes(frame, -1, -2) @ _grid_tangents(field)[good])
+    even = np.swapaxes(per_mm, -1, -2) @ per_mm  # a whole window's slopes are equally sure along columns and rows
+
+    def variance(points: Float) -> Float:
+        made = strain_covariance(frame, gradient, strain.options.tensor, points[good], even, strain.strain[good])
+        return np.asarray(np.diagonal(made, axis1=1, axis2=2))
+
+    out = np.full((*field.shape, 3), np.nan)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        out[good] = np.clip(variance(frozen) / variance(field.covariance), 0.0, 1.0)
+    return out
+
+
+def _grid_tangents(field: Field) -> Float:
+    """Tangents (r, c, 3, 2) of the grid's columns and rows, mm a step, the median's where a neighbour is missing."""
+    out = np.stack([_steps(field.xyz_mm, axis) for axis in (1, 0)], axis=-1)
+    known = np.isfinite(out).all(axis=(-1, -2))
+    if not known.any():
+        return np.broadcast_to(np.eye(3, 2), out.shape)
+    out[~known] = np.median(out[known], axis=0)
+    return np.asarray(out)
+
+
+def _steps(values: Float, axis: int) -> Float:
+    if values.shape[axis] == 1:
+        return np.full(values.shape, np.nan)
+    return np.asarray(np.gradient(values, axis=axis))
+
+
+def _moved(field: Field, good: Bool, frame: Float) -> Float:
+    """Tangents (n, 3, 2) where they have gone, as the patches know it."""
+    moved = frame
+    if field.stretch is not None:
+        e = field.stretch[good]
+        moved = moved @ (np.eye(2) + np.stack([e[:, 0], e[:, 2], e[:, 2], e[:, 1]], axis=-1).reshape(-1, 2, 2))
+    if field.rotation_rad is not None:
+        moved = Rotation.from_rotvec(field.rotation_rad[good]).as_matrix() @ moved
+    return np.asarray(moved)
