@@ -15,7 +15,7 @@ ARGS ?=
 # only compile the same kernels again
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n > 3 ? 4 : n + 1)))
 
-.PHONY: help demo quick test test-deep serve check check-page bench format accuracy coverage fuzz load openapi reference docs torture pagespeed pagepictures clean
+.PHONY: help demo quick test test-deep serve check check-page kernels bench format accuracy coverage fuzz load openapi reference docs torture pagespeed pagepictures clean
 
 help:
 	@echo "make demo    start the service on the simulated paper rig and run the plate experiment over HTTP"
@@ -59,15 +59,24 @@ $(STAMP): $(PROGRAM) $(ARAVIS)
 demo: $(PROGRAM)
 	$(BIN)/stereorig demo $(ARGS)
 
+# Compiled once, side by side, where several workers would each compile the same kernels; nothing to do while no source is newer
+KERNELS := $(VENV)/.kernels
+$(KERNELS): $(STAMP) $(shell find core sim server/compute tests/support -name '*.py')
+	@echo "Compiling kernels (once) ..."
+	@$(BIN)/python -m tests.support.kernels
+	@touch $@
+
 PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-quick: $(STAMP)
+kernels: $(KERNELS)
+
+quick: $(KERNELS)
 	$(PYTEST) -m 'not deep and not devices' tests/unit tests/contract $(ARGS)
 
-test: $(STAMP)
+test: $(KERNELS)
 	$(PYTEST) $(ARGS)
 
-test-deep: $(STAMP)
+test-deep: $(KERNELS)
 	$(PYTEST) -m deep $(ARGS)
 
 serve: $(PROGRAM) $(ARAVIS)

@@ -9,6 +9,7 @@ the marker of its tests. Depth is a second marker, `deep`: long forms that `make
 from __future__ import annotations
 
 import os
+import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -33,15 +34,41 @@ TESTS = Path(__file__).parent
 # What waits longest begins first, and the many short files fill the workers up at the end
 ORDER = ("contract", "crash", "service", "browser", "accuracy", "page", "unit")
 
+# Of the deep tier, files of minutes begin first: one of them would be left over at the end on a single core. A worker
+# takes its next file when two tests are left of its own, and would keep a long one waiting: a short one is the fourth
+DEEP_FIRST = (
+    "crash/test_torture.py",
+    "crash/test_fuzz_more.py",
+    "accuracy/test_coverage_chain.py",
+    "accuracy/test_prefilter.py",
+    "accuracy/test_common_coverage.py",
+    "unit/core/test_calibration_compare.py",
+    "service/cli/test_demo.py",
+)
+
 # A run that was started in the background ignores Ctrl-C, and what it starts would inherit that
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Of the deep tier, do not load the nine files in ten that have none of its tests: every worker would."""
+    if config.option.markexpr == "deep" and collection_path.match("test_*.py"):
+        return True if re.search(r"\bdeep\b|\bnormal_depth\b", collection_path.read_text("utf-8")) is None else None
+    return None
+
+
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark every test with its tier, which is the folder that it lies in, and what is left to the deep tier."""
-    items.sort(key=lambda item: ORDER.index(item.path.relative_to(TESTS).parts[0]))
+    first = DEEP_FIRST if config.option.markexpr == "deep" else ()
+
+    def place(item: pytest.Item) -> tuple[int, int]:
+        path = item.path.relative_to(TESTS)
+        early = first.index(path.as_posix()) if path.as_posix() in first else len(first)
+        return early, ORDER.index(path.parts[0])
+
+    items.sort(key=place)
     for item in items:
         folders = item.path.relative_to(TESTS).parts
         item.add_marker(folders[0])

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from scipy.stats import chi2, norm
 
 from core.arrays import Float
 from core.calibration import COVARIANCE_NAMES
@@ -18,6 +17,7 @@ from core.orientation.consequence import Consequence, consequence_of
 from core.orientation.estimate import estimate_change
 from core.orientation.matched import MatchedPoints, across_line
 from core.orientation.noise import blocks_of, effective_variance, robust_weights
+from core.significance import chi_square_tail, two_sided_sigmas
 
 Against = Literal["calibration", "reference", "last_step"]
 Pattern = Literal["mean", "slope", "curvature"]
@@ -191,7 +191,7 @@ def judge_offsets(
         C = C + J @ covariance @ J.T
     c = smooth.coefficients
     chi_square = float(c @ np.linalg.solve(C, c))
-    p_value = float(chi2.sf(chi_square, 6))
+    p_value = chi_square_tail(chi_square, 6)
     expected = float(np.sqrt(np.trace(C)))
     rms = float(np.sqrt(max(c @ c - np.trace(smooth.covariance), 0.0)))
     moved: bool | None = p_value < CHANCE and rms > 3.0 * _FLOOR_PX[against]
@@ -214,7 +214,7 @@ def judge_offsets(
         carried_by=max(parts, key=lambda name: parts[name]),
         chi_square=chi_square,
         p_value=p_value,
-        sigmas=float(norm.isf(p_value / 2.0)) if p_value > _NO_NUMBER else float(np.sqrt(chi_square)),
+        sigmas=two_sided_sigmas(p_value) if p_value > _NO_NUMBER else float(np.sqrt(chi_square)),
         change_deg=tuple(float(v) for v in np.degrees(estimate.change)),
         change_sigma_deg=tuple(float(v) for v in np.degrees(np.sqrt(np.diag(estimate.covariance)))),
         determined=estimate.determined,

@@ -8,7 +8,6 @@ moments: what the next order of the displacement over the window leaves. Bending
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import oaconvolve
 
 from core.arrays import Float
 from core.field.points.result import Field
@@ -113,6 +112,8 @@ def _second(values: Float, axis: int, lag: int) -> Float:
 
 def _noise_ratio(half: int, lag: int, moments: Float, shared: SharedPixels, step: tuple[float, float]) -> Float:
     """(3,) variance of the estimate over that of the strain itself, in whole windows."""
+    from scipy.signal import oaconvolve  # slow to load, and not every start needs it
+
     offsets, _ = window_offsets(half)
     side = 2 * (half + lag) + 1
     at = np.arange(-side, side + 1)

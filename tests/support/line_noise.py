@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -31,6 +32,7 @@ BLURS: dict[str, Callable[[Array], Array]] = {
 }
 
 
+@functools.cache
 def clean_pictures() -> dict[str, Array]:
     """Grey levels without noise under each blur."""
     fine = fine_picture(CAMERA, LineGrid(GRID.pitch_mm, GRID.lines, GRID.line_width_mm), n=SAMPLES)

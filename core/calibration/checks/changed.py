@@ -13,12 +13,12 @@ from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from core.arrays import Float
 from core.cameras.camera import POSE_NAMES, Camera, angles_from_rotation, rotation_derivatives
 from core.cameras.stereo import StereoPair
 from core.names import CAMERAS
+from core.significance import chi_square_tail
 
 Cause = Literal["scale", "camera_moved", "focal_length", "image_centre", "distortion", "lens"]
 _FOCAL = ("phd_px", "fx_px", "fy_px")
@@ -240,7 +240,7 @@ def _explanations(
         made = np.linalg.qr(np.linalg.solve(L, group / sd[:, None]))[0]
         left = white - made @ (made.T @ white)
         statistic, degrees = float(left @ left), size - made.shape[1]
-        out.append(Explanation(cause, camera_or_none, statistic, degrees, float(chi2.sf(statistic, degrees))))
+        out.append(Explanation(cause, camera_or_none, statistic, degrees, chi_square_tail(statistic, degrees)))
     return out
 
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from core.arrays import Float
 from core.calibration.checks.changed import Changes, find_changes
@@ -22,6 +21,7 @@ from core.calibration.volume import CalibratedVolume
 from core.cameras.camera import Camera, RigidTransform
 from core.cameras.stereo import StereoPair
 from core.errors import CalibrationInputError
+from core.significance import chi_square_tail
 
 #: probability below which two calibrations differ: three standard deviations of a Gaussian
 SIGNIFICANT = 0.0027
@@ -206,7 +206,7 @@ def compare_calibrations(a: UncertainPair, b: UncertainPair, points_mm: Float) -
     worst = int(np.argmax(np.linalg.norm(vectors, axis=1)))
     scale = float(scale_row @ shape)
     statistic, degrees, outside, predicted_px = _test(a, b, points_mm, images, b_from_a)
-    probability = None if statistic is None else float(chi2.sf(statistic, degrees))
+    probability = None if statistic is None else chi_square_tail(statistic, degrees)
     agrees = None
     if probability is not None and predicted_px is not None:
         agrees = probability >= SIGNIFICANT and outside <= 3.0 * predicted_px

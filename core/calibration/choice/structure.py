@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
-from scipy.stats import f as f_distribution
 
 from core.arrays import Float
 from core.calibration.fit.adjust import Adjustment
@@ -24,6 +23,7 @@ from core.calibration.fit.normal import Extra, Normal, assemble, inverse
 from core.calibration.fit.observations import ViewRows
 from core.calibration.inputs import NominalCamera
 from core.names import CAMERAS
+from core.significance import f_tail
 
 SIGNIFICANT = 1e-4
 _DEGREE = 5
@@ -298,7 +298,7 @@ class _Score:
         left = max(redundancy - base - gain, _LEAST_LEFT * redundancy)
         freedom = max(redundancy - q, 1.0)
         statistic = (gain / q) / (left / freedom) if q else 0.0
-        probability = float(f_distribution.sf(statistic, q, freedom)) if q else 1.0
+        probability = f_tail(statistic, q, freedom) if q else 1.0
         sigma = np.sqrt(np.diagonal(C)) * np.sqrt(left / freedom)
         noise = float(np.mean([self._noise[c] for c in cameras]))
         count = float(sum(self._counts[c] for c in cameras))

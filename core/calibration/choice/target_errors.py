@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import f as f_distribution
 
 from core.arrays import Float
 from core.calibration.choice.structure import SIGNIFICANT, Structure
 from core.calibration.fit.adjust import Adjustment
 from core.calibration.fit.normal import assemble
 from core.calibration.fit.observations import ViewRows
+from core.significance import f_tail
 
 NAME = "target points"
 _WEAK = 1e-9  # weight of a prior that says nothing, 1/mm^2
@@ -57,7 +57,7 @@ def find_target_errors(
         return None
     # the squares left over their own freedom; lenses and poses took up a part of the gain, so that this is careful
     left = max(redundancy - gain, 1e-9) / (redundancy - q)
-    probability = float(f_distribution.sf((gain / q) / left, q, redundancy - q))
+    probability = f_tail((gain / q) / left, q, redundancy - q)
     if not probability < SIGNIFICANT:
         return None
     excess = d**2 - left * np.diagonal(inverse, axis1=1, axis2=2)

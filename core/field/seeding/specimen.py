@@ -13,7 +13,7 @@ from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.errors import RegionError
 from core.field.points.features import Box
-from core.field.points.images import MeasureImage, features_of
+from core.field.points.images import MeasureImage, different, features_of
 from core.field.region.textured import TextureMap, texture_map
 from core.field.seeding.diagnosis import diagnose, seed_error
 from core.field.seeding.epipolar_search import sweep
@@ -104,11 +104,16 @@ def find_specimen(pair: StereoPair, image1: MeasureImage, image2: MeasureImage, 
 
     Raises
     ------
+    ImageError
+        ``image_blank``, ``same_image``.
     SeedError
         ``not_seeded`` if there are no matches to go by.
     RegionError
         ``region_not_found`` if nothing remains.
     """
+    for image in (image1, image2):
+        image.refuse_blank()
+    different(image1, image2)
     scale = scales((_whole(image1), _whole(image2)), (image1.shape, image2.shape))[0]
     shape = scattered_shape(pair, *features_of([(image1, _whole(image1)), (image2, _whole(image2))], scale))
     if len(shape.xy_px) < _MIN_MATCHES:

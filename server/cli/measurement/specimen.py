@@ -33,13 +33,10 @@ def found_specimen(
         The images cannot be used; ``not_seeded`` where they have no matches.
     """
     # the kernels' modules take seconds to load: only where they are needed
-    from core.field.points.images import MeasureImage, different
+    from core.field.points.images import MeasureImage
     from core.field.seeding.specimen import find_specimen
 
     one, two = (MeasureImage(read_image(path), str(path)) for path in (pair.cam1, pair.cam2))
-    for image in (one, two):
-        image.refuse_blank()
-    different(one, two)
     if mask is not None and mask.shape != one.shape:
         raise RegionError(
             f"The mask is {mask.shape[1]} x {mask.shape[0]} px, camera 1's image {one.shape[1]} x {one.shape[0]} px.",

@@ -9,6 +9,7 @@ spared, of the service's modules and of its worker's.
 
 from __future__ import annotations
 
+import gc
 import json
 import multiprocessing
 import os
@@ -82,6 +83,8 @@ def serve(order: dict[str, Any]) -> None:
 def main() -> int:
     """Load, then fork for every line."""
     load()
+    gc.collect()
+    gc.freeze()  # what all services share: the rounds of the collector at their starts would copy it, page by page
     fork_workers()
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # killed processes are not waited for
     print(json.dumps({"ready": True}), flush=True)

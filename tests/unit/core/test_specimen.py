@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from core.cameras.stereo import StereoPair
-from core.errors import RegionError, SeedError
+from core.errors import ImageError, RegionError, SeedError
 from core.field.points.images import MeasureImage
 from core.field.region.textured import texture_map
 from core.field.seeding.specimen import Specimen, find_specimen
@@ -186,8 +186,12 @@ def test_bands_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_nothing_to_find_is_said() -> None:
     rng = np.random.default_rng(6)
     noise = [rng.normal(90.0, 4.0, SIZE[::-1]).round().astype(np.uint8) for _ in range(2)]
-    with pytest.raises(SeedError):
+    with pytest.raises(ImageError) as blank:
         found((noise[0], noise[1]))
+    assert blank.value.code == "image_blank"
+    one, other = (np.clip(np.rint(110.0 + white(seed, 1.6, 35.0)), 0, 255).astype(np.uint8) for seed in (13, 14))
+    with pytest.raises(SeedError):
+        found((one, other))
     with pytest.raises(RegionError) as caught:
         found(picture("plain"), 201)
     assert caught.value.code == "region_not_found"

@@ -8,7 +8,7 @@ from typing import Annotated, Self
 from fastapi import APIRouter
 from pydantic import Field, model_validator
 
-from core.field.points.images import MeasureImage, different
+from core.field.points.images import MeasureImage
 from core.field.seeding.specimen import find_specimen
 from core.settings import SUBSET_PX, SubsetPx, Whole, require_odd
 from server.api.models import Region, Reply, Request
@@ -55,9 +55,6 @@ def find_region(service: ServiceDep, test_id: TestId, body: FindRegionRequest) -
         MeasureImage(read_image(path), f"{cam} of step {body.reference}")
         for cam, path in (("cam1", step.cam1), ("cam2", step.cam2))
     )
-    for image in (one, two):
-        image.refuse_blank()
-    different(one, two)
     specimen = find_specimen(pair, one, two, subset_px=body.subset_px)
     return FoundRegionReply.model_validate(
         {

@@ -20,6 +20,7 @@ import numpy as np
 from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
 from server.formats.calibrations.programs.imported_pair import (
+    ImageSize,
     euler_zyx,
     invalid,
     opencv_lens,
@@ -28,8 +29,6 @@ from server.formats.calibrations.programs.imported_pair import (
     unreadable,
     unsupported,
 )
-
-ImageSize = tuple[int, int] | None
 
 LENS_NOTE = (
     "k1 k2 k3 were taken as factors of r^2, r^4, r^6, as OpenCV and VIC-3D have them; DICe itself reads them in "

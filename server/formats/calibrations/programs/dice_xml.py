@@ -23,6 +23,7 @@ from core.cameras.camera import RigidTransform
 from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
 from server.formats.calibrations.programs.imported_pair import (
+    ImageSize,
     euler_zyx,
     invalid,
     opencv_lens,
@@ -31,8 +32,6 @@ from server.formats.calibrations.programs.imported_pair import (
     unreadable,
     unsupported,
 )
-
-ImageSize = tuple[int, int] | None
 
 VIC3D_NOTE = (
     "the lens was taken as VIC-3D's, 1 + k1 r^2 + k2 r^4 + k3 r^6, from which its numbers come; DICe itself reads them "

@@ -15,6 +15,9 @@ from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
 from core.errors import FileFormatError
 
+ImageSize = tuple[int, int] | None
+"""Columns and rows, where a program's file states them."""
+
 _MIN_BASELINE_MM = 1e-9  # two equal poses, composed, leave the digits' end
 _ROTATION_TOLERANCE = 1e-4  # files carry six digits and more; a wrong axis order is off by far more
 

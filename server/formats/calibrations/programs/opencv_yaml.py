@@ -16,9 +16,14 @@ from numpy.typing import NDArray
 
 from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
-from server.formats.calibrations.programs.imported_pair import invalid, opencv_lens, pair_of, unreadable, unsupported
-
-ImageSize = tuple[int, int] | None
+from server.formats.calibrations.programs.imported_pair import (
+    ImageSize,
+    invalid,
+    opencv_lens,
+    pair_of,
+    unreadable,
+    unsupported,
+)
 
 KEYS = ("cameraMatrix1", "cameraMatrix2", "distCoeffs1", "distCoeffs2", "R", "T")
 _LENGTHS = (4, 5, 8, 12, 14)

@@ -21,6 +21,7 @@ from core.cameras.camera import RigidTransform
 from core.cameras.lens import OpenCVLens
 from core.cameras.stereo import StereoPair
 from server.formats.calibrations.programs.imported_pair import (
+    ImageSize,
     euler_zyx,
     euler_zyx_deg,
     invalid,
@@ -30,7 +31,6 @@ from server.formats.calibrations.programs.imported_pair import (
     unsupported,
 )
 
-ImageSize = tuple[int, int] | None
 _INTRINSICS = ("cx", "cy", "fx", "fy", "skew")
 _DISTORTION = ("k1", "k2", "k3")
 

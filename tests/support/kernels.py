@@ -1,0 +1,88 @@
+"""Compile the kernels before the tests run: several workers would each compile the same ones at the same time.
+
+    python -m tests.support.kernels
+
+A process a group, side by side; numba keeps what they compile on disk. What is missing here is compiled by the first
+test that needs it.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+
+import numpy as np
+
+from tests.support.requirements import ROOT
+
+
+def measure() -> None:
+    """Shapes and motions with plane patches, as a service does when it starts; line crossings."""
+    import server.compute.measurement
+    from core.field.region.cuts import Cuts, crosses
+
+    server.compute.measurement.warm_up(1)
+    crosses([[1.0, 5.0]], [[5.0, 1.0]], Cuts([[[0.0, 0.0], [9.0, 9.0]]]))
+
+
+def curved() -> None:
+    """The same with quadratic patches: the shape here, the motion in a process beside it."""
+    from core.matching.fit import fit_shape
+    from core.matching.options import MatchOptions
+    from tests.support.matching_scene import paper_pair
+
+    command = [sys.executable, "-m", "server.compute.background_compilation", "quadratic"]
+    with subprocess.Popen(command, cwd=ROOT):
+        picture = np.random.default_rng(1).normal(128.0, 20.0, (64, 64))
+        options = MatchOptions(subset_px=21, patch="quadratic")
+        fit_shape(paper_pair(size=64), picture, picture, [[32.0, 32.0]], [[np.nan] * 3], options)
+
+
+def targets() -> None:
+    """Line grids and boards, drawn by the tests' own renderers."""
+    from core.boards import BoardTarget, detect_board
+    from core.grid import GridOptions, detect_grid
+    from tests.support.board_images import BoardCamera, board_image
+    from tests.support.grid_images import PAPER_TARGET, grid_image, paper_camera
+
+    picture = grid_image(paper_camera())
+    for line_model in ("straight", "local"):
+        detect_grid(picture, PAPER_TARGET, options=GridOptions(line_model=line_model))  # type: ignore[arg-type]
+    camera = BoardCamera()
+    for kind in ("checkerboard", "circles"):
+        board = BoardTarget(kind=kind, size=(9, 7), pitch_mm=5.0)  # type: ignore[arg-type]
+        detect_board(board_image(camera, board), board)
+
+
+def scenes() -> None:
+    """Every scene of the simulated world."""
+    from server.config.rig_file import parse_config
+    from sim.catalog import SCENE_NAMES, TARGET_SCENES
+    from sim.rig import SimRig
+    from sim.world import SimWorld
+    from tests.support.tiny_rig import tiny_rig
+
+    rig = SimRig.from_dict(parse_config(tiny_rig()).model_dump(exclude_none=True))
+    world = SimWorld(rig, lambda _: 0.0)
+    for name in {*SCENE_NAMES, *TARGET_SCENES}:
+        world.set_scene(name)
+        world.expose("cam1", exposure_ms=10.0, gain_db=0.0, rng=np.random.default_rng(1))
+
+
+GROUPS: dict[str, Callable[[], None]] = {f.__name__: f for f in (measure, curved, targets, scenes)}
+
+
+def main() -> int:
+    """Run one group, or all of them side by side."""
+    if len(sys.argv) > 1:
+        GROUPS[sys.argv[1]]()
+        return 0
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    running = [subprocess.Popen([sys.executable, "-m", __spec__.name, name], env=environment) for name in GROUPS]
+    return max(process.wait() for process in running)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
