@@ -22,7 +22,8 @@ from server.formats.results.writing import Provenance, write_field
 from server.store.index import analysis_entry
 from tests.support import results_page
 from tests.support.page_bench import UNREACHED, Watched, tabbed, watched
-from tests.support.results_page import API, ENDS, LINE, Bench, drawn, given, shown, with_a_cut
+from tests.support.results_page import API, ENDS, LINE, RECTANGLE, Bench, drawn, given, shown, with_a_cut
+from tests.support.service_rig import wait_for_job
 
 bench, page = results_page.bench, results_page.page  # fixtures
 
@@ -610,4 +611,67 @@ def test_a_failed_check_stands_at_the_head_of_the_results_and_in_the_lists(page:
     assert [one["code"] for one in entry["warnings"]] == ["epipolar_check_failed", "low_coverage"]
     report = bench.client.get(f"{bench.path(doubtful)}/report").text
     assert report.index('data-warning="epipolar_check_failed"') < report.index('class="boxes"')
+    page.sound()
+
+
+def test_a_running_analysis_is_followed_until_it_is_finished(page: Watched, bench: Bench) -> None:
+    calibration = bench.client.get(f"{API}/tests/{bench.test_id}").json()["calibration_id"]
+    test_id = bench.client.post(f"{API}/tests", json={"name": "followed", "calibration_id": calibration}).json()["id"]
+
+    def capture(load: float) -> None:
+        bench.client.put(f"{API}/sim/scene", json={"scene": "plate", "load": load})
+        assert bench.client.post(f"{API}/tests/{test_id}/steps", json={"load_n": load}).status_code == 201
+
+    capture(0.0)
+    asked = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "spacing_px": 10, "follow": True}
+    made = bench.client.post(f"{API}/tests/{test_id}/analyses", json=asked).json()
+    page.open(f"#/results/{test_id}/{made['analysis_id']}")
+    at = page.page
+    at.set_default_timeout(60_000)
+    # the reference has no W: its shape is shown, and W as soon as a step has it
+    drawn(at, "0 z_mm reference")
+    counter, follow = at.locator('[data-role="step"]'), at.get_by_label("follow the newest step")
+    expect(counter).to_contain_text("1 of 1")
+    expect(follow).to_be_checked()
+    given(at, ENDS, (80, 90, 160, 90))
+    at.locator("details", has=at.get_by_label(ENDS[0])).evaluate("one => { one.open = true }")
+    at.locator("details", has=at.get_by_label(ENDS[0])).get_by_role("button", name="Use").click()
+    wait_for_chart(at, "extensometer-chart", "a.x.length === 1")
+    capture(344.5)
+    drawn(at, "1 w_mm reference")
+    expect(counter).to_contain_text("2 of 2")
+    wait_for_chart(at, "extensometer-chart", "a.x.length === 2")  # histories are read anew
+    # who looks at an earlier step stays there; the counter is right at once
+    at.get_by_role("button", name="Step before").click()
+    drawn(at, "0 z_mm reference")
+    expect(follow).not_to_be_checked()
+    capture(689.0)
+    expect(counter).to_contain_text("1 of 3")
+    wait_for_chart(at, "extensometer-chart", "a.x.length === 3")
+    expect(at.locator('canvas[data-role="map"]')).to_have_attribute("data-shown", "0 z_mm reference")
+    follow.check()
+    drawn(at, "2 w_mm reference")
+    # the test's screen says so, too, and either of them finishes it
+    page.open(f"#/test/{test_id}")
+    expect(at.locator('[data-role="measuring"]')).to_have_text("measuring: waiting for the next step")
+    at.locator('[data-role="progress"]').get_by_role("button", name="Finish").click()
+    expect(at.locator('[data-role="progress"] .badge')).to_have_text("succeeded")
+    expect(at.locator('[data-role="measuring"]')).to_have_text("")
+    document = bench.client.get(f"{API}/tests/{test_id}/analyses/{made['analysis_id']}").json()
+    assert document["steps_finished"] == [0, 1, 2]
+    page.sound()
+
+
+def test_a_failed_analysis_shows_its_problem_and_nothing_to_choose(page: Watched, bench: Bench) -> None:
+    dark = bench.client.post(f"{API}/tests/{bench.test_id}/analyses", json={"region": {"rectangle": [0, 0, 12, 12]}})
+    made = dark.json()
+    assert wait_for_job(bench.client, made["job"])["state"] == "failed"
+    page.open(f"#/results/{bench.test_id}/{made['analysis_id']}")
+    at = page.page
+    expect(at.locator(".problem").first).to_be_visible()
+    for name in ("Field", "Step", "Image"):
+        expect(at.get_by_label(name, exact=True)).to_be_hidden()
+    for name in ("Play through the steps", "3-D surface", "Save the file"):
+        expect(at.get_by_role("button", name=name)).to_have_count(0)
+    expect(at.get_by_role("link", name="Back to the test")).to_be_visible()
     page.sound()

@@ -10,6 +10,7 @@ import { gauges } from "./results/gauges.js";
 import { frames } from "./results/frame.js";
 import { mark, pinned } from "./results/probe.js";
 import { interval } from "./results/uncertainty.js";
+import { live, usualField } from "./results/live.js";
 import { stateBadge, warningsBox, warningsCell } from "./results/warnings.js";
 import { h, replace, table, when, num, count, quantity, field, select, definitions, notify, problemText } from "../lib/dom.js";
 
@@ -19,9 +20,10 @@ import { h, replace, table, when, num, count, quantity, field, select, definitio
 /** @import { Shown } from "./results/analysis.js" */
 /** @import { Interval } from "./results/uncertainty.js" */
 /** @typedef {"image" | "surface" | "compare"} Mode */
-/** @typedef {{ step: number | null, field: string | null, image: Over, mode: Mode, info: Shown | null, playing: object | null, pinned?: number }} State */
+/** @typedef {{ step: number | null, field: string | null, chosen: boolean, image: Over, mode: Mode, info: Shown | null, playing: object | null, pinned?: number }} State */
 /** @typedef {{ result: Result, state: State, map: FieldMap, scale: Scale, interval: Interval, ends: Ends, probe: HTMLElement, message: HTMLElement, readonly step: number | null,
- *   readonly info: Shown | null, onpick: (x: number, y: number, event: Event) => unknown, drawn: Set<() => unknown> }} Viewer shared by the parts of the screen; `drawn` is called after each change of step, field or scale */
+ *   readonly info: Shown | null, onpick: (x: number, y: number, event: Event) => unknown, drawn: Set<() => unknown>, landed: Set<() => unknown> }} Viewer shared by the parts of the screen;
+ *   `drawn` is called after each change of step, field or scale, `landed` once more steps are finished */
 /** @typedef {{ root: HTMLElement, update: () => Promise<void>, close: () => void, attach?: () => void }} OtherView shown instead of the map */
 
 /**
@@ -95,7 +97,7 @@ async function show(root, testId, analysisId, query) {
   if (query.get("frame") === "system") result.use("system");
   /** @type {State} */
   const state = {
-    step: result.steps.includes(asked) ? asked : result.steps.at(-1) ?? null, field: query.get("field"), image: "reference", mode: "image", info: null, playing: null,
+    step: result.steps.includes(asked) ? asked : result.steps.at(-1) ?? null, field: query.get("field"), chosen: Boolean(query.get("field")), image: "reference", mode: "image", info: null, playing: null,
   };
 
   const map = new FieldMap("Field over the image of camera 1", (x, y, event) => screen.onpick(x, y, event));
@@ -125,38 +127,47 @@ async function show(root, testId, analysisId, query) {
     get info() { return state.info; },
     onpick: (x, y) => pick(x, y),
     drawn: new Set(),
+    landed: new Set(),
   };
   screen.interval = interval(screen);
 
   async function drawFields() {
     if (state.step === null) return;
     const { shown } = await result.fields(state.step);
-    let key = state.field;
-    if (!shown.some((one) => one.key === key)) {
-      // a field that this step lacks (a shape has no displacement) stays chosen for the others
-      key = key ?? (shown.some((one) => one.key === "w_mm") ? "w_mm" : "z_mm");
-    }
-    state.info = shown.find((one) => one.key === key) ?? null;
-    if (!state.info && !state.field) state.info = shown[0];
-    state.field = state.info?.key ?? key;
+    // a field that was chosen and that this step lacks (a shape has no displacement) stays chosen for the others
+    if (!state.chosen) state.field = usualField(shown.map((one) => one.key));
+    state.info = shown.find((one) => one.key === state.field) ?? null;
     const groups = [...new Set(shown.map((one) => one.group))];
     replace(fieldChoice, state.info ? null : h("option", { value: state.field, selected: true }, `${state.field} (not in this step)`),
       groups.map((group) => h("optgroup", { label: group }, shown.filter((one) => one.group === group).map((one) =>
         h("option", { value: one.key, selected: one.key === state.field, title: one.about }, one.unit ? `${one.text} (${one.unit})` : one.text)))));
   }
 
-  async function refresh() {
-    if (state.step === null) {
-      message.textContent = "No step is finished yet. The page updates by itself.";
-      return;
-    }
-    replace(cameras, camerasNote(result.analysis.summary?.steps?.find((one) => one.n === state.step)));
+  /** Which step is shown, of how many. */
+  function counter() {
+    if (state.step === null) return;
+    const at = result.steps.indexOf(state.step);
     slider.max = String(Math.max(result.steps.length - 1, 0));
-    slider.value = String(result.steps.indexOf(state.step ?? NaN));
+    slider.value = String(at);
     slider.setAttribute("aria-valuetext", result.stepText(state.step));
-    stepText.textContent = `${result.stepText(state.step)} · ${result.steps.indexOf(state.step ?? NaN) + 1} of ${result.steps.length}`;
+    replace(stepText, h("span.name", { title: result.stepText(state.step) }, result.stepText(state.step)), h("span.of", `${at + 1} of ${result.steps.length}`));
+  }
+
+  /** Without a finished step there is nothing to choose: what is the matter stands alone. */
+  function nothing() {
+    const none = state.step === null;
+    for (const part of dependent) part.hidden = none;
+    replace(empty, !none ? null : following.running() ? h("p.quiet", { role: "status" }, "No step is finished yet. The page updates by itself.")
+      : h("p.quiet", "No step was measured. ", h("a", { href: `#/test/${testId}` }, "Back to the test"), " to draw the region and measure again."));
+  }
+
+  async function refresh() {
+    nothing();
+    if (state.step === null) return;
+    replace(cameras, camerasNote(result.analysis.summary?.steps?.find((one) => one.n === state.step)));
+    counter();
     await drawFields();
-    const address = `#/results/${testId}/${analysisId}?step=${state.step}&field=${encodeURIComponent(state.field ?? "")}${result.frame === "system" ? "&frame=system" : ""}`;
+    const address = `#/results/${testId}/${analysisId}?step=${state.step}${state.chosen ? `&field=${encodeURIComponent(state.field ?? "")}` : ""}${result.frame === "system" ? "&frame=system" : ""}`;
     if (location.hash !== address && location.hash.startsWith(`#/results/${testId}/${analysisId}`)) history.replaceState(null, "", address);
     if (!state.info) {
       message.textContent = `Step ${state.step} has no ${state.field}: ${state.step === result.reference ? "it is the reference of the displacements." : "choose another field."}`;
@@ -215,6 +226,13 @@ async function show(root, testId, analysisId, query) {
   /** @param {number | null} n */
   async function setStep(n) {
     state.step = n;
+    await refresh();
+  }
+
+  /** A step chosen by hand. @param {number} n */
+  async function choose(n) {
+    state.step = n;
+    following.moved();
     await refresh();
   }
 
@@ -281,13 +299,13 @@ async function show(root, testId, analysisId, query) {
   }
   ends.push(() => other?.close());
 
-  fieldChoice.addEventListener("change", () => { state.field = fieldChoice.value; scale.forget(); refresh().catch(notify); });
+  fieldChoice.addEventListener("change", () => { state.field = fieldChoice.value; state.chosen = true; scale.forget(); refresh().catch(notify); });
   imageChoice.addEventListener("change", () => { state.image = /** @type {Over} */ (imageChoice.value); refresh().catch(notify); });
-  slider.addEventListener("input", () => setStep(result.steps[Number(slider.value)]).catch(notify));
+  slider.addEventListener("input", () => choose(result.steps[Number(slider.value)]).catch(notify));
   const fade = () => { map.view.canvas.style.opacity = String(Number(opacity.value) / 100); };
   opacity.addEventListener("input", fade);
   fade();
-  const move = (/** @type {number} */ by) => setStep(result.steps[Math.min(Math.max(result.steps.indexOf(state.step ?? NaN) + by, 0), result.steps.length - 1)]).catch(notify);
+  const move = (/** @type {number} */ by) => choose(result.steps[Math.min(Math.max(result.steps.indexOf(state.step ?? NaN) + by, 0), result.steps.length - 1)]).catch(notify);
 
   function drawStatus() {
     const { analysis } = result;
@@ -295,15 +313,17 @@ async function show(root, testId, analysisId, query) {
     replace(warned, warningsBox(analysis.warnings));
   }
 
+  const following = live(screen, setStep);
+  const empty = h("div", { "data-role": "empty" });
+  const controls = h("div.row.controls", h("div.field", h("label", { for: "resultfield" }, "Field"), Object.assign(fieldChoice, { id: "resultfield" })),
+    axesField, field("Image", imageChoice), field("Opacity", opacity, "%"),
+    h("div.field.grow", h("label", { for: "resultstep" }, "Step "), h("span.control",
+      h("button", { type: "button", "aria-label": "Step before", onclick: () => move(-1) }, "◂"), Object.assign(slider, { id: "resultstep" }),
+      h("button", { type: "button", "aria-label": "Next step", onclick: () => move(1) }, "▸"), play, stepText)));
+  const pictured = h("div", stage, message, cameras);
+  const figures = h("section.panel.figures", { "aria-label": "Figures" }, scale.root, h("h2", "Statistics"), statistics, screen.interval.root, h("h2", "Probe"), probe);
   replace(root,
-    h("div.spread", h("h1", "Results: ", h("a", { href: `#/results/${testId}` }, result.test.name || testId), ` · ${result.analysis.label || analysisId}`), status, modes), warned,
-    h("div.row.controls", h("div.field", h("label", { for: "resultfield" }, "Field"), Object.assign(fieldChoice, { id: "resultfield" })),
-      axesField, field("Image", imageChoice), field("Opacity", opacity, "%"),
-      h("div.field.grow", h("label", { for: "resultstep" }, "Step "), h("span.control",
-        h("button", { type: "button", "aria-label": "Step before", onclick: () => move(-1) }, "◂"), Object.assign(slider, { id: "resultstep" }),
-        h("button", { type: "button", "aria-label": "Next step", onclick: () => move(1) }, "▸"), play, stepText))),
-    h("div.grid.side.measured", h("div", stage, message, cameras),
-      h("section.panel.figures", { "aria-label": "Figures" }, scale.root, h("h2", "Statistics"), statistics, screen.interval.root, h("h2", "Probe"), probe), below));
+    h("div.spread", h("h1", "Results: ", h("a", { href: `#/results/${testId}` }, result.test.name || testId), ` · ${result.analysis.label || analysisId}`), status, modes), warned, following.root, empty, controls, h("div.grid.side.measured", pictured, figures, below));
 
   drawStatus();
   screen.drawn.add(() => mark(screen));
@@ -311,16 +331,19 @@ async function show(root, testId, analysisId, query) {
   const gaugePanels = gauges(screen);
   const axes = frames(screen, async () => { scale.forget(); state.pinned = undefined; replace(probe, h("p.quiet", "Click a point to see all its values.")); await refresh(); });
   axesField.append(h("label", { for: "resultframe" }, "Axes"), axes.choice);
-  below.append(gaugePanels, axes.root, files(screen), aboutPanel.root);
+  const filesPanel = files(screen);
+  below.append(gaugePanels, axes.root, filesPanel, aboutPanel.root);
+  const dependent = [modes, controls, pictured, figures, gaugePanels, axes.root, filesPanel]; // on a finished step
   await refresh();
   ends.push(events.on("result", async (event) => {
     if (event.analysis_id !== analysisId) return;
-    const first = state.step === null;
     await result.refresh();
     drawStatus();
-    slider.max = String(Math.max(result.steps.length - 1, 0));
+    counter();
     aboutPanel.draw();
-    if (first) await setStep(result.steps.at(-1) ?? null);
+    await following.landed();
+    if (scale.overAll) await redraw();
+    for (const listener of screen.landed) await listener();
   }), events.on("step_failed", async (event) => {
     if (event.analysis_id !== analysisId) return;
     await result.refresh();
@@ -330,6 +353,7 @@ async function show(root, testId, analysisId, query) {
     if (job.id !== result.analysis.job_id || job.state === result.analysis.state) return;
     await result.refresh();
     drawStatus();
+    nothing();
     aboutPanel.draw();
   }), () => { state.playing = null; });
   return () => ends.forEach((end) => end());

@@ -449,6 +449,7 @@ export function gauges(screen) {
     if (state.line) await readLine().catch(notify);
     if (state.area && screen.info) await readArea().catch(notify);
   });
+  screen.landed.add(() => Promise.all([readExtensometers(), readArea()]).catch(notify)); // histories of all steps
   screen.ends.push(() => Object.values(plots).forEach((one) => one?.close()));
   return root;
 }

@@ -2,7 +2,7 @@
 import * as api from "../../lib/api.js";
 import { View, stroke } from "../../widgets/view.js";
 import { greyOf } from "../../widgets/grey.js";
-import { stateBadge, warningsBox } from "../results/warnings.js";
+import { running } from "./running.js";
 import { RegionEditor } from "../../widgets/region_editor.js";
 import { h, replace, svg, field, number, select, action, table, badge, num, count, quantity, notify, problemText } from "../../lib/dom.js";
 
@@ -24,6 +24,7 @@ export async function measurePanel(id, test, ends, done) {
   const root = h("section.panel", { "aria-label": "Region and analysis" }, h("h2", "Region and analysis"));
   const body = h("div");
   root.append(body);
+  const jobs = running(id, ends, done);
   /** @type {Awaited<ReturnType<typeof build>> | null} */
   let built = null;
 
@@ -190,9 +191,6 @@ export async function measurePanel(id, test, ends, done) {
     }
     for (const input of [window_, strain]) input.addEventListener("input", drawGauge);
 
-    const progress = h("div", { role: "status", "data-role": "progress" });
-    const stopped = new AbortController();
-    ends.push(() => stopped.abort());
     const start = action("Measure", async () => {
       const region = editor.region();
       if (!region) throw api.problemOf({ cause: "There is no region.", remedy: "Draw a rectangle or a polygon over camera 1's image." });
@@ -206,29 +204,9 @@ export async function measurePanel(id, test, ends, done) {
       if (wanted) body_.steps = wanted;
       if (follow_.checked) body_.follow = true;
       const { job, analysis_id: analysis } = await api.post(`/tests/${id}/analyses`, body_);
+      jobs.show(job, analysis, follow_.checked);
       await done();
-      follow(job, analysis).catch((error) => api.aborted(error) || notify(error));
     }, { kind: "primary" });
-
-    /**
-     * @param {Model<"JobReply">} job
-     * @param {string} analysis
-     */
-    async function follow(job, analysis) {
-      const bar = h("progress", { max: 1, "aria-label": "Progress of the analysis" });
-      const text = h("span");
-      const link = h("a.button", { href: `#/results/${id}/${analysis}` }, "Show results");
-      replace(progress, h("div.row", h("span", { style: { flex: 1, minWidth: "10rem" } }, bar), text, action("Cancel", () => api.post(`/jobs/${job.id}:cancel`), { kind: "danger" }), link));
-      const ended = await api.finished(job.id, { signal: stopped.signal, onprogress: (now) => {
-        const { phase: stage, done: ready, total, eta_s: eta } = now.progress ?? {};
-        if (total) bar.value = ready / total;
-        text.textContent = now.state === "queued" ? "waiting" : `${stage ?? ""}${eta ? `, ${num(eta, 2)} s left` : ""}`;
-      } });
-      const problem = ["succeeded", "cancelled"].includes(ended.state) ? null : problemText(api.jobProblem(ended));
-      const warnings = /** @type {import("../results/warnings.js").Warning[] | undefined} */ (ended.result?.warnings);
-      replace(progress, h("div.row", stateBadge(ended.state, warnings), link), problem, warningsBox(warnings));
-      await done();
-    }
 
     replace(body,
       h("div.row", h("label", { for: "reference-step" }, "Reference step"), Object.assign(reference, { id: "reference-step" }), editor.bar), editor.hint,
@@ -246,7 +224,7 @@ export async function measurePanel(id, test, ends, done) {
               field("Reference is updated", update), field("Smoothing window", smoothing, "points", "odd; empty: none"))),
           h("fieldset", h("legend", "Strain"), h("label.check", strain, "compute strain"), h("div.fields", field("Window", window_, "points", "odd"), field("Fit", order), field("Tensor", tensor)), gauge),
           h("div.fields", field("Steps", which, "", "such as 1-5, 8; empty: all"), field("Label", label)), h("label.check", follow_, "continue with each new step"),
-          h("div.row", { style: { marginTop: "0.5rem" } }, start), progress)));
+          h("div.row", { style: { marginTop: "0.5rem" } }, start), jobs.root)));
     editor.use("rectangle");
     editor.drawList();
     drawGauge();
@@ -262,7 +240,7 @@ export async function measurePanel(id, test, ends, done) {
   }
 
   await steps(test);
-  return { root, steps: (/** @type {Test} */ fresh) => steps(fresh).catch(notify) };
+  return { root, head: jobs.head, steps: (/** @type {Test} */ fresh) => steps(fresh).catch(notify) };
 }
 
 /**
