@@ -8,6 +8,7 @@ import { about, files } from "./results/about.js";
 import { camerasNote } from "./results/cameras.js";
 import { gauges } from "./results/gauges.js";
 import { frames } from "./results/frame.js";
+import { overlay } from "./results/overlay.js";
 import { mark, pinned } from "./results/probe.js";
 import { interval } from "./results/uncertainty.js";
 import { live, usualField } from "./results/live.js";
@@ -18,10 +19,11 @@ import { h, replace, table, when, num, count, quantity, field, select, definitio
 /** @import { Ends } from "#dom" */
 /** @import { Over } from "../widgets/field_map.js" */
 /** @import { Shown } from "./results/analysis.js" */
+/** @import { Overlay } from "./results/overlay.js" */
 /** @import { Interval } from "./results/uncertainty.js" */
 /** @typedef {"image" | "surface" | "compare"} Mode */
 /** @typedef {{ step: number | null, field: string | null, chosen: boolean, image: Over, mode: Mode, info: Shown | null, playing: object | null, pinned?: number }} State */
-/** @typedef {{ result: Result, state: State, map: FieldMap, scale: Scale, interval: Interval, ends: Ends, probe: HTMLElement, message: HTMLElement, readonly step: number | null,
+/** @typedef {{ result: Result, state: State, map: FieldMap, scale: Scale, interval: Interval, overlay: Overlay, ends: Ends, probe: HTMLElement, message: HTMLElement, readonly step: number | null,
  *   readonly info: Shown | null, onpick: (x: number, y: number, event: Event) => unknown, drawn: Set<() => unknown>, landed: Set<() => unknown> }} Viewer shared by the parts of the screen;
  *   `drawn` is called after each change of step, field or scale, `landed` once more steps are finished */
 /** @typedef {{ root: HTMLElement, update: () => Promise<void>, close: () => void, attach?: () => void }} OtherView shown instead of the map */
@@ -122,7 +124,7 @@ async function show(root, testId, analysisId, query) {
   const play = h("button", { type: "button", "aria-pressed": "false", title: "Play through the steps", onclick: () => playing(!state.playing) }, "▶ Play");
   /** @type {Viewer} */
   const screen = {
-    result, state, map, scale, ends, probe, message, interval: /** @type {any} */ (null),
+    result, state, map, scale, ends, probe, message, interval: /** @type {any} */ (null), overlay: /** @type {any} */ (null),
     get step() { return state.step; },
     get info() { return state.info; },
     onpick: (x, y) => pick(x, y),
@@ -130,6 +132,7 @@ async function show(root, testId, analysisId, query) {
     landed: new Set(),
   };
   screen.interval = interval(screen);
+  screen.overlay = overlay(screen);
 
   async function drawFields() {
     if (state.step === null) return;
@@ -150,7 +153,7 @@ async function show(root, testId, analysisId, query) {
     slider.max = String(Math.max(result.steps.length - 1, 0));
     slider.value = String(at);
     slider.setAttribute("aria-valuetext", result.stepText(state.step));
-    replace(stepText, h("span.name", { title: result.stepText(state.step) }, result.stepText(state.step)), h("span.of", `${at + 1} of ${result.steps.length}`));
+    replace(stepText, h("span.of", `${at + 1} of ${result.steps.length}`), h("span.name", { title: result.stepText(state.step) }, result.stepText(state.step)));
   }
 
   /** Without a finished step there is nothing to choose: what is the matter stands alone. */
@@ -320,7 +323,7 @@ async function show(root, testId, analysisId, query) {
     h("div.field.grow", h("label", { for: "resultstep" }, "Step "), h("span.control",
       h("button", { type: "button", "aria-label": "Step before", onclick: () => move(-1) }, "◂"), Object.assign(slider, { id: "resultstep" }),
       h("button", { type: "button", "aria-label": "Next step", onclick: () => move(1) }, "▸"), play, stepText)));
-  const pictured = h("div", stage, message, cameras);
+  const pictured = h("div", stage, screen.overlay.root, message, cameras);
   const figures = h("section.panel.figures", { "aria-label": "Figures" }, scale.root, h("h2", "Statistics"), statistics, screen.interval.root, h("h2", "Probe"), probe);
   replace(root,
     h("div.spread", h("h1", "Results: ", h("a", { href: `#/results/${testId}` }, result.test.name || testId), ` · ${result.analysis.label || analysisId}`), status, modes), warned, following.root, empty, controls, h("div.grid.side.measured", pictured, figures, below));
