@@ -22,7 +22,18 @@ from server.formats.results.writing import Provenance, write_field
 from server.store.index import analysis_entry
 from tests.support import results_page
 from tests.support.page_bench import UNREACHED, Watched, tabbed, watched
-from tests.support.results_page import API, ENDS, LINE, RECTANGLE, Bench, drawn, given, shown, with_a_cut
+from tests.support.results_page import (
+    API,
+    ENDS,
+    LINE,
+    RECTANGLE,
+    Bench,
+    drawn,
+    given,
+    shown,
+    two_digits_of_u,
+    with_a_cut,
+)
 from tests.support.service_rig import wait_for_job
 
 bench, page = results_page.bench, results_page.page  # fixtures
@@ -127,17 +138,29 @@ def test_what_is_under_the_mouse_is_the_probes(page: Watched, bench: Bench) -> N
         at.mouse.move(*point_on_screen(at, *spot))
         w = reply["values"]["w_mm"]["value"]
         expect(readout).to_have_attribute("data-value", repr(w))
-        text = f"{w:.5g}".replace("-", "\N{MINUS SIGN}")[:7]
-        expect(readout).to_contain_text(text)
-        expect(readout).to_contain_text("±")
+        expect(readout).to_contain_text(two_digits_of_u(w, reply["values"]["w_mm"]["sigma"]))
     at.mouse.click(*point_on_screen(at, 103.4, 98.2))
     reply = bench.client.get(
         f"{bench.path()}/probe", params={"x_px": 103.4, "y_px": 98.2, "step": 2, "frame": "specimen"}
     ).json()
     pinned = at.locator('[data-role="probe"]')
     expect(pinned).to_contain_text(f"row {reply['row']}, column {reply['col']}, step 2")
-    row = pinned.locator("tr", has=at.get_by_role("cell", name="w_mm", exact=True))
-    expect(row).to_contain_text(f"{reply['values']['w_mm']['value']:.5f}".replace("-", "\N{MINUS SIGN}")[:7])
+    row = pinned.locator("tr", has=at.get_by_role("cell", name="W", exact=True))
+    w = reply["values"]["w_mm"]
+    expect(row).to_contain_text(two_digits_of_u(w["value"], w["sigma"]))
+    # what matters stands first
+    expect(pinned.locator("table caption").first).to_have_text("Displacement")
+    # and its history: zero at the reference, then what each step measured
+    at.locator('[data-role="point"] summary').click()
+    steps = [
+        bench.client.get(
+            f"{bench.path()}/probe", params={"x_px": 103.4, "y_px": 98.2, "step": n, "frame": "specimen"}
+        ).json()["values"]["w_mm"]
+        for n in (1, 2)
+    ]
+    got = answer_of(at, "point-chart")
+    assert got["value"] == [0, *(one["value"] for one in steps)]
+    assert got["sigma"] == [0, *(one["sigma"] for one in steps)]
     page.sound()
 
 
@@ -149,14 +172,14 @@ def test_the_interval_is_chosen_and_a_click_shows_the_budget(page: Watched, benc
     readout, says = at.locator(".view .readout").first, at.locator('[data-role="includes"]')
     expect(says).to_contain_text("u (k = 1) includes matching, reference, calibration")
     at.mouse.move(*point_on_screen(at, *spot))
-    expect(readout).to_contain_text(f"± {w['sigma']:.2g}")
+    expect(readout).to_contain_text(two_digits_of_u(w["value"], w["sigma"]))
     expect(readout).to_contain_text("u, k = 1")
     at.get_by_label("Uncertainties shown").select_option("95 %")
     expect(says).to_contain_text("U (k = 1.96, 95 %) includes")
     at.mouse.move(*point_on_screen(at, spot[0] + 0.2, spot[1]))
-    expect(readout).to_contain_text(f"± {w['expanded']:.2g}")
+    expect(readout).to_contain_text(two_digits_of_u(w["value"], w["expanded"]))
     at.mouse.click(*point_on_screen(at, *spot))
-    row = at.locator('[data-role="probe"] tr', has=at.get_by_role("cell", name="w_mm", exact=True)).first
+    row = at.locator('[data-role="probe"] tr', has=at.get_by_role("cell", name="W", exact=True)).first
     budget = row.locator('[data-role="budget"]')
     expect(budget).to_be_hidden()
     row.get_by_role("button").click()
@@ -184,7 +207,7 @@ def test_numbers_without_the_calibrations_uncertainty_say_so(page: Watched, benc
     at.mouse.move(*point_on_screen(at, 103.4, 98.2))
     expect(at.locator(".view .readout").first).to_contain_text(lacking)
     at.mouse.click(*point_on_screen(at, 103.4, 98.2))
-    expect(at.locator('[data-role="probe"] table caption').first).to_contain_text(lacking)
+    expect(at.locator('[data-role="probe"]')).to_contain_text(lacking)
     at.locator("summary", has_text="Extensometers").click()
     given(at, ENDS, (80, 90, 160, 90))
     at.locator("details", has=at.get_by_label(ENDS[0])).get_by_role("button", name="Use").click()
@@ -321,7 +344,7 @@ def test_extensometers_by_two_clicks_and_by_keyboard_against_load_and_channels(p
     answer_of(at, "extensometer-chart")
     given(at, ENDS, (120, 70, 120, 160))
     at.locator("details", has=at.get_by_label(ENDS[0])).get_by_role("button", name="Use").click()
-    expect(at.get_by_role("button", name="Remove e2")).to_be_visible()
+    expect(at.get_by_role("button", name="Remove E2")).to_be_visible()
     at.get_by_label("Against", exact=True).select_option("load")
     at.get_by_label("Show", exact=True).select_option("elongation_mm")
     wait_for_chart(at, "extensometer-chart", "a.x[1] === 689 && a.value[1].length === 2")
@@ -334,8 +357,8 @@ def test_extensometers_by_two_clicks_and_by_keyboard_against_load_and_channels(p
     assert got["x"] == [0.0, 689.0, 1378.0]
     at.get_by_label("Against", exact=True).select_option("channel:stroke_mm")
     wait_for_chart(at, "extensometer-chart", "a.x[2] === 6.89")
-    at.get_by_role("button", name="Remove e1").click()
-    expect(at.get_by_role("button", name="Remove e1")).to_have_count(0)
+    at.get_by_role("button", name="Remove E1").click()
+    expect(at.get_by_role("button", name="Remove E1")).to_have_count(0)
     # ends outside the field are refused with cause and remedy
     given(at, ENDS, (1, 1, 120, 160))
     at.locator("details", has=at.get_by_label(ENDS[0])).get_by_role("button", name="Use").click()
@@ -718,4 +741,49 @@ def test_lines_and_vectors_lie_over_the_map_and_the_surface(page: Watched, bench
     at.get_by_role("button", name="True scale").click()
     expect(space).to_have_attribute("data-magnification", "1")
     expect(at.get_by_text("Give a factor from 0 to 1000.")).to_be_hidden()
+    page.sound()
+
+
+def test_strain_is_shown_in_percent_by_choice(page: Watched, bench: Bench) -> None:
+    at = shown(page, bench, name="exx")
+    bar = at.locator('[data-role="colourbar"] .of').first
+    expect(bar).to_have_text("µm/m")
+    at.get_by_label("Unit of strain").select_option("%")
+    expect(bar).to_have_text("%")
+    low, _ = limits(at)
+    first = at.locator('[data-role="colourbar"] .marks span').first.inner_text().replace("\N{MINUS SIGN}", "-")
+    assert float(first) == pytest.approx(low * 1e-4, abs=1e-3)
+    assert low == pytest.approx(float(np.nanpercentile(bench.field(2, "exx"), 1)) * 1e6, rel=1e-4)
+    # kept for the next time
+    shown(page, bench, name="exx")
+    expect(bar).to_have_text("%")
+    page.sound()
+
+
+def test_a_phone_shows_the_step_and_a_low_bar(chromium: Browser, bench: Bench) -> None:
+    origin = str(bench.client.base_url).rstrip("/")
+    with watched(chromium, origin, viewport={"width": 390, "height": 844}, has_touch=True) as page:
+        at = shown(page, bench)
+        assert not at.evaluate("document.documentElement.scrollWidth > document.documentElement.clientWidth")
+        bar, step = at.locator("#bar").bounding_box(), at.locator('[data-role="step"]').bounding_box()
+        assert bar is not None
+        assert step is not None
+        assert bar["height"] < 844 / 8
+        assert step["x"] + step["width"] <= 390
+        expect(at.get_by_role("button", name="STOP")).to_be_in_viewport()
+        page.sound()
+
+
+def test_nothing_moves_when_the_numbers_change(page: Watched, bench: Bench) -> None:
+    at = shown(page, bench)
+    places = """() => ['.view .frame', '[data-role=colourbar]', 'input[aria-label=Step]', '[data-role=interval]']
+        .map(one => { const b = document.querySelector(one).getBoundingClientRect(); return [b.x, b.y, b.width] })"""
+    before = at.evaluate(places)
+    for spot in ((103.4, 98.2), (20.0, 30.0)):
+        at.mouse.move(*point_on_screen(at, *spot))
+        expect(at.locator(".view .readout").first).to_contain_text("grey")
+        assert at.evaluate(places) == before
+    at.get_by_role("button", name="Step before").click()
+    drawn(at, "1 w_mm reference")
+    assert at.evaluate(places) == before
     page.sound()

@@ -29,10 +29,10 @@ export function useStrainUnit(unit) {
 /**
  * Unit to show numbers of a unit in, and the factor to it.
  * @param {string} unit
- * @param {number | null | undefined} size of the largest of the numbers
+ * @param {number | null} [size] of the largest of the numbers
  */
-export function shown(unit, size) {
-  if (unit === "mm" && size !== null && size !== undefined && Math.abs(size) < SMALL_MM) return { unit: "µm", factor: 1000 };
+export function shown(unit, size = null) {
+  if (unit === "mm" && size !== null && Math.abs(size) < SMALL_MM) return { unit: "µm", factor: 1000 };
   if (unit === "µm/m" && strain === "%") return { unit: "%", factor: 1e-4 };
   return { unit, factor: 1 };
 }
@@ -72,7 +72,7 @@ export function uncertain(value, u, unit) {
  * @param {string} unit
  */
 export function amount(value, unit, digits = 4) {
-  const to = shown(unit, value);
+  const to = shown(unit, value ?? null);
   const text = num(value === null || value === undefined ? value : value * to.factor, digits);
   return text === "–" || !to.unit ? text : `${text}\u00a0${to.unit}`;
 }

@@ -9,10 +9,12 @@ import { camerasNote } from "./results/cameras.js";
 import { gauges } from "./results/gauges.js";
 import { frames } from "./results/frame.js";
 import { overlay } from "./results/overlay.js";
+import { pointHistory } from "./results/point_history.js";
 import { mark, pinned } from "./results/probe.js";
 import { interval } from "./results/uncertainty.js";
 import { live, usualField } from "./results/live.js";
 import { stateBadge, warningsBox, warningsCell } from "./results/warnings.js";
+import { amount, shown as shown_, strainUnit, useStrainUnit } from "../lib/units.js";
 import { h, replace, table, when, num, count, quantity, field, select, definitions, notify, problemText } from "../lib/dom.js";
 
 /** @import { Here } from "../main.js" */
@@ -120,6 +122,17 @@ async function show(root, testId, analysisId, query) {
     h("button", { type: "button", "data-mode": name, "aria-pressed": String(name === "image"), onclick: () => setMode(name).catch(notify) }, text)));
   const stage = h("div", map.view.root);
   const below = h("div");
+  const strainChoice = select([["µm/m", "µm/m"], ["%", "%"]], strainUnit(), { "aria-label": "Unit of strain", "data-role": "strain-unit" });
+  strainChoice.addEventListener("change", async () => {
+    useStrainUnit(strainChoice.value === "%" ? "%" : "µm/m");
+    try {
+      await drawFields();
+      await redraw();
+      for (const listener of screen.interval.changed) await listener();
+    } catch (error) {
+      notify(error);
+    }
+  });
   const axesField = h("div.field");
   const play = h("button", { type: "button", "aria-pressed": "false", title: "Play through the steps", onclick: () => playing(!state.playing) }, "▶ Play");
   /** @type {Viewer} */
@@ -143,7 +156,7 @@ async function show(root, testId, analysisId, query) {
     const groups = [...new Set(shown.map((one) => one.group))];
     replace(fieldChoice, state.info ? null : h("option", { value: state.field, selected: true }, `${state.field} (not in this step)`),
       groups.map((group) => h("optgroup", { label: group }, shown.filter((one) => one.group === group).map((one) =>
-        h("option", { value: one.key, selected: one.key === state.field, title: one.about }, one.unit ? `${one.text} (${one.unit})` : one.text)))));
+        h("option", { value: one.key, selected: one.key === state.field, title: one.about }, one.unit ? `${one.text} (${shown_(one.unit).unit})` : one.text)))));
   }
 
   /** Which step is shown, of how many. */
@@ -205,9 +218,11 @@ async function show(root, testId, analysisId, query) {
     scale.lay(values, info.unit, info.flags, Boolean(info.signed));
     map.redraw(scale);
     const s = map.now.statistics;
+    const { unit, factor } = shown_(info.unit, Math.max(Math.abs(s.min ?? 0), Math.abs(s.max ?? 0))); // one unit for all
+    const text = (/** @type {number | null} */ v, digits = 4) => quantity(v === null ? null : factor * v, unit, digits);
     replace(statistics, [...definitions([
-      ["min", quantity(s.min, info.unit)], ["max", quantity(s.max, info.unit)], ["mean", quantity(s.mean, info.unit)], ["sd", quantity(s.sd, info.unit, 3)],
-      ["valid", `${count(s.count)} of ${count(s.within)} points (${num(s.within ? (100 * s.count) / s.within : null, 4)} %)`],
+      ["min", text(s.min)], ["max", text(s.max)], ["mean", text(s.mean)], ["sd", text(s.sd, 3)],
+      ["valid", h("span.whole", { title: "points with a value, of those in the region" }, `${count(s.count)} of ${count(s.within)} (${num(s.within ? (100 * s.count) / s.within : null, 3)} %)`)],
     ]).children]);
     for (const listener of screen.drawn) await listener();
     await principal();
@@ -223,7 +238,7 @@ async function show(root, testId, analysisId, query) {
     if (state.step !== step || state.info !== info || !map.now) return;
     const { grid } = map.now;
     const mean = (/** @type {ArrayLike<number>} */ of) => { const known = measured(grid, of); return known.length ? known.reduce((sum, v) => sum + v, 0) / known.length : null; };
-    statistics.append(...definitions([["principal strains, mean", `${num(mean(e1), 4)} and ${quantity(mean(e2), info.unit || "µm/m", 4)}`]]).children);
+    statistics.append(...definitions([["principal strains, mean", h("span.whole", `${amount(mean(e1), "µm/m")}, ${amount(mean(e2), "µm/m")}`)]]).children);
   }
 
   /** @param {number | null} n */
@@ -270,6 +285,7 @@ async function show(root, testId, analysisId, query) {
     state.pinned = i;
     const answer = await api.get(`${result.path}/probe`, { x_px: Math.max(grid.x[i], 0), y_px: Math.max(grid.y[i], 0), step: state.step, frame: result.frame });
     pinned(screen, answer);
+    point.draw();
   }
 
   /** @type {OtherView | null} */
@@ -324,7 +340,7 @@ async function show(root, testId, analysisId, query) {
       h("button", { type: "button", "aria-label": "Step before", onclick: () => move(-1) }, "◂"), Object.assign(slider, { id: "resultstep" }),
       h("button", { type: "button", "aria-label": "Next step", onclick: () => move(1) }, "▸"), play, stepText)));
   const pictured = h("div", stage, screen.overlay.root, message, cameras);
-  const figures = h("section.panel.figures", { "aria-label": "Figures" }, scale.root, h("h2", "Statistics"), statistics, screen.interval.root, h("h2", "Probe"), probe);
+  const figures = h("section.panel.figures", { "aria-label": "Figures" }, scale.root, h("h2", "Statistics"), statistics, h("div.row", h("span", "Strain in"), strainChoice), screen.interval.root, h("h2", "Probe"), probe);
   replace(root,
     h("div.spread", h("h1", "Results: ", h("a", { href: `#/results/${testId}` }, result.test.name || testId), ` · ${result.analysis.label || analysisId}`), status, modes), warned, following.root, empty, controls, h("div.grid.side.measured", pictured, figures, below));
 
@@ -335,8 +351,9 @@ async function show(root, testId, analysisId, query) {
   const axes = frames(screen, async () => { scale.forget(); state.pinned = undefined; replace(probe, h("p.quiet", "Click a point to see all its values.")); await refresh(); });
   axesField.append(h("label", { for: "resultframe" }, "Axes"), axes.choice);
   const filesPanel = files(screen);
-  below.append(gaugePanels, axes.root, filesPanel, aboutPanel.root);
-  const dependent = [modes, controls, pictured, figures, gaugePanels, axes.root, filesPanel]; // on a finished step
+  const point = pointHistory(screen);
+  below.append(point.root, gaugePanels, axes.root, filesPanel, aboutPanel.root);
+  const dependent = [modes, controls, pictured, figures, point.root, gaugePanels, axes.root, filesPanel]; // on a finished step
   await refresh();
   ends.push(events.on("result", async (event) => {
     if (event.analysis_id !== analysisId) return;

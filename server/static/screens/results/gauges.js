@@ -3,6 +3,7 @@ import * as api from "../../lib/api.js";
 import { chart } from "../../widgets/plots.js";
 import { h, svg, numeric, replace, table, num, count, number, select, field, action, notify, problemText } from "../../lib/dom.js";
 import { nudge, onGrab } from "../../widgets/view.js";
+import { amount, shown, uncertain } from "../../lib/units.js";
 import { shownUnit } from "./analysis.js";
 import { budgetTable, withBudget } from "./uncertainty.js";
 /** @import { Attributes } from "#dom" */
@@ -138,8 +139,14 @@ export function gauges(screen) {
     }
     if (tool === "line") state.line = [from, to];
     if (tool === "area") state.area = [Math.min(from[0], to[0]), Math.min(from[1], to[1]), Math.max(from[0], to[0]), Math.max(from[1], to[1])];
-    if (tool === "extensometer") { state.serial += 1; state.extensometers.push({ name: `e${state.serial}`, a: from, b: to }); }
+    if (tool === "extensometer") state.extensometers.push({ name: nextName(), a: from, b: to });
     if (tool !== "probe") changed(tool);
+  }
+
+  /** E1, E2 ...: e1 and e2 are the principal strains. Gauges that were saved under other names keep them. */
+  function nextName() {
+    do state.serial += 1; while (state.extensometers.some((one) => one.name === `E${state.serial}`));
+    return `E${state.serial}`;
   }
 
   /** @param {Kind} tool */
@@ -231,7 +238,7 @@ export function gauges(screen) {
   };
   const lineInputs = four(["Line from x", "Line from y", "Line to x", "Line to y"], ([x0, y0, x1, y1]) => { state.line = [[x0, y0], [x1, y1]]; return changed("line"); });
   const areaInputs = four(["Area left", "Area top", "Area right", "Area bottom"], (v) => { state.area = v; return changed("area"); });
-  const extInputs = four(["Extensometer a x", "Extensometer a y", "Extensometer b x", "Extensometer b y"], ([x0, y0, x1, y1]) => { state.serial += 1; state.extensometers.push({ name: `e${state.serial}`, a: [x0, y0], b: [x1, y1] }); return changed("extensometer"); });
+  const extInputs = four(["Extensometer a x", "Extensometer a y", "Extensometer b x", "Extensometer b y"], ([x0, y0, x1, y1]) => { state.extensometers.push({ name: nextName(), a: [x0, y0], b: [x1, y1] }); return changed("extensometer"); });
   function fillInputs() {
     if (state.line) state.line.flat().forEach((v, k) => { lineInputs.inputs[k].value = String(v); });
     if (state.area) state.area.forEach((v, k) => { areaInputs.inputs[k].value = String(v); });
@@ -282,7 +289,9 @@ export function gauges(screen) {
     if (!answers.line) return;
     const { line, from, name } = answers.line;
     const { value, sigma, units, budget, not_included: lacking } = line.values[name];
-    const { unit, factor } = shownUnit(name, units);
+    const { unit: base, factor: toBase } = shownUnit(name, units);
+    const to = shown(base, toBase * value.reduce((/** @type {number} */ most, v) => Math.max(most, Math.abs(v ?? 0)), 0));
+    const [unit, factor] = [to.unit, to.factor * toBase];
     const scaled = (/** @type {(number | null)[]} */ list) => list.map((v) => (v === null ? null : v * factor));
     const values = scaled(value);
     const errors = scaled(sigma).map((v) => (v === null ? null : interval.factor * v));
@@ -365,7 +374,10 @@ export function gauges(screen) {
     const steps = answers.extensometer.filter((one) => !one.problem);
     const rows = steps.map((one) => ({ n: one.n, label: one.label, x: abscissa(one.n) ?? NaN, each: one.extensometers ?? [] })).filter((one) => Number.isFinite(one.x)).sort((p, q) => p.x - q.x);
     const strain = name.endsWith("strain");
-    const factor = strain ? 1e6 : 1;
+    const base = strain ? "µm/m" : "mm";
+    const most = Math.max(0, ...rows.flatMap((one) => one.each.map((gauge) => Math.abs(gauge?.values[name]?.value ?? 0) * (strain ? 1e6 : 1))));
+    const { unit, factor: to } = shown(base, most);
+    const factor = (strain ? 1e6 : 1) * to;
     /** @typedef {typeof rows[number]} Row */
     const of = (/** @type {Row} */ one, /** @type {number} */ k, /** @type {"value" | "sigma"} */ part) => one.each[k]?.values[name]?.[part] ?? null;
     /** @type {Parameters<typeof chart>[1]["series"]} */
@@ -383,18 +395,17 @@ export function gauges(screen) {
       bands.push([at + 1, at + 2]);
     });
     extChart.dataset.answer = JSON.stringify({ x: data[0], value: rows.map((one) => state.extensometers.map((_, k) => of(one, k, "value"))), sigma: rows.map((one) => state.extensometers.map((_, k) => of(one, k, "sigma"))) });
-    const unit = strain ? "µm/m" : "mm";
     await plot("extensometer", extChart, { x: over.selectedOptions[0].text, y: `${what.selectedOptions[0].text.replace(" (mm)", "")} (${unit})`, height: 250, series, bands, data, label: `${name} of the extensometers` });
     const valueText = (/** @type {Row} */ one, /** @type {number} */ k) => {
       const [v, s] = [of(one, k, "value"), of(one, k, "sigma")];
       if (v === null) return one.each[k]?.missing?.replace(/_/g, " ") || "–";
-      if (s === null) return num(v * factor, 5);
+      if (s === null) return amount((v * factor) / to, base);
       const { budget, not_included: lacking } = one.each[k].values[name];
-      return withBudget(`${num(v * factor, 5)} ± ${num(s * factor * interval.factor, 2)}`, budgetTable(budget, unit, factor, lacking ?? ""));
+      return withBudget(uncertain((v * factor) / to, (s * factor * interval.factor) / to, base), budgetTable(budget, base, factor / to, lacking ?? ""));
     };
     replace(extTable, table([
       ["Step", (one) => one.n], ["Label", (one) => one.label], ...(over.value === "n" ? [] : [numeric(over.selectedOptions[0].text, (/** @type {Row} */ one) => num(one.x, 6))]),
-      ...state.extensometers.map((gauge, k) => numeric(`${gauge.name} (${unit})`, (/** @type {Row} */ one) => valueText(one, k))),
+      ...state.extensometers.map((gauge, k) => numeric(gauge.name, (/** @type {Row} */ one) => valueText(one, k))),
     ], rows, { caption: `± ${interval.text}` }),
     h("div.row", state.extensometers.map((gauge) => h("button", { type: "button", onclick: () => { state.extensometers = state.extensometers.filter((one) => one !== gauge); changed("extensometer"); } }, `Remove ${gauge.name}`))));
   }
@@ -416,18 +427,18 @@ export function gauges(screen) {
     answers.area = { name, steps };
     const { unit, factor } = shownUnit(name, steps.at(-1)?.areas?.[0]?.values[name]?.units ?? "");
     /** @type {(one: GaugeReadings, part: "mean" | "mean_sigma" | "sd" | "rms" | "min" | "max", digits?: number) => string} */
-    const cell = (one, part, digits = 5) => num((one.areas?.[0]?.values[name]?.[part] ?? NaN) * factor, digits);
-    const uncertain = (/** @type {GaugeReadings} */ one) => {
+    const cell = (one, part, digits = 4) => amount((one.areas?.[0]?.values[name]?.[part] ?? NaN) * factor, unit, digits);
+    const mean = (/** @type {GaugeReadings} */ one) => {
       const v = one.areas?.[0]?.values[name];
-      if (!v || v.mean_sigma === null) return "–";
-      return withBudget(num(v.mean_sigma * factor * interval.factor, 2), budgetTable(v.mean_budget, unit, factor, v.not_included ?? ""));
+      if (!v || v.mean_sigma === null) return cell(one, "mean");
+      return withBudget(uncertain((v.mean ?? NaN) * factor, v.mean_sigma * factor * interval.factor, unit), budgetTable(v.mean_budget, unit, factor, v.not_included ?? ""));
     };
     areaBox.dataset.answer = JSON.stringify(steps.map((one) => one.areas?.[0]?.values[name] ?? null));
     replace(areaBox, table([
-      ["Step", (one) => one.n], ["Label", (one) => one.label], ["Mean", (one) => cell(one, "mean"), { numeric: true }], [`± ${interval.symbol}`, uncertain, { numeric: true }],
+      ["Step", (one) => one.n], ["Label", (one) => one.label], [`Mean ± ${interval.symbol}`, mean, { numeric: true }],
       ["sd", (one) => cell(one, "sd", 3), { numeric: true }], ["rms", (one) => cell(one, "rms"), { numeric: true }], ["Min", (one) => cell(one, "min"), { numeric: true }], ["Max", (one) => cell(one, "max"), { numeric: true }],
       ["Points", (one) => (one.problem ? one.problem.cause ?? "–" : `${one.areas?.[0].valid} of ${one.areas?.[0].points}`), { numeric: true }],
-    ], steps, { caption: `${name}${unit ? ` in ${unit}` : ""} over the rectangle; ${interval.text}` }));
+    ], steps, { caption: `${name} over the rectangle; ${interval.text}` }));
   }
 
   interval.changed.add(() => Promise.all([drawLine(), drawExtensometers(), answers.area && drawArea(answers.area.name, answers.area.steps)]));

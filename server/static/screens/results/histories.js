@@ -1,0 +1,73 @@
+// What histories are drawn against: step number, time, load, a channel, the number in the label.
+import * as api from "../../lib/api.js";
+import { h, select, replace } from "../../lib/dom.js";
+
+/** @import { Model } from "#routes" */
+/** @import { Result } from "./analysis.js" */
+
+/** @type {WeakMap<Result, Map<number, Partial<Model<"StepReply">>>>} step -> its document, for channels */
+const documents = new WeakMap();
+
+/** @param {Result} result */
+async function channelsOf(result) {
+  const known = documents.get(result) ?? new Map();
+  documents.set(result, known);
+  const wanted = [...new Set([...result.steps, result.reference])].filter((n) => !known.has(n));
+  // channels are in the steps' own documents; a few at a time
+  for (let k = 0; k < wanted.length; k += 8) {
+    await Promise.all(wanted.slice(k, k + 8).map(async (n) => known.set(n, await api.get(`/tests/${result.testId}/steps/${n}`).catch(() => ({})))));
+  }
+  return known;
+}
+
+/** "pressure_kpa" -> "pressure (kPa)": the unit that a channel's name ends in. @param {string} name */
+export function channelText(name) {
+  const units = /** @type {Record<string, string>} */ ({ kpa: "kPa", mpa: "MPa", pa: "Pa", bar: "bar", n: "N", kn: "kN", mm: "mm", um: "µm", v: "V", mv: "mV", s: "s", c: "°C", degc: "°C", k: "K", nm: "N m", hz: "Hz", deg: "°", percent: "%" });
+  const found = /^(.+)_([a-z]+)$/.exec(name);
+  const unit = found ? units[found[2]] : undefined;
+  return found && unit ? `${found[1].replaceAll("_", " ")} (${unit})` : name.replaceAll("_", " ");
+}
+
+/** The choice of an abscissa. @param {Result} result */
+export function abscissas(result) {
+  const choice = select([["n", "step number"]], "n");
+  /** @type {Map<number, Partial<Model<"StepReply">>>} */
+  let documents_ = new Map();
+  let chosen = false; // by the user
+  choice.addEventListener("change", () => { chosen = true; });
+  async function fill() {
+    const listed = result.test.steps ?? [];
+    const found = [["n", "step number"]];
+    if (listed.some((one) => one.captured_utc)) found.push(["time", "time (s)"]);
+    if (listed.some((one) => one.load_n !== null && one.load_n !== undefined)) found.push(["load", "load (N)"]);
+    documents_ = await channelsOf(result);
+    const channels = [...new Set([...documents_.values()].flatMap((one) => Object.keys(one.channels ?? {})))];
+    for (const name of channels) found.push([`channel:${name}`, channelText(name)]);
+    if (listed.some((one) => Number.isFinite(parseFloat(one.label ?? "")))) found.push(["label", "number in the label"]);
+    const before = choice.value;
+    replace(choice, found.map(([value, text]) => h("option", { value, selected: value === before }, text)));
+    if (!chosen && channels.length) choice.value = `channel:${channels[0]}`; // what drives the test
+  }
+  /**
+   * @param {number} n
+   * @returns {number | null}
+   */
+  function at(n) {
+    const listed = (/** @type {number} */ k) => (result.test.steps ?? []).find((one) => one.n === k);
+    const step = listed(n);
+    const time = (/** @type {typeof step} */ one) => Date.parse(one?.timestamp_utc ?? one?.captured_utc ?? "");
+    if (choice.value === "n") return n;
+    if (choice.value === "time") return (time(step) - time(listed(result.reference))) / 1000;
+    if (choice.value === "load") return step?.load_n ?? null;
+    if (choice.value === "label") return Number.isFinite(parseFloat(step?.label ?? "")) ? parseFloat(step?.label ?? "") : null;
+    return documents_.get(n)?.channels?.[choice.value.slice(8)] ?? null;
+  }
+  return { choice, fill, at, get text() { return choice.selectedOptions[0]?.text ?? ""; } };
+}
+
+const RELATIVE = /^([uvw]_mm|exx|eyy|exy|e1|e2|max_shear|von_mises|strain|elongation_mm|true_strain)$/;
+/**
+ * Whether a quantity is relative to the reference, where it is zero by definition.
+ * @param {string} name
+ */
+export const isRelative = (name) => RELATIVE.test(name);
