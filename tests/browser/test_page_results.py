@@ -787,3 +787,46 @@ def test_nothing_moves_when_the_numbers_change(page: Watched, bench: Bench) -> N
     drawn(at, "1 w_mm reference")
     assert at.evaluate(places) == before
     page.sound()
+
+
+def test_several_lines_and_lines_over_the_steps_are_in_one_plot(page: Watched, bench: Bench) -> None:
+    at = shown(page, bench)
+    at.get_by_role("button", name="Line", exact=True).click()
+    both = ((75, 80, 165, 140), (120, 70, 120, 160))
+    for ends in both:
+        given(at, LINE, ends)
+        at.locator("details", has=at.get_by_label(LINE[0])).get_by_role("button", name="Use").click()
+        answer_of(at, "line-chart")
+        at.get_by_role("button", name="Keep this line").click()
+    wait_for_chart(at, "lines-chart", "a.length === 2")
+    at.get_by_label("Steps of the lines").select_option("all")
+    wait_for_chart(at, "lines-chart", "a.length === 4")  # the reference has no W
+    body = {"lines": [{"vertices_px": [e[:2], e[2:]]} for e in both], "variables": ["w_mm"]}
+    steps = bench.client.post(f"{bench.path()}/gauges?frame=specimen", json=body).json()["steps"]
+    wanted = [(f"L{k + 1}, step {n}", steps[n]["lines"][k]["values"]["w_mm"]["value"]) for n in (1, 2) for k in (0, 1)]
+    assert [(one["label"], one["value"]) for one in answer_of(at, "lines-chart")] == wanted
+    at.get_by_role("button", name="Remove L1").click()
+    wait_for_chart(at, "lines-chart", "a.length === 2")
+    page.sound()
+
+
+def test_the_size_of_the_displacement_is_a_field_with_its_uncertainty(page: Watched, bench: Bench) -> None:
+    at = shown(page, bench, name="d_mm")
+    uvw = np.stack([bench.field(2, name) for name in ("u_mm", "v_mm", "w_mm")])
+    assert bench.field(2, "d_mm") == pytest.approx(np.linalg.norm(uvw, axis=0), rel=1e-6)
+    low, high = limits(at)
+    assert (low, high) == pytest.approx(tuple(np.nanpercentile(bench.field(2, "d_mm"), [1, 99])), rel=1e-6)
+    # nearly all of it is W here, so its uncertainty is that of W
+    assert bench.field(2, "sigma_d_mm") == pytest.approx(bench.field(2, "sigma_w_mm"), rel=0.02)
+    at.mouse.move(*point_on_screen(at, 103.4, 98.2))
+    expect(at.locator(".view .readout").first).to_contain_text("±")
+    query = {"format": "csv", "variables": "d_mm,sigma_d_mm", "step": 2}
+    lines = bench.client.get(f"{bench.path()}/export", params=query).text.splitlines()
+    head = next(line for line in lines if not line.startswith("#"))
+    assert {"d_mm", "sigma_d_mm"} <= set(head.split(","))
+    area = {"areas": [{"rectangle_px": [90, 90, 150, 140]}], "variables": ["d_mm"], "steps": [2]}
+    read = bench.client.post(f"{bench.path()}/gauges?frame=specimen", json=area).json()["steps"][0]["areas"][0]
+    x, y = bench.field(2, "x_px"), bench.field(2, "y_px")
+    inside = (x >= 90) & (x <= 150) & (y >= 90) & (y <= 140)
+    assert read["values"]["d_mm"]["mean"] == pytest.approx(float(np.linalg.norm(uvw, axis=0)[inside].mean()), abs=1e-9)
+    page.sound()

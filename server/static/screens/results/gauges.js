@@ -5,6 +5,8 @@ import { h, svg, numeric, replace, table, num, count, number, select, field, act
 import { nudge, onGrab } from "../../widgets/view.js";
 import { amount, shown, uncertain } from "../../lib/units.js";
 import { shownUnit } from "./analysis.js";
+import { distanceMm } from "../../lib/along.js";
+import { lines } from "./lines.js";
 import { budgetTable, withBudget } from "./uncertainty.js";
 /** @import { Attributes } from "#dom" */
 /** @import { Body, GaugeReadings, Model } from "#routes" */
@@ -168,6 +170,9 @@ export function gauges(screen) {
   function path(d, colour) {
     return [svg("path", { d, ...stroke("#000", { "stroke-width": 4, opacity: 0.6 }) }), svg("path", { d, ...stroke(colour) })];
   }
+  /** @type {(ends: [Spot, Spot], name: string) => SVGElement} */
+  const label = ([a, b], name) => svg("text", { x: (a[0] + b[0]) / 2, y: (a[1] + b[1]) / 2, fill: "#fff", stroke: "#000", "stroke-width": 3, "paint-order": "stroke", style: { fontSize: "calc(13px * var(--px))", strokeWidth: "calc(3px * var(--px))" } }, ` ${name}`);
+  const more = lines(screen, { current: () => state.line, body, redraw: () => draw() });
   /** @type {number | undefined} */
   let later;
   screen.ends.push(() => clearTimeout(later));
@@ -212,10 +217,11 @@ export function gauges(screen) {
           handle([area[0], area[1]], INK.area, (x, y) => { area.splice(0, 2, Math.min(x, area[2] - 1), Math.min(y, area[3] - 1)); }, "area", "Upper left corner of the area"),
           handle([area[2], area[3]], INK.area, (x, y) => { area.splice(2, 2, Math.max(x, area[0] + 1), Math.max(y, area[1] + 1)); }, "area", "Lower right corner of the area"));
       }
+      for (const one of more.kept) parts.push(svg("path", { d: segment(...one.ends), ...stroke(INK.line, { "stroke-width": 1.5, "stroke-dasharray": "6 4" }) }), label(one.ends, one.name));
       if (line) parts.push(...path(segment(...line), INK.line), ...line.map((end, k) => handle(end, INK.line, (x, y) => { line[k] = [x, y]; }, "line", `${k ? "End" : "Beginning"} of the line`)));
       for (const one of state.extensometers) {
         parts.push(...path(segment(one.a, one.b), INK.extensometer), .../** @type {const} */ (["a", "b"]).map((k) => handle(one[k], INK.extensometer, (x, y) => { one[k] = [x, y]; }, "extensometer", `End ${k} of extensometer ${one.name}`)),
-          svg("text", { x: (one.a[0] + one.b[0]) / 2, y: (one.a[1] + one.b[1]) / 2, fill: "#fff", stroke: "#000", "stroke-width": 3, "paint-order": "stroke", style: { fontSize: "calc(13px * var(--px))", strokeWidth: "calc(3px * var(--px))" } }, ` ${one.name}`));
+          label([one.a, one.b], one.name));
       }
       /** @type {[Spot, Spot] | null} */
       const going = drag ? [drag.from, drag.to] : state.first && mouse ? [state.first, mouse] : null;
@@ -277,6 +283,7 @@ export function gauges(screen) {
     const [line] = step.lines ?? [];
     answers.line = { line, from, name };
     await drawLine();
+    await more.draw();
   }
   /** @type {(values: (number | null)[], sigma: (number | null)[], sign: 1 | -1) => (number | null)[]} */
   const beside = (values, sigma, sign) => values.map((v, k) => { const s = sigma[k]; return v === null || s === null ? null : v + sign * s; });
@@ -295,21 +302,14 @@ export function gauges(screen) {
     const scaled = (/** @type {(number | null)[]} */ list) => list.map((v) => (v === null ? null : v * factor));
     const values = scaled(value);
     const errors = scaled(sigma).map((v) => (v === null ? null : interval.factor * v));
-    const positions = values.map((_, k) => ["x_mm", "y_mm", "z_mm"].map((axis) => line.values[axis].value[k] ?? NaN));
-    let length = 0;
-    const mm = values.map((_, k) => {
-      const piece = k ? Math.hypot(...positions[k].map((to, axis) => to - positions[k - 1][axis])) : 0;
-      if (Number.isFinite(piece)) length += piece;
-      return length;
-    });
-    const whole = positions.every(([x]) => Number.isFinite(x));
-    const inMm = along.value === "mm" && whole;
+    const mm = distanceMm(["x_mm", "y_mm", "z_mm"].map((axis) => line.values[axis].value));
+    const inMm = along.value === "mm" && mm !== null;
     const x = inMm ? mm : line.distance_px;
     const band = (/** @type {1 | -1} */ sign) => beside(values, errors, sign);
     const missing = value.filter((v) => v === null).length;
     replace(lineText, h("p.quiet", `${count(value.length)} positions from (${from[0].join(", ")}) to (${from[1].join(", ")}) px`,
       missing ? `; ${missing} without a value: ${[...new Set(line.missing.filter(Boolean))].join(", ").replace(/_/g, " ")}` : "",
-      along.value === "mm" && !whole ? "; the distance in mm is unknown where points are missing, so it is given in px" : "", errors.some((v) => v !== null) ? `; the band is ± ${interval.symbol}: ${interval.text}` : "; no standard uncertainty is known"),
+      along.value === "mm" && !mm ? "; the distance in mm is unknown where points are missing, so it is given in px" : "", errors.some((v) => v !== null) ? `; the band is ± ${interval.symbol}: ${interval.text}` : "; no standard uncertainty is known"),
       budgetTable(rms(budget), unit, factor, lacking ?? ""));
     lineChart.dataset.answer = JSON.stringify({ x, value, sigma });
     await plot("line", lineChart, { x: inMm ? "distance (mm)" : "distance (px)", y: `${screen.info?.text ?? name}${unit ? ` (${unit})` : ""}`, height: 230,
@@ -445,7 +445,7 @@ export function gauges(screen) {
   rigid.addEventListener("change", () => { for (const read of [readLine, readArea, readExtensometers]) read().catch(notify); });
   const clear = (/** @type {"line" | "area"} */ tool) => h("button", { type: "button", onclick: () => { state[tool] = null; if (tool === "line") { answers.line = null; plots.line?.close(); plots.line = null; lineChart.replaceChildren(); lineText.replaceChildren(); } else { answers.area = null; areaBox.replaceChildren(); } draw(); } }, "Clear");
   const panels = {
-    line: h("details.panel", h("summary", "Line"), h("p.quiet", "Choose the tool Line above the picture and drag, or give its ends."), lineInputs.row, h("div.row", field("Along", along), clear("line")), lineText, lineChart),
+    line: h("details.panel", h("summary", "Line"), h("p.quiet", "Choose the tool Line above the picture and drag, or give its ends."), lineInputs.row, h("div.row", field("Along", along), clear("line")), lineText, lineChart, more.root),
     extensometer: h("details.panel", h("summary", "Extensometers"), h("p.quiet", "Choose the tool Extensometer and click its two ends, or give them."), extInputs.row, h("div.row", field("Show", what), field("Against", over)), extChart, extTable),
     area: h("details.panel", h("summary", "Area"), h("p.quiet", "Choose the tool Area and drag a rectangle, or give its corners."), h("div.row", areaInputs.row, clear("area")), areaBox),
   };
@@ -458,6 +458,7 @@ export function gauges(screen) {
     if (now === last) return;
     last = now;
     if (state.line) await readLine().catch(notify);
+    else if (more.kept.length) await more.draw().catch(notify);
     if (state.area && screen.info) await readArea().catch(notify);
   });
   screen.landed.add(() => Promise.all([readExtensometers(), readArea()]).catch(notify)); // histories of all steps
