@@ -41,6 +41,7 @@ export function running(testId, ends, done) {
     known.set(job.id, { job, row, draw, link });
     draw(job);
     drawHead();
+    api.get(`/jobs/${job.id}`).then(take, notify); // it may have ended before it was shown
   }
 
   /** @param {Job} job */
