@@ -128,7 +128,7 @@ def _as_stored(source: Source, files: Sequence[Path], request: ExportRequest, ou
 
 def _as_vtu(source: Source, files: Sequence[Path], request: ExportRequest, out: Path) -> Iterator[Path]:
     mask = None if source.mask is None else read_mask(source.mask)
-    there = {path: variables_of(path) for path in source.files}
+    there = {path: variables_of(path, derived=True) for path in source.files}
     moves = any("u_mm" in names for names in there.values())
     asked = None if request.variables is None else [in_file(name, source.coverage) for name in request.variables]
     require_known(files, asked)

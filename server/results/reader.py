@@ -14,6 +14,7 @@ from core.settings import CoverageFields
 from core.status import PointStatus
 from server.base.errors import NotFoundError
 from server.formats.results.budgets import PointBudget, field_budgets, strain_budgets
+from server.formats.results.derived import DERIVED, derive, derived_names
 from server.formats.results.netcdf import opened
 from server.formats.results.reading import read_field
 from server.formats.results.strain import read_strain
@@ -59,8 +60,13 @@ class Variable:
         )
 
 
+def derived_variable(held: Any, name: str) -> Variable:
+    """Return a variable that follows from those of an open file."""
+    return Variable(derive(held, name), *DERIVED[name], dimensions=_GRID)
+
+
 def read_variable(path: Path, name: str) -> Variable:
-    """Read one variable.
+    """Read one variable, or what follows from those that the file has.
 
     Raises
     ------
@@ -68,6 +74,8 @@ def read_variable(path: Path, name: str) -> Variable:
         ``field_missing``, with the names that there are.
     """
     with opened(path) as data:
+        if name in derived_names(data.variables):
+            return derived_variable(data.variables, name)
         if name not in data.variables:
             raise NotFoundError(
                 f"{path.name} has no variable {name!r}.",
@@ -100,9 +108,13 @@ class VariableHead:
 
 
 def list_variables(path: Path) -> list[VariableHead]:
-    """Return every variable of a result file."""
+    """Return every variable of a result file, then those that follow from them."""
     with opened(path) as data:
-        return [
+        shape = list(data.variables["status"].shape)
+        derived = [
+            VariableHead(name, *DERIVED[name], list(_GRID), shape, None, None) for name in derived_names(data.variables)
+        ]
+        held = [
             VariableHead(
                 name=name,
                 units=str(getattr(variable, "units", "1")),
@@ -114,6 +126,7 @@ def list_variables(path: Path) -> list[VariableHead]:
             )
             for name, variable in data.variables.items()
         ]
+        return held + derived
 
 
 def _flags(variable: Any) -> dict[int, str] | None:
@@ -215,6 +228,7 @@ def probe_result(path: Path, x_px: float, y_px: float, asked: CoverageFields) ->
     with opened(path) as data:
         statement = Statement(Included.of(data), asked)
         variables = {name: Variable.of(v) for name, v in data.variables.items() if v.dimensions[:2] == _GRID}
+        variables |= {name: derived_variable(data.variables, name) for name in derived_names(data.variables)}
     distance = np.hypot(variables["x_px"].values - x_px, variables["y_px"].values - y_px)
     row, col = (int(i) for i in np.unravel_index(int(np.nanargmin(distance)), distance.shape))
     budgets = _budgets_at(path, row, col)

@@ -17,13 +17,14 @@ from core.field.region.cuts import Cuts, from_arrays
 from core.settings import Coverage, CoverageFields
 from core.status import PointStatus
 from server.base.errors import NotFoundError
+from server.formats.results.derived import derived_names
 from server.formats.results.folder import number_of
 from server.formats.results.netcdf import opened
 from server.formats.results.reading import causes_of
 from server.formats.results.settings import current_inputs, current_settings
 from server.formats.results.uncertainty import Included, Statement
 from server.results.channels import Recorded, recorded_with
-from server.results.reader import Variable
+from server.results.reader import Variable, derived_variable
 from server.results.uncertainty import COMMON_FACTOR, as_matrix, in_file, matrix_columns, with_intervals
 from server.store.durable import known_json
 
@@ -183,7 +184,8 @@ def _read(path: Path, data: Any, names: Sequence[str] | None, always: Sequence[s
     lacking = [name for name in ALWAYS if name not in over_grid]
     if lacking:
         raise FileFormatError(f"{path.name} is no result: it lacks {', '.join(lacking)}.", file=path.name)
-    missing = [name for name in names or () if name not in over_grid]
+    derived = [name for name in derived_names(data.variables) if names is not None and name in names]  # where asked for
+    missing = [name for name in names or () if name not in over_grid and name not in derived]
     if missing:
         raise NotFoundError(
             f"{path.name} has no variable {missing[0]!r} over its points; it has {', '.join(over_grid)}.",
@@ -193,6 +195,7 @@ def _read(path: Path, data: Any, names: Sequence[str] | None, always: Sequence[s
         )
     wanted = set(over_grid) if names is None else {*always, *names}
     variables = {name: as_matrix(name, Variable.of(data.variables[name])) for name in over_grid if name in wanted}
+    variables |= {name: derived_variable(data.variables, name) for name in derived}
     cuts = None
     if "cut_line" in data.variables:
         points = np.stack([np.asarray(data.variables[n][...], dtype=np.float64) for n in ("cut_x_px", "cut_y_px")], 1)
@@ -236,7 +239,7 @@ def each(source: Source, steps: Sequence[int] | None, names: Sequence[str] | Non
         names = [in_file(name, source.coverage) for name in names]
     require_known(files, names)
     for path in files:
-        there = [] if names is None else variables_of(path)
+        there = [] if names is None else variables_of(path, derived=True)
         wanted = None if names is None else [name for name in names if name in there]
         yield with_coverage(read_step(path, wanted), source)
 
@@ -259,16 +262,17 @@ def require_known(files: Sequence[Path], names: Sequence[str] | None) -> None:
     NotFoundError
         ``field_missing``, with the names that there are.
     """
-    there = [set(variables_of(path)) for path in files] if names else []
+    there = [set(variables_of(path, derived=True)) for path in files] if names else []
     for name in names or ():
         if not any(name in found for found in there):
             read_step(files[-1], [name])  # the error names those that there are
 
 
-def variables_of(path: Path) -> list[str]:
-    """Return the names of a result file's variables over its points."""
+def variables_of(path: Path, *, derived: bool = False) -> list[str]:
+    """Return the names of a result file's variables over its points, and of those that follow from them."""
     with opened(path) as data:
-        return [name for name, v in data.variables.items() if tuple(v.dimensions[:2]) == _GRID]
+        held = [name for name, v in data.variables.items() if tuple(v.dimensions[:2]) == _GRID]
+        return held + (derived_names(data.variables) if derived else [])
 
 
 def require_same_grid(step: StepResult, first: StepResult) -> None:

@@ -26,6 +26,7 @@ from server.config.rig_file import parse_config
 from server.workflows.service import Service
 from tests.support.page_bench import Watched
 from tests.support.page_editor import Editor
+from tests.support.results_page import two_digits_of_u
 from tests.support.service_rig import SMALL, true_cameras
 
 pytestmark = pytest.mark.timeout(500)
@@ -224,7 +225,7 @@ def check_field(shown: Page, client: httpx.Client, test_id: str) -> None:
             for name in names
         }
 
-    fields = read("specimen", ("x_px", "y_px", "w_mm", "status"))
+    fields = read("specimen", ("x_px", "y_px", "w_mm", "sigma_w_mm", "status"))
     system = read("system", ("x_mm", "y_mm", "w_mm"))
     assert np.isin(fields["status"], (0, 10)).mean() > 0.95
     stored = client.get(f"{API}/tests/{test_id}/steps/0/cam1", params={"format": "png"}).content
@@ -246,7 +247,7 @@ def check_field(shown: Page, client: httpx.Client, test_id: str) -> None:
         expect(readout).to_have_attribute("data-value", repr(float(fields["w_mm"][r, c])))
         expect(readout).to_have_attribute("data-column", "131")
         expect(readout).to_have_attribute("data-row", "105")
-        expect(readout).to_contain_text(f"{fields['w_mm'][r, c]:.5f}".replace("-", "\N{MINUS SIGN}")[:7])
+        expect(readout).to_contain_text(two_digits_of_u(float(fields["w_mm"][r, c]), float(fields["sigma_w_mm"][r, c])))
     # large as it is now, a pixel of the image is many of the screen: its middle has its grey level, but for the JPEG
     for column, row in ((131, 105), (132, 105), (131, 103)):
         x, y = on_screen(canvas, column, row)

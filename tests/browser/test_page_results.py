@@ -22,7 +22,19 @@ from server.formats.results.writing import Provenance, write_field
 from server.store.index import analysis_entry
 from tests.support import results_page
 from tests.support.page_bench import UNREACHED, Watched, tabbed, watched
-from tests.support.results_page import API, ENDS, LINE, Bench, drawn, given, shown, with_a_cut
+from tests.support.results_page import (
+    API,
+    ENDS,
+    LINE,
+    RECTANGLE,
+    Bench,
+    drawn,
+    given,
+    shown,
+    two_digits_of_u,
+    with_a_cut,
+)
+from tests.support.service_rig import wait_for_job
 
 bench, page = results_page.bench, results_page.page  # fixtures
 
@@ -126,17 +138,29 @@ def test_what_is_under_the_mouse_is_the_probes(page: Watched, bench: Bench) -> N
         at.mouse.move(*point_on_screen(at, *spot))
         w = reply["values"]["w_mm"]["value"]
         expect(readout).to_have_attribute("data-value", repr(w))
-        text = f"{w:.5g}".replace("-", "\N{MINUS SIGN}")[:7]
-        expect(readout).to_contain_text(text)
-        expect(readout).to_contain_text("±")
+        expect(readout).to_contain_text(two_digits_of_u(w, reply["values"]["w_mm"]["sigma"]))
     at.mouse.click(*point_on_screen(at, 103.4, 98.2))
     reply = bench.client.get(
         f"{bench.path()}/probe", params={"x_px": 103.4, "y_px": 98.2, "step": 2, "frame": "specimen"}
     ).json()
     pinned = at.locator('[data-role="probe"]')
     expect(pinned).to_contain_text(f"row {reply['row']}, column {reply['col']}, step 2")
-    row = pinned.locator("tr", has=at.get_by_role("cell", name="w_mm", exact=True))
-    expect(row).to_contain_text(f"{reply['values']['w_mm']['value']:.5f}".replace("-", "\N{MINUS SIGN}")[:7])
+    row = pinned.locator("tr", has=at.get_by_role("cell", name="W", exact=True))
+    w = reply["values"]["w_mm"]
+    expect(row).to_contain_text(two_digits_of_u(w["value"], w["sigma"]))
+    # what matters stands first
+    expect(pinned.locator("table caption").first).to_have_text("Displacement")
+    # and its history: zero at the reference, then what each step measured
+    at.locator('[data-role="point"] summary').click()
+    steps = [
+        bench.client.get(
+            f"{bench.path()}/probe", params={"x_px": 103.4, "y_px": 98.2, "step": n, "frame": "specimen"}
+        ).json()["values"]["w_mm"]
+        for n in (1, 2)
+    ]
+    got = answer_of(at, "point-chart")
+    assert got["value"] == [0, *(one["value"] for one in steps)]
+    assert got["sigma"] == [0, *(one["sigma"] for one in steps)]
     page.sound()
 
 
@@ -148,14 +172,14 @@ def test_the_interval_is_chosen_and_a_click_shows_the_budget(page: Watched, benc
     readout, says = at.locator(".view .readout").first, at.locator('[data-role="includes"]')
     expect(says).to_contain_text("u (k = 1) includes matching, reference, calibration")
     at.mouse.move(*point_on_screen(at, *spot))
-    expect(readout).to_contain_text(f"± {w['sigma']:.2g}")
+    expect(readout).to_contain_text(two_digits_of_u(w["value"], w["sigma"]))
     expect(readout).to_contain_text("u, k = 1")
     at.get_by_label("Uncertainties shown").select_option("95 %")
     expect(says).to_contain_text("U (k = 1.96, 95 %) includes")
     at.mouse.move(*point_on_screen(at, spot[0] + 0.2, spot[1]))
-    expect(readout).to_contain_text(f"± {w['expanded']:.2g}")
+    expect(readout).to_contain_text(two_digits_of_u(w["value"], w["expanded"]))
     at.mouse.click(*point_on_screen(at, *spot))
-    row = at.locator('[data-role="probe"] tr', has=at.get_by_role("cell", name="w_mm", exact=True)).first
+    row = at.locator('[data-role="probe"] tr', has=at.get_by_role("cell", name="W", exact=True)).first
     budget = row.locator('[data-role="budget"]')
     expect(budget).to_be_hidden()
     row.get_by_role("button").click()
@@ -183,7 +207,7 @@ def test_numbers_without_the_calibrations_uncertainty_say_so(page: Watched, benc
     at.mouse.move(*point_on_screen(at, 103.4, 98.2))
     expect(at.locator(".view .readout").first).to_contain_text(lacking)
     at.mouse.click(*point_on_screen(at, 103.4, 98.2))
-    expect(at.locator('[data-role="probe"] table caption').first).to_contain_text(lacking)
+    expect(at.locator('[data-role="probe"]')).to_contain_text(lacking)
     at.locator("summary", has_text="Extensometers").click()
     given(at, ENDS, (80, 90, 160, 90))
     at.locator("details", has=at.get_by_label(ENDS[0])).get_by_role("button", name="Use").click()
@@ -320,7 +344,7 @@ def test_extensometers_by_two_clicks_and_by_keyboard_against_load_and_channels(p
     answer_of(at, "extensometer-chart")
     given(at, ENDS, (120, 70, 120, 160))
     at.locator("details", has=at.get_by_label(ENDS[0])).get_by_role("button", name="Use").click()
-    expect(at.get_by_role("button", name="Remove e2")).to_be_visible()
+    expect(at.get_by_role("button", name="Remove E2")).to_be_visible()
     at.get_by_label("Against", exact=True).select_option("load")
     at.get_by_label("Show", exact=True).select_option("elongation_mm")
     wait_for_chart(at, "extensometer-chart", "a.x[1] === 689 && a.value[1].length === 2")
@@ -333,8 +357,8 @@ def test_extensometers_by_two_clicks_and_by_keyboard_against_load_and_channels(p
     assert got["x"] == [0.0, 689.0, 1378.0]
     at.get_by_label("Against", exact=True).select_option("channel:stroke_mm")
     wait_for_chart(at, "extensometer-chart", "a.x[2] === 6.89")
-    at.get_by_role("button", name="Remove e1").click()
-    expect(at.get_by_role("button", name="Remove e1")).to_have_count(0)
+    at.get_by_role("button", name="Remove E1").click()
+    expect(at.get_by_role("button", name="Remove E1")).to_have_count(0)
     # ends outside the field are refused with cause and remedy
     given(at, ENDS, (1, 1, 120, 160))
     at.locator("details", has=at.get_by_label(ENDS[0])).get_by_role("button", name="Use").click()
@@ -687,4 +711,199 @@ def test_a_plot_is_saved_as_numbers_and_as_pictures_and_starts_at_the_reference(
     given(at, ("Area left", "Area top", "Area right", "Area bottom"), (90, 90, 150, 140))
     at.locator("details", has=at.get_by_label("Area left")).get_by_role("button", name="Use").click()
     expect(at.locator('[data-role="area-chart"] canvas')).to_be_visible()
+    page.sound()
+
+
+def test_a_running_analysis_is_followed_until_it_is_finished(page: Watched, bench: Bench) -> None:
+    calibration = bench.client.get(f"{API}/tests/{bench.test_id}").json()["calibration_id"]
+    test_id = bench.client.post(f"{API}/tests", json={"name": "followed", "calibration_id": calibration}).json()["id"]
+
+    def capture(load: float) -> None:
+        bench.client.put(f"{API}/sim/scene", json={"scene": "plate", "load": load})
+        assert bench.client.post(f"{API}/tests/{test_id}/steps", json={"load_n": load}).status_code == 201
+
+    capture(0.0)
+    asked = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "spacing_px": 10, "follow": True}
+    made = bench.client.post(f"{API}/tests/{test_id}/analyses", json=asked).json()
+    page.open(f"#/results/{test_id}/{made['analysis_id']}")
+    at = page.page
+    at.set_default_timeout(60_000)
+    # the reference has no W: its shape is shown, and W as soon as a step has it
+    drawn(at, "0 z_mm reference")
+    counter, follow = at.locator('[data-role="step"]'), at.get_by_label("follow the newest step")
+    expect(counter).to_contain_text("1 of 1")
+    expect(follow).to_be_checked()
+    at.locator("details", has=at.get_by_label(ENDS[0])).evaluate("one => { one.open = true }")
+    given(at, ENDS, (80, 90, 160, 90))
+    at.locator("details", has=at.get_by_label(ENDS[0])).get_by_role("button", name="Use").click()
+    assert len(answer_of(at, "extensometer-chart")["x"]) == 1
+    capture(344.5)
+    drawn(at, "1 w_mm reference")
+    expect(counter).to_contain_text("2 of 2")
+    wait_for_chart(at, "extensometer-chart", "a.x.length === 2")  # histories are read anew
+    # who looks at an earlier step stays there; the counter is right at once
+    at.get_by_role("button", name="Step before").click()
+    drawn(at, "0 z_mm reference")
+    expect(follow).not_to_be_checked()
+    capture(689.0)
+    expect(counter).to_contain_text("1 of 3")
+    wait_for_chart(at, "extensometer-chart", "a.x.length === 3")
+    expect(at.locator('canvas[data-role="map"]')).to_have_attribute("data-shown", "0 z_mm reference")
+    follow.check()
+    drawn(at, "2 w_mm reference")
+    # the test's screen says so, too, and either of them finishes it
+    page.open(f"#/test/{test_id}")
+    expect(at.locator('[data-role="measuring"]')).to_have_text("measuring: waiting for the next step")
+    at.locator('[data-role="progress"]').get_by_role("button", name="Finish").click()
+    expect(at.locator('[data-role="progress"] .badge')).to_have_text("succeeded")
+    expect(at.locator('[data-role="measuring"]')).to_have_text("")
+    document = bench.client.get(f"{API}/tests/{test_id}/analyses/{made['analysis_id']}").json()
+    assert document["steps_finished"] == [0, 1, 2]
+    page.sound()
+
+
+def test_a_failed_analysis_shows_its_problem_and_nothing_to_choose(page: Watched, bench: Bench) -> None:
+    asked = {"region": {"rectangle": RECTANGLE}, "max_sigma_px": 0.001}  # no match is as good
+    made = bench.client.post(f"{API}/tests/{bench.test_id}/analyses", json=asked).json()
+    assert wait_for_job(bench.client, made["job"])["state"] == "failed"
+    page.open(f"#/results/{bench.test_id}/{made['analysis_id']}")
+    at = page.page
+    expect(at.locator(".problem").first).to_be_visible()
+    for name in ("Field", "Step", "Image"):
+        expect(at.get_by_label(name, exact=True)).to_be_hidden()
+    for name in ("Play through the steps", "3-D surface", "Save the file"):
+        expect(at.get_by_role("button", name=name)).to_have_count(0)
+    expect(at.get_by_role("link", name="Back to the test")).to_be_visible()
+    page.sound()
+
+
+def test_lines_and_vectors_lie_over_the_map_and_the_surface(page: Watched, bench: Bench) -> None:
+    at = shown(page, bench, analysis_id=bench.cut_id)
+    over = at.locator("g.overlay")
+    at.get_by_label("contour lines, about").check()
+    at.get_by_label("Vectors", exact=True).select_option("displacement")
+    expect(over).to_have_attribute("data-vectors", str(13 * 12 - 3))  # one a point that has a value
+    pieces = int(over.get_attribute("data-lines") or 0)
+    assert pieces > 50
+    # the legend's arrow is as long as its figure says: the drawn arrows have the same scale
+    legend = at.locator(".view .arrow-legend")
+    expect(legend).to_contain_text("µm")
+    u, v = (bench.field(2, name, bench.cut_id) for name in ("u_mm", "v_mm"))
+    status = np.isin(bench.field(2, "status", bench.cut_id), (0, 10))
+    typical = np.sort(np.hypot(u, v)[status])[int(0.95 * (status.sum() - 1))]
+    stated = float((legend.get_attribute("data-text") or "").split("\u00a0")[0]) * 1e-3
+    # 0.9 of the room between two points, 10 px, for the vector that 95 % do not exceed
+    zoom = at.locator(".view .content").first.evaluate("one => new DOMMatrix(one.style.transform).a")
+    assert float(legend.get_attribute("data-length") or 0) == pytest.approx(9 * zoom * stated / typical, rel=1e-3)
+    at.get_by_label("A vector every so many points").fill("3")
+    at.get_by_label("A vector every so many points").press("Tab")
+    expect(over).to_have_attribute("data-vectors", re.compile(r"^(1[4-9]|20)$"))
+    at.get_by_role("button", name="3-D surface").click()
+    space = at.locator(".space")
+    expect(space).to_have_attribute("data-lines", str(pieces))  # the same lines, open at the same crack
+    expect(space.locator(".arrow-legend")).to_contain_text("mm")
+    # the axes turn with the view
+    triad = space.locator(".triad")
+    before = triad.get_attribute("data-x")
+    space.focus()
+    at.keyboard.press("ArrowLeft")
+    expect(triad).not_to_have_attribute("data-x", before or "")
+    for factor in ("0", "1000"):
+        at.get_by_label("Displacement ×").fill(factor)
+        at.get_by_label("Displacement ×").press("Tab")
+        expect(space).to_have_attribute("data-magnification", factor)
+    at.get_by_label("Displacement ×").fill("1001")
+    at.get_by_label("Displacement ×").press("Tab")
+    expect(at.get_by_text("Give a factor from 0 to 1000.")).to_be_visible()
+    at.get_by_role("button", name="True scale").click()
+    expect(space).to_have_attribute("data-magnification", "1")
+    expect(at.get_by_text("Give a factor from 0 to 1000.")).to_be_hidden()
+    page.sound()
+
+
+def test_strain_is_shown_in_percent_by_choice(page: Watched, bench: Bench) -> None:
+    at = shown(page, bench, name="exx")
+    bar = at.locator('[data-role="colourbar"] .of').first
+    expect(bar).to_have_text("µm/m")
+    at.get_by_label("Unit of strain").select_option("%")
+    expect(bar).to_have_text("%")
+    low, _ = limits(at)
+    first = at.locator('[data-role="colourbar"] .marks span').first.inner_text().replace("\N{MINUS SIGN}", "-")
+    assert float(first) == pytest.approx(low * 1e-4, abs=1e-3)
+    assert low == pytest.approx(float(np.nanpercentile(bench.field(2, "exx"), 1)) * 1e6, rel=1e-4)
+    # kept for the next time
+    shown(page, bench, name="exx")
+    expect(bar).to_have_text("%")
+    page.sound()
+
+
+def test_a_phone_shows_the_step_and_a_low_bar(chromium: Browser, bench: Bench) -> None:
+    origin = str(bench.client.base_url).rstrip("/")
+    with watched(chromium, origin, viewport={"width": 390, "height": 844}, has_touch=True) as page:
+        at = shown(page, bench)
+        assert not at.evaluate("document.documentElement.scrollWidth > document.documentElement.clientWidth")
+        bar, step = at.locator("#bar").bounding_box(), at.locator('[data-role="step"]').bounding_box()
+        assert bar is not None
+        assert step is not None
+        assert bar["height"] < 844 / 8
+        assert step["x"] + step["width"] <= 390
+        expect(at.get_by_role("button", name="STOP")).to_be_in_viewport()
+        page.sound()
+
+
+def test_nothing_moves_when_the_numbers_change(page: Watched, bench: Bench) -> None:
+    at = shown(page, bench)
+    places = """() => ['.view .frame', '[data-role=colourbar]', 'input[aria-label=Step]', '[data-role=interval]']
+        .map(one => { const b = document.querySelector(one).getBoundingClientRect(); return [b.x, b.y, b.width] })"""
+    before = at.evaluate(places)
+    for spot in ((103.4, 98.2), (20.0, 30.0)):
+        at.mouse.move(*point_on_screen(at, *spot))
+        expect(at.locator(".view .readout").first).to_contain_text("grey")
+        assert at.evaluate(places) == before
+    at.get_by_role("button", name="Step before").click()
+    drawn(at, "1 w_mm reference")
+    assert at.evaluate(places) == before
+    page.sound()
+
+
+def test_several_lines_and_lines_over_the_steps_are_in_one_plot(page: Watched, bench: Bench) -> None:
+    at = shown(page, bench)
+    at.get_by_role("button", name="Line", exact=True).click()
+    both = ((75, 80, 165, 140), (120, 70, 120, 160))
+    for ends in both:
+        given(at, LINE, ends)
+        at.locator("details", has=at.get_by_label(LINE[0])).get_by_role("button", name="Use").click()
+        answer_of(at, "line-chart")
+        at.get_by_role("button", name="Keep this line").click()
+    wait_for_chart(at, "lines-chart", "a.length === 2")
+    at.get_by_label("Steps of the lines").select_option("all")
+    wait_for_chart(at, "lines-chart", "a.length === 4")  # the reference has no W
+    body = {"lines": [{"vertices_px": [e[:2], e[2:]]} for e in both], "variables": ["w_mm"]}
+    steps = bench.client.post(f"{bench.path()}/gauges?frame=specimen", json=body).json()["steps"]
+    wanted = [(f"L{k + 1}, step {n}", steps[n]["lines"][k]["values"]["w_mm"]["value"]) for n in (1, 2) for k in (0, 1)]
+    assert [(one["label"], one["value"]) for one in answer_of(at, "lines-chart")] == wanted
+    at.get_by_role("button", name="Remove L1").click()
+    wait_for_chart(at, "lines-chart", "a.length === 2")
+    page.sound()
+
+
+def test_the_size_of_the_displacement_is_a_field_with_its_uncertainty(page: Watched, bench: Bench) -> None:
+    at = shown(page, bench, name="d_mm")
+    uvw = np.stack([bench.field(2, name) for name in ("u_mm", "v_mm", "w_mm")])
+    assert bench.field(2, "d_mm") == pytest.approx(np.linalg.norm(uvw, axis=0), rel=1e-6)
+    low, high = limits(at)
+    assert (low, high) == pytest.approx(tuple(np.nanpercentile(bench.field(2, "d_mm"), [1, 99])), rel=1e-6)
+    # nearly all of it is W here, so its uncertainty is that of W
+    assert bench.field(2, "sigma_d_mm") == pytest.approx(bench.field(2, "sigma_w_mm"), rel=0.02)
+    at.mouse.move(*point_on_screen(at, 103.4, 98.2))
+    expect(at.locator(".view .readout").first).to_contain_text("±")
+    query = {"format": "csv", "variables": "d_mm,sigma_d_mm", "step": 2}
+    lines = bench.client.get(f"{bench.path()}/export", params=query).text.splitlines()
+    head = next(line for line in lines if not line.startswith("#"))
+    assert {"d_mm", "sigma_d_mm"} <= set(head.split(","))
+    area = {"areas": [{"rectangle_px": [90, 90, 150, 140]}], "variables": ["d_mm"], "steps": [2]}
+    read = bench.client.post(f"{bench.path()}/gauges?frame=specimen", json=area).json()["steps"][0]["areas"][0]
+    x, y = bench.field(2, "x_px"), bench.field(2, "y_px")
+    inside = (x >= 90) & (x <= 150) & (y >= 90) & (y <= 140)
+    assert read["values"]["d_mm"]["mean"] == pytest.approx(float(np.linalg.norm(uvw, axis=0)[inside].mean()), abs=1e-9)
     page.sound()

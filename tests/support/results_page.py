@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from typing import Any
 
 import httpx
@@ -121,3 +122,11 @@ API = "/api/v1"
 def drawn(at: Page, what: str) -> None:
     at.wait_for_selector(f'canvas[data-role="map"][data-shown="{what}"]', state="attached")
     at.wait_for_function("() => document.querySelector('canvas[data-role=map]').width === 256")
+
+
+def two_digits_of_u(value_mm: float, u_mm: float) -> str:
+    """A length as the GUM (7.2.6) has it stated, two digits of u; in micrometres below 0.1 mm."""
+    unit, times = ("µm", 1000) if max(abs(value_mm), u_mm) < 0.1 else ("mm", 1)
+    value, u = Decimal(value_mm) * times, Decimal(f"{u_mm * times:.1e}")
+    text = f"{value.quantize(u)} ± {u:f}\N{NO-BREAK SPACE}{unit}"
+    return text.replace("-", "\N{MINUS SIGN}")

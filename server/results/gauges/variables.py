@@ -19,6 +19,7 @@ from core.strain import surface_strain
 from core.strain.mean import MeanStrainVariance, mean_strain_variance
 from core.strain.result import StrainField
 from server.base.errors import NotFoundError
+from server.formats.results.derived import DERIVED, MAGNITUDE, magnitude
 from server.formats.results.layout import COVARIANCE_NAMES, field_variable
 from server.formats.results.strain import read_strain
 from server.results.reader import Variable, read_variable
@@ -103,6 +104,10 @@ class Variables:
         of_field = field_variable(self.field, name)
         if of_field is not None:
             return Variable(*of_field), sigma
+        if name in DERIVED and self.field.uvw_mm is not None:  # of the field as it is now, its rigid motion removed
+            size, of_size = magnitude(self.field.uvw_mm, self.field.total_covariance[..., 3:, 3:])
+            held = np.where(self.field.valid, size if name == MAGNITUDE else of_size, np.nan)
+            return Variable(held, *DERIVED[name]), of_size if name == MAGNITUDE else None
         variable = read_variable(self.path, name)
         values = self._along_axes.get(name, variable.values)
         if values.shape != self.field.shape or not np.issubdtype(values.dtype, np.number):

@@ -10,20 +10,26 @@ import { files } from "./results/export.js";
 import { gauges } from "./results/gauges.js";
 import { frames } from "./results/frame.js";
 import { Workspace, keptDisplay } from "./results/kept.js";
+import { overlay } from "./results/overlay.js";
+import { pointHistory } from "./results/point_history.js";
 import { mark, pinned } from "./results/probe.js";
 import { interval } from "./results/uncertainty.js";
+import { live, usualField } from "./results/live.js";
 import { stateBadge, warningsBox, warningsCell } from "./results/warnings.js";
+import { amount, shown as shown_, strainUnit, useStrainUnit } from "../lib/units.js";
 import { h, replace, table, when, num, count, quantity, field, select, definitions, notify, problemText } from "../lib/dom.js";
 
 /** @import { Here } from "../main.js" */
 /** @import { Ends } from "#dom" */
 /** @import { Over } from "../widgets/field_map.js" */
 /** @import { Shown } from "./results/analysis.js" */
+/** @import { Overlay } from "./results/overlay.js" */
 /** @import { Interval } from "./results/uncertainty.js" */
 /** @typedef {"image" | "surface" | "compare"} Mode */
-/** @typedef {{ step: number | null, field: string | null, image: Over, mode: Mode, info: Shown | null, playing: object | null, pinned?: number }} State */
-/** @typedef {{ result: Result, state: State, map: FieldMap, scale: Scale, interval: Interval, workspace: Workspace, ends: Ends, probe: HTMLElement, message: HTMLElement, readonly step: number | null,
- *   readonly info: Shown | null, onpick: (x: number, y: number, event: Event) => unknown, drawn: Set<() => unknown> }} Viewer shared by the parts of the screen; `drawn` is called after each change of step, field or scale */
+/** @typedef {{ step: number | null, field: string | null, chosen: boolean, image: Over, mode: Mode, info: Shown | null, playing: object | null, pinned?: number }} State */
+/** @typedef {{ result: Result, state: State, map: FieldMap, scale: Scale, interval: Interval, workspace: Workspace, overlay: Overlay, ends: Ends, probe: HTMLElement, message: HTMLElement, readonly step: number | null,
+ *   readonly info: Shown | null, onpick: (x: number, y: number, event: Event) => unknown, drawn: Set<() => unknown>, landed: Set<() => unknown> }} Viewer shared by the parts of the screen;
+ *   `drawn` is called after each change of step, field or scale, `landed` once more steps are finished */
 /** @typedef {{ root: HTMLElement, update: () => Promise<void>, close: () => void, attach?: () => void }} OtherView shown instead of the map */
 
 /**
@@ -98,7 +104,7 @@ async function show(root, testId, analysisId, query) {
   if (query.get("frame") === "system") result.use("system");
   /** @type {State} */
   const state = {
-    step: result.steps.includes(asked) ? asked : result.steps.at(-1) ?? null, field: query.get("field"), image: "reference", mode: "image", info: null, playing: null,
+    step: result.steps.includes(asked) ? asked : result.steps.at(-1) ?? null, field: query.get("field"), chosen: Boolean(query.get("field")), image: "reference", mode: "image", info: null, playing: null,
   };
 
   const map = new FieldMap("Field over the image of camera 1", (x, y, event) => screen.onpick(x, y, event));
@@ -121,47 +127,68 @@ async function show(root, testId, analysisId, query) {
     h("button", { type: "button", "data-mode": name, "aria-pressed": String(name === "image"), onclick: () => setMode(name).catch(notify) }, text)));
   const stage = h("div", map.view.root);
   const below = h("div");
+  const strainChoice = select([["µm/m", "µm/m"], ["%", "%"]], strainUnit(), { "aria-label": "Unit of strain", "data-role": "strain-unit" });
+  strainChoice.addEventListener("change", async () => {
+    useStrainUnit(strainChoice.value === "%" ? "%" : "µm/m");
+    try {
+      await drawFields();
+      await redraw();
+      for (const listener of screen.interval.changed) await listener();
+    } catch (error) {
+      notify(error);
+    }
+  });
   const axesField = h("div.field");
   const play = h("button", { type: "button", "aria-pressed": "false", title: "Play through the steps", onclick: () => playing(!state.playing) }, "▶ Play");
   /** @type {Viewer} */
   const screen = {
-    result, state, map, scale, workspace, ends, probe, message, interval: /** @type {any} */ (null),
+    result, state, map, scale, workspace, ends, probe, message, interval: /** @type {any} */ (null), overlay: /** @type {any} */ (null),
     get step() { return state.step; },
     get info() { return state.info; },
     onpick: (x, y) => pick(x, y),
     drawn: new Set(),
+    landed: new Set(),
   };
   screen.interval = interval(screen);
+  screen.overlay = overlay(screen);
 
   async function drawFields() {
     if (state.step === null) return;
     const { shown } = await result.fields(state.step);
-    let key = state.field;
-    if (!shown.some((one) => one.key === key)) {
-      // a field that this step lacks (a shape has no displacement) stays chosen for the others
-      key = key ?? (shown.some((one) => one.key === "w_mm") ? "w_mm" : "z_mm");
-    }
-    state.info = shown.find((one) => one.key === key) ?? null;
-    if (!state.info && !state.field) state.info = shown[0];
-    state.field = state.info?.key ?? key;
+    // a field that was chosen and that this step lacks (a shape has no displacement) stays chosen for the others
+    if (!state.chosen) state.field = usualField(shown.map((one) => one.key));
+    state.info = shown.find((one) => one.key === state.field) ?? null;
     const groups = [...new Set(shown.map((one) => one.group))];
     replace(fieldChoice, state.info ? null : h("option", { value: state.field, selected: true }, `${state.field} (not in this step)`),
       groups.map((group) => h("optgroup", { label: group }, shown.filter((one) => one.group === group).map((one) =>
-        h("option", { value: one.key, selected: one.key === state.field, title: one.about }, one.unit ? `${one.text} (${one.unit})` : one.text)))));
+        h("option", { value: one.key, selected: one.key === state.field, title: one.about }, one.unit ? `${one.text} (${shown_(one.unit).unit})` : one.text)))));
+  }
+
+  /** Which step is shown, of how many. */
+  function counter() {
+    if (state.step === null) return;
+    const at = result.steps.indexOf(state.step);
+    slider.max = String(Math.max(result.steps.length - 1, 0));
+    slider.value = String(at);
+    slider.setAttribute("aria-valuetext", result.stepText(state.step));
+    replace(stepText, h("span.of", `${at + 1} of ${result.steps.length}`), h("span.name", { title: result.stepText(state.step) }, result.stepText(state.step)));
+  }
+
+  /** Without a finished step there is nothing to choose: what is the matter stands alone. */
+  function nothing() {
+    const none = state.step === null;
+    for (const part of dependent) part.hidden = none;
+    replace(empty, !none ? null : following.running() ? h("p.quiet", { role: "status" }, "No step is finished yet. The page updates by itself.")
+      : h("p.quiet", "No step was measured. ", h("a", { href: `#/test/${testId}` }, "Back to the test"), " to draw the region and measure again."));
   }
 
   async function refresh() {
-    if (state.step === null) {
-      message.textContent = "No step is finished yet. The page updates by itself.";
-      return;
-    }
+    nothing();
+    if (state.step === null) return;
     replace(cameras, camerasNote(result.analysis.summary?.steps?.find((one) => one.n === state.step)));
-    slider.max = String(Math.max(result.steps.length - 1, 0));
-    slider.value = String(result.steps.indexOf(state.step ?? NaN));
-    slider.setAttribute("aria-valuetext", result.stepText(state.step));
-    stepText.textContent = `${result.stepText(state.step)} · ${result.steps.indexOf(state.step ?? NaN) + 1} of ${result.steps.length}`;
+    counter();
     await drawFields();
-    const address = `#/results/${testId}/${analysisId}?step=${state.step}&field=${encodeURIComponent(state.field ?? "")}${result.frame === "system" ? "&frame=system" : ""}`;
+    const address = `#/results/${testId}/${analysisId}?step=${state.step}${state.chosen ? `&field=${encodeURIComponent(state.field ?? "")}` : ""}${result.frame === "system" ? "&frame=system" : ""}`;
     if (location.hash !== address && location.hash.startsWith(`#/results/${testId}/${analysisId}`)) history.replaceState(null, "", address);
     if (!state.info) {
       message.textContent = `Step ${state.step} has no ${state.field}: ${state.step === result.reference ? "it is the reference of the displacements." : "choose another field."}`;
@@ -196,9 +223,11 @@ async function show(root, testId, analysisId, query) {
     scale.lay(values, info.unit, info.flags, Boolean(info.signed));
     map.redraw(scale);
     const s = map.now.statistics;
+    const { unit, factor } = shown_(info.unit, Math.max(Math.abs(s.min ?? 0), Math.abs(s.max ?? 0))); // one unit for all
+    const text = (/** @type {number | null} */ v, digits = 4) => quantity(v === null ? null : factor * v, unit, digits);
     replace(statistics, [...definitions([
-      ["min", quantity(s.min, info.unit)], ["max", quantity(s.max, info.unit)], ["mean", quantity(s.mean, info.unit)], ["sd", quantity(s.sd, info.unit, 3)],
-      ["valid", `${count(s.count)} of ${count(s.within)} points (${num(s.within ? (100 * s.count) / s.within : null, 4)} %)`],
+      ["min", text(s.min)], ["max", text(s.max)], ["mean", text(s.mean)], ["sd", text(s.sd, 3)],
+      ["valid", h("span.whole", { title: "points with a value, of those in the region" }, `${count(s.count)} of ${count(s.within)} (${num(s.within ? (100 * s.count) / s.within : null, 3)} %)`)],
     ]).children]);
     for (const listener of screen.drawn) await listener();
     await principal();
@@ -214,12 +243,19 @@ async function show(root, testId, analysisId, query) {
     if (state.step !== step || state.info !== info || !map.now) return;
     const { grid } = map.now;
     const mean = (/** @type {ArrayLike<number>} */ of) => { const known = measured(grid, of); return known.length ? known.reduce((sum, v) => sum + v, 0) / known.length : null; };
-    statistics.append(...definitions([["principal strains, mean", `${num(mean(e1), 4)} and ${quantity(mean(e2), info.unit || "µm/m", 4)}`]]).children);
+    statistics.append(...definitions([["principal strains, mean", h("span.whole", `${amount(mean(e1), "µm/m")}, ${amount(mean(e2), "µm/m")}`)]]).children);
   }
 
   /** @param {number | null} n */
   async function setStep(n) {
     state.step = n;
+    await refresh();
+  }
+
+  /** A step chosen by hand. @param {number} n */
+  async function choose(n) {
+    state.step = n;
+    following.moved();
     await refresh();
   }
 
@@ -254,6 +290,7 @@ async function show(root, testId, analysisId, query) {
     state.pinned = i;
     const answer = await api.get(`${result.path}/probe`, { x_px: Math.max(grid.x[i], 0), y_px: Math.max(grid.y[i], 0), step: state.step, frame: result.frame });
     pinned(screen, answer);
+    point.draw();
   }
 
   /** @type {OtherView | null} */
@@ -286,13 +323,13 @@ async function show(root, testId, analysisId, query) {
   }
   ends.push(() => other?.close());
 
-  fieldChoice.addEventListener("change", () => { state.field = fieldChoice.value; display.chosen(); refresh().catch(notify); });
+  fieldChoice.addEventListener("change", () => { state.field = fieldChoice.value; state.chosen = true; display.chosen(); refresh().catch(notify); });
   imageChoice.addEventListener("change", () => { state.image = /** @type {Over} */ (imageChoice.value); refresh().catch(notify); });
-  slider.addEventListener("input", () => setStep(result.steps[Number(slider.value)]).catch(notify));
+  slider.addEventListener("input", () => choose(result.steps[Number(slider.value)]).catch(notify));
   const fade = () => { map.view.canvas.style.opacity = String(Number(opacity.value) / 100); };
   opacity.addEventListener("input", fade);
   fade();
-  const move = (/** @type {number} */ by) => setStep(result.steps[Math.min(Math.max(result.steps.indexOf(state.step ?? NaN) + by, 0), result.steps.length - 1)]).catch(notify);
+  const move = (/** @type {number} */ by) => choose(result.steps[Math.min(Math.max(result.steps.indexOf(state.step ?? NaN) + by, 0), result.steps.length - 1)]).catch(notify);
 
   function drawStatus() {
     const { analysis } = result;
@@ -300,15 +337,17 @@ async function show(root, testId, analysisId, query) {
     replace(warned, warningsBox(analysis.warnings));
   }
 
+  const following = live(screen, setStep);
+  const empty = h("div", { "data-role": "empty" });
+  const controls = h("div.row.controls", h("div.field", h("label", { for: "resultfield" }, "Field"), Object.assign(fieldChoice, { id: "resultfield" })),
+    axesField, field("Image", imageChoice), field("Opacity", opacity, "%"),
+    h("div.field.grow", h("label", { for: "resultstep" }, "Step "), h("span.control",
+      h("button", { type: "button", "aria-label": "Step before", onclick: () => move(-1) }, "◂"), Object.assign(slider, { id: "resultstep" }),
+      h("button", { type: "button", "aria-label": "Next step", onclick: () => move(1) }, "▸"), play, stepText)));
+  const pictured = h("div", stage, screen.overlay.root, message, cameras);
+  const figures = h("section.panel.figures", { "aria-label": "Figures" }, scale.root, h("h2", "Statistics"), statistics, h("div.row", h("span", "Strain in"), strainChoice), screen.interval.root, h("h2", "Probe"), probe);
   replace(root,
-    h("div.spread", h("h1", "Results: ", h("a", { href: `#/results/${testId}` }, result.test.name || testId), ` · ${result.analysis.label || analysisId}`), status, modes), warned,
-    h("div.row.controls", h("div.field", h("label", { for: "resultfield" }, "Field"), Object.assign(fieldChoice, { id: "resultfield" })),
-      axesField, field("Image", imageChoice), field("Opacity", opacity, "%"),
-      h("div.field.grow", h("label", { for: "resultstep" }, "Step "), h("span.control",
-        h("button", { type: "button", "aria-label": "Step before", onclick: () => move(-1) }, "◂"), Object.assign(slider, { id: "resultstep" }),
-        h("button", { type: "button", "aria-label": "Next step", onclick: () => move(1) }, "▸"), play, stepText))),
-    h("div.grid.side.measured", h("div", stage, message, cameras),
-      h("section.panel.figures", { "aria-label": "Figures" }, scale.root, h("h2", "Statistics"), statistics, screen.interval.root, h("h2", "Probe"), probe), below));
+    h("div.spread", h("h1", "Results: ", h("a", { href: `#/results/${testId}` }, result.test.name || testId), ` · ${result.analysis.label || analysisId}`), status, modes), warned, following.root, empty, controls, h("div.grid.side.measured", pictured, figures, below));
 
   drawStatus();
   screen.drawn.add(() => mark(screen));
@@ -317,16 +356,20 @@ async function show(root, testId, analysisId, query) {
   const gaugePanels = gauges(screen);
   const axes = frames(screen, async () => { scale.forget(); state.pinned = undefined; replace(probe, h("p.quiet", "Click a point to see all its values.")); await refresh(); });
   axesField.append(h("label", { for: "resultframe" }, "Axes"), axes.choice);
-  below.append(gaugePanels, axes.root, files(screen), aboutPanel.root);
+  const filesPanel = files(screen);
+  const point = pointHistory(screen);
+  below.append(point.root, gaugePanels, axes.root, filesPanel, aboutPanel.root);
+  const dependent = [modes, controls, pictured, figures, point.root, gaugePanels, axes.root, filesPanel]; // on a finished step
   await refresh();
   ends.push(events.on("result", async (event) => {
     if (event.analysis_id !== analysisId) return;
-    const first = state.step === null;
     await result.refresh();
     drawStatus();
-    slider.max = String(Math.max(result.steps.length - 1, 0));
+    counter();
     aboutPanel.draw();
-    if (first) await setStep(result.steps.at(-1) ?? null);
+    await following.landed();
+    if (scale.overAll) await redraw();
+    for (const listener of screen.landed) await listener();
   }), events.on("step_failed", async (event) => {
     if (event.analysis_id !== analysisId) return;
     await result.refresh();
@@ -336,6 +379,7 @@ async function show(root, testId, analysisId, query) {
     if (job.id !== result.analysis.job_id || job.state === result.analysis.state) return;
     await result.refresh();
     drawStatus();
+    nothing();
     aboutPanel.draw();
   }), () => { state.playing = null; });
   return () => ends.forEach((end) => end());

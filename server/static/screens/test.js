@@ -136,6 +136,6 @@ async function one(root, id) {
     }),
     () => clearTimeout(later),
   );
-  replace(root, h("div.spread", title, h("a", { href: "#/test" }, "All tests")), h("div.grid", head, steps.root, measure.root, analyses));
+  replace(root, h("div.spread", title, measure.head, h("a", { href: "#/test" }, "All tests")), h("div.grid", head, steps.root, measure.root, analyses));
   return () => ends.forEach((end) => end());
 }

@@ -1,7 +1,8 @@
 // A field over an image, with the values under the mouse.
 import * as api from "../lib/api.js";
 import { View } from "./view.js";
-import { num, quantity } from "../lib/dom.js";
+import { num } from "../lib/dom.js";
+import { amount, uncertain } from "../lib/units.js";
 import { greyOf } from "./grey.js";
 import { statistics } from "../lib/point_grid.js";
 /** @import { Result, Shown } from "../screens/results/analysis.js" */
@@ -187,8 +188,8 @@ export class FieldMap {
     this.view.readout.dataset.value = String(values[i]);
     if (info.flags) return `${info.text}: ${(info.flags[values[i]] ?? values[i]).toString().replace(/_/g, " ")}`;
     if (!grid.valid[i] || !Number.isFinite(values[i])) return `${info.text}: no valid value`;
-    if (!sigma || !Number.isFinite(sigma[i])) return `${info.text} ${quantity(values[i], info.unit, 5)}`;
+    if (!sigma || !Number.isFinite(sigma[i])) return `${info.text} ${amount(values[i], info.unit)}`;
     const k = this.factor === 1 ? "u, k = 1" : `U, k = ${num(this.factor, 3)}`;
-    return `${info.text} ${num(values[i], 5)} ± ${num(this.factor * sigma[i], 2)}\u00a0${info.unit} (${k}${this.lacking ? `; ${this.lacking}` : ""})`;
+    return `${info.text} ${uncertain(values[i], this.factor * sigma[i], info.unit)} (${k}${this.lacking ? `; ${this.lacking}` : ""})`;
   }
 }

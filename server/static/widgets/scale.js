@@ -1,6 +1,7 @@
 // The colour scale: its controls, its bar, and the colouring of values with it.
 import { MAPS, ENTRIES, colours, entry, percentiles, suited, statusColour, bytes } from "../lib/colour.js";
-import { h, replace, field, number, pen, select, num, tick } from "../lib/dom.js";
+import { h, replace, field, number, pen, select } from "../lib/dom.js";
+import { amount, evenMarks, shown } from "../lib/units.js";
 
 /** @import { MapName } from "../lib/colour.js" */
 /** @import { Raster } from "../lib/point_grid.js" */
@@ -35,7 +36,8 @@ export class Scale {
     this.legend = h("div.colourbar", { role: "img", "aria-label": "Colour bar", "data-role": "colourbar" }, this.bar, this.marks);
     this.flagList = h("ul.flags", { hidden: true });
     this.byPercentiles = h("div.fields", field("From", this.lowest, "%"), field("to", this.highest, "%"), steps ? field("Over", this.span) : null);
-    this.byLimits = h("div.fields", { hidden: true }, field("From", this.lowGiven), field("to", this.highGiven));
+    this.limitUnits = [h("span.unit"), h("span.unit")];
+    this.byLimits = h("div.fields", { hidden: true }, field("From", this.lowGiven), this.limitUnits[0], field("to", this.highGiven), this.limitUnits[1]);
     this.levels.title = "0: smooth";
     this.controls = h("div.tight", h("div.fields", field("Colours", this.map), field("Levels", this.levels), h("label.check", this.reverse, "reversed")),
       field("Limits", this.limits), this.byPercentiles, this.byLimits);
@@ -154,11 +156,13 @@ export class Scale {
     const image = new ImageData(ENTRIES, 1);
     for (let i = 0; i < ENTRIES; i += 1) image.data.set([this.rgb[3 * i], this.rgb[3 * i + 1], this.rgb[3 * i + 2], 255], 4 * i);
     pen(this.bar).putImageData(image, 0, 0);
-    const digits = Math.min(7, Math.max(3, 2 + Math.ceil(Math.log10(Math.max(Math.abs(this.low), Math.abs(this.high)) / (this.high - this.low) || 1))));
-    const shares = [0, 0.25, 0.5, 0.75, 1];
-    replace(this.marks, shares.map((share) => h("span", { style: { left: `${100 * share}%` } }, tick(Number((this.low + share * (this.high - this.low)).toPrecision(digits)) * (Math.abs(this.low + share * (this.high - this.low)) < 1e-9 * (this.high - this.low) ? 0 : 1)))),
-      h("span.of", this.unit));
-    this.legend.setAttribute("aria-label", `Colour bar from ${num(this.low, 4)} to ${num(this.high, 4)} ${this.unit}`);
+    const { unit, factor } = shown(this.unit, Math.max(Math.abs(this.low), Math.abs(this.high)));
+    const at = (/** @type {number[]} */ shares) => ({ shares, texts: evenMarks(shares.map((share) => factor * (this.low + share * (this.high - this.low)))) });
+    let { shares, texts } = at([0, 0.25, 0.5, 0.75, 1]);
+    if (texts.some((text) => text.length > 6)) ({ shares, texts } = at([0, 0.5, 1])); // long numbers need room
+    replace(this.marks, shares.map((share, k) => h("span", { style: { left: `${100 * share}%` } }, texts[k])), h("span.of", unit));
+    for (const one of this.limitUnits) one.textContent = this.unit;
+    this.legend.setAttribute("aria-label", `Colour bar from ${amount(this.low, this.unit)} to ${amount(this.high, this.unit)}`);
     this.legend.dataset.low = String(this.low);
     this.legend.dataset.high = String(this.high);
     this.legend.dataset.map = this.name;

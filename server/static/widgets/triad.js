@@ -60,3 +60,26 @@ export function drawTriad(frame, axes, text) {
   svg("circle", { cx: MIDDLE, cy: MIDDLE, r: 5.5, fill: "none", stroke: "#6db3ff", "stroke-width": 1.5 }), z,
   Object.assign(svg("text", { x: MIDDLE - 12, y: MIDDLE + 13, fill: "#6db3ff", "text-anchor": "middle", "font-size": 11 }), { textContent: "Z" })));
 }
+
+const INKS = ["#ff8f7a", "#7be08f", "#6db3ff"];
+
+/**
+ * Draw the three axes as they stand in a view in space; an earlier drawing goes.
+ * @param {HTMLElement} frame
+ * @param {number[][]} directions of X, Y and Z: to the right, downwards, towards who looks
+ * @param {string} text which axes they are
+ */
+export function drawTriad3(frame, directions, text) {
+  frame.querySelector(".triad")?.remove();
+  const each = directions.map(([x, y, z], k) => ({ x, y, z, name: "XYZ"[k], colour: INKS[k] })).sort((a, b) => a.z - b.z); // the nearest is drawn last
+  const parts = each.flatMap(({ x, y, name, colour }) => {
+    const [tx, ty] = [MIDDLE + LONG * x, MIDDLE + LONG * y];
+    const size = Math.hypot(x, y);
+    const [ex, ey] = size > 0.15 ? [(5 * x) / size, (5 * y) / size] : [0, 0]; // no head on an axis that points at who looks
+    return [svg("path", { d: `M${MIDDLE} ${MIDDLE}L${tx} ${ty}M${tx - ex - ey / 2} ${ty - ey + ex / 2}L${tx} ${ty}L${tx - ex + ey / 2} ${ty - ey - ex / 2}`, stroke: colour, "stroke-width": 2, fill: "none" }),
+      Object.assign(svg("text", { x: MIDDLE + (LONG + 8) * x, y: MIDDLE + (LONG + 8) * y, fill: colour, "text-anchor": "middle", "dominant-baseline": "central", "font-size": 12, "font-weight": 600 }), { textContent: name })];
+  });
+  const data = Object.fromEntries(directions.map((d, k) => [`data-${"xyz"[k]}`, d.map((v) => v.toFixed(3)).join(" ")]));
+  frame.append(svg("svg", { class: "triad", viewBox: "0 0 88 88", width: 88, height: 88, role: "img", ...data, "aria-label": `Axes of the numbers, ${text}: X, Y and Z as they stand in this view` },
+    svg("circle", { cx: MIDDLE, cy: MIDDLE, r: 43, fill: "#0b0d0ebb" }), ...parts));
+}

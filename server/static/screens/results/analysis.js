@@ -11,14 +11,14 @@ const MAX_BYTES = 300e6;
 const STRAIN = /^(sigma_)?(exx|eyy|exy|e1|e2|max_shear|von_mises)(_patch)?$/;
 /** @type {Record<string, string>} */
 const NAMES = {
-  x_mm: "X", y_mm: "Y", z_mm: "Z", u_mm: "U", v_mm: "V", w_mm: "W", exx: "exx", eyy: "eyy", exy: "exy", e1: "e1, larger principal", e2: "e2, smaller principal",
+  d_mm: "|d|, size of the displacement", x_mm: "X", y_mm: "Y", z_mm: "Z", u_mm: "U", v_mm: "V", w_mm: "W", exx: "exx", eyy: "eyy", exy: "exy", e1: "e1, larger principal", e2: "e2, smaller principal",
   max_shear: "max. shear", von_mises: "von Mises strain", strain_angle_rad: "direction of e1", epipolar_px: "epipolar offset", noise_grey: "image noise",
   status: "status", strain_status: "status of the strain", iterations: "iterations", theta_rad: "theta", phi_rad: "phi", zp_mm: "zp",
 };
 /** @type {[name: string, variables: RegExp][]} */
 const GROUPS = [
-  ["Displacement", /^[uvw]_mm$/], ["Shape", /^[xyz]_mm$/], ["Strain", /^(exx|eyy|exy|e1|e2|max_shear|von_mises|strain_angle_rad)$/],
-  ["Quality", /^(zncc|epipolar_px|noise_grey|status|strain_status|iterations|reference_step)/], ["Standard uncertainty", /^sigma_/], ["Strain of the patches", /_patch$/], ["Other", /./],
+  ["Displacement", /^[uvwd]_mm$/], ["Strain", /^(exx|eyy|exy|e1|e2|max_shear|von_mises|strain_angle_rad)$/], ["Shape", /^[xyz]_mm$/],
+  ["Quality", /^(zncc|epipolar_px|noise_grey|status$|strain_status)/], ["Standard uncertainty", /^sigma_/], ["Internals", /./],
 ];
 
 /**
@@ -31,8 +31,20 @@ export function shownUnit(name, units) {
   return { unit: units === "pixel" ? "px" : units === "1" ? "" : units === "count" ? "grey" : units, factor: 1 };
 }
 
-/** @param {string} name */
-const pretty = (name) => NAMES[name] ?? (name.startsWith("sigma_") ? `σ of ${NAMES[name.slice(6)] ?? name.slice(6)}` : name.replace(/_/g, " "));
+/**
+ * Name of a variable as it is shown.
+ * @param {string} name
+ */
+export const pretty = (name) => NAMES[name] ?? (name.startsWith("sigma_") ? `σ of ${NAMES[name.slice(6)] ?? name.slice(6)}` : name.replace(/_/g, " "));
+
+/**
+ * Group that a variable stands in, and that group's place.
+ * @param {string} name
+ */
+export function groupOf(name) {
+  const at = GROUPS.findIndex(([, pattern]) => pattern.test(name));
+  return { at, group: GROUPS[at][0] };
+}
 
 export class Result {
   /**
@@ -153,7 +165,7 @@ export class Result {
       /** @type {Shown[]} */
       const shown = [];
       for (const one of fields) {
-        const group = GROUPS.find(([, pattern]) => pattern.test(one.name))?.[0] ?? "Other";
+        const { group } = groupOf(one.name);
         const { unit } = shownUnit(one.name, one.units);
         const common = { name: one.name, group, unit, about: one.long_name, flags: one.flags ?? null };
         if (one.dimensions.join() === "row,col" && !["x_px", "y_px"].includes(one.name)) shown.push({ ...common, key: one.name, component: null, text: pretty(one.name) });

@@ -3,9 +3,12 @@ import * as api from "../../lib/api.js";
 import { chart } from "../../widgets/plots.js";
 import { h, svg, numeric, replace, table, num, count, number, select, field, action, notify, problemText } from "../../lib/dom.js";
 import { nudge, onGrab } from "../../widgets/view.js";
+import { amount, shown, uncertain } from "../../lib/units.js";
 import { shownUnit } from "./analysis.js";
 import { keptGauges } from "./kept.js";
 import { abscissas, areaChart, isRelative } from "./histories.js";
+import { distanceMm } from "../../lib/along.js";
+import { lines } from "./lines.js";
 import { budgetTable, withBudget } from "./uncertainty.js";
 /** @import { Attributes } from "#dom" */
 /** @import { Body, GaugeReadings } from "#routes" */
@@ -33,8 +36,8 @@ export function gauges(screen) {
   view.svg.removeAttribute("aria-hidden");
   view.svg.setAttribute("role", "group");
   view.svg.setAttribute("aria-label", "Gauges drawn over the picture");
-  /** @type {{ tool: Tool, line: [Spot, Spot] | null, area: Four | null, extensometers: { name: string, a: Spot, b: Spot }[], serial: number, first: Spot | null }} */
-  const state = { tool: "probe", line: null, area: null, extensometers: [], serial: 0, first: null };
+  /** @type {{ tool: Tool, line: [Spot, Spot] | null, area: Four | null, extensometers: { name: string, a: Spot, b: Spot }[], serial: number, first: Spot | null, kept: { name: string, ends: [Spot, Spot] }[] }} `kept`: lines beside the one that is drawn now */
+  const state = { tool: "probe", line: null, area: null, extensometers: [], serial: 0, first: null, kept: [] };
   const rigid = h("input", { type: "checkbox" });
   const keep = keptGauges(screen.workspace, state, rigid);
   /** @type {(more: Partial<Request>) => Request} */
@@ -141,8 +144,14 @@ export function gauges(screen) {
     }
     if (tool === "line") state.line = [from, to];
     if (tool === "area") state.area = [Math.min(from[0], to[0]), Math.min(from[1], to[1]), Math.max(from[0], to[0]), Math.max(from[1], to[1])];
-    if (tool === "extensometer") { state.serial += 1; state.extensometers.push({ name: `e${state.serial}`, a: from, b: to }); }
+    if (tool === "extensometer") state.extensometers.push({ name: nextName(), a: from, b: to });
     if (tool !== "probe") changed(tool);
+  }
+
+  /** E1, E2 ...: e1 and e2 are the principal strains. Gauges that were saved under other names keep them. */
+  function nextName() {
+    do state.serial += 1; while (state.extensometers.some((one) => one.name === `E${state.serial}`));
+    return `E${state.serial}`;
   }
 
   /** @param {Kind} tool */
@@ -164,6 +173,9 @@ export function gauges(screen) {
   function path(d, colour) {
     return [svg("path", { d, ...stroke("#000", { "stroke-width": 4, opacity: 0.6 }) }), svg("path", { d, ...stroke(colour) })];
   }
+  /** @type {(ends: [Spot, Spot], name: string) => SVGElement} */
+  const label = ([a, b], name) => svg("text", { x: (a[0] + b[0]) / 2, y: (a[1] + b[1]) / 2, fill: "#fff", stroke: "#000", "stroke-width": 3, "paint-order": "stroke", style: { fontSize: "calc(13px * var(--px))", strokeWidth: "calc(3px * var(--px))" } }, ` ${name}`);
+  const more = lines(screen, { kept: state.kept, current: () => state.line, body, redraw: () => draw() });
   /** @type {number | undefined} */
   let later;
   screen.ends.push(() => clearTimeout(later));
@@ -209,10 +221,11 @@ export function gauges(screen) {
           handle([area[0], area[1]], INK.area, (x, y) => { area.splice(0, 2, Math.min(x, area[2] - 1), Math.min(y, area[3] - 1)); }, "area", "Upper left corner of the area"),
           handle([area[2], area[3]], INK.area, (x, y) => { area.splice(2, 2, Math.max(x, area[0] + 1), Math.max(y, area[1] + 1)); }, "area", "Lower right corner of the area"));
       }
+      for (const one of more.kept) parts.push(svg("path", { d: segment(...one.ends), ...stroke(INK.line, { "stroke-width": 1.5, "stroke-dasharray": "6 4" }) }), label(one.ends, one.name));
       if (line) parts.push(...path(segment(...line), INK.line), ...line.map((end, k) => handle(end, INK.line, (x, y) => { line[k] = [x, y]; }, "line", `${k ? "End" : "Beginning"} of the line`)));
       for (const one of state.extensometers) {
         parts.push(...path(segment(one.a, one.b), INK.extensometer), .../** @type {const} */ (["a", "b"]).map((k) => handle(one[k], INK.extensometer, (x, y) => { one[k] = [x, y]; }, "extensometer", `End ${k} of extensometer ${one.name}`)),
-          svg("text", { x: (one.a[0] + one.b[0]) / 2, y: (one.a[1] + one.b[1]) / 2, fill: "#fff", stroke: "#000", "stroke-width": 3, "paint-order": "stroke", style: { fontSize: "calc(13px * var(--px))", strokeWidth: "calc(3px * var(--px))" } }, ` ${one.name}`));
+          label([one.a, one.b], one.name));
       }
       /** @type {[Spot, Spot] | null} */
       const going = drag ? [drag.from, drag.to] : state.first && mouse ? [state.first, mouse] : null;
@@ -235,7 +248,7 @@ export function gauges(screen) {
   };
   const lineInputs = four(["Line from x", "Line from y", "Line to x", "Line to y"], ([x0, y0, x1, y1]) => { state.line = [[x0, y0], [x1, y1]]; return changed("line"); });
   const areaInputs = four(["Area left", "Area top", "Area right", "Area bottom"], (v) => { state.area = v; return changed("area"); });
-  const extInputs = four(["Extensometer a x", "Extensometer a y", "Extensometer b x", "Extensometer b y"], ([x0, y0, x1, y1]) => { state.serial += 1; state.extensometers.push({ name: `e${state.serial}`, a: [x0, y0], b: [x1, y1] }); return changed("extensometer"); });
+  const extInputs = four(["Extensometer a x", "Extensometer a y", "Extensometer b x", "Extensometer b y"], ([x0, y0, x1, y1]) => { state.extensometers.push({ name: nextName(), a: [x0, y0], b: [x1, y1] }); return changed("extensometer"); });
   function fillInputs() {
     if (state.line) state.line.flat().forEach((v, k) => { lineInputs.inputs[k].value = String(v); });
     if (state.area) state.area.forEach((v, k) => { areaInputs.inputs[k].value = String(v); });
@@ -274,6 +287,7 @@ export function gauges(screen) {
     const [line] = step.lines ?? [];
     answers.line = { line, from, name };
     await drawLine();
+    await more.draw();
   }
   /** @type {(values: (number | null)[], sigma: (number | null)[], sign: 1 | -1) => (number | null)[]} */
   const beside = (values, sigma, sign) => values.map((v, k) => { const s = sigma[k]; return v === null || s === null ? null : v + sign * s; });
@@ -286,25 +300,20 @@ export function gauges(screen) {
     if (!answers.line) return;
     const { line, from, name } = answers.line;
     const { value, sigma, units, budget, not_included: lacking } = line.values[name];
-    const { unit, factor } = shownUnit(name, units);
+    const { unit: base, factor: toBase } = shownUnit(name, units);
+    const to = shown(base, toBase * value.reduce((/** @type {number} */ most, v) => Math.max(most, Math.abs(v ?? 0)), 0));
+    const [unit, factor] = [to.unit, to.factor * toBase];
     const scaled = (/** @type {(number | null)[]} */ list) => list.map((v) => (v === null ? null : v * factor));
     const values = scaled(value);
     const errors = scaled(sigma).map((v) => (v === null ? null : interval.factor * v));
-    const positions = values.map((_, k) => ["x_mm", "y_mm", "z_mm"].map((axis) => line.values[axis].value[k] ?? NaN));
-    let length = 0;
-    const mm = values.map((_, k) => {
-      const piece = k ? Math.hypot(...positions[k].map((to, axis) => to - positions[k - 1][axis])) : 0;
-      if (Number.isFinite(piece)) length += piece;
-      return length;
-    });
-    const whole = positions.every(([x]) => Number.isFinite(x));
-    const inMm = along.value === "mm" && whole;
+    const mm = distanceMm(["x_mm", "y_mm", "z_mm"].map((axis) => line.values[axis].value));
+    const inMm = along.value === "mm" && mm !== null;
     const x = inMm ? mm : line.distance_px;
     const band = (/** @type {1 | -1} */ sign) => beside(values, errors, sign);
     const missing = value.filter((v) => v === null).length;
     replace(lineText, h("p.quiet", `${count(value.length)} positions from (${from[0].join(", ")}) to (${from[1].join(", ")}) px`,
       missing ? `; ${missing} without a value: ${[...new Set(line.missing.filter(Boolean))].join(", ").replace(/_/g, " ")}` : "",
-      along.value === "mm" && !whole ? "; the distance in mm is unknown where points are missing, so it is given in px" : "", errors.some((v) => v !== null) ? `; the band is ± ${interval.symbol}: ${interval.text}` : "; no standard uncertainty is known"),
+      along.value === "mm" && !mm ? "; the distance in mm is unknown where points are missing, so it is given in px" : "", errors.some((v) => v !== null) ? `; the band is ± ${interval.symbol}: ${interval.text}` : "; no standard uncertainty is known"),
       budgetTable(rms(budget), unit, factor, lacking ?? ""));
     lineChart.dataset.answer = JSON.stringify({ x, value, sigma });
     await plot("line", lineChart, { x: inMm ? "distance (mm)" : "distance (px)", y: `${screen.info?.text ?? name}${unit ? ` (${unit})` : ""}`, height: 320, said: interval.text,
@@ -341,7 +350,10 @@ export function gauges(screen) {
     const rows = [...(start === null || steps.some((one) => one.n === start) ? [] : [{ n: start, label, extensometers: [] }]), ...steps]
       .map((one) => ({ n: one.n, label: one.label, x: against.at(one.n) ?? NaN, each: one.extensometers ?? [] })).filter((one) => Number.isFinite(one.x)).sort((p, q) => p.x - q.x);
     const strain = name.endsWith("strain");
-    const factor = strain ? 1e6 : 1;
+    const base = strain ? "µm/m" : "mm";
+    const most = Math.max(0, ...rows.flatMap((one) => one.each.map((gauge) => Math.abs(gauge?.values[name]?.value ?? 0) * (strain ? 1e6 : 1))));
+    const { unit, factor: to } = shown(base, most);
+    const factor = (strain ? 1e6 : 1) * to;
     /** @typedef {typeof rows[number]} Row */
     const of = (/** @type {Row} */ one, /** @type {number} */ k, /** @type {"value" | "sigma"} */ part) => one.each[k]?.values[name]?.[part] ?? (one.n === start ? 0 : null);
     /** @type {Parameters<typeof chart>[1]["series"]} */
@@ -359,18 +371,17 @@ export function gauges(screen) {
       bands.push([at + 1, at + 2]);
     });
     extChart.dataset.answer = JSON.stringify({ x: data[0], value: rows.map((one) => state.extensometers.map((_, k) => of(one, k, "value"))), sigma: rows.map((one) => state.extensometers.map((_, k) => of(one, k, "sigma"))) });
-    const unit = strain ? "µm/m" : "mm";
     await plot("extensometer", extChart, { x: against.text, y: `${what.selectedOptions[0].text.replace(" (mm)", "")} (${unit})`, height: 320, said: interval.text, series, bands, data, label: `${name} of the extensometers` });
     const valueText = (/** @type {Row} */ one, /** @type {number} */ k) => {
       const [v, s] = [of(one, k, "value"), of(one, k, "sigma")];
       if (v === null) return one.each[k]?.missing?.replace(/_/g, " ") || "–";
-      if (s === null) return num(v * factor, 5);
+      if (s === null) return amount((v * factor) / to, base);
       const { budget, not_included: lacking } = one.each[k]?.values[name] ?? {};
-      return withBudget(`${num(v * factor, 5)} ± ${num(s * factor * interval.factor, 2)}`, budgetTable(budget, unit, factor, lacking ?? ""));
+      return withBudget(uncertain((v * factor) / to, (s * factor * interval.factor) / to, base), budgetTable(budget, base, factor / to, lacking ?? ""));
     };
     replace(extTable, table([
       ["Step", (one) => one.n], ["Label", (one) => one.label], ...(over.value === "n" ? [] : [numeric(against.text, (/** @type {Row} */ one) => num(one.x, 6))]),
-      ...state.extensometers.map((gauge, k) => numeric(`${gauge.name} (${unit})`, (/** @type {Row} */ one) => valueText(one, k))),
+      ...state.extensometers.map((gauge, k) => numeric(gauge.name, (/** @type {Row} */ one) => valueText(one, k))),
     ], rows, { caption: `± ${interval.text}` }),
     h("div.row", state.extensometers.map((gauge) => h("button", { type: "button", onclick: () => { state.extensometers = state.extensometers.filter((one) => one !== gauge); changed("extensometer"); } }, `Remove ${gauge.name}`))));
   }
@@ -396,28 +407,28 @@ export function gauges(screen) {
     answers.area = { name, steps };
     const { unit, factor } = shownUnit(name, steps.at(-1)?.areas?.[0]?.values[name]?.units ?? "");
     /** @type {(one: GaugeReadings, part: "mean" | "mean_sigma" | "sd" | "rms" | "min" | "max", digits?: number) => string} */
-    const cell = (one, part, digits = 5) => num((one.areas?.[0]?.values[name]?.[part] ?? NaN) * factor, digits);
-    const uncertain = (/** @type {GaugeReadings} */ one) => {
+    const cell = (one, part, digits = 4) => amount((one.areas?.[0]?.values[name]?.[part] ?? NaN) * factor, unit, digits);
+    const mean = (/** @type {GaugeReadings} */ one) => {
       const v = one.areas?.[0]?.values[name];
-      if (!v || v.mean_sigma === null) return "–";
-      return withBudget(num(v.mean_sigma * factor * interval.factor, 2), budgetTable(v.mean_budget, unit, factor, v.not_included ?? ""));
+      if (!v || v.mean_sigma === null) return cell(one, "mean");
+      return withBudget(uncertain((v.mean ?? NaN) * factor, v.mean_sigma * factor * interval.factor, unit), budgetTable(v.mean_budget, unit, factor, v.not_included ?? ""));
     };
     plots.area?.close();
     plots.area = null;
     areaChart(areaPlot, { result, against: areaAgainst, name, unit, factor, interval, steps }).then((made) => { plots.area?.close(); plots.area = made; }, notify);
     areaBox.dataset.answer = JSON.stringify(steps.map((one) => one.areas?.[0]?.values[name] ?? null));
     replace(areaBox, table([
-      ["Step", (one) => one.n], ["Label", (one) => one.label], ["Mean", (one) => cell(one, "mean"), { numeric: true }], [`± ${interval.symbol}`, uncertain, { numeric: true }],
+      ["Step", (one) => one.n], ["Label", (one) => one.label], [`Mean ± ${interval.symbol}`, mean, { numeric: true }],
       ["sd", (one) => cell(one, "sd", 3), { numeric: true }], ["rms", (one) => cell(one, "rms"), { numeric: true }], ["Min", (one) => cell(one, "min"), { numeric: true }], ["Max", (one) => cell(one, "max"), { numeric: true }],
       ["Points", (one) => (one.problem ? one.problem.cause ?? "–" : `${one.areas?.[0].valid} of ${one.areas?.[0].points}`), { numeric: true }],
-    ], steps, { caption: `${name}${unit ? ` in ${unit}` : ""} over the rectangle; ${interval.text}` }));
+    ], steps, { caption: `${name} over the rectangle; ${interval.text}` }));
   }
 
   interval.changed.add(() => Promise.all([drawLine(), drawExtensometers(), answers.area && drawArea(answers.area.name, answers.area.steps)]));
   rigid.addEventListener("change", () => { for (const read of [readLine, readArea, readExtensometers]) read().catch(notify); });
   const clear = (/** @type {"line" | "area"} */ tool) => h("button", { type: "button", onclick: () => { state[tool] = null; if (tool === "line") { answers.line = null; plots.line?.close(); plots.line = null; lineChart.replaceChildren(); lineText.replaceChildren(); } else { answers.area = null; plots.area?.close(); plots.area = null; areaPlot.replaceChildren(); areaBox.replaceChildren(); } draw(); } }, "Clear");
   const panels = {
-    line: h("details.panel", h("summary", "Line"), h("p.quiet", "Choose the tool Line above the picture and drag, or give its ends."), lineInputs.row, h("div.row", field("Along", along), clear("line")), lineText, lineChart),
+    line: h("details.panel", h("summary", "Line"), h("p.quiet", "Choose the tool Line above the picture and drag, or give its ends."), lineInputs.row, h("div.row", field("Along", along), clear("line")), lineText, lineChart, more.root),
     extensometer: h("details.panel", h("summary", "Extensometers"), h("p.quiet", "Choose the tool Extensometer and click its two ends, or give them."), extInputs.row, h("div.row", field("Show", what), field("Against", over)), extChart, extTable),
     area: h("details.panel", h("summary", "Area"), h("p.quiet", "Choose the tool Area and drag a rectangle, or give its corners."), h("div.row", areaInputs.row, field("Area against", areaAgainst.choice), clear("area")), areaPlot, areaBox),
   };
@@ -434,8 +445,10 @@ export function gauges(screen) {
     if (now === last) return;
     last = now;
     if (state.line) await readLine().catch(notify);
+    else if (more.kept.length) await more.draw().catch(notify);
     if (state.area && screen.info) await readArea().catch(notify);
   });
+  screen.landed.add(() => Promise.all([readExtensometers(), readArea()]).catch(notify)); // histories of all steps
   screen.ends.push(() => Object.values(plots).forEach((one) => one?.close()));
   return root;
 }

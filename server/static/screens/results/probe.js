@@ -1,12 +1,13 @@
 // The pinned point: all its values.
 import { h, svg, replace, table, num, badge, STATE_KIND } from "../../lib/dom.js";
-import { shownUnit } from "./analysis.js";
+import { groupOf, pretty, shownUnit } from "./analysis.js";
 import { budgetTable, withBudget, withUncertainty } from "./uncertainty.js";
 
 /** @import { Reply } from "#routes" */
 /** @import { Viewer } from "../results.js" */
 
 const CORRELATIONS = 3;
+const INTERNALS = "Internals";
 /** @typedef {Reply<"get", "/tests/{test_id}/analyses/{analysis_id}/probe">} Answer */
 /** @type {WeakMap<Viewer, Answer>} */
 const answers = new WeakMap(); // the one shown, for another interval
@@ -27,24 +28,31 @@ export function pinned(screen, answer) {
  * @param {Answer} answer
  */
 function draw(screen, answer) {
-  /** @type {{ name: string, text: string | HTMLElement }[]} */
+  /** @typedef {{ name: string, title: string, at: number, group: string, text: string | HTMLElement }} Row */
+  /** @type {Row[]} */
   const rows = [];
   for (const [name, { value, units, sigma, not_included: lacking, budget }] of Object.entries(answer.values)) {
     if (name.startsWith("sigma_") || name === "status" || name === "strain_status") continue;
     const { unit, factor } = shownUnit(name, units);
+    const row = { name: pretty(name), title: name, ...groupOf(name) };
     if (Array.isArray(value)) {
-      if (value.length <= CORRELATIONS) rows.push(.../** @type {(number | null)[]} */ (value).map((one, k) => ({ name: `${name} ${k + 1}`, text: num(one, 5) })));
+      if (value.length <= CORRELATIONS) rows.push(.../** @type {(number | null)[]} */ (value).map((one, k) => ({ ...row, name: `${row.name} ${k + 1}`, text: num(one, 5) })));
       continue;
     }
     const shown = value === null || value === undefined ? null : value * factor;
     const u = sigma === null || sigma === undefined || shown === null ? null : sigma * factor;
     const text = withUncertainty(shown, u, unit, screen.interval.factor);
-    rows.push({ name, text: u === null ? text : /** @type {string | HTMLElement} */ (withBudget(text, budgetTable(budget, unit, factor, lacking ?? ""))) });
+    rows.push({ ...row, text: u === null ? text : /** @type {string | HTMLElement} */ (withBudget(text, budgetTable(budget, unit, factor, lacking ?? ""))) });
   }
-  const { text } = screen.interval;
+  rows.sort((p, q) => p.at - q.at); // what matters first
+  const columns = /** @type {import("#dom").Column<Row>[]} */ ([["Number", (row) => h("span", { title: row.title }, row.name)], [`Value ± ${screen.interval.symbol}`, (row) => row.text, { numeric: true }]]);
+  const kept = screen.probe.querySelector("details")?.open ?? false;
+  /** @param {Row[]} of */
+  const groups = (of) => [...new Set(of.map((row) => row.group))].map((group) => h("div", { "data-group": group }, table(columns, of.filter((row) => row.group === group), { caption: group })));
   replace(screen.probe,
     h("div.spread", h("span", `row ${answer.row}, column ${answer.col}, step ${answer.step}`), badge(answer.status.replace(/_/g, " "), STATE_KIND[answer.status] ?? "warn")),
-    table([["Number", (row) => row.name], [`Value ± ${screen.interval.symbol}`, (row) => row.text, { numeric: true }]], rows, { caption: `All values of the point; ${text}` }));
+    groups(rows.filter((row) => row.group !== INTERNALS)),
+    h("details", { open: kept }, h("summary", "Internals"), groups(rows.filter((row) => row.group === INTERNALS))));
   mark(screen);
 }
 

@@ -1,6 +1,10 @@
 // The measured surface in space with the field on it: rotated by mouse, finger or keys; its displacement magnified.
 import { h, replace, field, number, action, tick } from "../../lib/dom.js";
 import { ENTRIES } from "../../lib/colour.js";
+import { marks, round125 } from "../../lib/even.js";
+import { trianglesOf } from "../../lib/isolines.js";
+import { drawTriad3 } from "../../widgets/triad.js";
+import { spaceOverlay } from "./surface_overlay.js";
 
 /** @import { Viewer } from "../results.js" */
 /** @import { Grid } from "../../lib/point_grid.js" */
@@ -18,29 +22,7 @@ async function three() {
 /** Radians about the vertical and the horizontal. @type {Record<string, [number, number]>} */
 const TURNS = { ArrowLeft: [0.12, 0], ArrowRight: [-0.12, 0], ArrowUp: [0, 0.12], ArrowDown: [0, -0.12] };
 
-/**
- * 1, 2 or 5 times a power of ten, not above `value`.
- * @param {number} value
- */
-function round125(value) {
-  if (!(value > 0) || !Number.isFinite(value)) return 1;
-  const power = 10 ** Math.floor(Math.log10(value));
-  return ([5, 2, 1].find((one) => one * power <= value) ?? 1) * power;
-}
-
-/**
- * Even marks between two numbers.
- * @param {number} low
- * @param {number} high
- */
-function marks(low, high, max = 5) {
-  const rough = (high - low) / max;
-  const power = 10 ** Math.floor(Math.log10(rough));
-  const step = ([1, 2, 5, 10].find((one) => one * power >= rough) ?? 10) * power;
-  const out = [];
-  for (let v = Math.ceil(low / step - 1e-9) * step; v <= high + 1e-9 * step; v += step) out.push(Math.abs(v) < 1e-9 * step ? 0 : Number(v.toPrecision(12)));
-  return out;
-}
+const MAX_TIMES = 1000;
 
 /** @param {Viewer} screen */
 export async function surface(screen) {
@@ -48,13 +30,17 @@ export async function surface(screen) {
   const { result, map, scale } = screen;
   const space = h("div.space", { tabindex: 0, role: "application", "aria-label": "Surface in space: arrow keys rotate, + and − zoom, 0 resets the view" });
   const labels = h("div.labels", { "aria-hidden": "true" });
-  const magnification = number(null, { min: 0, "data-role": "magnification" });
+  const magnification = number(null, { min: 0, max: MAX_TIMES, "data-role": "magnification" });
   const depth = number(1, { min: 0 });
   const grid = h("input", { type: "checkbox" });
   const note = h("span.quiet", { role: "status" });
   const reset = h("button", { type: "button", onclick: () => resetView() }, "Reset view");
+  const wrong = h("small.problem", { role: "alert", hidden: true }, `Give a factor from 0 to ${MAX_TIMES}.`);
+  const trueScale = h("button", { type: "button", title: "Displacements as large as they are", onclick: () => { magnification.value = "1"; depth.value = "1"; again(); } }, "True scale");
+  const usualScale = h("button", { type: "button", title: "Displacements as large as can be seen well", onclick: () => { magnification.value = ""; again(); } }, "Usual");
   const root = h("div.panel", { "data-role": "surface" },
-    h("div.row", field("Displacement ×", magnification), field("Depth ×", depth), h("label.check", grid, "grid lines"), reset, action("Save picture", save), note), space);
+    h("div.row", field("Displacement ×", magnification), trueScale, usualScale, field("Depth ×", depth), h("label.check", grid, "grid lines"), reset, action("Save picture", save)),
+    h("p.row.surface-note", note, wrong), space);
 
   /** @type {import("three").WebGLRenderer} */
   let renderer;
@@ -79,17 +65,20 @@ export async function surface(screen) {
   texture.colorSpace = THREE.SRGBColorSpace;
   texture.minFilter = THREE.NearestFilter;
   texture.magFilter = THREE.NearestFilter;
-  const material = new THREE.MeshLambertMaterial({ map: texture, side: THREE.DoubleSide });
+  const material = new THREE.MeshLambertMaterial({ map: texture, side: THREE.DoubleSide, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 });
   const plain = new THREE.MeshLambertMaterial({ color: 0x9aa3a8, side: THREE.DoubleSide }); // measured, but without a value of this field
   const mesh = new THREE.Mesh(new THREE.BufferGeometry(), [material, plain]);
   const wire = new THREE.LineSegments(new THREE.BufferGeometry(), new THREE.LineBasicMaterial({ color: 0x000000, transparent: true, opacity: 0.35 }));
   const box = new THREE.LineSegments(new THREE.BufferGeometry(), new THREE.LineBasicMaterial({ color: 0x808a90 }));
   scene.add(mesh, wire, box);
+  const over = spaceOverlay(THREE, scene, space);
+  screen.overlay.changed.add(update);
 
   /** @type {{ n: number, grid: Grid, position: Each, motion: Each | null } | null} */
   let held = null;
   /** @type {{ span: [number, number][], origin: number[], size: number, times: number, deep: number } | null} */
   let bounds = null;
+  let shownAt = new Float32Array();
   /** @type {{ at: number[], text: string }[]} */
   let ticks = [];
   /** @type {number[]} */
@@ -124,10 +113,12 @@ export async function surface(screen) {
     }
     if (!(high[0] >= low[0])) return false;
     const size = Math.hypot(...[0, 1, 2].map((k) => high[k] - low[k])) || 1;
-    const usual = largest > 0 ? Math.max(round125((0.12 * size) / largest), 1) : 1;
+    const usual = largest > 0 ? Math.min(Math.max(round125((0.12 * size) / largest), 1), MAX_TIMES) : 1;
     magnification.placeholder = String(usual);
     magnification.disabled = !motion;
-    const times = motion ? factor(magnification, usual) : 0;
+    const asked_ = factor(magnification, usual);
+    wrong.hidden = asked_ >= 0 && asked_ <= MAX_TIMES;
+    const times = motion ? Math.min(Math.max(asked_, 0), MAX_TIMES) : 0;
     const deep = factor(depth, 1);
     const middle = (low[2] + high[2]) / 2;
     const at = new Float32Array(3 * count);
@@ -145,23 +136,13 @@ export async function surface(screen) {
         at[3 * i + k] = v - origin[k];
       }
     }
-    triangles = [];
     /** @type {number[]} */
     const lines = [];
     const whole = (/** @type {number} */ i) => g.valid[i] && Number.isFinite(at[3 * i]) && (!motion || Number.isFinite(motion[0][i]));
-    for (let r = 0; r < g.rows - 1; r += 1) {
-      for (let c = 0; c < g.cols - 1; c += 1) {
-        const cell = r * g.cols + c;
-        const [p, q, s, t] = g.corners(cell);
-        const good = [whole(p), whole(q), whole(s), whole(t)];
-        const number_ = good.filter(Boolean).length;
-        const each = number_ === 4 ? [[p, s, q], [q, s, t]] : number_ === 3 ? [[p, s, t, q].filter((_, k) => good[[0, 2, 3, 1][k]])] : [];
-        for (const three_ of each) if (g.whole(cell, three_)) triangles.push(...three_);
-        if (!each.length) continue;
-        if (good[0] && good[1] && !g.parted(cell, p, q)) lines.push(p, q);
-        if (good[0] && good[2] && !g.parted(cell, p, s)) lines.push(p, s);
-      }
-    }
+    triangles = trianglesOf(g, whole, (cell, [p, q, s], good) => {
+      if (good[0] && good[1] && !g.parted(cell, p, q)) lines.push(p, q);
+      if (good[0] && good[2] && !g.parted(cell, p, s)) lines.push(p, s);
+    });
     const attribute = new THREE.BufferAttribute(at, 3);
     mesh.geometry.dispose();
     mesh.geometry = new THREE.BufferGeometry();
@@ -177,6 +158,7 @@ export async function surface(screen) {
     // a flat surface needs a box of some depth
     for (const one of span) if (one[1] - one[0] < 0.02 * size) { const m = (one[0] + one[1]) / 2; one[0] = m - 0.01 * size; one[1] = m + 0.01 * size; }
     bounds = { span, origin, size, times, deep };
+    shownAt = at;
     axes(bounds);
     space.dataset.triangles = String(triangles.length / 3);
     space.dataset.magnification = String(times);
@@ -293,6 +275,10 @@ export async function surface(screen) {
         span.style.transform = `translate(${((v.x + 1) / 2) * width}px, ${((1 - v.y) / 2) * height}px) translate(-50%, -50%)`;
         span.hidden = v.z > 1;
       });
+      over.place(height / (2 * Math.tan((camera.fov * Math.PI) / 360) * camera.position.distanceTo(controls.target)));
+      const turned = new THREE.Quaternion().copy(camera.quaternion).invert();
+      drawTriad3(space, [[1, 0, 0], [0, 1, 0], [0, 0, 1]].map(([x, y, z]) => { const a = new THREE.Vector3(x, y, z).applyQuaternion(turned); return [a.x, -a.y, a.z]; }),
+        result.frame === "specimen" ? "the specimen's" : "the calibration's");
       space.dataset.drawn = `${map.now?.n} ${map.now?.info.key}`;
     });
   }
@@ -324,10 +310,21 @@ export async function surface(screen) {
       paint();
       if (first) resetView();
     } else paint();
+    await lines(mine);
     draw();
   }
 
-  for (const input of [magnification, depth]) input.addEventListener("change", () => { if (held && build()) { paint(); draw(); } });
+  /** Contour lines and vectors on the surface as it is shown. @param {number} mine */
+  async function lines(mine = asked) {
+    const vectors = await screen.overlay.vectors();
+    if (mine !== asked || !held || !map.now || !bounds) return;
+    const { values, grid: g } = map.now;
+    over.contours(shownAt, triangles, values, screen.overlay.levels()?.levels ?? []);
+    over.arrows(shownAt, vectors, vectors ? (vectors.every * bounds.size) / Math.hypot(g.rows, g.cols) : 0);
+  }
+
+  const again = () => { if (held && build()) { paint(); lines().then(draw); } };
+  for (const input of [magnification, depth]) input.addEventListener("change", again);
   grid.addEventListener("change", () => { wire.visible = grid.checked; draw(); });
   space.addEventListener("keydown", (event) => {
     const turn = TURNS[event.key];
@@ -350,6 +347,8 @@ export async function surface(screen) {
   observer.observe(space);
   const close = () => {
     asked += 1;
+    screen.overlay.changed.delete(update);
+    over.close();
     observer.disconnect();
     controls.dispose();
     for (const one of [mesh, wire, box]) one.geometry.dispose();

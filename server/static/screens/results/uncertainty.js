@@ -1,6 +1,7 @@
 // How uncertainties are shown: one standard uncertainty or an interval of 95 %, and what they include.
 import * as api from "../../lib/api.js";
-import { h, replace, select, badge, notify, num, quantity } from "../../lib/dom.js";
+import { h, replace, select, badge, notify, num } from "../../lib/dom.js";
+import { amount, uncertain } from "../../lib/units.js";
 
 /** @import { Model } from "#routes" */
 /** @import { Viewer } from "../results.js" */
@@ -73,7 +74,7 @@ export function interval(screen) {
  * @param {number} factor
  */
 export function withUncertainty(value, sigma, unit, factor) {
-  return sigma === null ? quantity(value, unit, 5) : `${num(value, 5)} ± ${num(factor * sigma, 2)}${unit ? `\u00a0${unit}` : ""}`;
+  return uncertain(value, sigma === null ? null : factor * sigma, unit);
 }
 
 /**
@@ -88,7 +89,7 @@ export function budgetTable(budget, unit, scale, lacking) {
   if (!parts.length) return lacking ? h("p.quiet", lacking) : null;
   const whole = parts.reduce((sum, [, part]) => sum + Number(part) ** 2, 0);
   return h("table.budget", { "data-role": "budget" }, h("caption", "Budget of u (k = 1)", lacking ? `; ${lacking}` : ""),
-    h("tbody", parts.map(([cause, part]) => h("tr", h("th", { scope: "row" }, cause), h("td.numeric", quantity(scale * Number(part), unit, 2)),
+    h("tbody", parts.map(([cause, part]) => h("tr", h("th", { scope: "row" }, cause), h("td.numeric", amount(scale * Number(part), unit, 2)),
       h("td.numeric", whole > 0 ? `${num((100 * Number(part) ** 2) / whole, 2)} %` : "–")))));
 }
 

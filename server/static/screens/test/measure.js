@@ -2,7 +2,7 @@
 import * as api from "../../lib/api.js";
 import { View, stroke } from "../../widgets/view.js";
 import { greyOf } from "../../widgets/grey.js";
-import { stateBadge, warningsBox } from "../results/warnings.js";
+import { running } from "./running.js";
 import { RegionEditor } from "../../widgets/region_editor.js";
 import { Workspace } from "../../lib/workspace.js";
 import { draw } from "./drawing.js";
@@ -29,6 +29,7 @@ export async function measurePanel(id, test, ends, done) {
   const root = h("section.panel", { "aria-label": "Region and analysis" }, h("h2", "Region and analysis"));
   const body = h("div");
   root.append(body);
+  const jobs = running(id, ends, done);
   /** @type {ReturnType<typeof build> | null} */
   let building = null;
 
@@ -260,10 +261,6 @@ export async function measurePanel(id, test, ends, done) {
     }
     body.addEventListener("input", keep);
     body.addEventListener("change", keep);
-
-    const progress = h("div", { role: "status", "data-role": "progress" });
-    const stopped = new AbortController();
-    ends.push(() => stopped.abort());
     const start = action("Measure", async () => {
       const region = editor.region();
       if (!region) throw api.problemOf({ cause: "There is no region.", remedy: "Draw a rectangle or a polygon over camera 1's image." });
@@ -280,29 +277,9 @@ export async function measurePanel(id, test, ends, done) {
         if (error.code !== "not_calibrated") throw error;
         throw api.problemOf({ cause: "This test has no calibration.", remedy: "Choose one at the head of this screen." });
       });
+      jobs.show(job, analysis, follow_.checked);
       await done();
-      follow(job, analysis).catch((error) => api.aborted(error) || notify(error));
     }, { kind: "primary" });
-
-    /**
-     * @param {Model<"JobReply">} job
-     * @param {string} analysis
-     */
-    async function follow(job, analysis) {
-      const bar = h("progress", { max: 1, "aria-label": "Progress of the analysis" });
-      const text = h("span");
-      const link = h("a.button", { href: `#/results/${id}/${analysis}` }, "Show results");
-      replace(progress, h("div.row", h("span", { style: { flex: 1, minWidth: "10rem" } }, bar), text, action("Cancel", () => api.post(`/jobs/${job.id}:cancel`), { kind: "danger" }), link));
-      const ended = await api.finished(job.id, { signal: stopped.signal, onprogress: (now) => {
-        const { phase: stage, done: ready, total, eta_s: eta } = now.progress ?? {};
-        if (total) bar.value = ready / total;
-        text.textContent = now.state === "queued" ? "waiting" : `${stage ?? ""}${eta ? `, ${num(eta, 2)} s left` : ""}`;
-      } });
-      const problem = ["succeeded", "cancelled"].includes(ended.state) ? null : problemText(api.jobProblem(ended));
-      const warnings = /** @type {import("../results/warnings.js").Warning[] | undefined} */ (ended.result?.warnings);
-      replace(progress, h("div.row", stateBadge(ended.state, warnings), link), problem, warningsBox(warnings));
-      await done();
-    }
 
     replace(body,
       h("div.row", h("label", { for: "reference-step" }, "Reference step"), Object.assign(reference, { id: "reference-step" }), editor.bar), editor.more, editor.hint,
@@ -320,7 +297,7 @@ export async function measurePanel(id, test, ends, done) {
               field("Reference is updated", update), field("Smoothing window", smoothing, "points", "odd; empty: none"))),
           h("fieldset", h("legend", "Strain"), h("label.check", strain, "compute strain"), h("div.fields", field("Window", window_, "points", "odd"), field("Fit", order), field("Tensor", tensor)), gauge, gaugeWarning),
           h("div.fields", field("Steps", which, "", "such as 1-5, 8; empty: all"), field("Label", label)), h("label.check", follow_, "continue with each new step"),
-          h("div.row", { style: { marginTop: "0.5rem" } }, start), progress)));
+          h("div.row", { style: { marginTop: "0.5rem" } }, start), jobs.root)));
     body.before(await recipesBar(id, workspace.state, { take, now }));
     editor.use("rectangle");
     editor.drawList();
@@ -344,7 +321,7 @@ export async function measurePanel(id, test, ends, done) {
   }
 
   await steps(test);
-  return { root, steps: (/** @type {Test} */ fresh) => steps(fresh).catch(notify) };
+  return { root, head: jobs.head, steps: (/** @type {Test} */ fresh) => steps(fresh).catch(notify) };
 }
 
 /**

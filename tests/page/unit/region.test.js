@@ -1,8 +1,8 @@
 // Shapes of a region and the virtual gauge: numbers alone. Run by `node --test`.
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { box, corners, nothing, pointsFrom, radius, regionOf, textOf, throughThree, trouble } from "../../server/static/widgets/region/shapes.js";
-import { gaugePx, gaugeText } from "../../server/static/widgets/region/gauge.js";
+import { box, corners, nothing, pointsFrom, radius, regionOf, textOf, throughThree, trouble } from "../../../server/static/widgets/region/shapes.js";
+import { gaugePx, gaugeText } from "../../../server/static/widgets/region/gauge.js";
 
 const SIZE = { width: 200, height: 160 };
 const CIRCLE = { form: "circle", points: [[100, 80], [130, 80]] };

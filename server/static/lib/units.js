@@ -1,0 +1,90 @@
+// Units and digits of the numbers that are shown: µm below 0.1 mm, strain in µm/m or %, digits by the standard uncertainty.
+import { num, tick } from "./dom.js";
+
+const MINUS = "−";
+const SMALL_MM = 0.1;
+const KEPT = "strainUnit";
+
+/** @typedef {"µm/m" | "%"} StrainUnit */
+/** @type {StrainUnit} */
+let strain = "µm/m";
+try {
+  if (globalThis.localStorage?.getItem(KEPT) === "%") strain = "%";
+} catch {
+  // a browser that keeps nothing: the usual unit
+}
+
+export const strainUnit = () => strain;
+
+/** @param {StrainUnit} unit */
+export function useStrainUnit(unit) {
+  strain = unit;
+  try {
+    globalThis.localStorage?.setItem(KEPT, unit);
+  } catch {
+    // not kept
+  }
+}
+
+/**
+ * Unit to show numbers of a unit in, and the factor to it.
+ * @param {string} unit
+ * @param {number | null} [size] of the largest of the numbers
+ */
+export function shown(unit, size = null) {
+  if (unit === "mm" && size !== null && Math.abs(size) < SMALL_MM) return { unit: "µm", factor: 1000 };
+  if (unit === "µm/m" && strain === "%") return { unit: "%", factor: 1e-4 };
+  return { unit, factor: 1 };
+}
+
+/**
+ * A number to a decimal place: 1 is tenths, -1 tens.
+ * @param {number} value
+ * @param {number} decimals
+ */
+function fixed(value, decimals) {
+  const rounded = decimals < 0 ? Math.round(value * 10 ** decimals) / 10 ** decimals : value;
+  const text = rounded.toFixed(Math.max(Math.min(decimals, 12), 0));
+  return Number(text) === 0 ? text.replace("-", "") : text.replace("-", MINUS);
+}
+
+/**
+ * A value and its standard uncertainty with two digits of it, in the unit that suits.
+ * @param {number | null | undefined} value
+ * @param {number | null | undefined} u in the same unit
+ * @param {string} unit
+ * @returns {string} a value without an uncertainty with four digits; an unknown value is a dash
+ */
+export function uncertain(value, u, unit) {
+  if (value === null || value === undefined || !Number.isFinite(value)) return "–";
+  if (u === null || u === undefined || !(u > 0) || !Number.isFinite(u)) return amount(value, unit);
+  const to = shown(unit, Math.max(Math.abs(value), u));
+  const two = Number((u * to.factor).toPrecision(2));
+  const decimals = 1 - Math.floor(Math.log10(two) + 1e-12);
+  const after = to.unit ? `\u00a0${to.unit}` : "";
+  if (decimals > 8) return `${num(value * to.factor, 5)} ± ${num(two, 2)}${after}`;
+  return `${fixed(value * to.factor, decimals)} ± ${fixed(two, decimals)}${after}`;
+}
+
+/**
+ * A number in the unit that suits.
+ * @param {number | null | undefined} value
+ * @param {string} unit
+ */
+export function amount(value, unit, digits = 4) {
+  const to = shown(unit, value ?? null);
+  const text = num(value === null || value === undefined ? value : value * to.factor, digits);
+  return text === "–" || !to.unit ? text : `${text}\u00a0${to.unit}`;
+}
+
+/**
+ * Marks of a scale, all with the same decimals, as few as tell neighbours apart.
+ * @param {readonly number[]} values
+ */
+export function evenMarks(values) {
+  const step = Math.min(...values.slice(1).map((v, k) => Math.abs(v - values[k])).filter((v) => v > 0));
+  const largest = Math.max(...values.map(Math.abs));
+  if (!Number.isFinite(step) || largest >= 1e5 || largest < 1e-3) return values.map((v) => tick(Number(v.toPrecision(3))));
+  const decimals = Math.max(0, 1 - Math.floor(Math.log10(step) + 1e-9));
+  return values.map((v) => fixed(v, Math.min(decimals, 6)));
+}

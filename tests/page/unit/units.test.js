@@ -1,0 +1,44 @@
+// Numbers as they are shown, against the rules of the GUM and figures worked out by hand.
+import assert from "node:assert/strict";
+import { test } from "node:test";
+import { amount, evenMarks, shown, uncertain, useStrainUnit } from "../../../server/static/lib/units.js";
+
+const plain = (text) => text.replaceAll("\u00a0", " ");
+
+test("lengths below 0.1 mm are shown in micrometres", () => {
+  assert.equal(plain(amount(-0.0000406, "mm")), "−0.04060 µm");
+  assert.equal(plain(amount(0.0999, "mm")), "99.90 µm");
+  assert.equal(plain(amount(0.1, "mm")), "0.1000 mm");
+  assert.equal(plain(amount(0, "mm")), "0 µm");
+  assert.equal(amount(null, "mm"), "–");
+  assert.deepEqual(shown("px", 0.01), { unit: "px", factor: 1 });
+});
+
+test("a value has the digits that its uncertainty warrants: two of u", () => {
+  assert.equal(plain(uncertain(-0.000040606, 0.00009, "mm")), "−0.041 ± 0.090 µm");
+  assert.equal(plain(uncertain(12.345678, 0.00213, "mm")), "12.3457 ± 0.0021 mm");
+  assert.equal(plain(uncertain(1234.4, 123, "µm/m")), "1230 ± 120 µm/m");
+  assert.equal(plain(uncertain(1998.2, 9.96, "µm/m")), "1998 ± 10 µm/m");
+  assert.equal(plain(uncertain(0.00001, 0.0123, "mm")), "0 ± 12 µm");
+  assert.equal(plain(uncertain(-0.0000001, 0.0123, "mm")), "0 ± 12 µm");
+  assert.equal(plain(uncertain(0.98, 0.0123, "")), "0.980 ± 0.012");
+});
+
+test("without an uncertainty a value stands alone, and an unknown one is a dash", () => {
+  assert.equal(plain(uncertain(0.98765, null, "")), "0.9877");
+  assert.equal(uncertain(Number.NaN, 1, "mm"), "–");
+});
+
+test("strain is in um/m or % by choice", () => {
+  assert.equal(plain(uncertain(2012.3, 34, "µm/m")), "2012 ± 34 µm/m");
+  useStrainUnit("%");
+  assert.equal(plain(uncertain(2012.3, 34, "µm/m")), "0.2012 ± 0.0034 %");
+  assert.equal(plain(amount(0.0123, "mm")), "12.30 µm");
+  useStrainUnit("µm/m");
+});
+
+test("a scale's marks have the same decimals", () => {
+  assert.deepEqual(evenMarks([-0.538, -0.269, 0, 0.269, 0.538]), ["−0.54", "−0.27", "0.00", "0.27", "0.54"]);
+  assert.deepEqual(evenMarks([-116, -104, -92.1, -79.9, -67.8]), ["−116", "−104", "−92", "−80", "−68"]);
+  assert.deepEqual(evenMarks([1000, 1250, 1500, 1750, 2000]), ["1000", "1250", "1500", "1750", "2000"]);
+});
