@@ -19,6 +19,7 @@ from server.exports.mesh import triangles_of
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.results.reading import read_field, read_head
 from server.formats.results.writing import Provenance, write_field
+from server.report.source import find_source
 from server.store.index import analysis_entry
 from tests.support import results_page
 from tests.support.page_bench import UNREACHED, Watched, tabbed, watched
@@ -610,4 +611,35 @@ def test_a_failed_check_stands_at_the_head_of_the_results_and_in_the_lists(page:
     assert [one["code"] for one in entry["warnings"]] == ["epipolar_check_failed", "low_coverage"]
     report = bench.client.get(f"{bench.path(doubtful)}/report").text
     assert report.index('data-warning="epipolar_check_failed"') < report.index('class="boxes"')
+    page.sound()
+
+
+def test_gauges_field_limits_and_colours_are_there_again_and_go_into_the_report(page: Watched, bench: Bench) -> None:
+    at = shown(page, bench)
+    at.get_by_text("Extensometers", exact=True).click()
+    given(at, ENDS, (80.0, 100.0, 160.0, 110.0))
+    at.locator("details", has=at.get_by_label(ENDS[0])).get_by_role("button", name="Use").click()
+    at.get_by_label("Colours").select_option("cividis")
+    at.get_by_label("Limits").select_option("given")
+    given(at, ("Lower limit", "Upper limit"), (-0.02, 0.03))
+    at.get_by_label("Upper limit", exact=True).press("Tab")
+    assert limits(at) == (-0.02, 0.03)
+    # left at once, then opened anew
+    at.goto("about:blank")
+    page.open(f"#/results/{bench.test_id}/{bench.analysis_id}")
+    drawn(at, "2 w_mm reference")
+    assert limits(at) == (-0.02, 0.03)
+    expect(at.locator('[data-role="colourbar"]').first).to_have_attribute("data-map", "cividis")
+    expect(at.get_by_role("button", name="Remove e1")).to_be_attached()
+    # limits are a field's own
+    at.get_by_label("Field", exact=True).select_option("u_mm")
+    drawn(at, "2 u_mm reference")
+    assert limits(at) != (-0.02, 0.03)
+    at.get_by_label("Field", exact=True).select_option("w_mm")
+    drawn(at, "2 w_mm reference")
+    at.wait_for_function("() => document.querySelector('[data-role=colourbar]').dataset.low === '-0.02'")
+    metadata = find_source(bench.service.tests.analysis_path(bench.test_id, bench.analysis_id)).metadata
+    assert metadata.gauges is not None
+    [gauge] = metadata.gauges.extensometers
+    assert (gauge.name, gauge.a_px, gauge.b_px) == ("e1", (80.0, 100.0), (160.0, 110.0))
     page.sound()
