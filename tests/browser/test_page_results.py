@@ -643,3 +643,22 @@ def test_gauges_field_limits_and_colours_are_there_again_and_go_into_the_report(
     [gauge] = metadata.gauges.extensometers
     assert (gauge.name, gauge.a_px, gauge.b_px) == ("e1", (80.0, 100.0), (160.0, 110.0))
     page.sound()
+
+
+def test_an_analysis_without_a_result_shows_its_reason_and_no_dead_controls(page: Watched, bench: Bench) -> None:
+    stored = bench.service.tests.analysis(bench.test_id, bench.analysis_id).plain()
+    kept = {k: stored[k] for k in ("kind", "settings", "steps", "inputs", "software")}
+    failed = bench.service.tests.create_analysis(bench.test_id, {**kept, "label": "failed"})
+    bench.service.catalog.put_entry("analysis", bench.test_id, failed.id, analysis_entry(failed))
+    problem = {"code": "image_blank", "cause": "There is noise only.", "remedy": "Check the lens cap."}
+    summary = {"state": "failed", "steps": [], "problem": problem}
+    bench.service.tests.put_summary(bench.test_id, failed.id, summary)
+    at = page.open(f"#/results/{bench.test_id}/{failed.id}").locator("main")
+    expect(at.get_by_text("There is noise only.")).to_be_visible()
+    expect(at.get_by_text("No step of this analysis has a result.")).to_be_visible()
+    expect(at.get_by_role("link", name="Measure again on the test's screen.")).to_be_visible()
+    for dead in (at.get_by_role("button", name="Next step"), at.get_by_label("Field", exact=True)):
+        expect(dead).to_be_hidden()
+    expect(at.get_by_text("Export and report")).to_be_hidden()
+    expect(at.get_by_text("Settings, checks and warnings")).to_be_visible()
+    page.sound()

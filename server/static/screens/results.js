@@ -131,6 +131,9 @@ async function show(root, testId, analysisId, query) {
   };
   screen.interval = interval(screen);
 
+  /** @type {HTMLElement[]} hidden while no step has a result */
+  const without = [];
+
   async function drawFields() {
     if (state.step === null) return;
     const { shown } = await result.fields(state.step);
@@ -150,8 +153,13 @@ async function show(root, testId, analysisId, query) {
 
   async function refresh() {
     if (state.step === null) {
-      message.textContent = "No step is finished yet. The page updates by itself.";
+      const ended = ["succeeded", "failed", "cancelled", "interrupted"].includes(result.analysis.state);
+      replace(message, ended ? ["No step of this analysis has a result. ", h("a", { href: `#/test/${testId}` }, "Measure again on the test's screen.")] : "No step is finished yet. The page updates by itself.");
+      for (const node of without) node.hidden = true; // controls of nothing
       return;
+    }
+    if (without[0]?.hidden) {
+      for (const node of without) node.hidden = false;
     }
     replace(cameras, camerasNote(result.analysis.summary?.steps?.find((one) => one.n === state.step)));
     slider.max = String(Math.max(result.steps.length - 1, 0));
@@ -308,6 +316,7 @@ async function show(root, testId, analysisId, query) {
     h("div.grid.side.measured", h("div", stage, message, cameras),
       h("section.panel.figures", { "aria-label": "Figures" }, scale.root, h("h2", "Statistics"), statistics, screen.interval.root, h("h2", "Probe"), probe), below));
 
+  without.push(.../** @type {NodeListOf<HTMLElement>} */ (root.querySelectorAll(".controls, .figures, .view")), modes);
   drawStatus();
   screen.drawn.add(() => mark(screen));
   screen.drawn.add(display.keep);
@@ -315,7 +324,9 @@ async function show(root, testId, analysisId, query) {
   const gaugePanels = gauges(screen);
   const axes = frames(screen, async () => { scale.forget(); state.pinned = undefined; replace(probe, h("p.quiet", "Click a point to see all its values.")); await refresh(); });
   axesField.append(h("label", { for: "resultframe" }, "Axes"), axes.choice);
-  below.append(gaugePanels, axes.root, files(screen), aboutPanel.root);
+  const filesPanel = files(screen);
+  below.append(gaugePanels, axes.root, filesPanel, aboutPanel.root);
+  without.push(gaugePanels, axes.root, filesPanel);
   await refresh();
   ends.push(events.on("result", async (event) => {
     if (event.analysis_id !== analysisId) return;
