@@ -28,10 +28,10 @@ from core.settings import (
 )
 from server.cli.measurement.image_lists import ImagePair, expand, pair_up, pairs_of_test_folder
 from server.cli.measurement.image_pairs import check_cameras, checked_pairs, checked_shapes, first_readable
-from server.cli.measurement.recipe import mask_of, notes_on, polygon_of, with_recipe
 from server.cli.measurement.region import check_region, check_whole, parse_rectangle
 from server.cli.measurement.sequence import MeasureJob, measure_sequence
 from server.cli.measurement.specimen import SPECIMEN_FILE, found_specimen
+from server.cli.recipe import mask_of, notes_on, polygon_of, with_recipe
 from server.cli.terminal import ProgressLine
 from server.compute.seeds import check_positions
 from server.formats.calibrations.in_test import calibration_in
