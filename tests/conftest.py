@@ -134,7 +134,8 @@ def chromium() -> Iterator[Browser]:
 @pytest.fixture
 def page(chromium: Browser, client: httpx.Client) -> Iterator[Watched]:
     """A page of its own on the service, watched."""
-    from tests.support.page_bench import watched
+    from tests.support.page_bench import undrawn, watched
 
+    undrawn(client)
     with watched(chromium, str(client.base_url).rstrip("/")) as made:
         yield made

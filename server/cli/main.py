@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "simstage": ("server.cli.operation.simstage", "run a simulated motion controller on a socket or pty"),
     "calibrate": ("server.cli.measurement.calibrate", "calibrate a pair of cameras from grid images"),
     "expect": ("server.cli.operation.expect", "predict what a planned measurement will leave uncertain"),
+    "channels": ("server.cli.operation.channels", "a load frame's record, aligned with the steps of a test by time"),
     "guide": ("server.cli.operation.guide", "calibrate on a running service from a target held by hand"),
     "noise": ("server.cli.measurement.noise", "measure the cameras' noise from repeated frames"),
     "measure": ("server.cli.measurement.measure", "measure shape and displacement from image files"),

@@ -19,6 +19,7 @@ from server.exports.mesh import triangles_of
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.results.reading import read_field, read_head
 from server.formats.results.writing import Provenance, write_field
+from server.report.source import find_source
 from server.store.index import analysis_entry
 from tests.support import results_page
 from tests.support.page_bench import UNREACHED, Watched, tabbed, watched
@@ -691,7 +692,7 @@ def test_a_plot_is_saved_as_numbers_and_as_pictures_and_starts_at_the_reference(
         chart.get_by_role("button", name="Save as CSV").click()
     said, head, *lines = saved.value.path().read_text().splitlines()
     assert "k = 1" in said
-    assert head == "stroke (mm),strain (µm/m),u of e1 (µm/m)"
+    assert head == "stroke (mm),strain (µm/m),u of E1 (µm/m)"
     table = np.array([[float(v) for v in line.split(",")] for line in lines])
     np.testing.assert_allclose(table[:, 1], [1e6 * v[0] for v in got["value"]], rtol=1e-12)
     np.testing.assert_allclose(table[1:, 2], [1e6 * s[0] for s in got["sigma"][1:]], rtol=1e-12)
@@ -701,7 +702,7 @@ def test_a_plot_is_saved_as_numbers_and_as_pictures_and_starts_at_the_reference(
     with at.expect_download() as saved:
         chart.get_by_role("button", name="Save as SVG").click()
     drawing = saved.value.path().read_text()
-    for words in ("stroke (mm)", "strain (µm/m)", "e1", "k = 1"):
+    for words in ("stroke (mm)", "strain (µm/m)", "E1", "k = 1"):
         assert words in drawing
     # wide enough to read
     box, panel = chart.bounding_box(), at.locator("details", has=at.get_by_label(ENDS[0])).bounding_box()
@@ -906,4 +907,35 @@ def test_the_size_of_the_displacement_is_a_field_with_its_uncertainty(page: Watc
     x, y = bench.field(2, "x_px"), bench.field(2, "y_px")
     inside = (x >= 90) & (x <= 150) & (y >= 90) & (y <= 140)
     assert read["values"]["d_mm"]["mean"] == pytest.approx(float(np.linalg.norm(uvw, axis=0)[inside].mean()), abs=1e-9)
+    page.sound()
+
+
+def test_gauges_field_limits_and_colours_are_there_again_and_go_into_the_report(page: Watched, bench: Bench) -> None:
+    at = shown(page, bench)
+    at.get_by_text("Extensometers", exact=True).click()
+    given(at, ENDS, (80.0, 100.0, 160.0, 110.0))
+    at.locator("details", has=at.get_by_label(ENDS[0])).get_by_role("button", name="Use").click()
+    at.get_by_label("Colours", exact=True).select_option("cividis")
+    at.get_by_label("Limits", exact=True).select_option("given")
+    given(at, ("Lower limit", "Upper limit"), (-0.02, 0.03))
+    at.get_by_label("Upper limit", exact=True).press("Tab")
+    assert limits(at) == (-0.02, 0.03)
+    # left at once, then opened anew
+    at.goto("about:blank")
+    page.open(f"#/results/{bench.test_id}/{bench.analysis_id}")
+    drawn(at, "2 w_mm reference")
+    assert limits(at) == (-0.02, 0.03)
+    expect(at.locator('[data-role="colourbar"]').first).to_have_attribute("data-map", "cividis")
+    expect(at.get_by_role("button", name="Remove E1")).to_be_attached()
+    # limits are a field's own
+    at.get_by_label("Field", exact=True).select_option("u_mm")
+    drawn(at, "2 u_mm reference")
+    assert limits(at) != (-0.02, 0.03)
+    at.get_by_label("Field", exact=True).select_option("w_mm")
+    drawn(at, "2 w_mm reference")
+    at.wait_for_function("() => document.querySelector('[data-role=colourbar]').dataset.low === '-0.02'")
+    metadata = find_source(bench.service.tests.analysis_path(bench.test_id, bench.analysis_id)).metadata
+    assert metadata.gauges is not None
+    [gauge] = metadata.gauges.extensometers
+    assert (gauge.name, gauge.a_px, gauge.b_px) == ("E1", (80.0, 100.0), (160.0, 110.0))
     page.sound()

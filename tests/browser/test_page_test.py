@@ -311,3 +311,23 @@ def test_seeds_in_both_views_and_a_measurement(
     summary = client.get(f"{API}/tests/{plate}/analyses/{analysis['id']}").json()["summary"]
     assert summary["state"] == "complete" or summary["steps"]
     page.sound()
+
+
+def test_a_test_without_calibration_is_given_one_at_its_head(
+    page: Watched, client: httpx.Client, calibration: str
+) -> None:
+    test_id = new_test(client, name="later")
+    shown = page.open(f"#/test/{test_id}")
+    head = shown.locator('[data-role="calibration"]')
+    expect(head).to_contain_text("This test names no calibration: choose one")
+    head.get_by_label("Calibration").select_option(calibration)
+    expect(shown.get_by_text("New analyses are measured with this calibration.")).to_be_visible()
+    expect(head.get_by_label("Calibration")).to_have_value(calibration)
+    expect(head).not_to_contain_text("names no calibration")
+    assert client.get(f"{API}/tests/{test_id}").json()["calibration_id"] == calibration
+    # other changes name the state that they were meant for, too
+    shown.get_by_text("Name, specimen and notes").click()
+    shown.get_by_label("Name", exact=True).first.fill("renamed")
+    shown.get_by_role("button", name="Save", exact=True).click()
+    expect(shown.get_by_role("heading", name="renamed")).to_be_visible()
+    page.sound()

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import urlsplit
 
+import httpx
 import pytest
 
 if os.environ.get("CI", "").lower() != "true":
@@ -104,6 +105,12 @@ def watched(made: Browser, origin: str, **options: Any) -> Iterator[Watched]:
         yield watch
     finally:
         context.close()
+
+
+def undrawn(client: httpx.Client) -> None:
+    """Forget what earlier tests drew: the page keeps it with each test."""
+    for test in client.get("/api/v1/tests").json()["tests"]:
+        client.put(f"/api/v1/tests/{test['id']}/workspace", json={}).raise_for_status()
 
 
 def tabbed(page: Page) -> list[dict[str, Any]]:

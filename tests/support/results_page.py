@@ -18,7 +18,7 @@ from server.formats.results.reading import read_field
 from server.formats.results.writing import Provenance, write_field
 from server.store.index import analysis_entry
 from server.workflows.service import Service
-from tests.support.page_bench import Watched, watched
+from tests.support.page_bench import Watched, undrawn, watched
 from tests.support.service_rig import SMALL, served, wait_for_job, wait_for_rig
 
 RECTANGLE = [60, 60, 180, 170]
@@ -94,6 +94,7 @@ def with_a_cut(service: Service, test_id: str, analysis_id: str, line: Sequence[
 
 @pytest.fixture
 def page(chromium: Browser, bench: Bench) -> Iterator[Watched]:
+    undrawn(bench.client)
     with watched(chromium, str(bench.client.base_url).rstrip("/")) as made:
         yield made
 

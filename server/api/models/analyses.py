@@ -5,8 +5,9 @@ from __future__ import annotations
 from itertools import combinations
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import ConfigDict, Field, StringConstraints, model_validator
+from pydantic import ConfigDict, Field, StringConstraints, field_validator, model_validator
 from pydantic.config import JsonDict
+from pydantic_core import PydanticKnownError
 
 from core import settings
 from core.settings import StoredSettings, disagreement
@@ -59,6 +60,10 @@ class Region(settings.Region):
         return self
 
 
+#: in place of a region that neither the request nor a recipe gives
+_MISSING: Any = type("Missing", (), {"__repr__": lambda _: "nothing"})()
+
+
 def _none_yet() -> Any:
     """Return nothing, in place of the region that a recipe gives."""
     return None
@@ -107,6 +112,20 @@ class AnalysisRequest(settings.AnalysisSettings):
 
     @model_validator(mode="before")
     @classmethod
+    def _of_a_recipe(cls, given: Any) -> Any:
+        if isinstance(given, dict) and "region" not in given and given.get("recipe") is None:
+            return {**given, "region": _MISSING}
+        return given
+
+    @field_validator("region", mode="before")
+    @classmethod
+    def _there(cls, given: Any) -> Any:
+        if given is _MISSING:
+            raise PydanticKnownError("missing")
+        return given
+
+    @model_validator(mode="before")
+    @classmethod
     def _shapes_alone(cls, given: Any) -> Any:
         if isinstance(given, dict) and given.get("pattern") == "projected":
             return {"kind": "profile", **given}
@@ -116,8 +135,6 @@ class AnalysisRequest(settings.AnalysisSettings):
     def _follows_or_names(self) -> Self:
         if self.follow and self.steps is not None:
             raise disagreement("give steps or follow, not both")
-        if "region" not in self.model_fields_set and self.recipe is None:
-            raise ValueError("region is missing: give one, or a recipe that has one")
         return self
 
     def stored(self) -> StoredSettings:

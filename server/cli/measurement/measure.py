@@ -29,17 +29,24 @@ from core.settings import (
 )
 from server.cli.measurement.image_lists import ImagePair, expand, pair_up, pairs_of_test_folder
 from server.cli.measurement.image_pairs import check_cameras, checked_pairs, checked_shapes, first_readable
-from server.cli.measurement.recipe import mask_of, notes_on, with_recipe
 from server.cli.measurement.region import check_region, check_whole, parse_outline
 from server.cli.measurement.sequence import MeasureJob, measure_sequence
 from server.cli.measurement.specimen import SPECIMEN_FILE, found_specimen
+from server.cli.recipe import mask_of, notes_on, with_recipe
 from server.cli.terminal import ProgressLine
 from server.compute.seeds import check_positions
 from server.formats.calibrations.in_test import calibration_in
 from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
+from server.formats.files import write_bytes
 from server.formats.images import read_mask
 from server.formats.noise_json import load_noise
+from server.formats.results.reading import read_head
+from server.formats.results.summary import to_json
+from server.results.gauges.framed import FRAME_HELP, put_into_frame
+from server.results.gauges.frames import frame_asked, frame_of_test
+from server.results.gauges.request import Alignment
 from server.results.images.projected_pattern import check_settings
+from server.store.durable import known_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -138,6 +145,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the pattern is projected and does not move with the surface: the shape of each pair is measured by "
         "itself, no displacement",
     )
+    add("--frame", metavar="FRAME", help=f"{FRAME_HELP}; the files are written in it")
     add("--out", metavar="DIR", help="for step_0000.nc (shape), step_0001.nc ... (displacement) and summary.json")
 
 
@@ -149,10 +157,22 @@ def run(args: argparse.Namespace) -> int:
     """Run the command; return the exit status."""
     progress = ProgressLine()
     try:
-        summary = measure_sequence(_prepare(args, progress), progress)
+        asked = _frame(args)
+        job = _prepare(args, progress)
+        summary = measure_sequence(job, progress)
+        files = [job.out / f"step_{one['n']:04d}.nc" for one in summary["steps"]]
+        frame = read_head(files[-1]).frame if asked is None else put_into_frame(files, asked)
+        write_bytes(job.out / "summary.json", to_json({**summary, "frame": frame}))
+        progress.note(f"frame of the files: {frame}")
     finally:
         progress.close()
     return SOME_FAILED if summary["steps_failed"] else 0
+
+
+def _frame(args: argparse.Namespace) -> Alignment | None:
+    """Return the frame that is asked for; None: the system frame."""
+    kept = None if args.folder is None else known_json(Path(args.folder) / "test.json").get("frame")
+    return frame_asked(args.frame, frame_of_test(kept if isinstance(kept, dict) else None))
 
 
 def _missing(option: str) -> InputError:

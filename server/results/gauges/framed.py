@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 from core.errors import MeasurementError
+from server.formats.files import recorded_sha256, write_bytes
 from server.formats.results.reading import read_head
 from server.results.gauges.fields import FieldWriter
 from server.results.gauges.frames import frame_asked, frame_of_test
@@ -31,6 +33,20 @@ def write_framed(files: Sequence[Path], asked: Alignment, folder: Path, *, strai
     if problem is not None:
         raise MeasurementError(problem.cause, code=problem.code, remedy=problem.remedy)
     return writer.written
+
+
+def put_into_frame(files: Sequence[Path], asked: Alignment) -> str:
+    """Replace result files of one measurement by the same in a frame; return the frame that they then state.
+
+    Raises
+    ------
+    StereorigError
+        As :func:`write_framed`; the files are then as they were.
+    """
+    with tempfile.TemporaryDirectory(dir=files[0].parent, prefix=".frame") as folder:
+        for source, made in zip(files, write_framed(files, asked, Path(folder)), strict=True):
+            write_bytes(source, made.read_bytes(), checksum=recorded_sha256(source) is not None)
+    return read_head(files[-1]).frame
 
 
 def asked_at(text: str | None, folder: Path) -> Alignment | None:

@@ -438,7 +438,7 @@ export function gauges(screen) {
   let first = true;
   screen.drawn.add(async () => {
     draw();
-    if (first && state.extensometers.length) readExtensometers().catch(notify);
+    if (first && state.extensometers.length) { panels.extensometer.open = true; readExtensometers().catch(notify); }
     if (first) for (const name of /** @type {const} */ (["line", "area"])) panels[name].open = Boolean(state[name]);
     first = false;
     const now = `${screen.step} ${screen.info?.key} ${result.frame}`;
