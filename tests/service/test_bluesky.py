@@ -38,6 +38,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         service.close()
 
 
+@pytest.mark.deep
 @pytest.mark.skipif(
     bool(MISSING) and os.environ.get("CI") != "true",
     reason=f"{' and '.join(MISSING)} not installed: pip install '.[dev]' brings them",
