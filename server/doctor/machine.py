@@ -10,6 +10,7 @@ import time
 from importlib import metadata
 from pathlib import Path
 
+import core
 from server.doctor.report import Notebook
 from server.formats.version import software_version
 
@@ -18,6 +19,8 @@ _PACKAGES = ("numpy", "scipy", "opencv-python-headless", "numba", "pyserial", "f
 #: what more can be done with packages that need not be there
 _EXTRAS = {"xarray": ("xarray", "data sets"), "progress": ("rich", "progress bars"), "aravis": ("PyGObject", "GenICam")}
 _NAME = re.compile(r"^[A-Za-z0-9._-]+")
+# their compiled forms lie beside them where they can; the package itself takes seconds to load
+_KERNELS = Path(core.__file__).parent / "matching" / "kernels"
 _MEMORY_GIB = 1.0
 # of the wall clock against the monotonic one while the doctor runs; slewing by NTP stays below 0.5 ms a second
 _STEP_S = 0.05
@@ -56,6 +59,29 @@ def check_software(book: Notebook) -> None:
     lacking = [f"{extra} ({what}: {name})" for extra, (name, what) in _EXTRAS.items() if extra not in there]
     text = "; ".join(filter(None, (", ".join(there), f"not installed: {', '.join(lacking)}" if lacking else "")))
     book.note("software", "extras", "ok", text)
+
+
+def check_kernels(book: Notebook, kernels: Path = _KERNELS) -> None:
+    """Note where compiled kernels are kept; where nothing can be kept, every start compiles them anew."""
+    own = os.environ.get("NUMBA_CACHE_DIR")
+    places = [Path(own)] if own else [kernels / "__pycache__", Path.home() / ".cache" / "numba"]
+    place = next((p for p in places if _can_write(p)), None)
+    named = " and ".join(map(str, places))
+    if place is None:
+        found = f"cannot be kept: {named} cannot be written"
+        remedy = "Set NUMBA_CACHE_DIR to a folder that this user may write: else each start compiles for half a minute."
+        book.note("software", "compiled kernels", "warning", found, remedy=remedy)
+        return
+    compiled = any(place.rglob("*.nbi")) if place.is_dir() else False
+    when = "there already" if compiled else "none yet: the first measurement compiles them, half a minute"
+    book.note("software", "compiled kernels", "ok", f"{when} ({place})")
+
+
+def _can_write(folder: Path) -> bool:
+    """Whether a file could be made in a folder that is there, or that would have to be made."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder.is_dir() and os.access(folder, os.W_OK)
 
 
 def required() -> list[str]:

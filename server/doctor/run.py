@@ -13,7 +13,7 @@ from server.config.rig_file import RigConfig, load_config
 from server.doctor.cameras import check_frames, check_identity, check_pairs, check_settings, watch
 from server.doctor.disk import check_disk
 from server.doctor.link import check_link, check_network
-from server.doctor.machine import ClockWatch, check_machine, check_software
+from server.doctor.machine import ClockWatch, check_kernels, check_machine, check_software
 from server.doctor.report import Check, Notebook, Report
 from server.doctor.stage import check_stage
 from server.formats.version import software_version
@@ -51,6 +51,7 @@ def examine(
     book = Notebook(on_check)
     clock = ClockWatch()
     check_software(book)
+    check_kernels(book)
     check_machine(book)
     config = _read(book, path)
     if config is not None:

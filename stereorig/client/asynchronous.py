@@ -83,7 +83,7 @@ class AsyncClient:
     async def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
         """Do as :meth:`Client.ask`."""
         try:
-            return checked(await self._http.request(method, path.lstrip("/"), **options))
+            return checked(await self._http.request(method, "/" + path.lstrip("/"), **options))
         except httpx.TransportError as error:
             raise no_answer(self.url, error) from error
 
@@ -179,7 +179,7 @@ class AsyncClient:
             return await self.ask(wanted.method, wanted.path, **wanted.options)
         try:
             async with self._http.stream(
-                wanted.method, wanted.path.lstrip("/"), params=dict(wanted.params)
+                wanted.method, "/" + wanted.path.lstrip("/"), params=dict(wanted.params)
             ) as response:
                 if not response.is_success:
                     await response.aread()

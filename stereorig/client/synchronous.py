@@ -89,7 +89,7 @@ class Client:
             As the service refused it.
         """
         try:
-            return checked(self._http.request(method, path.lstrip("/"), **options))
+            return checked(self._http.request(method, "/" + path.lstrip("/"), **options))
         except httpx.TransportError as error:
             raise no_answer(self.url, error) from error
 
@@ -207,7 +207,9 @@ class Client:
         if wanted.into is None:
             return self.ask(wanted.method, wanted.path, **wanted.options)
         try:
-            with self._http.stream(wanted.method, wanted.path.lstrip("/"), params=dict(wanted.params)) as response:
+            with self._http.stream(
+                wanted.method, "/" + wanted.path.lstrip("/"), params=dict(wanted.params)
+            ) as response:
                 if not response.is_success:
                     response.read()
                 checked(response)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import json
 import re
 import sys
 import time
@@ -23,7 +24,7 @@ from stereorig.client import AsyncAnalysis, AsyncClient, AsyncTest
 from stereorig.client.errors import error_of
 from stereorig.client.synchronous import Analysis, Client, Test
 from tests.support.document_scripts import WRITTEN, one_block, run
-from tests.support.service_rig import SMALL, served, wait_for_rig
+from tests.support.service_rig import SMALL, served, true_cameras, wait_for_rig
 
 PAGE = "docs/tutorial/client.md"
 #: what the page's pixels are on the small rig, whose images have half as many
@@ -126,6 +127,13 @@ def test_exports_are_written(analysis: Analysis, tmp_path: Path) -> None:
         analysis.export(tmp_path / "b.csv", "csv", step=77)
     assert refused.value.code == "not_found" or "77" in refused.value.cause
     assert not (tmp_path / "b.csv").exists()
+
+
+def test_a_calibration_is_imported_and_accepted(tiny: Client, tmp_path: Path) -> None:
+    # its path begins with a word and a colon, which must not be read as a URL's scheme
+    (tmp_path / "calibration.json").write_text(json.dumps(true_cameras(SMALL)), encoding="utf-8")
+    made = tiny.import_calibration(tmp_path / "calibration.json", label="from a file", accept=True)
+    assert [entry.id for entry in tiny.calibrations(accepted=True)] == [made.id]
 
 
 def test_a_job_is_watched_and_its_problem_is_raised(tiny: Client) -> None:

@@ -30,5 +30,6 @@ def one_block(page: str, language: str, like: str) -> str:
 def run(command: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
     """Run a command in a folder, with `stereorig` of this checkout on its path."""
     folders = [str(Path(sys.executable).parent), os.environ["PATH"]]
-    environment = {**os.environ, "PATH": os.pathsep.join(folders), "PYTHONPATH": str(ROOT)}
+    packages = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = {**os.environ, "PATH": os.pathsep.join(folders), "PYTHONPATH": os.pathsep.join(packages)}
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)

@@ -4,7 +4,7 @@ import { drawn } from "./region/drawing.js";
 import { rows } from "./region/list.js";
 import { Painting } from "./region/painting.js";
 import { listen, pick, pickInTwo } from "./region/pointing.js";
-import { box, distance, MIN_POINTS, nothing, regionOf, round, throughThree, trouble } from "./region/shapes.js";
+import { box, distance, nothing, regionOf, round, throughThree } from "./region/shapes.js";
 import { hintOf, MODES, TOOLS } from "./region/tools.js";
 /** @import { View, Position } from "./view.js" */
 /** @import { Model } from "#routes" */
@@ -247,31 +247,6 @@ export class RegionEditor {
     if (kind === "rectangle" || kind === "circle") return { form: kind, points };
     const three = kind === "three" && this.tip && points.length === 2 ? [...points, this.tip] : points;
     return kind === "three" && three.length === 3 ? throughThree(three) : null;
-  }
-
-  /** End the shape that is being drawn; a dragged one that encloses nothing was a click. */
-  finish(dragged = false) {
-    if (!this.draft) return;
-    const { kind, points } = this.draft;
-    if (kind === "crack") {
-      if (points.length < MIN_POINTS.crack) {
-        this.hint.textContent = `At least ${MIN_POINTS.crack} points are needed.`;
-        return;
-      }
-      this.draft = null;
-      this.change((state) => state.cracks.push(points));
-      return;
-    }
-    const shape = kind === "polygon" ? /** @type {Shape} */ ({ form: kind, points }) : kind === "three" && points.length < 3 ? null : this.draftShape;
-    const wrong = shape ? trouble(shape) : kind === "three" && points.length === 3 ? "The three points lie on one line: no circle goes through them." : "Three points are needed.";
-    if (dragged || (kind === "three" && points.length === 3)) this.draft = null;
-    if (!shape || wrong) {
-      if (!dragged) this.hint.textContent = kind === "polygon" ? "At least 3 points are needed." : String(wrong);
-      this.draw();
-      return;
-    }
-    this.draft = null;
-    this.put(shape);
   }
 
   /**

@@ -12,13 +12,13 @@ export class Painting {
     this.brush = 20;
     this.size = number(this.brush, { min: 1, max: 1000, step: 1 });
     this.size.addEventListener("change", () => this.setBrush(Number(this.size.value)));
-    this.file = h("input", { type: "file", accept: "image/png,.png" });
+    this.file = h("input", { type: "file", accept: "image/png,.png", title: "PNG of camera 1's size, white where points may lie" });
     this.file.addEventListener("change", () => this.#load());
     this.trouble = h("p.problem", { role: "alert", hidden: true });
     this.controls = [
       field("Brush", this.size, "px"),
       h("button", { type: "button", title: "Points lie where they did not, and the other way round; the region becomes a mask", onclick: () => this.invert() }, "Invert"),
-      field("Mask file", this.file, "", "PNG of camera 1's size, white where points may lie"),
+      field("Mask file", this.file),
       h("button", { type: "button", title: "The whole region as a PNG, also for stereorig measure --mask", onclick: () => this.#save() }, "Save the mask"), this.trouble,
     ];
   }

@@ -1,6 +1,6 @@
 // Drawing by mouse, finger and pen, and by the cross-hair that keys move.
 import { onGrab } from "../view.js";
-import { distance, MIN_POINTS } from "./shapes.js";
+import { distance, MIN_POINTS, trouble } from "./shapes.js";
 /** @import { RegionEditor } from "../region_editor.js" */
 /** @import { Spot } from "./shapes.js" */
 
@@ -24,7 +24,7 @@ export function pick(editor, x, y, event) {
   if (!editor.draft) editor.draft = { kind, points: DRAGGED.includes(kind) ? [spot, spot] : [spot] };
   else if (DRAGGED.includes(kind)) {
     editor.draft.points[1] = spot;
-    editor.finish();
+    finish(editor);
   } else point(editor, spot);
   editor.draw();
   return undefined;
@@ -43,10 +43,37 @@ function point(editor, spot) {
   const twice = distance(last, spot) * one.scale < 3;
   const least = kind === "crack" ? MIN_POINTS.crack : 3;
   const closed = kind === "polygon" && points.length >= 3 && distance(points[0], spot) * one.scale < 9;
-  if (closed || (twice && kind !== "three" && points.length >= least)) editor.finish();
+  if (closed || (twice && kind !== "three" && points.length >= least)) finish(editor);
   else if (!twice) {
     points.push(spot);
-    if (kind === "three" && points.length === 3) editor.finish();
+    if (kind === "three" && points.length === 3) finish(editor);
+  }
+}
+
+/**
+ * End the shape that is being drawn; a dragged one that encloses nothing was a click.
+ * @param {RegionEditor} editor
+ */
+function finish(editor, dragged = false) {
+  if (!editor.draft) return;
+  const { kind, points } = editor.draft;
+  if (kind === "crack") {
+    if (points.length < MIN_POINTS.crack) {
+      editor.hint.textContent = `At least ${MIN_POINTS.crack} points are needed.`;
+      return;
+    }
+    editor.draft = null;
+    editor.change((state) => state.cracks.push(points));
+    return;
+  }
+  const three = kind === "three";
+  const shape = kind === "polygon" ? { form: kind, points } : three && points.length < 3 ? null : editor.draftShape;
+  const wrong = shape ? trouble(shape) : three && points.length === 3 ? "The three points lie on one line: no circle goes through them." : "Three points are needed.";
+  if (dragged || !wrong || (three && points.length === 3)) editor.draft = null;
+  if (shape && !wrong) editor.put(shape);
+  else {
+    if (!dragged) editor.hint.textContent = kind === "polygon" ? "At least 3 points are needed." : String(wrong);
+    editor.draw();
   }
 }
 
@@ -140,7 +167,7 @@ export function listen(editor) {
       return;
     }
     editor.draft.points[1] = spotOf(event);
-    editor.finish(true);
+    finish(editor, true);
   }, true);
   frame.addEventListener("pointercancel", drop);
   frame.addEventListener("pointerleave", () => {
@@ -163,7 +190,7 @@ function key(editor, event) {
     if (event.shiftKey) editor.redo();
     else editor.undo();
   } else if (command && letter === "y") editor.redo();
-  else if (event.key === "Enter" && draft && !editor.one.aim) editor.finish();
+  else if (event.key === "Enter" && draft && !editor.one.aim) finish(editor);
   else if (event.key === "Backspace" && draft) {
     draft.points.pop();
     if (!draft.points.length || DRAGGED.includes(draft.kind)) editor.draft = null;

@@ -1,4 +1,4 @@
-"""The scale of camera 1's image, told before anything is measured."""
+"""Regions of several outlines are measured; the scale of camera 1's image is told before that."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from core.cameras.camera import Camera
 from server.config.rig_file import parse_config
 from server.workflows.service import Service
-from tests.support.service_rig import SMALL, new_test, true_cameras
+from tests.support.service_rig import SMALL, new_test, true_cameras, wait_for_job
 
 API = "/api/v1"
 
@@ -24,13 +24,40 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     made.close()
 
 
-def test_the_scale_is_the_length_that_a_pixel_sees_on_the_plate(client: httpx.Client) -> None:
-    cameras = true_cameras(SMALL)
-    sent = client.post(f"{API}/calibrations:import", files={"file": ("c.json", json.dumps(cameras))})
+@pytest.fixture(scope="module")
+def plate(client: httpx.Client) -> str:
+    sent = client.post(f"{API}/calibrations:import", files={"file": ("c.json", json.dumps(true_cameras(SMALL)))})
     test_id = new_test(client, name="plate", calibration_id=str(sent.json()["id"]))
     client.put(f"{API}/sim/scene", json={"scene": "plate", "load": 0.0}).raise_for_status()
     client.post(f"{API}/tests/{test_id}/steps", json={"label": "reference"}).raise_for_status()
-    reply = client.get(f"{API}/tests/{test_id}/scale", params={"step": 0}).raise_for_status().json()
+    return test_id
+
+
+def test_outlines_that_do_not_touch_are_measured_each(client: httpx.Client, plate: str) -> None:
+    circles = np.array([(95.0, 110.0, 22.0), (165.0, 110.0, 18.0)])
+    body = {
+        "kind": "profile",
+        "region": {"outlines": [{"circle": circle} for circle in circles.tolist()]},
+        "subset_px": 21,
+        "spacing_px": 6,
+    }
+    begun = client.post(f"{API}/tests/{plate}/analyses", json=body)
+    assert begun.status_code == 202, begun.text
+    assert wait_for_job(client, begun.json()["job"])["state"] == "succeeded"
+    url = f"{API}/tests/{plate}/analyses/{begun.json()['analysis_id']}"
+    z_mm = np.array(client.get(f"{url}/steps/0/fields/z_mm").json()["values"], dtype=float)
+    # the grid starts at the upper left corner of the box about both
+    rows, cols = z_mm.shape
+    x, y = np.meshgrid(73.0 + 6.0 * np.arange(cols), 88.0 + 6.0 * np.arange(rows))
+    inside = (np.hypot(x[..., None] - circles[:, 0], y[..., None] - circles[:, 1]) <= circles[:, 2]).any(axis=-1)
+    assert np.array_equal(np.isfinite(z_mm), inside)
+    assert inside.sum() > 60
+    assert client.get(url).json()["settings"]["region"]["outlines"][1]["circle"] == [165.0, 110.0, 18.0]
+
+
+def test_the_scale_is_the_length_that_a_pixel_sees_on_the_plate(client: httpx.Client, plate: str) -> None:
+    cameras = true_cameras(SMALL)
+    reply = client.get(f"{API}/tests/{plate}/scale", params={"step": 0}).raise_for_status().json()
     # the plate lies in Z = 0: two points on it 1 mm apart, across camera 1's line of sight, by the rig's own camera
     camera = Camera.from_paper(**cameras["cam1"])
     axis = camera.cam_from_sys.rotation[2]
