@@ -100,7 +100,9 @@ def make_report(source: Source, coverage: CoverageFields | None = None) -> Repor
     if not measured.loaded:
         missing.append(Missing("Load of the steps", "give load_n with each step"))
     if source.metadata.gauges is None and len(measured.steps) > 1:
-        remedy = "draw extensometers, points, areas or lines on the Results screen, or name them in `gauges` of the metadata"
+        remedy = (
+            "draw extensometers, points, areas or lines on the Results screen, or name them in `gauges` of the metadata"
+        )
         missing.append(Missing("Gauges", remedy))
     made = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
     page, policy = render(
