@@ -317,7 +317,7 @@ export function gauges(screen) {
       budgetTable(rms(budget), unit, factor, lacking ?? ""));
     lineChart.dataset.answer = JSON.stringify({ x, value, sigma });
     await plot("line", lineChart, { x: inMm ? "distance (mm)" : "distance (px)", y: `${screen.info?.text ?? name}${unit ? ` (${unit})` : ""}`, height: 320, said: interval.text,
-      series: [{ label: name, u: errors }, { label: `+ ${interval.symbol}`, edge: true }, { label: `− ${interval.symbol}`, edge: true }], bands: [[2, 3]], data: [x, values, band(1), band(-1)], label: `${name} along the line` });
+      series: [{ label: name, u: errors }, { label: `+ ${interval.symbol}`, edge: true, colour: 0 }, { label: `− ${interval.symbol}`, edge: true, colour: 0 }], bands: [[2, 3]], data: [x, values, band(1), band(-1)], label: `${name} along the line` });
   }
 
   const extChart = h("div", { "data-role": "extensometer-chart" });

@@ -90,6 +90,6 @@ export function areaChart(box, { result, against, name, unit, factor, interval, 
     .filter((one) => Number.isFinite(one.x)).sort((p, q) => p.x - q.x);
   const edge = (/** @type {1 | -1} */ sign) => rows.map((one) => (one.value === null || one.u === null ? null : one.value + sign * one.u));
   return chart(box, { x: against.text, y: `mean ${name}${unit ? ` (${unit})` : ""}`, height: 320, said: interval.text, label: `Mean of ${name} over the area`,
-    series: [{ label: `mean ${name}`, dots: true, u: rows.map((one) => one.u) }, { label: `+ ${interval.symbol}`, edge: true }, { label: `− ${interval.symbol}`, edge: true }], bands: [[2, 3]],
+    series: [{ label: `mean ${name}`, dots: true, u: rows.map((one) => one.u) }, { label: `+ ${interval.symbol}`, edge: true, colour: 0 }, { label: `− ${interval.symbol}`, edge: true, colour: 0 }], bands: [[2, 3]],
     data: [rows.map((one) => one.x), rows.map((one) => one.value), edge(1), edge(-1)] });
 }
