@@ -87,8 +87,6 @@ def test_a_part_that_stands_out_by_four_tenths_of_the_fields_width_is_within_the
     assert 1.0 / found.low >= depth_mm + 0.4 * wide_mm
 
 
-@pytest.mark.parametrize("degrees", [50.0, 58.0, 65.0])
-@pytest.mark.parametrize("degrees", [50.0, 58.0, 65.0])
 def test_a_search_in_an_image_of_something_else_finds_nothing() -> None:
     matcher, plane = fitter()
     other = prepare(
