@@ -28,6 +28,7 @@ _TRIMMED = 0.02
 _CLEARLY = 1.1
 _CURVED_NOISE = 1.9  # over a plane patch's: the root of 3.5 for gradients alike all over the subset, as measured
 _SURELY = 1.0
+_EXPLAINED = 1.5  # standard deviation of a curved patch's residuals over the sample's median
 
 
 def advise(choice: PatchChoice, estimate: PlaneError | None) -> PatchChoice:
@@ -93,7 +94,9 @@ def choose_patch(fitter: Fitter, points: PointFits, xy_px: Float, estimate: Plan
     if good.mean() < _SHARE or good.sum() < _MIN_POINTS:
         share = f"{100.0 * (1.0 - good.mean()):.0f} %"
         return _simple(plane, f"{plane}: quadratic patches do not converge on {share} of the points tried", len(index))
-    kept = np.flatnonzero(good)
+    # what neither patch explains, as a subset across an edge, tells nothing of curvature
+    explained = good & (curved.noise <= _EXPLAINED * np.median(curved.noise[good]))
+    kept = np.flatnonzero(explained if explained.sum() >= _MIN_POINTS else good)
     a, b = flat.take(kept), curved.take(kept)
     _count_residuals(curved_fitter, a, b, xy[kept])
     return decide(*_compared(fitter, xy[kept], a, b), plane=plane)

@@ -8,15 +8,10 @@ import numpy as np
 
 from core.field.checks.patch_choice import advise
 from core.field.checks.patch_choice import choose_patch as choose
-from core.field.checks.plane_error import PlaneError, plane_error
+from core.field.checks.plane_error import plane_error
 from core.field.growth.grow import fit_in_batches
 from core.field.growth.state import SAMPLE_FAR_PX, FieldInputs, GrowthState, fresh_attempts
-from core.field.parts.beside_edges import beside_edges
-from core.field.points.fitter import PointFits
 from core.field.points.result import Field
-from core.status import PointStatus
-
-_ENOUGH, _ENOUGH_SHARE = 256, 0.5  # points off all edges, and their share, of which either is enough to go by
 
 
 def keep_patch(inputs: FieldInputs, state: GrowthState, previous: Field | None) -> GrowthState:
@@ -40,37 +35,18 @@ def refit_curved(inputs: FieldInputs, state: GrowthState) -> GrowthState:
 
 def choose_patch(inputs: FieldInputs, state: GrowthState) -> GrowthState:
     """Estimate the plane patches' bias; with ``auto``, change to curved ones if their total error is smaller."""
-    points, estimate = state.points, None
+    estimate = None
     if state.fitter.terms == 3:
-        estimate = _plane_error(inputs, points)
-        if estimate is not None and estimate.error_mm > 0.0:
-            points = _off_edges(inputs, state)
-            estimate = _plane_error(inputs, points)
+        estimate = plane_error(
+            state.points,
+            shape=inputs.grid.shape,
+            rays=inputs.rays,
+            spacing_px=inputs.grid.spacing_px,
+            subset_px=inputs.options.subset_px,
+        )
     if inputs.options.patch != "auto":
         return replace(state, patch=advise(state.patch, estimate))
     if state.patch.kept:
         return state
-    state = replace(state, patch=choose(state.fitter, points, inputs.xy_px, estimate))
+    state = replace(state, patch=choose(state.fitter, state.points, inputs.xy_px, estimate))
     return refit_curved(inputs, state) if state.patch.patch == "quadratic" else state
-
-
-def _plane_error(inputs: FieldInputs, points: PointFits) -> PlaneError | None:
-    return plane_error(
-        points,
-        shape=inputs.grid.shape,
-        rays=inputs.rays,
-        spacing_px=inputs.grid.spacing_px,
-        subset_px=inputs.options.subset_px,
-    )
-
-
-def _off_edges(inputs: FieldInputs, state: GrowthState) -> PointFits:
-    """Return the points without those that straddle an edge, which no patch of one surface explains."""
-    points = state.points
-    edges = beside_edges(state.fitter, points, inputs.grid.shape, inputs.rays, inputs.grid.spacing_px)
-    left = int((points.ok & ~edges).sum())
-    if left < min(_ENOUGH, _ENOUGH_SHARE * points.ok.sum()):
-        return points
-    smooth = points.take(np.arange(len(points.status)))
-    smooth.reject(edges & points.ok, PointStatus.NEIGHBOUR_MISMATCH)
-    return smooth

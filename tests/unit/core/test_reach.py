@@ -13,7 +13,7 @@ from core.field.points.fitter import Fitter, PointFits
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field
 from core.field.points.starts import depth_per_px
-from core.field.seeding.local_search import depth_range, search_shapes, tilts
+from core.field.seeding.local_search import deeper_range, depth_range, search_shapes, steep_tilts, tilts
 from core.field.seeding.predicted import local_motion, predicted_motion, seen_elsewhere
 from core.field.sequence.still_visible import still_visible
 from core.matching import MatchOptions, prepare
@@ -64,6 +64,27 @@ def test_a_search_finds_faces_of_any_tilt_from_the_depths_alone(degrees: float, 
     assert found.ok[could].mean() > 0.8
     off = np.abs(found.w[found.ok, 0] - w[found.ok, 0]) / depth_per_px(PAIR, rays(), w[:, 0])[found.ok]
     assert off.max() < 0.2  # a match elsewhere is pixels off
+
+
+@pytest.mark.parametrize("degrees", [50.0, 58.0, 65.0])
+def test_steep_tilts_come_within_half_a_step_of_every_face_up_to_65_degrees(degrees: float) -> None:
+    """Disparity over a subset changes as the slope does: the face's slope, not its angle, must be met."""
+    between_rad, subset_px = 0.4, 27
+    normals = np.concatenate([tilts(between_rad, subset_px), steep_tilts(between_rad, subset_px)])
+    slopes = normals[:, :2] / normals[:, 2:]
+    turn = np.linspace(0.0, 2.0 * np.pi, 97)
+    faces = np.tan(np.deg2rad(degrees)) * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    nearest = np.linalg.norm(faces[:, None] - slopes[None], axis=-1).min(axis=1)
+    disparity_px = nearest * subset_px // 2 * 2.0 * np.tan(0.5 * between_rad)
+    assert disparity_px.max() < 1.7  # the refinement finds its way over two
+
+
+def test_a_part_that_stands_out_by_four_tenths_of_the_fields_width_is_within_the_deeper_range() -> None:
+    depth_mm, wide_mm = 300.0, 30.0
+    ray = np.array([[x / depth_mm, 0.0, 1.0] for x in np.linspace(-0.5 * wide_mm, 0.5 * wide_mm, 20)])
+    found = deeper_range(PAIR, ray, np.full(len(ray), 1.0 / depth_mm))
+    assert 1.0 / found.high <= depth_mm - 0.4 * wide_mm
+    assert 1.0 / found.low >= depth_mm + 0.4 * wide_mm
 
 
 def test_a_search_in_an_image_of_something_else_finds_nothing() -> None:
