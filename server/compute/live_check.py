@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from core.errors import ImageError, MeasurementError, RegionError
@@ -15,7 +13,7 @@ from core.measure import measure_shape
 from core.orientation.coarse import features_off_px
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.calibrations.volume import own_px_of, rbe_of
-from server.worker.tasks import LiveCheckTask
+from server.worker.tasks import LiveCheckTask, LiveFinding
 
 _POINTS = 300  # over the whole image: a smooth offset needs no more
 _MIN_VALID = 20
@@ -23,10 +21,10 @@ _SPACING_PX = 12.0  # at least
 _COARSE_PX = 1.0  # features are found to 0.7 px: above it they say more than subsets, whose search ends at 1.5 px
 
 
-def check_live(task: LiveCheckTask) -> dict[str, Any]:
-    """Return the offset from the epipolar lines: ``level``, ``offset_px``, ``own_px``, ``points``, ``text``.
+def check_live(task: LiveCheckTask) -> LiveFinding:
+    """Return the offset from the epipolar lines.
 
-    ``level`` is ``ok``, ``warning``, ``failed`` or ``no_texture``. A surface is measured as a test's reference would
+    A surface is measured as a test's reference would
     be, on a coarse grid over the whole image. Where the cameras turned so far that nothing matches, the offset is that
     of features, to some tenths of a pixel.
     """
@@ -44,13 +42,7 @@ def check_live(task: LiveCheckTask) -> dict[str, Any]:
         if int(shape.valid.sum()) >= _MIN_VALID:
             found = check_epipolar(shape, rbe_of(loaded), imported=loaded.imported)
             if found is not None:
-                return {
-                    "level": found.level,
-                    "offset_px": found.offset_px,
-                    "own_px": found.own_px,
-                    "points": int(shape.valid.sum()),
-                    "text": found.reason,
-                }
+                return LiveFinding(found.level, found.reason, found.offset_px, found.own_px, int(shape.valid.sum()))
     except ImageError:
         return _no_texture(own)  # blank, or noise alone
     except (MeasurementError, RegionError):
@@ -63,9 +55,9 @@ def check_live(task: LiveCheckTask) -> dict[str, Any]:
         level, text = "warning", text + "; the imported calibration's own error is not known"
     else:
         level, text = "failed", text + "; a camera was moved since, or the calibration belongs to another set-up"
-    return {"level": level, "offset_px": off_px, "own_px": own, "points": 0, "text": text}
+    return LiveFinding(level, text, off_px, own)
 
 
-def _no_texture(own_px: float | None) -> dict[str, Any]:
+def _no_texture(own_px: float | None) -> LiveFinding:
     text = "too little of the picture is seen by both cameras with a texture to match"
-    return {"level": "no_texture", "offset_px": None, "own_px": own_px, "points": 0, "text": text}
+    return LiveFinding("no_texture", text, own_px=own_px)

@@ -225,6 +225,31 @@ class LiveCheckTask:
 
 
 @dataclass(frozen=True)
+class LiveFinding:
+    """What a live pair says of a calibration.
+
+    Parameters
+    ----------
+    level
+        ``ok``, ``warning``, ``failed`` or ``no_texture``.
+    text
+        The finding in a sentence.
+    offset_px
+        How far points lie off their epipolar lines; None: not known.
+    own_px
+        The calibration's own offset at most; None: not known.
+    points
+        Points that were matched; 0 where the offset is that of features, or none.
+    """
+
+    level: str
+    text: str
+    offset_px: float | None = None
+    own_px: float | None = None
+    points: int = 0
+
+
+@dataclass(frozen=True)
 class GuideTask:
     """A guided acquisition.
 
@@ -269,9 +294,9 @@ def find_in_pair(task: LookTask) -> dict[str, int]:
     return found
 
 
-def check_live(task: LiveCheckTask) -> dict[str, Any]:
+def check_live(task: LiveCheckTask) -> LiveFinding:
     """Say how far a live pair's points lie off their epipolar lines."""
-    seen: dict[str, Any] = _heavy("server.compute.live_check").check_live(task)
+    seen: LiveFinding = _heavy("server.compute.live_check").check_live(task)
     return seen
 
 

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import time
-from typing import Any
+from dataclasses import dataclass
 
 from core.errors import MeasurementError, StateError
 from server.rig.cameras import CapturedPair
 from server.rig.shared import SharedReading
 from server.store.folder import now_utc
-from server.worker.tasks import LiveCheckTask, check_live
+from server.worker.tasks import LiveCheckTask, LiveFinding, check_live
 from server.workflows.calibration.review import newest_accepted
 from server.workflows.calibration.sequence import way_back
 from server.workflows.service import Service
 
 _PAIR_S = 5.0
 _PATIENCE_S = 30.0
+
+
+@dataclass(frozen=True)
+class LiveCheck:
+    """A finding, of which calibration, and when; its level is ``off_zero`` or ``busy``, too, where none was made."""
+
+    calibration_id: str
+    finding: LiveFinding
+    checked_utc: str
 
 
 class LiveChecks:
@@ -25,7 +34,7 @@ class LiveChecks:
         self._service = service
         self._shared = SharedReading(self._check)
 
-    def __call__(self) -> dict[str, Any]:
+    def __call__(self) -> LiveCheck:
         """Return the check of the newest accepted calibration by a live pair.
 
         Its ``level`` is ``off_zero`` where a stage stands elsewhere, ``busy`` while jobs compute: then nothing was
@@ -40,28 +49,30 @@ class LiveChecks:
         """
         return self._shared()
 
-    def _check(self) -> dict[str, Any]:
+    def _check(self) -> LiveCheck:
         service = self._service
         calibration_id = newest_accepted(service)
-        unchecked = {"calibration_id": calibration_id, "offset_px": None, "own_px": None, "points": 0}
+        return LiveCheck(calibration_id, self._finding(calibration_id), now_utc())
+
+    def _finding(self, calibration_id: str) -> LiveFinding:
+        service = self._service
         if service.config.calibration.moves != "target" and (back := way_back(service)) is not None:
             text = str(back["text"]).split(":")[0] + ": the calibration holds at dZ = 0"
-            return {**unchecked, "level": "off_zero", "text": text, "checked_utc": now_utc()}
+            return LiveFinding("off_zero", text)
         if service.jobs.active_count() or not service.worker.ready.is_set():
-            text = "a job is running, or the computation starts; the check goes on after it"
-            return {**unchecked, "level": "busy", "text": text, "checked_utc": now_utc()}
+            return LiveFinding("busy", "a job is running, or the computation starts; the check goes on after it")
         pixels = self._pair().pixels
         file = service.calibrations.path(calibration_id) / "calibration.json"
         task = LiveCheckTask(file, (pixels["cam1"], pixels["cam2"]))
         try:
             running = service.worker.submit(check_live, task)
-            seen = running.result(timeout=_PATIENCE_S)
+            found: LiveFinding = running.result(timeout=_PATIENCE_S)
         except TimeoutError:
             running.request_stop()
-            seen = {"level": "busy", "text": "the computation took too long"}
+            return LiveFinding("busy", "the computation took too long")
         except MeasurementError as error:
-            seen = {"level": "no_texture", "text": error.cause}
-        return {**unchecked, **seen, "checked_utc": now_utc()}
+            return LiveFinding("no_texture", error.cause)
+        return found
 
     def _pair(self) -> CapturedPair:
         """Take a pair as a live view does: without the hold, and given up where none comes."""

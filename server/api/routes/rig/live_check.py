@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 
@@ -23,4 +25,7 @@ async def check_calibration(request: Request) -> LiveCheckReply:
     It takes a second or more, and is not made while a job runs or a stage stands off the calibrated place.
     """
     checks: LiveChecks = request.app.state.live_checks
-    return LiveCheckReply.model_validate(await run_in_threadpool(checks))
+    found = await run_in_threadpool(checks)
+    return LiveCheckReply.model_validate(
+        {"calibration_id": found.calibration_id, **asdict(found.finding), "checked_utc": found.checked_utc}
+    )
