@@ -18,6 +18,7 @@ from core.field.checks.block_median import block_medians, reach_of, spacing_of
 from core.field.points.fitter import PointFits
 from core.field.points.starts import view_cosines
 from core.robust import MAD_TO_SIGMA
+from core.status import PointStatus
 
 _LOST_TO_VIEW = 0.015
 """1 - zncc over the squared excess of the blur's variance, relative to one camera's own: three times what real speckle
@@ -30,6 +31,7 @@ _SHAPE_FACTOR, _SHAPE_LOSS = 12.0, 0.04
 _WIDER = 3  # so far about a point that a crack is in a small part of it
 _FEW = 12
 _LEAST = 1e-7
+_UNTRIED = (PointStatus.MASKED, PointStatus.OUTSIDE_IMAGE, PointStatus.LOW_TEXTURE)
 
 
 class CorrelationLimits(NamedTuple):
@@ -99,6 +101,8 @@ def lost_correlation(
         if k == 2:  # of camera 2 nothing but what is new
             level = np.maximum(level, 1.0 - points.zncc[:, 0])
         expected[:, k] = level * allowed
+    if points.zncc.shape[1] > 1:
+        expected[:, 1:] = np.minimum(expected[:, 1:], _where_most_are_lost(points, shape, reach, texture, limits))
     with np.errstate(invalid="ignore"):
         suspect = np.flatnonzero(ok & (1.0 - points.zncc > expected).any(axis=1))
     if len(suspect):
@@ -110,6 +114,26 @@ def lost_correlation(
         lost = _LOST_TO_VIEW * np.maximum(view - np.stack(about, axis=1), 0.0)
         bad[suspect] = (1.0 - points.zncc[suspect] > expected[suspect] + lost[suspect]).any(axis=1)
     return bad
+
+
+def _where_most_are_lost(
+    points: PointFits, shape: tuple[int, int], reach: int, texture: Float, limits: CorrelationLimits
+) -> Float:
+    """(n, k - 1) largest loss in time where most points are lost; inf elsewhere.
+
+    What is left of a part that something else is seen in is no measure of what is usual there: the parts that kept most
+    of their points are, and what the point lost between the cameras before anything happened.
+    """
+    ok = points.ok
+    tried = ~np.isin(points.status, _UNTRIED)
+    kept = block_medians(ok.astype(float), tried, shape, reach, otherwise=1.0) > 0.5
+    late = np.where(ok[:, None], np.maximum(1.0 - points.zncc, _LEAST), 1.0)
+    level = np.repeat(late[:, :1], late.shape[1] - 1, axis=1)
+    sound = ok & kept
+    if sound.sum() >= _FEW:
+        usual = np.median(late[sound, 1:] * texture[sound, None], axis=0)
+        level = np.maximum(level, usual / texture[:, None])
+    return np.where(kept[:, None], np.inf, limits.max_factor * level)
 
 
 def _of_the_best(
