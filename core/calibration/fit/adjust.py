@@ -30,6 +30,10 @@ _LAST, _NEAR = 10, 0.1  # last steps, and what they may still gain: a tenth of w
 _LENS_AND_POSE = 10.0  # unknowns of a camera that correlated observations feel
 # what both axes' tilts must gain of the sum of squares to be shown: chance reaches it once in a hundred (4 unknowns)
 _SHOWN_TILT = 13.28
+# or what is left of the prior's standard deviation where the views tell most: with a lens that surely distorts, or a
+# field wide enough, they know the tilt better than the prior does
+_TOLD_TILT = 0.5
+_SURE = 2.0  # standard deviations of a distortion that may be the target's errors
 
 
 @dataclass(frozen=True)
@@ -109,7 +113,10 @@ def adjust(
     fit = _adjusted(layout, start, views, nominal_nodes_mm, held, max_iterations, noise_px, rounds)
     normal = assemble(layout, fit.state, views, nominal_nodes_mm, priors, fit.noise_px)
     _, g, _ = normal.reduced()
-    if float(g @ covariance(normal).unknowns @ g) > _SHOWN_TILT:
+    gained = float(g @ covariance(normal).unknowns @ g)
+    known = replace(fit.state, x=_surely_distorted(layout, fit))
+    told = _told(assemble(layout, known, views, nominal_nodes_mm, priors, fit.noise_px), held)
+    if gained > _SHOWN_TILT or told < _TOLD_TILT:
         return _adjusted(
             layout, fit.state, views, nominal_nodes_mm, priors, max_iterations, fit.noise_px, rounds, fit.iterations
         )
@@ -130,6 +137,25 @@ def _without_tilts(layout: Layout, priors: Priors) -> Priors:
     free, weight = priors.free.copy(), priors.weight.copy()
     free[tilts], weight[tilts] = False, 0.0
     return replace(priors, free=free, weight=weight)
+
+
+def _surely_distorted(layout: Layout, fit: Adjustment) -> Float:
+    """Return the unknowns with the distortion less what errors may have made of it."""
+    x = fit.state.x.copy()
+    sigma = np.sqrt(np.diagonal(fit.covariance))
+    for c in range(2):
+        lens = layout.lens(c)
+        terms = slice(lens.start + 3, lens.stop - 1)
+        x[terms] = np.sign(x[terms]) * np.maximum(np.abs(x[terms]) - _SURE * sigma[terms], 0.0)
+    return x
+
+
+def _told(normal: Normal, held: Priors) -> float:
+    """Return the least share of the prior's standard deviation that is left of what ``held`` holds."""
+    tilts = np.flatnonzero(normal.free & ~held.free)
+    root = np.sqrt(normal.prior[tilts])
+    left = covariance(normal).unknowns[np.ix_(tilts, tilts)] * root[:, None] * root
+    return float(np.sqrt(np.linalg.eigvalsh(left)[0]))
 
 
 def _of_held(normal: Normal, fitted: Float) -> Float:
