@@ -223,7 +223,12 @@ def test_from_the_rig_to_the_report(page: Watched, client: httpx.Client, made: M
 
     go(shown, "Jobs & system", "Jobs and system")
     for kind in ("calibration", "analysis"):
-        expect(shown.locator("tr", has_text=kind).first).to_contain_text("succeeded")
+        row = shown.locator("tr", has_text=kind).first
+        expect(row).to_contain_text("succeeded")
+        # how long it took, in the units that people use
+        expect(row.locator("td").nth(4)).to_have_text(
+            re.compile(r"^(\d(\.\d)?|\d\d)\u00a0s$|^\d+\u00a0min( \d+\u00a0s)?$")
+        )
     audit("8 jobs")
     sound(page)
 
@@ -333,6 +338,8 @@ def check_report(shown: Page) -> None:
     for image in report.locator("img").all():
         assert image.evaluate("image => image.complete && image.naturalWidth > 0")
     in_every_size(report)("6 report")
+    # the steps' table is as wide as the page, on a screen as on paper
+    assert report.locator(".wide:has(#steps-table)").evaluate("table => table.scrollWidth - table.clientWidth") <= 0
     report.close()
 
 

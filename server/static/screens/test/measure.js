@@ -245,6 +245,7 @@ export async function measurePanel(id, test, ends, done) {
         const value = correct(input) ? Number(input.value) : before[name]; // one that is being typed is not kept yet
         if (value !== undefined) found[name] = value;
       }
+      if ((found.prefilter_px ?? 0) > (found.subset_px ?? 0) / 4) found.prefilter_px = 0; // as one that is being typed
       found.smoothing_window = smoothing.value === "" ? null : correct(smoothing) ? Number(smoothing.value) : before.smoothing_window ?? null;
       if (strain.checked) found.strain = /** @type {Request["strain"]} */ ({ ...(correct(window_) ? { window: Number(window_.value) } : {}), order: order.value === "auto" ? "auto" : Number(order.value), tensor: tensor.value });
       return found;
