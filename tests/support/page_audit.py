@@ -83,6 +83,7 @@ def auditor(at: Page, styles: Sequence[Style] = STYLES, axe_at: Sequence[Style] 
         for scheme, (width, height) in styles:
             at.set_viewport_size({"width": width, "height": height})
             at.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
+            at.evaluate("scrollTo(0, 0)")  # the bar stands at the head, over nothing
             at.evaluate(DRAWN)
             where = f"{state}, {scheme}, {width} x {height}"
             if axe_at is None or (scheme, (width, height)) in axe_at:
