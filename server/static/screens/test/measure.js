@@ -203,7 +203,7 @@ export async function measurePanel(id, test, ends, done) {
       drawGauge();
     }
     function drawGauge() {
-      const { text, warning } = strain.checked ? gaugeText(gaugePx(Number(window_.value), Number(spacing.value), Number(subset.value)), mmPerPx, editor.width()) : { text: "", warning: "" };
+      const { text, warning } = strain.checked && [window_, spacing, subset].every(correct) ? gaugeText(gaugePx(Number(window_.value), Number(spacing.value), Number(subset.value)), mmPerPx, editor.width()) : { text: "", warning: "" };
       gauge.textContent = text;
       gaugeWarning.textContent = warning;
       gaugeWarning.hidden = !warning;
