@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,13 +9,10 @@ from playwright.sync_api import Browser, Page, expect
 
 from server.workflows.service import Service
 from tests.support import results_page
+from tests.support.page_audit import Audit, auditor
 from tests.support.page_bench import Watched, watched
 from tests.support.results_page import ENDS, LINE, Bench, given, shown
 from tests.support.service_rig import served, tiny_config, wait_for_rig
-
-if os.environ.get("CI", "").lower() != "true":
-    pytest.importorskip("axe_playwright_python", reason="pip install axe-playwright-python to test the page")
-from axe_playwright_python.base import AXE_SCRIPT
 
 bench, page = results_page.bench, results_page.page  # fixtures
 
@@ -25,44 +20,13 @@ pytestmark = pytest.mark.timeout(500)
 expect.set_options(timeout=30_000)  # the machine may be busy
 
 API = "/api/v1"
-RULES = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "best-practice"]
-DESK, ACROSS, UPRIGHT = (1280, 800), (1024, 768), (768, 1024)
-STYLES = [("light", DESK), ("dark", DESK), ("light", ACROSS), ("dark", UPRIGHT)]
-RUN = """async rules => {
-    const told = await axe.run(document, {runOnly: {type: 'tag', values: rules}, resultTypes: ['violations']});
-    const found = told.violations.map(one => `${one.id} (${one.help}): `
-        + one.nodes.map(node => `${node.target} ${node.failureSummary}`).join(' | '));
-    return [found, told.passes.length];
-}"""
 AREA = ("Area left", "Area top", "Area right", "Area bottom")
-
-Audit = Callable[[str], None]
 
 
 @pytest.fixture
 def audit(page: Watched) -> Audit:
     """Fail where axe finds anything on the page in its present state, in any style, or it is wider than the screen."""
     return auditor(page.page)
-
-
-def auditor(at: Page) -> Audit:
-    def run(state: str) -> None:
-        if at.evaluate("typeof axe") == "undefined":
-            at.evaluate(AXE_SCRIPT)
-        found: list[str] = []
-        for scheme, (width, height) in STYLES:
-            at.set_viewport_size({"width": width, "height": height})
-            at.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
-            at.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
-            violations, passed = at.evaluate(RUN, RULES)
-            assert passed > 10, "axe has looked at nothing"
-            found += [f"{state}, {scheme}, {width} x {height}: {one}" for one in violations]
-            wider = at.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
-            if wider > 0:
-                found.append(f"{state} is {wider} px wider than {width} px")
-        assert not found, "\n".join(found)
-
-    return run
 
 
 def unfold(at: Page) -> None:

@@ -97,9 +97,19 @@ def test_two_calibrations_are_compared_in_space_and_a_distance_is_checked(
     # the list is newest first
     reply = client.get(f"{API}/calibrations/{turned}/comparison", params={"with": own}).json()
     expect(in_space).to_contain_text(reply["text"], timeout=SLOW)
-    shown.get_by_role("dialog").get_by_role("button", name="Close").click()
-    # two marks 1 mm apart, imaged by the cameras themselves
+    # the comparison does not stay over another screen
+    shown.evaluate("location.hash = '#/jobs'")
+    expect(shown.get_by_role("heading", level=1, name="Jobs and system")).to_be_visible()
+    expect(shown.get_by_role("dialog")).to_have_count(0)
+    shown.go_back()
+    # what is missing is said beside it
     shown.get_by_text("Known distance", exact=True).first.click()
+    shown.get_by_role("button", name="Check the distance").click()
+    distance = shown.locator(".field", has=shown.get_by_role("spinbutton", name="Known distance"))
+    expect(distance.get_by_role("alert")).to_have_text("The known distance is needed here.")
+    marks = shown.get_by_role("group", name="Marks in cam2, px")
+    expect(marks.get_by_role("alert")).to_have_text("Give mark 1, x, in px.")
+    # two marks 1 mm apart, imaged by the cameras themselves
     shown.get_by_role("spinbutton", name="Known distance").fill("1")
     ends = np.array([[-0.5, 0.2, 0.0], [0.5, 0.2, 0.0]])
     for cam, numbers in cameras.items():
@@ -107,6 +117,7 @@ def test_two_calibrations_are_compared_in_space_and_a_distance_is_checked(
         for k, (x, y) in enumerate(marks):
             shown.get_by_label(f"{cam}, mark {k + 1}, x").fill(repr(float(x)))
             shown.get_by_label(f"{cam}, mark {k + 1}, y").fill(repr(float(y)))
+    expect(shown.get_by_role("main").get_by_role("alert")).to_have_count(0)
     shown.get_by_role("button", name="Check the distance").click()
     found = shown.locator('[data-role="known-distance"]')
     expect(found).to_contain_text("agrees", timeout=SLOW)

@@ -37,6 +37,11 @@ def test_a_target_in_the_hand_is_seen_taken_and_fitted(page: Watched, client: ht
     shown = page.open("#/calibrate")
     panel = shown.get_by_role("region", name="Guided acquisition")
     panel.get_by_label("Purpose").fill("by hand")
+    panel.get_by_label("Goal").fill("-1")
+    panel.get_by_role("button", name="Begin guided acquisition").click()
+    expect(panel.get_by_role("alert")).to_have_text("Give more than 0\u00a0µm, not −1\u00a0µm.")
+    panel.get_by_label("Goal").fill("")
+    expect(panel.get_by_role("alert")).to_have_count(0)
     panel.get_by_role("button", name="Begin guided acquisition").click()
     # the first view is taken by itself, and the next proposed with its worth
     sentence = panel.locator('[data-role="proposal"]')

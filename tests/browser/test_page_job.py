@@ -1,5 +1,7 @@
 """The whole job in a browser, as a user does it: rig, calibration, test, region, seeds, measurement, field, files.
 
+Each screen is looked at as it is left, in every size and both colours.
+
 Everything that the page can do is done by mouse and keyboard; the API is only read, to compare. What the page cannot
 do is done to the simulated world: a camera's cable is pulled and put back.
 """
@@ -24,6 +26,7 @@ from playwright.sync_api import Locator, Page, expect
 from core.cameras.camera import Camera
 from server.config.rig_file import parse_config
 from server.workflows.service import Service
+from tests.support.page_audit import in_every_size
 from tests.support.page_bench import Watched
 from tests.support.page_editor import Editor
 from tests.support.results_page import two_digits_of_u
@@ -133,7 +136,12 @@ def grey_of(picture: bytes) -> int:
 
 def test_from_the_rig_to_the_report(page: Watched, client: httpx.Client, made: Made) -> None:
     shown = page.open()
+    audit = in_every_size(shown)
+    go(shown, "Results", "Results")
+    expect(shown.get_by_role("link", name="Make a test")).to_have_attribute("href", "#/test")  # nothing is there yet
+    go(shown, "Rig", "tiny rig")
     live_pictures_move(shown)
+    audit("1 rig")
     put_before_the_cameras(shown, "grid", 0)
 
     # calibrate by the rig file's plan, and accept
@@ -150,11 +158,13 @@ def test_from_the_rig_to_the_report(page: Watched, client: httpx.Client, made: M
     expect(verdict).to_contain_text("accepted")
     made.calibration_id = client.get(f"{API}/calibrations").json()["calibrations"][-1]["id"]
     expect(verdict).to_contain_text(made.calibration_id)
+    audit("2 calibration")
 
     # a test with the accepted calibration, and the operator's metadata
     put_before_the_cameras(shown, "plate", STEPS[0][0])
     go(shown, "Test", "Tests")
     expect(shown.get_by_label("Calibration", exact=True)).to_have_value(made.calibration_id)
+    audit("3 new test")
     shown.get_by_label("Name").fill("Pressure test")
     shown.get_by_label("Specimen").fill("aluminium plate 7")
     shown.keyboard.press("Tab")  # to the calibration, the notes, the button
@@ -195,6 +205,7 @@ def test_from_the_rig_to_the_report(page: Watched, client: httpx.Client, made: M
     shown.get_by_label("Subset", exact=True).fill("25")
     shown.get_by_label("Spacing", exact=True).fill("5")
     expect(shown.locator('[data-role="texture"]')).to_contain_text("subsets")
+    audit("4 test with a region")
     shown.get_by_role("button", name="Measure", exact=True).click()
     progress = shown.locator('[data-role="progress"]')
     expect(progress.get_by_label("Progress of the analysis")).to_be_visible()
@@ -204,11 +215,21 @@ def test_from_the_rig_to_the_report(page: Watched, client: httpx.Client, made: M
 
     check_field(shown, client, made.test_id)
     export_opens(shown, client, made.test_id)
+    audit("5 results and export")
     check_report(shown)
+    go(shown, "Results", "Results")
+    expect(shown.get_by_role("heading", level=2, name="Pressure test")).to_be_visible()
+    audit("7 list of results")
 
     go(shown, "Jobs & system", "Jobs and system")
     for kind in ("calibration", "analysis"):
-        expect(shown.locator("tr", has_text=kind).first).to_contain_text("succeeded")
+        row = shown.locator("tr", has_text=kind).first
+        expect(row).to_contain_text("succeeded")
+        # how long it took, in the units that people use
+        expect(row.locator("td").nth(4)).to_have_text(
+            re.compile(r"^(\d(\.\d)?|\d\d)\u00a0s$|^\d+\u00a0min( \d+\u00a0s)?$")
+        )
+    audit("8 jobs")
     sound(page)
 
 
@@ -316,6 +337,9 @@ def check_report(shown: Page) -> None:
     assert report.locator("img").count() + report.locator("svg").count() > 2
     for image in report.locator("img").all():
         assert image.evaluate("image => image.complete && image.naturalWidth > 0")
+    in_every_size(report)("6 report")
+    # the steps' table is as wide as the page, on a screen as on paper
+    assert report.locator(".wide:has(#steps-table)").evaluate("table => table.scrollWidth - table.clientWidth") <= 0
     report.close()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from playwright.sync_api import Locator, expect
 
 from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
+from core.settings import SMOOTHING_WINDOW, SPACING_PX, STRAIN_WINDOW, SUBSET_PX
 from server.config.rig_file import parse_config
 from server.workflows.service import Service
 from tests.support.page_bench import Watched
@@ -129,11 +131,23 @@ def test_the_path_leads_back_to_the_test_and_its_parts_and_ticks_what_is_done(pa
 
 
 def test_cameras_off_their_place_are_told_where_one_captures_with_the_way_back(
-    page: Watched, client: httpx.Client, plate: str
+    page: Watched, client: httpx.Client, calibration: str
 ) -> None:
+    test_id = new_test(client, name="off its place", calibration_id=calibration)
     moved = client.post(f"{API}/stage/moves", json={"dz_mm": {"cam1": 1.0, "cam2": 1.0}}, params={"wait": 30}).json()
     assert moved["job"]["state"] == "succeeded"
-    shown = page.open(f"#/test/{plate}")
+    for _ in range(3):
+        assert client.post(f"{API}/tests/{test_id}/steps", json={}).status_code == 201
+    shown = page.open(f"#/test/{test_id}")
+    # the long badges of neighbouring thumbnails stay apart
+    badges = shown.locator('[data-role="thumbnails"] .badge')
+    expect(badges).to_have_count(3)
+    expect(badges.first).to_have_text("cameras off their calibrated position")
+    boxes = [badge.bounding_box() for badge in badges.all()]
+    for one, other in itertools.pairwise(boxes):
+        assert one
+        assert other
+        assert one["x"] + one["width"] < other["x"]
     note = shown.locator('[data-role="way-back"]')
     expect(note).to_contain_text("cam1 by 1.000")
     note.get_by_role("button", name="Back to the calibrated position").click()
@@ -271,6 +285,71 @@ def test_subsets_are_drawn_to_scale_and_texture_is_judged(page: Watched, client:
     expect(shown.get_by_text("a subset of 41 px")).to_be_visible()
     shown.get_by_role("button", name="Zoom to the subsets").click()
     assert square.evaluate(ON_SCREEN) == pytest.approx(41 * 6, abs=1)
+    page.sound()
+
+
+def test_each_field_of_a_measurement_says_its_error_beside_itself_and_nothing_is_sent(
+    page: Watched, plate: str
+) -> None:
+    shown = page.open(f"#/test/{plate}")
+    sent: list[str] = []
+    shown.on("request", lambda one: one.method == "POST" and sent.append(one.url))
+    measure = shown.get_by_role("region", name="Region and analysis")
+
+    def beside(label: str) -> Locator:
+        return measure.locator(".field", has=shown.get_by_label(label, exact=True)).get_by_role("alert")
+
+    # the limits are those of the settings
+    for label, limits in (
+        ("Subset", SUBSET_PX),
+        ("Spacing", SPACING_PX),
+        ("Window", STRAIN_WINDOW),
+        ("Smoothing window", SMOOTHING_WINDOW),
+    ):
+        control = measure.get_by_label(label, exact=True)
+        kept = [control.get_attribute(name) for name in ("min", "max", "step")]
+        assert kept == [str(limits.low), str(limits.high), "2" if limits.odd else "1"]
+    for label, text, said in (
+        ("Subset", "32", "Give an odd number, 31 or 33, not 32\u00a0px: it has a middle."),
+        ("Spacing", "0", "Give 1 to 1000\u00a0px, not 0\u00a0px."),
+        ("Window", "", "A window is needed here."),
+        ("Smoothing window", "2", "Give 3 to 51\u00a0points, not 2\u00a0points."),
+        ("Prefilter, sd", "9", "Give a quarter of the subset at most, 8\u00a0px, not 9\u00a0px."),
+        ("Largest sigma of a match", "2", "Give 0.001 to 1\u00a0px, not 2\u00a0px."),
+        ("Steps", "0-7", "There is no step 2: the test has steps 0 to 1."),
+    ):
+        measure.get_by_label(label, exact=True).fill(text)
+        shown.keyboard.press("Tab")
+        expect(beside(label)).to_have_text(said)
+    Editor(shown).drag((90, 80), (170, 160))
+    expect(measure.locator('[data-role="texture"]')).to_have_text("Correct the fields that are marked.")
+    start = measure.get_by_role("button", name="Measure", exact=True)
+    start.click()
+    expect(measure.get_by_label("Subset", exact=True)).to_be_focused()
+    assert sent == []
+    # put right, each takes its error back; without strain its window is not asked about
+    measure.get_by_label("compute strain").uncheck()
+    expect(beside("Window")).to_have_count(0)
+    measure.get_by_label("Subset", exact=True).fill("37")
+    expect(beside("Subset")).to_have_count(0)
+    expect(beside("Prefilter, sd")).to_have_count(0)  # 9 px is a quarter of it
+    for label, text in (
+        ("Spacing", "10"),
+        ("Smoothing window", ""),
+        ("Largest sigma of a match", "0.1"),
+        ("Steps", ""),
+    ):
+        measure.get_by_label(label, exact=True).fill(text)
+    expect(measure.get_by_role("alert")).to_have_count(0)
+    # what cannot stand beside a field is left behind with its screen
+    Editor(shown).key("Control+z")  # the region goes
+    expect(measure.locator('[data-role="texture"]')).to_contain_text("Draw a region")
+    start.click()
+    notice = shown.locator("#notices .notice.bad")
+    expect(notice).to_contain_text("There is no region.")
+    shown.get_by_role("link", name="Jobs & system", exact=True).click()
+    expect(shown.get_by_role("heading", level=1, name="Jobs and system")).to_be_visible()
+    expect(notice).to_have_count(0)
     page.sound()
 
 

@@ -66,10 +66,10 @@ export function allRight(rules) {
 
 /**
  * What is wrong with a number's text, of these limits; empty: nothing.
- * @param {{ low?: number | null, high?: number | null, unit?: string, whole?: boolean, required?: boolean, above?: number, what?: string }} limits
+ * @param {{ low?: number | null, high?: number | null, unit?: string, whole?: boolean, odd?: boolean, required?: boolean, above?: number, what?: string }} limits
  * @returns {(text: string) => string}
  */
-export function numberWithin({ low = null, high = null, unit = "", whole = false, required = true, above, what = "A number" }) {
+export function numberWithin({ low = null, high = null, unit = "", whole = false, odd = false, required = true, above, what = "A number" }) {
   const shown = (/** @type {number} */ value) => `${String(value).replace("-", "−")}${unit ? `\u00a0${unit}` : ""}`;
   return (text) => {
     if (!text) return required ? `${what} is needed here.` : "";
@@ -82,8 +82,30 @@ export function numberWithin({ low = null, high = null, unit = "", whole = false
       if (high === null) return `Give ${shown(low)} at least, not ${shown(value)}.`;
       return `Give ${low} to ${shown(high)}, not ${shown(value)}.`;
     }
+    if (odd && value % 2 === 0) return `Give an odd number, ${[value - 1, value + 1].filter((near) => (low === null || near >= low) && (high === null || near <= high)).join(" or ")}, not ${shown(value)}: it has a middle.`;
     return "";
   };
+}
+
+/**
+ * The rule of a number by the limits that its control has: `min`, `max`, and `step`, 1 for whole numbers, 2 for odd ones.
+ * @param {HTMLInputElement} control
+ * @param {string} what its name in a sentence: "A spacing"
+ * @param {{ unit?: string, required?: boolean, more?: (value: number) => string }} [others] `more` is asked once it is a number within its limits
+ * @returns {[HTMLInputElement, Rule]}
+ */
+export function limited(control, what, { unit = "", required = true, more } = {}) {
+  const [low, high] = [control.min, control.max].map((text) => (text === "" ? null : Number(text)));
+  const within = numberWithin({ low, high, unit, what, required, whole: ["1", "2"].includes(control.step), odd: control.step === "2" });
+  return [control, rule(control, (text) => within(text) || (text && more?.(Number(text)) || ""))];
+}
+
+/**
+ * Take back the errors of fields that were put right by something else than typing.
+ * @param {readonly [Entry, Rule][]} rules
+ */
+export function again(rules) {
+  for (const [control, check] of rules) if (control.getAttribute("aria-invalid") === "true") check();
 }
 
 /**

@@ -83,10 +83,10 @@ async function list(root, testId) {
       ["Test", (one) => h("button.plain", { type: "button", onclick: () => choose(one) }, one.name || one.id)],
       ["Specimen", (one) => one.specimen],
       ["Made", (one) => when(one.created_utc)],
-    ], tests, { caption: "Tests, newest first", onrow: choose, empty: "There is no test yet. Make one on the Test screen." })),
+    ], tests, { caption: "Tests, newest first", onrow: choose, empty: "There is no test yet." })),
     detail));
   if (chosen) choose(chosen);
-  else replace(detail, h("p.quiet", "Results appear here once a test was measured."));
+  else replace(detail, h("p.quiet", "Results appear here once a test was measured."), h("a.button.primary", { href: "#/test" }, "Make a test"));
   return events.on("result", (event) => { if (event.test_id === chosen?.id) choose(chosen); });
 }
 

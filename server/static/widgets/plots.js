@@ -90,10 +90,8 @@ export async function chart(box, { x, y, series, height = 200, data, bars = fals
   };
   box.replaceChildren();
   box.classList.add("chart");
-  box.setAttribute("role", "img");
-  box.setAttribute("aria-label", label ?? `${y} over ${x}`);
   let now = data;
-  const drawn = h("div");
+  const drawn = h("div", { role: "img", "aria-label": label ?? `${y} over ${x}` }); // the buttons below are no part of the picture
   box.append(drawn);
   if (files) box.append(plotButtons(() => ({ x, y, series, data: now, bars, bands, label, said })));
   let plot = new Plot(options(), now, drawn);

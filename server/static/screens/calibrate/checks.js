@@ -1,5 +1,6 @@
 // Checks of a calibration that a user asks for: a known distance, and a second calibration compared in space.
 import * as api from "../../lib/api.js";
+import { allRight, numberWithin, rule, tell } from "../../lib/fields.js";
 import { h, replace, field, number, action, table, definitions, badge, num, quantity, when } from "../../lib/dom.js";
 
 /** @import { Model } from "#routes" */
@@ -45,10 +46,13 @@ export function distanceCheck(document_) {
   const marks = /** @type {const} */ (["cam1", "cam2"]).map((cam) => ({ cam, xy: [0, 1].map((k) => ({ x: number(null, { step: "any", "aria-label": `${cam}, mark ${k + 1}, x` }), y: number(null, { step: "any", "aria-label": `${cam}, mark ${k + 1}, y` }) })) }));
   const distance = number(null, { min: 0, step: "any" });
   const sigma = number(0, { min: 0, step: "any" });
+  const rules = /** @type {[HTMLInputElement, import("../../lib/fields.js").Rule][]} */ ([
+    [distance, rule(distance, numberWithin({ above: 0, unit: "mm", what: "The known distance" }))], [sigma, rule(sigma, numberWithin({ low: 0, unit: "mm", what: "A standard deviation" }))],
+    ...marks.map(({ xy }) => marked(xy.flatMap(({ x, y }) => [x, y]))),
+  ]);
 
   async function check() {
-    const inputs = [distance, ...marks.flatMap(({ xy }) => xy.flatMap(({ x, y }) => [x, y]))];
-    if (inputs.some((input) => input.value === "")) throw api.problemOf({ cause: "Distance or marks are not all given.", remedy: "Give the distance and both marks in both images." });
+    if (!allRight(rules)) return;
     const of = (/** @type {number} */ c) => /** @type {[[number, number], [number, number]]} */ (marks[c].xy.map(({ x, y }) => [Number(x.value), Number(y.value)]));
     const body = { points_px: { cam1: of(0), cam2: of(1) }, distance_mm: Number(distance.value), distance_sigma_mm: Number(sigma.value) };
     replace(found, distanceFound(await api.post(`/calibrations/${/** @type {"{calibration_id}"} */ (document_.id)}/distance:check`, body)));
@@ -60,4 +64,19 @@ export function distanceCheck(document_) {
     h("div.fields", field("Known distance", distance, "mm"), field("its standard deviation", sigma, "mm")),
     marks.map(({ cam, xy }) => h("fieldset", h("legend", `Marks in ${cam}, px`), h("div.row", xy.map(({ x, y }, k) => h("span.control", `${k + 1}: x`, x, "y", y))))),
     h("div.row", action("Check the distance", check)));
+}
+
+/**
+ * The rule of both marks in an image: one error for the four numbers, at the first that is missing.
+ * @param {HTMLInputElement[]} inputs
+ * @returns {[HTMLInputElement, import("../../lib/fields.js").Rule]}
+ */
+function marked(inputs) {
+  const check = () => {
+    const missing = inputs.find((input) => input.value === "" || input.validity.badInput);
+    for (const input of inputs) tell(input, input === missing ? `Give ${input.getAttribute("aria-label")?.split(", ").slice(1).join(", ")}, in px.` : "");
+    return !missing;
+  };
+  for (const input of inputs) input.addEventListener("input", () => inputs.some((one) => one.getAttribute("aria-invalid") === "true") && check());
+  return [inputs[0], check];
 }

@@ -1,6 +1,7 @@
 // A guided acquisition: both cameras live with the target drawn over, what the views cover, and the next view.
 import * as api from "../../lib/api.js";
 import { View, stroke } from "../../widgets/view.js";
+import { allRight, limited, numberWithin, rule } from "../../lib/fields.js";
 import { h, svg, replace, field, number, select, action, badge, num, notify, problemText } from "../../lib/dom.js";
 
 /** @import { Ends } from "#dom" */
@@ -30,9 +31,10 @@ export function guidePanel(rig, ends, done) {
   const automatic = h("input", { type: "checkbox", checked: true });
   const label = h("input", { type: "text", maxlength: 300, placeholder: "purpose" });
   const live = h("div", { "data-role": "guide" });
+  const rules = /** @type {[HTMLInputElement, import("../../lib/fields.js").Rule][]} */ ([[goal, rule(goal, numberWithin({ above: 0, unit: "µm", required: false }))], limited(frames, "A number of frames")]);
   const begin = action("Begin guided acquisition", async () => {
+    if (!allRight(rules)) return;
     const wanted = goal.value.trim() ? Number(goal.value) : null;
-    if (wanted !== null && !(wanted > 0)) throw api.problemOf({ cause: `Goal: “${goal.value}” is not a number above 0.`, remedy: "Write micrometres with a point, as 1.5, or nothing." });
     const { job, calibration_id: id } = await api.post("/calibrations:guide", {
       quantity: /** @type {"z" | "shape"} */ (quantity.value), goal_um: wanted, frames: Number(frames.value), automatic: automatic.checked, label: label.value,
     });

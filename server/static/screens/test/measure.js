@@ -5,6 +5,7 @@ import { greyOf } from "../../widgets/grey.js";
 import { running } from "./running.js";
 import { RegionEditor } from "../../widgets/region_editor.js";
 import { Workspace } from "../../lib/workspace.js";
+import { again, allRight, limited, numberWithin, rule } from "../../lib/fields.js";
 import { draw } from "./drawing.js";
 import { recipesBar } from "./recipes.js";
 import { gaugePx, gaugeText } from "../../widgets/region/gauge.js";
@@ -53,7 +54,7 @@ export async function measurePanel(id, test, ends, done) {
     views[0].svg.insertBefore(sample, views[0].svg.firstChild);
 
     const reference = select([], 0, { "aria-label": "Reference step" });
-    const subset = number(33, { min: 9, max: 255, step: 2 });
+    const subset = number(33, { min: 9, max: 401, step: 2 });
     const spacing = number(10, { min: 1, max: 1000, step: 1 });
     const showSample = h("input", { type: "checkbox", checked: true });
     const showTexture = h("input", { type: "checkbox" });
@@ -91,13 +92,14 @@ export async function measurePanel(id, test, ends, done) {
       replace(sample, parts);
     }
 
+    const correct = (/** @type {HTMLInputElement} */ input) => input.value !== "" && input.checkValidity();
     let asked = 0;
     async function rateTexture() {
       asked += 1;
       const mine = asked;
       const region = editor.region();
-      if (!region) {
-        replace(texture, h("p.quiet", "Draw a region to rate its speckle quality for such subsets."));
+      if (!region || ![subset, spacing].every(correct)) {
+        replace(texture, h("p.quiet", region ? "Correct the fields that are marked." : "Draw a region to rate its speckle quality for such subsets."));
         return;
       }
       try {
@@ -105,7 +107,7 @@ export async function measurePanel(id, test, ends, done) {
         if (mine !== asked) return;
         replace(texture,
           h("p", badge(`${rated.level} speckle quality`, LEVEL[rated.level] ?? ""), ` ${num(100 * rated.good_share, 3)} % of ${count(rated.subsets)} subsets with an expected error below ${rated.good_px} px, ${num(100 * rated.usable_share, 3)} % below ${rated.usable_px} px; median ${quantity(rated.median_error_px, "px", 2)} at a noise of ${num(rated.noise_grey, 3)} grey levels.`),
-          rated.proposed_subset_px && rated.proposed_subset_px !== rated.subset_px ? h("p.row", `Min. subset for this texture: ${rated.proposed_subset_px} px. `, h("button", { type: "button", onclick: () => { subset.value = String(rated.proposed_subset_px); changed(); } }, `Use ${rated.proposed_subset_px} px`)) : null,
+          rated.proposed_subset_px && rated.proposed_subset_px !== rated.subset_px ? h("p.row", `Min. subset for this texture: ${rated.proposed_subset_px} px. `, h("button", { type: "button", onclick: () => { subset.value = String(rated.proposed_subset_px); again(rules); changed(); } }, `Use ${rated.proposed_subset_px} px`)) : null,
           rated.proposed_subset_px ? null : h("p", "No subset up to 91 px is sufficient: the contrast is too low, or the speckles are too coarse."),
           h("details", h("summary", "Other sizes"), table([["Subset", (row) => quantity(row.subset_px, "px"), { numeric: true }], [`below ${rated.good_px} px`, (row) => quantity(100 * row.good_share, "%", 3), { numeric: true }], [`below ${rated.usable_px} px`, (row) => quantity(100 * row.usable_share, "%", 3), { numeric: true }]], rated.sizes, { caption: "Share of the region's subsets with an expected random error" })));
       } catch (error) {
@@ -116,6 +118,7 @@ export async function measurePanel(id, test, ends, done) {
     const found = h("span.quiet", { role: "status", "data-role": "found" });
     const find = action("Find the specimen", async () => {
       found.textContent = "";
+      if (!allRight(rules.filter(([control]) => control === subset))) return;
       const answer = await api.post(`/tests/${id}/region:find`, { reference: Number(reference.value), subset_px: Number(subset.value) });
       const region = /** @type {{ polygon: [number, number][], holes?: [number, number][][] }} */ (answer.region);
       editor.change((state) => Object.assign(state, { outlines: [{ form: "polygon", points: region.polygon }], holes: (region.holes ?? []).map((points) => ({ form: "polygon", points })), mask: null }));
@@ -128,7 +131,7 @@ export async function measurePanel(id, test, ends, done) {
       const on = showTexture.checked;
       overlays.forEach((image) => { image.hidden = !on; });
       legend.textContent = "";
-      if (!on) return;
+      if (!on || !correct(subset)) return;
       const answers = await Promise.all(views.map((_, k) => api.raw(`/tests/${id}/steps/${reference.value}/cam${k + 1}/maps/texture`, { subset_px: Number(subset.value) })));
       legend.textContent = answers[0].headers.get("X-Legend") ?? "";
       const fresh = await Promise.all(answers.map(async (answer) => URL.createObjectURL(await answer.blob())));
@@ -167,7 +170,7 @@ export async function measurePanel(id, test, ends, done) {
       clearTimeout(timer);
       timer = setTimeout(() => { rateTexture(); if (showTexture.checked) layTexture().catch(notify); }, 300);
     }
-    for (const input of [subset, spacing]) input.addEventListener("input", () => Number(input.value) > 0 && changed());
+    for (const input of [subset, spacing]) input.addEventListener("input", changed);
     showSample.addEventListener("change", drawSample);
     showTexture.addEventListener("change", () => layTexture().catch(notify));
     views[0].image.addEventListener("load", drawSample);
@@ -176,11 +179,11 @@ export async function measurePanel(id, test, ends, done) {
     const kind = select([["displacement", "shape and displacement"], ["profile", "shape only"]], "displacement");
     const patch = select([["auto", "auto: affine or quadratic"], ["affine", "affine (plane)"], ["rigid", "rigid (the paper's)"], ["quadratic", "quadratic (curved)"]], "auto");
     const interpolation = select([["quintic", "quintic B-spline"], ["cubic", "cubic B-spline"]], "quintic");
-    const prefilter = number(0, { min: 0, max: 64 });
+    const prefilter = number(0, { min: 0, max: 100.25 });
     const maxSigma = number(0.1, { min: 0.001, max: 1, step: "any" });
-    const smoothing = number(null, { min: 3, step: 2, placeholder: "none" });
+    const smoothing = number(null, { min: 3, max: 51, step: 2, placeholder: "none" });
     const strain = h("input", { type: "checkbox", checked: true });
-    const window_ = number(9, { min: 3, step: 2 });
+    const window_ = number(9, { min: 3, max: 101, step: 2 });
     const order = select([["auto", "planes or quadratics"], [1, "planes"], [2, "quadratics"]], "auto");
     const tensor = select([["green_lagrange", "Green-Lagrange"], ["infinitesimal", "infinitesimal"], ["hencky", "Hencky (logarithmic)"]], "green_lagrange");
     const noiseChoice = select([["", "from the residuals"], ...noise.filter((one) => one.state === "complete" || !one.state).map((one) => [one.id, String(one.plan.label || one.id)])], "");
@@ -200,18 +203,36 @@ export async function measurePanel(id, test, ends, done) {
       drawGauge();
     }
     function drawGauge() {
-      const { text, warning } = strain.checked ? gaugeText(gaugePx(Number(window_.value), Number(spacing.value), Number(subset.value)), mmPerPx, editor.width()) : { text: "", warning: "" };
+      const { text, warning } = strain.checked && [window_, spacing, subset].every(correct) ? gaugeText(gaugePx(Number(window_.value), Number(spacing.value), Number(subset.value)), mmPerPx, editor.width()) : { text: "", warning: "" };
       gauge.textContent = text;
       gaugeWarning.textContent = warning;
       gaugeWarning.hidden = !warning;
     }
     for (const input of [window_, strain]) input.addEventListener("input", drawGauge);
+    const rules = /** @type {[HTMLInputElement, import("../../lib/fields.js").Rule][]} */ ([
+      limited(subset, "A subset", { unit: "px" }), limited(spacing, "A spacing", { unit: "px" }),
+      limited(prefilter, "A prefilter", { unit: "px", more: (sd) => (sd > Number(subset.value) / 4 ? `Give a quarter of the subset at most, ${Number(subset.value) / 4}\u00a0px, not ${sd}\u00a0px.` : "") }),
+      limited(maxSigma, "A largest sigma", { unit: "px" }), limited(smoothing, "A window", { unit: "points", required: false }),
+      [window_, rule(window_, (text) => (strain.checked ? windowWrong(text) : ""))], [which, rule(which, stepsWrong)],
+    ]);
+    for (const input of [subset, strain, follow_]) input.addEventListener("input", () => again(rules)); // others' limits hang on these
+    const windowWrong = numberWithin({ low: Number(window_.min), high: Number(window_.max), unit: "points", whole: true, odd: true, what: "A window" });
+    /** @param {string} text of the steps */
+    function stepsWrong(text) {
+      try {
+        const there = (test.steps ?? []).map((one) => one.n);
+        const missing = follow_.checked ? undefined : stepList(text)?.find((n) => !there.includes(n));
+        return missing === undefined ? "" : `There is no step ${missing}: the test has ${there.length === 1 ? `step ${there[0]}` : `steps ${there[0]} to ${there.at(-1)}`}.`;
+      } catch (error) {
+        const { message, remedy } = /** @type {api.Problem} */ (error);
+        return `${message} ${remedy}`;
+      }
+    }
 
     // kept with the test as it is drawn; taken from elsewhere
     const workspace = await Workspace.open(id);
     ends.push(() => { workspace.close(); });
     let ready = false;
-    const correct = (/** @type {HTMLInputElement} */ input) => input.value !== "" && input.checkValidity();
     /** @returns {Model<"RecipeSettings">} */
     function settings() {
       const before = /** @type {Model<"RecipeSettings">} */ (workspace.value.settings ?? {});
@@ -224,6 +245,7 @@ export async function measurePanel(id, test, ends, done) {
         const value = correct(input) ? Number(input.value) : before[name]; // one that is being typed is not kept yet
         if (value !== undefined) found[name] = value;
       }
+      if ((found.prefilter_px ?? 0) > (found.subset_px ?? 0) / 4) found.prefilter_px = 0; // as one that is being typed
       found.smoothing_window = smoothing.value === "" ? null : correct(smoothing) ? Number(smoothing.value) : before.smoothing_window ?? null;
       if (strain.checked) found.strain = /** @type {Request["strain"]} */ ({ ...(correct(window_) ? { window: Number(window_.value) } : {}), order: order.value === "auto" ? "auto" : Number(order.value), tensor: tensor.value });
       return found;
@@ -248,6 +270,7 @@ export async function measurePanel(id, test, ends, done) {
       if (set.strain?.order) order.value = String(set.strain.order);
       if (set.strain?.tensor) tensor.value = set.strain.tensor;
       draw(editor, recipe);
+      again(rules);
       drawGauge();
     }
     /** @param {Recipe} recipe */
@@ -262,6 +285,7 @@ export async function measurePanel(id, test, ends, done) {
     body.addEventListener("input", keep);
     body.addEventListener("change", keep);
     const start = action("Measure", async () => {
+      if (!allRight(rules)) return;
       const region = editor.region();
       if (!region) throw api.problemOf({ cause: "There is no region.", remedy: "Draw a rectangle or a polygon over camera 1's image." });
       /** @type {Request} */

@@ -26,7 +26,7 @@ function row(editor, label, form, points, put, remove) {
     else if (form !== "seed" && form !== "crack" && trouble({ form, points: read })) wrong.textContent = trouble({ form, points: read });
     else editor.change((state) => put(state, circle ? [editor.inside(read[0]), [editor.inside(read[0])[0] + read[1][0] - read[0][0], editor.inside(read[0])[1]]] : read.map((p) => editor.inside(p))));
   });
-  return h("div.row", h("span", { style: { minWidth: "6.5rem" } }, label), h("span", { style: { flex: 1, minWidth: "9rem", display: "grid" } }, input, wrong), h("span.unit", "px"),
+  return h("div.row", h("span", { style: { minWidth: "6.5rem" } }, label), h("span", { style: { flex: 1, minWidth: "9rem", display: "grid", gridTemplateColumns: "minmax(0, 1fr)" } }, input, wrong), h("span.unit", "px"),
     h("button", { type: "button", "aria-label": `Delete ${label}`, onclick: () => editor.change(remove) }, "Delete"));
 }
 
