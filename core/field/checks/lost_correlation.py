@@ -31,6 +31,7 @@ _SHAPE_FACTOR, _SHAPE_LOSS = 12.0, 0.04
 _WIDER = 3  # so far about a point that a crack is in a small part of it
 _FEW = 12
 _LEAST = 1e-7
+_LOST = 0.25  # share of the points about a point from which on the others are no measure
 _UNTRIED = (PointStatus.MASKED, PointStatus.OUTSIDE_IMAGE, PointStatus.LOW_TEXTURE)
 
 
@@ -102,7 +103,7 @@ def lost_correlation(
             level = np.maximum(level, 1.0 - points.zncc[:, 0])
         expected[:, k] = level * allowed
     if points.zncc.shape[1] > 1:
-        expected[:, 1:] = np.minimum(expected[:, 1:], _where_most_are_lost(points, shape, reach, texture, limits))
+        expected[:, 1:] = np.minimum(expected[:, 1:], _where_many_are_lost(points, shape, reach, texture, limits))
     with np.errstate(invalid="ignore"):
         suspect = np.flatnonzero(ok & (1.0 - points.zncc > expected).any(axis=1))
     if len(suspect):
@@ -116,17 +117,17 @@ def lost_correlation(
     return bad
 
 
-def _where_most_are_lost(
+def _where_many_are_lost(
     points: PointFits, shape: tuple[int, int], reach: int, texture: Float, limits: CorrelationLimits
 ) -> Float:
-    """(n, k - 1) largest loss in time where most points are lost; inf elsewhere.
+    """(n, k - 1) largest loss in time where many points are lost; inf elsewhere.
 
     What is left of a part that something else is seen in is no measure of what is usual there: the parts that kept most
     of their points are, and what the point lost between the cameras before anything happened.
     """
     ok = points.ok
     tried = ~np.isin(points.status, _UNTRIED)
-    kept = block_medians(ok.astype(float), tried, shape, reach, otherwise=1.0) > 0.5
+    kept = block_medians(ok.astype(float), tried, shape, reach, otherwise=1.0, quantile=_LOST) > 0.5
     late = np.where(ok[:, None], np.maximum(1.0 - points.zncc, _LEAST), 1.0)
     level = np.repeat(late[:, :1], late.shape[1] - 1, axis=1)
     sound = ok & kept
