@@ -75,9 +75,10 @@ def test_rig(page: Watched, audit: Audit) -> None:
 
 def test_calibrate(page: Watched, bench: Bench, audit: Audit) -> None:
     at = page.open("#/calibrate")
-    expect(at.get_by_text("middle of the volume")).to_be_visible()
+    expect(at.get_by_text("middle of the volume")).to_be_attached()  # folded
     expect(at.get_by_role("region", name="Views")).to_be_visible()
     unfold(at)
+    expect(at.get_by_text("middle of the volume")).to_be_visible()
     audit("a calibration")
     at.get_by_role("button", name="Discard").first.click()
     expect(at.get_by_role("dialog")).to_be_visible()
