@@ -166,7 +166,7 @@ def test_an_analysis_takes_what_it_leaves_out_from_a_recipe(client: httpx.Client
     assert settings["region"]["rectangle"] == [60, 60, 90, 90]
     # and its region and settings can be taken again
     again = client.get(f"{url}/recipe").json()
-    assert again["region"] == {"rectangle": [60, 60, 90, 90], "cracks": [], "holes": []}
+    assert again["region"] == {"rectangle": [60, 60, 90, 90], "outlines": [], "cracks": [], "holes": []}
     assert (again["settings"]["spacing_px"], again["settings"]["kind"]) == (15, "profile")
     assert again["image_size_px"] == [160, 144]
     assert client.put(f"{API}/tests/{measurable}/workspace", json=again).status_code == 200

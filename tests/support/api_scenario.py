@@ -163,7 +163,7 @@ def run(client: httpx.Client, description: dict[str, Any]) -> Session:
     session.call("get_noise_file", noise["noise_id"])
     test = _test(session, calibration)
     analysis = _analysis(session, test)
-    _results(session.call, test, analysis)
+    _results(session, test, analysis)
     _ends(session, test, analysis, calibration, noise["noise_id"])
     return session
 
@@ -192,6 +192,7 @@ def _read_everything(call: Callable[..., httpx.Response]) -> None:
         call(operation)
     etag = call("get_camera", "cam1").headers["ETag"]
     call("patch_camera", "cam1", summary="Expose for 12 ms", body={"exposure_ms": 12.0}, headers={"If-Match": etag})
+    call("expose", "cam1", summary="Until the brightest hundredth is at 0.7 of full scale", body={"level": 0.7})
     call("patch_camera", "cam1", body={"exposure_ms": 10.0})
     call("get_frame", "cam1")
     call("get_pixel", "cam1", query={"x_px": 128, "y_px": 120})
@@ -237,6 +238,7 @@ def _calibration(session: Session) -> str:
     call("list_calibrations")
     call("get_calibration", calibration)
     call("get_calibration_file", calibration)
+    call("get_geometry", calibration)
     call("list_views", calibration)
     call("get_residuals", calibration)
     call("get_view", calibration, 0, "cam1")
@@ -257,6 +259,7 @@ def _calibration(session: Session) -> str:
     )
     decision = {"decision": "accepted", "note": "held-out residuals are small"}
     call("put_review", calibration, summary="Measure with it from now on", body=decision)
+    call("check_calibration")
     second = call(
         "import_calibration",
         summary="Both cameras as calibration.json",
@@ -340,6 +343,15 @@ def _test(session: Session, calibration: str) -> str:
     call("post_channels", test, body={"load_n": 1811.0})
     call("end_watch", test)
     call("rate_texture", test, 0, summary="Subsets of 21 px", body={"region": REGION, "subset_px": 21})
+    call("show_scale", test, query={"step": 0})
+    drawn = {"region": {"rectangle": [60, 60, 200, 180]}, "settings": {"subset_px": 21, "spacing_px": 10}}
+    call("put_workspace", test, summary="A region, subset and step", body=drawn)
+    call("get_workspace", test)
+    recipe = call("create_recipe", summary="For the next plates", body={"name": "plate", "recipe": drawn}).json()["id"]
+    call("list_recipes")
+    etag = call("get_recipe", recipe).headers["ETag"]
+    call("patch_recipe", recipe, summary="New name", body={"name": "plates"}, headers={"If-Match": etag})
+    call("delete_recipe", recipe)
     call("find_region", test, summary="On the specimen", body={"subset_px": 21})
     call("check_seeds", test, summary="One seed", body={"seeds": [[128, 120]], "seeds_cam2": [[128, 120]]})
     call("delete_step", test, imported)
@@ -368,6 +380,7 @@ def _analysis(session: Session, test: str) -> str:
     call("finish_analysis", test, other["analysis_id"])
     wait_for_job(client, again.json()["job"])
     call("delete_analysis", test, other["analysis_id"])
+    call("get_analysis_recipe", test, made["analysis_id"])
     call("list_analyses", test)
     call("get_analysis", test, made["analysis_id"])
     return str(made["analysis_id"])
@@ -380,7 +393,8 @@ def _until(true: Callable[[], bool], seconds: float = 240.0) -> None:
         time.sleep(0.05)
 
 
-def _results(call: Callable[..., httpx.Response], test: str, analysis: str) -> None:
+def _results(session: Session, test: str, analysis: str) -> None:
+    call, client = session.call, session.client
     call("list_fields", test, analysis, 1)
     part = {"rows": "0:2", "cols": "0:3"}
     for form in ("json", "npy", "csv", "nc", "f32", "png"):
@@ -417,6 +431,9 @@ def _results(call: Callable[..., httpx.Response], test: str, analysis: str) -> N
     )
     for form in ("csv", "nc"):
         call("export", test, analysis, query={"format": form, "step": 1})
+    begun = call("begin_export", test, analysis, query={"format": "csv", "step": 1}).json()["job"]
+    wait_for_job(client, begun)
+    call("job_file", begun["id"])
     call("get_report", test, analysis)
 
 
