@@ -40,7 +40,12 @@ covered too little in three trial replicates, and at 1.8 px pictures without noi
 three samples a side, the interpolation, or both may be the cause, which was not told apart, so that finer speckle is not proven here.
 A tilt of 1 mrad with its prior off did not fail on so small a sensor, nor did spatially correlated noise declared white, which the
 residual test sees: the control of the tilt is one of 20 mrad, and that of whiteness is noise of the reference taken for new in
-each step."""
+each step.
+
+The replicates of the strata with a tilt of 1 mrad are older than its present treatment (a tilt is held at its prior unless the views
+tell it better; fitted beside a distortion that the nodes' errors feign it claimed to be known): calibrations alone, drawn 150 times,
+have since a squared error over variance of a length of 0.87 +- 0.09, in place of 1.51, and cover it by 97 %. These strata are to be
+drawn anew."""
 
 
 def pools() -> dict[str, Pool]:
@@ -64,7 +69,9 @@ def text(by_name: dict[str, Pool]) -> str:
     others = [by_name[s.name] for s in OTHERS if s.name in by_name]
     covering = [p for p in (*main, *others) if p.stratum.must == "cover" and p.replicates >= LEAST]
     least = min(p.replicates for p in main) if main else 0
-    lines = [f"## {TITLE}", "", " ".join(_HOW.split()), "", " ".join(_CHOSEN.split()), ""]
+    lines = [f"## {TITLE}", "", " ".join(_HOW.split()), ""]
+    for paragraph in _CHOSEN.split("\n\n"):
+        lines += [" ".join(paragraph.split()), ""]
     if least < MAIN_REPLICATES:
         lines += [f"This page was written from {least} of {MAIN_REPLICATES} replicates of each main stratum.", ""]
     lines += _asked(main, covering) if covering else []
@@ -92,7 +99,6 @@ def _asked(main: Sequence[Pool], covering: Sequence[Pool]) -> list[str]:
     nees = [(mean(p.of(m), lambda c: c.nees), p.stratum.name, m) for p in main for m in p.motions()]
     total = 100.0 * mean(cells, lambda c: c.coverage)
     worst = [100.0 * v[2] for v in (low, high)]
-    inside = "yes" if worst[0] >= 92.0 and worst[1] <= 98.0 else "**no**"
     narrow, wide = min(nees), max(nees)
     every, sharp = mean(cells, lambda c: c.nees), sharpness(cells)
     return [
@@ -101,9 +107,9 @@ def _asked(main: Sequence[Pool], covering: Sequence[Pool]) -> list[str]:
         f"| coverage of 95 % intervals, mean of all {len(cells)} cells of {len(covering)} strata | {total:.1f} % | "
         f"94 to 96 % | {_between(94.0, total, 96.0)} |",
         f"| lowest motion of a main stratum ({low[0].stratum.name}: {low[1]}; +- {100 * low[3]:.1f}) | {worst[0]:.1f} % "
-        f"| 92 to 98 % | {inside} |",
+        f"| 92 to 98 % | {_between(92.0, worst[0], 98.0)} |",
         f"| highest ({high[0].stratum.name}: {high[1]}; +- {100 * high[3]:.1f}) | {worst[1]:.1f} % | 92 to 98 % "
-        f"| {inside} |",
+        f"| {_between(92.0, worst[1], 98.0)} |",
         f"| squared error over variance, mean of all cells | {every:.3f} | 0.95 to 1.05 | {_between(0.95, every, 1.05)} |",
         f"| the same, lowest motion of a main stratum ({narrow[1]}: {narrow[2]}) | {narrow[0]:.2f} | 0.85 to 1.2 | "
         f"{_between(0.85, narrow[0], 1.2)} |",
