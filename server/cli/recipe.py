@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from core.errors import InputError
+from core.field.region.outlines import outlines_of
 from core.settings import Outline
 from server.api.models.recipes import Recipe, recipe_in
 from server.formats.files import make_folder, write_bytes
@@ -78,8 +79,7 @@ def with_recipe(args: argparse.Namespace) -> tuple[argparse.Namespace, Recipe | 
         filled.crack = args.crack or [_text(v for point in line for v in point) for line in region.cracks]
         filled.hole = args.hole or [_text(v for point in line for v in point) for line in region.holes]
         if args.roi is None and args.mask is None:
-            own = Outline.model_construct(rectangle=region.rectangle, polygon=region.polygon, circle=None)
-            filled.roi = [text for one in (own, *region.outlines) if (text := _outline_text(one))] or None
+            filled.roi = [_outline_text(one) for one in outlines_of(region)] or None
     return filled, recipe
 
 
@@ -104,13 +104,13 @@ def notes_on(recipe: Recipe | None) -> Sequence[str]:
     return notes
 
 
-def _outline_text(one: Outline) -> str | None:
-    """Return an outline as ``--roi`` takes it; None if it has no form."""
+def _outline_text(one: Outline) -> str:
+    """Return an outline as ``--roi`` takes it."""
     if one.rectangle is not None:
         return _text(one.rectangle)
     if one.polygon is not None:
         return "polygon:" + _text(v for corner in one.polygon for v in corner)
-    return None if one.circle is None else "circle:" + _text(one.circle)
+    return "circle:" + _text(one.circle or ())
 
 
 def _text(values: Iterable[float]) -> str:

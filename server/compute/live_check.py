@@ -24,9 +24,8 @@ _COARSE_PX = 1.0  # features are found to 0.7 px: above it they say more than su
 def check_live(task: LiveCheckTask) -> LiveFinding:
     """Return the offset from the epipolar lines.
 
-    A surface is measured as a test's reference would
-    be, on a coarse grid over the whole image. Where the cameras turned so far that nothing matches, the offset is that
-    of features, to some tenths of a pixel.
+    A surface is measured as a test's reference would be, on a coarse grid over the whole image. Where the cameras
+    turned so far that nothing matches, the offset is that of features, to some tenths of a pixel.
     """
     loaded = load_calibration(task.calibration)
     images = [MeasureImage(task.pixels[k], f"camera {k + 1}'s live image") for k in range(2)]
@@ -35,7 +34,6 @@ def check_live(task: LiveCheckTask) -> LiveFinding:
     margin = options.subset_px // 2 + 1
     spacing = max(_SPACING_PX, float(np.sqrt(rows * cols / _POINTS)))
     own = own_px_of(loaded)
-    found = None
     try:
         grid = PointGrid.rectangle(margin, margin, cols - 1 - margin, rows - 1 - margin, spacing_px=spacing)
         shape = measure_shape(loaded.pair, images[0], images[1], grid, options)

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from core.calibration.checks.measures import focal_lengths_px
 from core.names import CAMERAS, CameraName
 from core.pattern import PatternSize, pattern_size
 from server.config.camera_metadata import CameraMetadata, LensMetadata, merged
@@ -101,7 +102,7 @@ def _lens_items(source: Source, cameras: dict[CameraName, CameraMetadata]) -> li
         if source.calibration is None:
             return None
         lens, pixel = getattr(source.calibration.pair, cam).lens, cameras[cam].pixel_um
-        phd = float(lens.phd_px if hasattr(lens, "phd_px") else lens.fx_px)
+        phd = focal_lengths_px(lens)[0]
         mm = "" if pixel is None else f" = {phd * pixel / 1000.0:.2f} mm"
         return Value(f"{phd:.1f} px{mm}", phd, CALIBRATION)
 

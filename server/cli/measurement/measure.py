@@ -160,7 +160,7 @@ def run(args: argparse.Namespace) -> int:
         asked = _frame(args)
         job = _prepare(args, progress)
         summary = measure_sequence(job, progress)
-        files = [job.out / f"step_{one['n']:04d}.nc" for one in summary["steps"]]
+        files = [job.out / one["file"] for one in summary["steps"]]
         frame = read_head(files[-1]).frame if asked is None else put_into_frame(files, asked)
         write_bytes(job.out / "summary.json", to_json({**summary, "frame": frame}))
         progress.note(f"frame of the files: {frame}")

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from fastapi import APIRouter, File, Form, Query, UploadFile
 
-from core.cameras.lens import OpenCVLens, SeidelLens
+from core.calibration.checks.measures import focal_lengths_px
 from core.errors import InputError
 from core.names import CAMERAS, CameraName
 from server.api.models.calibration_checks import (
@@ -58,9 +58,8 @@ def get_geometry(service: ServiceDep, calibration_id: CalibrationId) -> Geometry
     def seen(cam: CameraName) -> dict[str, object]:
         assert found is not None
         view, um, lens = found.views[cam], pitch_um[cam], (pair.cam1 if cam == "cam1" else pair.cam2).lens
-        phd_px = lens.phd_px if isinstance(lens, SeidelLens) else lens.fx_px if isinstance(lens, OpenCVLens) else None
         return {
-            "focal_length_mm": None if um is None or phd_px is None else 1e-3 * um * phd_px,
+            "focal_length_mm": None if um is None else 1e-3 * um * focal_lengths_px(lens)[0],
             "standoff_mm": view.standoff_mm,
             "field_of_view_mm": view.field_of_view_mm,
             "scale_mm_per_px": view.scale_mm_per_px,
