@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from core.arrays import Bool
 from core.field.checks.lost_correlation import CorrelationLimits, lost_correlation
 from core.field.points.fitter import PointFits
 from core.status import PointStatus
@@ -42,3 +43,34 @@ def test_a_slope_keeps_its_points_and_a_spot_in_the_plane_does_not() -> None:
     )
     assert lost[spot].all()
     assert not lost[~spot].any()
+
+
+def test_what_is_left_where_most_is_lost_is_no_measure_of_what_is_usual() -> None:
+    rng = np.random.default_rng(5)
+    points = PointFits.empty(len(XY), 3)
+    points.status[:] = PointStatus.OK
+    points.w[:] = plane_w(0.0, 0.0)
+    points.G[:] = 0.0
+    points.G[:, :, 0], points.G[:, 0, 1], points.G[:, 1, 2] = RAYS, 1.0, 1.0  # nothing has moved
+    # all points lose a hundred times more in time than between the cameras before anything happened
+    usual = np.array([0.002, 0.2, 0.2])
+    points.zncc[:] = 1.0 - usual * np.exp(0.1 * rng.standard_normal(points.zncc.shape))
+
+    def lost() -> Bool:
+        return lost_correlation(
+            points,
+            pair=pair(),
+            shape=GRID.shape,
+            xy_px=XY,
+            rays=RAYS,
+            texture=np.full(len(XY), 900.0),
+            subset_px=33,
+            limits=CorrelationLimits(6.0, 2.0, 6.0),
+        )
+
+    # as a blur does: every point is there, and may
+    assert not lost().any()
+    # as another pattern does: most are lost, and what is left shows it, too
+    points.status[rng.uniform(size=len(XY)) < 0.6] = PointStatus.NOT_SEEDED
+    assert points.ok.sum() > 50
+    assert lost()[points.ok].all()
