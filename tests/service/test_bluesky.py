@@ -18,7 +18,7 @@ from server.workflows.service import Service
 from tests.support.document_scripts import WRITTEN, one_block, run
 from tests.support.service_rig import SMALL, served, true_cameras, wait_for_rig
 
-PAGE = "docs/how_to/bluesky.md"
+PAGE = "docs/tutorial/bluesky.md"
 MISSING = [name for name in ("bluesky", "ophyd_async") if importlib.util.find_spec(name) is None]
 
 

@@ -169,7 +169,7 @@ def recipe_in(document: object, *, name: str) -> Recipe:
         raise InputError(
             f"{name}: {where}{first.problem}.",
             code="recipe_invalid",
-            remedy="Correct it; docs/how_to/recipes.md describes the file.",
+            remedy="Correct it; docs/reference/recipe_file.md describes the file.",
         ) from error
 
 
