@@ -63,13 +63,6 @@ def made() -> Made:
     return Made()
 
 
-def sound(page: Watched, *expected: int) -> None:
-    """Nothing went elsewhere, no error, nothing refused; a camera that is busy with a capture may have no figures."""
-    busy = [line for line in page.refused if line.startswith("409")]
-    assert [one for one in busy if not re.search(r"/cameras/cam[12]/stats$", one)] == []
-    page.sound(*expected, *([409] if busy else []))
-
-
 def go(shown: Page, screen: str, heading: str) -> None:
     """Choose a screen in the bar."""
     shown.get_by_role("navigation", name="Screens").get_by_role("link", name=screen, exact=True).click()
@@ -230,7 +223,7 @@ def test_from_the_rig_to_the_report(page: Watched, client: httpx.Client, made: M
             re.compile(r"^(\d(\.\d)?|\d\d)\u00a0s$|^\d+\u00a0min( \d+\u00a0s)?$")
         )
     audit("8 jobs")
-    sound(page)
+    page.sound_beside_captures()
 
 
 def check_field(shown: Page, client: httpx.Client, test_id: str) -> None:
@@ -371,7 +364,7 @@ def test_a_calibration_that_is_refused(page: Watched, client: httpx.Client, made
     choice = shown.get_by_label("Calibration", exact=True)
     expect(choice).to_have_value(made.calibration_id)
     assert refused["id"] not in [option.get_attribute("value") for option in choice.locator("option").all()]
-    sound(page)
+    page.sound_beside_captures()
 
 
 def test_a_camera_lost_in_mid_run(page: Watched, client: httpx.Client, service: Service, made: Made) -> None:
@@ -415,7 +408,7 @@ def test_a_camera_lost_in_mid_run(page: Watched, client: httpx.Client, service: 
     for cam in ("cam1", "cam2"):
         stored = client.get(f"{API}/tests/{made.test_id}/steps/{len(steps)}/{cam}", params={"format": "png"}).content
         assert Image.open(io.BytesIO(stored)).size == (WIDTH, HEIGHT)
-    sound(page, 503)
+    page.sound_beside_captures(503)
 
 
 def test_a_job_that_is_cancelled(page: Watched, client: httpx.Client, made: Made) -> None:
@@ -441,4 +434,4 @@ def test_a_job_that_is_cancelled(page: Watched, client: httpx.Client, made: Made
     go(shown, "Results", "Results")
     shown.get_by_role("link", name="too fine").click()
     expect(shown.get_by_text("cancelled", exact=True).first).to_be_visible()
-    sound(page)
+    page.sound_beside_captures()

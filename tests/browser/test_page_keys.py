@@ -15,7 +15,7 @@ from server.config.rig_file import parse_config
 from server.workflows.service import Service
 from tests.support.page_bench import FOCUS, UNREACHED, Watched, tabbed
 from tests.support.page_editor import asked
-from tests.support.service_rig import SMALL, new_test, true_cameras
+from tests.support.service_rig import SMALL, plate_test
 
 pytestmark = pytest.mark.timeout(300)
 expect.set_options(timeout=30_000)  # the machine may be busy
@@ -32,13 +32,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
 
 @pytest.fixture(scope="module")
 def plate(client: httpx.Client) -> str:
-    """A test with one step of the plate, its calibration imported."""
-    cameras = json.dumps(true_cameras(SMALL))
-    calibration = client.post(f"{API}/calibrations:import", files={"file": ("c.json", cameras)}).json()["id"]
-    test_id = new_test(client, name="plate", calibration_id=calibration)
-    client.put(f"{API}/sim/scene", json={"scene": "plate", "load": 0.0}).raise_for_status()
-    client.post(f"{API}/tests/{test_id}/steps", json={"label": "0"}).raise_for_status()
-    return test_id
+    return plate_test(client)
 
 
 def focused(at: Page) -> str:

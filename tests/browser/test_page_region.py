@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from server.config.rig_file import parse_config
 from server.workflows.service import Service
 from tests.support.page_bench import Watched
 from tests.support.page_editor import HEIGHT, WIDTH, Editor, posted
-from tests.support.service_rig import SMALL, new_test, true_cameras
+from tests.support.service_rig import SMALL, plate_test
 
 pytestmark = pytest.mark.timeout(300)
 API = "/api/v1"
@@ -33,11 +32,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
 
 @pytest.fixture(scope="module")
 def plate(client: httpx.Client) -> str:
-    sent = client.post(f"{API}/calibrations:import", files={"file": ("c.json", json.dumps(true_cameras(SMALL)))})
-    test_id = new_test(client, name="plate", calibration_id=str(sent.json()["id"]))
-    client.put(f"{API}/sim/scene", json={"scene": "plate", "load": 0.0}).raise_for_status()
-    client.post(f"{API}/tests/{test_id}/steps", json={"label": "reference"}).raise_for_status()
-    return test_id
+    return plate_test(client)
 
 
 def press(shown: Page, *names: str) -> None:

@@ -101,7 +101,7 @@ def test_make_tell_capture(page: Watched, client: httpx.Client, calibration: str
     expect(quality).to_contain_text(f"{step['quality']['cam2']['focus']:.3f}"[:4])
     thumbnail = shown.locator('[data-step="0"] img')
     shown.wait_for_function("image => image.naturalWidth === 132", arg=thumbnail.element_handle())
-    page.sound(409)  # no figures of a camera whose first frame a capture holds up
+    page.sound_beside_captures()
 
 
 def test_the_path_leads_back_to_the_test_and_its_parts_and_ticks_what_is_done(page: Watched, plate: str) -> None:

@@ -151,7 +151,7 @@ def test_the_tutorial_leads_from_the_grid_to_the_strain_map(chromium: Browser, c
         for one in asked:
             operator.do(one)
         strain_is_drawn(page.page)
-        page.sound(409)  # a camera that is busy with a capture has no figures
+        page.sound_beside_captures()
     test_id = client.get(f"{API}/tests").json()["tests"][-1]["id"]
     analysis = client.get(f"{API}/tests/{test_id}").json()["analyses"][-1]["id"]
     path = f"{API}/tests/{test_id}/analyses/{analysis}"

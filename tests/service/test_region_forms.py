@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 
 import httpx
@@ -12,7 +11,7 @@ import pytest
 from core.cameras.camera import Camera
 from server.config.rig_file import parse_config
 from server.workflows.service import Service
-from tests.support.service_rig import SMALL, new_test, true_cameras, wait_for_job
+from tests.support.service_rig import SMALL, new_test, plate_test, true_cameras, wait_for_job
 
 API = "/api/v1"
 
@@ -26,11 +25,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
 
 @pytest.fixture(scope="module")
 def plate(client: httpx.Client) -> str:
-    sent = client.post(f"{API}/calibrations:import", files={"file": ("c.json", json.dumps(true_cameras(SMALL)))})
-    test_id = new_test(client, name="plate", calibration_id=str(sent.json()["id"]))
-    client.put(f"{API}/sim/scene", json={"scene": "plate", "load": 0.0}).raise_for_status()
-    client.post(f"{API}/tests/{test_id}/steps", json={"label": "reference"}).raise_for_status()
-    return test_id
+    return plate_test(client)
 
 
 def test_outlines_that_do_not_touch_are_measured_each(client: httpx.Client, plate: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -75,6 +76,12 @@ class Watched:
         # the browser itself reports a refused request as an error of the console
         unexpected = [line for line in self.complaints if not ("Failed to load resource" in line and expected)]
         assert unexpected == []
+
+    def sound_beside_captures(self, *expected: int) -> None:
+        """Assert as :meth:`sound`; a camera that is busy with a capture may have no figures."""
+        busy = [line for line in self.refused if line.startswith("409")]
+        assert [one for one in busy if not re.search(r"/cameras/cam[12]/stats$", one)] == []
+        self.sound(*expected, *([409] if busy else []))
 
 
 def browser() -> contextlib.AbstractContextManager[Browser]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import socket
 import threading
 import time
@@ -105,6 +106,15 @@ def new_test(client: httpx.Client, **body: Any) -> str:
     answer = client.post("/api/v1/tests", json={"name": "a test", **body})
     assert answer.status_code == 201, answer.text
     return str(answer.json()["id"])
+
+
+def plate_test(client: httpx.Client) -> str:
+    """Make a test with one step of the plate, unloaded, and the true calibration of the small rig."""
+    sent = client.post("/api/v1/calibrations:import", files={"file": ("c.json", json.dumps(true_cameras(SMALL)))})
+    test_id = new_test(client, name="plate", calibration_id=str(sent.json()["id"]))
+    client.put("/api/v1/sim/scene", json={"scene": "plate", "load": 0.0}).raise_for_status()
+    client.post(f"/api/v1/tests/{test_id}/steps", json={"label": "reference"}).raise_for_status()
+    return test_id
 
 
 def data_of(path: Path) -> Path:
