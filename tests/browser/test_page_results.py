@@ -300,9 +300,9 @@ def answer_of(at: Page, role: str) -> Any:
 
 
 def wait_for_chart(at: Page, role: str, condition: str, arg: Any = None) -> None:
-    """Wait until what a chart shows fulfils a condition on ``a``, its answer, and ``arg``."""
-    answer = f"const a = JSON.parse(document.querySelector('[data-role={role}]').dataset.answer)"
-    at.wait_for_function(f"arg => {{ {answer}; return {condition} }}", arg=arg)
+    """Wait until a chart has an answer ``a`` that fulfils a condition on it and ``arg``."""
+    answer = f"const a = JSON.parse(document.querySelector('[data-role={role}]')?.dataset.answer ?? 'null')"
+    at.wait_for_function(f"arg => {{ {answer}; return a !== null && ({condition}) }}", arg=arg)
 
 
 def test_a_line_reads_what_the_gauges_read(page: Watched, bench: Bench) -> None:
