@@ -12,7 +12,8 @@ import pytest
 from tests.bench.coverage.chain import run
 from tests.bench.coverage.coverage import append, kept, replicate, wanted
 from tests.bench.coverage.draw import drawn
-from tests.bench.coverage.page import TILTED
+from tests.bench.coverage.figures import TILTED, Kept, figures_of, read_figures, write_figures
+from tests.bench.coverage.page import text
 from tests.bench.coverage.pooled import WHITE, mean, pooled
 from tests.bench.coverage.score import MEAN, OFF, SHAPE, scored
 from tests.bench.coverage.strata import CONTROLS, MAIN, STRATA, Stratum
@@ -69,6 +70,28 @@ def test_cells_are_pooled_over_replicates() -> None:
     # between replicates 1 and 0.5: their standard error
     assert pool.coverage("shape") == pytest.approx((0.75, 0.25))
     assert pooled(OF_4_UM, entries, control=OFF).cells[0].coverage == 0.0
+
+
+def test_a_stratum_drawn_anew_takes_the_place_of_its_kept_figures_and_no_other(tmp_path: Path) -> None:
+    path = tmp_path / "figures.json"
+    one, two = MAIN[:2]
+    older = {"shape|X": [100, 90, 110.0, 2.0, 8.0], "w of 2 mm|w": [100, 92, 120.0, 1.0, 1.0]}
+    newer = {"shape|X": [100, 97, 90.0, 2.0, 8.0], "w of 2 mm|w": [100, 99, 80.0, 1.0, 1.0]}
+    entries = [{"seed": k, "cells": older, "reasons": [], "warnings": []} for k in range(2)]
+    write_figures(
+        Kept({s.name: figures_of(s, entries, "2026-01-01") for s in (one, two)}, {"2026-01-01": (1, 4)}), path
+    )
+    shown = read_figures(path)
+    again = tmp_path / "again.json"
+    write_figures(shown, again)
+    assert again.read_text() == path.read_text()
+    shown.strata[two.name] = figures_of(two, [{"seed": 0, "cells": newer, "reasons": []}], "2026-02-02")
+    lines = text(shown).splitlines()
+    # by motion: 90 % of the kept one with the scatter of two equal replicates, 97 % of the new one without any
+    assert "| shape | 90.0 +- 0.0 (1.10) | 97.0 (0.90) |" in lines
+    assert "| w | 92.0 (1.20) | 99.0 (0.80) |" in lines
+    (days,) = (line for line in lines if line.startswith("Strata drawn on"))
+    assert days.startswith(f"Strata drawn on 2026-02-02: {two.name}. Strata drawn on 2026-01-01, with the program of")
 
 
 #: the same pictures under the same seed: a negative control scores the replicates of the main strata anew

@@ -1,8 +1,9 @@
 """Does the uncertainty cover? Replicates of the whole chain through the command line: ``make coverage``.
 
 Each replicate's sums are appended to a file of its stratum in ``bench_out/coverage``, so that a run that was stopped
-goes on where it was; ``--page`` writes the page from what is there. Options: ``--replicates N`` of each main stratum
-(125), ``--others N`` of each other one (30), ``--strata WORD[,WORD]`` those whose names hold a word, ``--threads N``.
+goes on where it was; ``--page`` writes the page from what is there; strata that were not drawn here keep the figures of
+``figures.json``. Options: ``--replicates N`` of each main stratum (125), ``--others N`` of each other one (30),
+``--strata WORD[,WORD]`` those whose names hold a word, ``--threads N``.
 """
 
 from __future__ import annotations
