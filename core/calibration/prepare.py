@@ -9,10 +9,9 @@ import numpy as np
 
 from core.arrays import Float
 from core.calibration.checks.positions import PositionCheck, check_positions
-from core.calibration.fit.adjust import parts_of_priors
+from core.calibration.fit.adjust import expected_covariance
 from core.calibration.fit.layout import Layout, State, camera_of
 from core.calibration.fit.named import named_covariance, parameter_names
-from core.calibration.fit.normal import assemble, covariance
 from core.calibration.fit.problem import Problem
 from core.calibration.fit.start import start_pose
 from core.calibration.inputs import (
@@ -187,7 +186,7 @@ def covariance_at(problem: Problem, layout: Layout, state: State, *, noise_px: f
 def covariance_parts_at(
     problem: Problem, layout: Layout, state: State, *, noise_px: float
 ) -> tuple[Float, dict[Cause, Float]]:
-    """Covariance as :func:`covariance_at`, and its parts by what is known before of stage and target.
+    """Covariance as :func:`covariance_at`, and its parts: :func:`core.calibration.fit.adjust.expected_covariance`.
 
     Raises
     ------
@@ -195,9 +194,7 @@ def covariance_parts_at(
         Code ``calibration_singular``.
     """
     noise = np.full(2, noise_px)
-    normal = assemble(layout, state, problem.rows, problem.flat_nodes_mm, problem.priors(layout), noise)
-    found = covariance(normal)
-    return found.unknowns, parts_of_priors(layout, normal, found)
+    return expected_covariance(layout, state, problem.rows, problem.flat_nodes_mm, problem.priors(layout), noise)
 
 
 def compare_positions(

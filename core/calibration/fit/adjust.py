@@ -114,7 +114,7 @@ def adjust(
     normal = assemble(layout, fit.state, views, nominal_nodes_mm, priors, fit.noise_px)
     _, g, _ = normal.reduced()
     gained = float(g @ covariance(normal).unknowns @ g)
-    known = replace(fit.state, x=_surely_distorted(layout, fit))
+    known = replace(fit.state, x=_surely_distorted(layout, fit.state.x, fit.covariance))
     told = _told(assemble(layout, known, views, nominal_nodes_mm, priors, fit.noise_px), held)
     if gained > _SHOWN_TILT or told < _TOLD_TILT:
         return _adjusted(
@@ -129,6 +129,46 @@ def adjust(
     )
 
 
+def expected_covariance(
+    layout: Layout, state: State, views: Sequence[ViewRows], nominal_nodes_mm: Float, priors: Priors, noise_px: Float
+) -> tuple[Float, dict[Cause, Float]]:
+    """Return what :func:`adjust` would state of views without any residual at a state.
+
+    Parameters
+    ----------
+    layout, state, views, nominal_nodes_mm, priors
+        As those of :func:`adjust`.
+    noise_px
+        (2,) of the views.
+
+    Returns
+    -------
+    tuple
+        The covariance (m, m) of the unknowns, and its parts by what is known before of stage and target. An axis' tilt
+        is held at its prior by the same rule; it shows in no residual, and the views alone may tell it.
+
+    Raises
+    ------
+    CalibrationError
+        Code ``calibration_singular``.
+    """
+
+    def stated(known: Priors) -> tuple[Float, dict[Cause, Float]]:
+        normal = assemble(layout, state, views, nominal_nodes_mm, known, noise_px)
+        found = covariance(normal)
+        return found.unknowns, parts_of_priors(layout, normal, found)
+
+    held = _without_tilts(layout, priors)
+    if held is not priors:
+        unknowns, by_prior = stated(held)
+        surely = replace(state, x=_surely_distorted(layout, state.x, unknowns))
+        if not _told(assemble(layout, surely, views, nominal_nodes_mm, priors, noise_px), held) < _TOLD_TILT:
+            normal = assemble(layout, state, views, nominal_nodes_mm, priors, noise_px)
+            spread = _of_held(normal, unknowns)
+            return unknowns + spread, {**by_prior, "stage": by_prior["stage"] + spread}
+    return stated(priors)
+
+
 def _without_tilts(layout: Layout, priors: Priors) -> Priors:
     """Return priors that hold the axes' tilts where they lie; the same priors where there is none to hold."""
     tilts = [k for c in range(2) for k in range(layout.tilt(c).start, layout.tilt(c).stop)]
@@ -139,10 +179,10 @@ def _without_tilts(layout: Layout, priors: Priors) -> Priors:
     return replace(priors, free=free, weight=weight)
 
 
-def _surely_distorted(layout: Layout, fit: Adjustment) -> Float:
-    """Return the unknowns with the distortion less what errors may have made of it."""
-    x = fit.state.x.copy()
-    sigma = np.sqrt(np.diagonal(fit.covariance))
+def _surely_distorted(layout: Layout, found: Float, fitted: Float) -> Float:
+    """Return the unknowns (m,) with the distortion less what errors, by the covariance (m, m), may have made of it."""
+    x = found.copy()
+    sigma = np.sqrt(np.diagonal(fitted))
     for c in range(2):
         lens = layout.lens(c)
         terms = slice(lens.start + 3, lens.stop - 1)
