@@ -11,11 +11,11 @@ import pytest
 import xarray as xr
 
 from core.calibration import COVARIANCE_NAMES, CalibrationOptions, CalibrationView, NominalCamera
-from core.calibration.fit.adjust import adjust
+from core.calibration.fit.adjust import adjust, expected_covariance
 from core.calibration.fit.layout import camera_of
 from core.calibration.fit.named import named_by_cause, named_derivatives, parameter_names
 from core.calibration.fit.problem import started
-from core.calibration.prepare import covariance_parts_at, problem_of
+from core.calibration.prepare import problem_of
 from core.cameras.camera import TEN_PARAMETER_NAMES, Camera
 from core.cameras.stereo import StereoPair
 from core.common.budget import budget_of, budget_of_difference
@@ -68,23 +68,28 @@ def test_each_causes_part_of_the_calibrations_covariance_is_what_it_does_alone()
     )
     target: Any = Grid(PITCH_MM, LINES, TOLERANCE_MM, PITCH)
 
-    def problem(**off: Any) -> Any:
-        return problem_of(_views(rng, **off), target, nominals, options)  # type: ignore[arg-type]
+    def problem(draw: Any, **off: Any) -> Any:
+        return problem_of(_views(draw, noise=NOISE_PX, **off), target, nominals, options)  # type: ignore[arg-type]
 
-    exact, start, _ = started(problem())
+    exact, start, _ = started(problem(np.random.default_rng(4)))
     layout = exact.layout("paper")
     priors = exact.priors(layout)
-    noise = np.full(2, NOISE_PX)
+
+    def fitted(draw: Any, noise: Any, **off: Any) -> Any:
+        p = problem(draw, **off)
+        return adjust(layout, state, p.rows, p.flat_nodes_mm, priors, max_iterations=60, noise_px=noise, rounds=1)
+
+    # the same noise in all views of one cause: without any it would be told as none, and the prior would count nothing
+    state = start
+    base = fitted(np.random.default_rng(4), np.full(2, NOISE_PX))
+    state, noise = base.state, base.noise_px
 
     def found(**off: Any) -> Any:
-        p = problem(**off)
-        return adjust(layout, state, p.rows, p.flat_nodes_mm, priors, max_iterations=60, noise_px=noise, rounds=1).state
+        return fitted(np.random.default_rng(4), noise, **off).state
 
-    state = start
-    state = found()
     J = named_derivatives(layout, priors, state.x)
     names = parameter_names(layout, priors)
-    whole, by_prior = covariance_parts_at(exact, layout, state, noise_px=NOISE_PX)
+    whole, by_prior = expected_covariance(layout, state, exact.rows, exact.flat_nodes_mm, priors, noise)
     parts = named_by_cause(layout, priors, state.x, whole, by_prior)
     np.testing.assert_allclose(sum(parts.values()), J @ whole @ J.T, rtol=1e-12, atol=1e-30)
     cameras = StereoPair(*(camera_of(layout, state.x, c) for c in range(2)))
@@ -106,7 +111,7 @@ def test_each_causes_part_of_the_calibrations_covariance_is_what_it_does_alone()
         # one by one, so that only what is not linear is left
         predicted = np.sqrt(np.einsum("ip,pq,iq->i", rows, parts[cause], rows))  # type: ignore[index]
         np.testing.assert_allclose(np.linalg.norm(columns, axis=1), predicted, rtol=0.02, atol=1e-3 * predicted.max())
-    drawn = np.stack([moved(noise=NOISE_PX) for _ in range(150)], axis=1)
+    drawn = np.stack([rows @ J @ (fitted(rng, noise).state.x - state.x) for _ in range(150)], axis=1)
     predicted = np.sqrt(np.einsum("ip,pq,iq->i", rows, parts["calibration"], rows))
     # 150 draws know a standard deviation to 6 %
     np.testing.assert_allclose(drawn.std(axis=1), predicted, rtol=0.18)
