@@ -24,6 +24,7 @@ from core.names import CAMERAS
 WEIGHTS = np.eye(3) - 0.25
 _MATCH_WEIGHTS = np.kron(WEIGHTS, np.eye(2))
 _AT_ONCE = 1024
+_FIRM = 1e-12  # of the variance
 Index = slice | Bool | NDArray[np.int64]
 _NOISE = np.kron(np.eye(3) + 1.0, np.eye(2))
 
@@ -227,6 +228,22 @@ class Estimator:
         root: Float = np.asarray(np.linalg.cholesky(every), dtype=np.float64)
         new = own @ inverse_of_lower(root) @ self.by_match[:, :, 2:]
         return np.asarray(new @ np.swapaxes(new, 1, 2))
+
+
+def lower_root(covariance: Float) -> Float:
+    """Return lower triangles (n, 3, 3) L with L L' the covariances (n, 3, 3).
+
+    Smoothed noise may have no variance in a direction, so that a rounding's worth of the whole is added.
+    """
+    size = np.trace(covariance, axis1=1, axis2=2)[:, None, None]
+    firm = covariance + np.maximum(_FIRM * size, np.finfo(np.float64).tiny) * np.eye(3)
+    try:
+        return np.asarray(np.linalg.cholesky(firm))
+    except np.linalg.LinAlgError:  # rounding left one of them a negative variance
+        value, vector = np.linalg.eigh(firm)
+        upper = np.linalg.qr(np.sqrt(np.maximum(value, 0.0))[:, :, None] * np.swapaxes(vector, 1, 2), mode="r")
+        sign = np.where(np.diagonal(upper, axis1=1, axis2=2) < 0.0, -1.0, 1.0)
+        return np.asarray(np.swapaxes(upper, 1, 2) * sign[:, None, :])
 
 
 def inverse_of_lower(L: Float) -> Float:

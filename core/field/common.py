@@ -10,11 +10,9 @@ from numpy.typing import NDArray
 from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.common.budget import budget_of
-from core.common.derivatives import Estimator, ReferenceView
+from core.common.derivatives import Estimator, ReferenceView, lower_root
 from core.common.factor import ParameterCovariance, factor_of
 from core.field.points.result import Field
-
-_FIRM = 1e-12  # of the variance: smoothed noise may have no variance in a direction
 
 
 @dataclass(eq=False)
@@ -41,7 +39,8 @@ class CommonParts:
         """Return the field with what is common in its uncertainty, to all its points and to all steps of a test.
 
         It gets the common factor of its points, none where the calibration's covariance is not known, and the part of
-        the displacement's noise that is the reference pair's, none for later references.
+        the displacement's noise that is the first reference pair's. Of what later references added it has nothing: that
+        counts as new in each step, which is more than there is between two steps of one reference.
 
         Parameters
         ----------
@@ -65,8 +64,11 @@ class CommonParts:
             found = factor_of(self.source, view.points_mm, now, own_mm=middle, estimator=at)
             causes = found.causes
             common = _spread(found.values, valid)
-        if now is not None and field.references is None:
-            frozen = _spread(_frozen(own[:, 3:, 3:], at), valid)
+        if now is not None:
+            added = None if field.references is None else field.references.added_share
+            if field.references is None or added is not None:
+                part = _frozen(own[:, 3:, 3:], at, None if added is None else added[valid])
+                frozen = _spread(part, valid)
         return replace(field, common=common, causes=causes, frozen=frozen)
 
     def _view(self, points: Float, valid: Bool) -> ReferenceView:
@@ -96,18 +98,23 @@ def _spread(values: Float, valid: Bool) -> Float:
     return out
 
 
-def _frozen(own: Float, at: Estimator) -> Float:
-    """(n, 3, 3) of the covariance of U, V, W what is the reference pair's noise."""
-    size = np.trace(own, axis1=1, axis2=2)[:, None, None]
-    firm = own + np.maximum(_FIRM * size, np.finfo(np.float64).tiny) * np.eye(3)
-    try:
-        root = np.linalg.cholesky(firm)
-    except np.linalg.LinAlgError:  # rounding left one of them a negative variance
-        value, vector = np.linalg.eigh(firm)
-        upper = np.linalg.qr(np.sqrt(np.maximum(value, 0.0))[:, :, None] * np.swapaxes(vector, 1, 2), mode="r")
-        sign = np.where(np.diagonal(upper, axis1=1, axis2=2) < 0.0, -1.0, 1.0)
-        root = np.swapaxes(upper, 1, 2) * sign[:, None, :]
-    return np.asarray(own - at.new_noise(root))
+def _frozen(own: Float, at: Estimator, added: Float | None = None) -> Float:
+    """(n, 3, 3) of the covariance of U, V, W what is the reference pair's noise.
+
+    ``added`` (n, 3, 3) is the share that later references added, of :class:`core.field.points.result.References`: the
+    rest is as if the step had been matched against the first one.
+    """
+    root = lower_root(own)
+    if added is None:
+        return np.asarray(own - at.new_noise(root))
+    left = root @ lower_root(_positive(np.eye(3) - added))
+    return np.asarray(left @ np.swapaxes(left, 1, 2) - at.new_noise(left))
+
+
+def _positive(matrices: Float) -> Float:
+    """Return symmetric matrices (n, 3, 3) without their negative eigenvalues: what a check lowered may leave some."""
+    value, vector = np.linalg.eigh(0.5 * (matrices + np.swapaxes(matrices, 1, 2)))
+    return np.asarray((vector * np.maximum(value, 0.0)[:, None, :]) @ np.swapaxes(vector, 1, 2))
 
 
 def notes_of(field: Field) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 import xarray as xr
 
 from core.calibration import COVARIANCE_NAMES, CalibrationOptions, CalibrationView, NominalCamera
+from core.calibration.expect import expect
 from core.calibration.fit.adjust import adjust, expected_covariance
 from core.calibration.fit.layout import camera_of
 from core.calibration.fit.named import named_by_cause, named_derivatives, parameter_names
@@ -23,11 +25,13 @@ from core.common.derivatives import Estimator, measured_derivatives
 from core.common.factor import Causes, ParameterCovariance, factor_of, joined
 from core.errors import CalibrationInputError
 from core.field.common import with_common_parts
+from core.field.points.images import MeasureImage
+from core.field.points.result import References
 from core.gauge.area import area_statistics
 from core.gauge.extensometer import extensometer
 from core.gauge.reading import difference
 from core.gauge.rigid import rigid_motion, without_rigid_motion
-from core.measure import MeasureOptions, ReferencePair
+from core.measure import MeasureOptions, PreviousStep, ReferencePair
 from core.names import BUDGET, CAMERAS, CAUSES
 from core.target import GridTarget
 from server.formats.results.reading import read_field
@@ -304,6 +308,100 @@ def test_rendered_steps_scatter_by_their_new_noise_about_one_reference_pair() ->
         seen = float(np.sqrt(np.mean(new[:, k] ** 2) / np.mean(every[:, k] ** 2)))
         stated = float(np.sqrt(1.0 - frozen[:, k].mean() / own[:, k].mean()))
         assert seen == pytest.approx(stated, rel=0.1)
+
+
+def _about_later_references(reference: Any, now: Sequence[Any], points: Any, options: MeasureOptions) -> list[Any]:
+    """Displacements of the steps ``now``, each but the first matched against the one before."""
+    first = ReferencePair(pair(), *reference)
+    images = {k: (MeasureImage(one), MeasureImage(two)) for k, (one, two) in enumerate(now, start=1)}
+    fields: dict[int, Any] = {}
+    sequence = first.sequence(
+        first.shape(points, options),
+        points,
+        options,
+        reference_update="always",
+        images_of=lambda n: images[n],
+        field_of=lambda n: fields[n],
+    )
+    for k, step in images.items():
+        fields[k] = sequence.measure(step, PreviousStep(k - 1, fields[k - 1]) if k > 1 else None)
+    return list(fields.values())
+
+
+@pytest.mark.deep
+def test_steps_matched_against_later_references_scatter_by_what_is_told_as_new() -> None:
+    points = grid(spacing_px=16.0)
+    options = MeasureOptions(subset_px=21, patch="affine")
+    motions = [(0.11, 0.06, 0.15, 0.0, 0.0, 0.0), (0.2, 0.1, 0.3, 0.0, 0.0, 0.0), (0.31, 0.17, 0.42, 0.0, 0.0, 0.0)]
+
+    def drawn(seed: int, reference: int) -> list[Any]:
+        now = [take("block", 1.0, motion, seed=1000 * k + seed) for k, motion in enumerate(motions, start=1)]
+        return _about_later_references(take("block", seed=reference), now, points, options)
+
+    # twelve tests about one reference pair, and twelve whose reference is drawn, too
+    about_one, about_many = [drawn(k, 1) for k in range(12)], [drawn(500 + k, 100 + k) for k in range(12)]
+    ok = np.all([f.valid for test in about_one + about_many for f in test], axis=0)
+    told = [with_common_parts(f, None, pair()) for f in about_one[0]]
+    own, frozen = (
+        [np.diagonal(part[ok], axis1=1, axis2=2).mean(axis=0) for part in parts]
+        for parts in ([f.covariance[..., 3:, 3:] for f in told], [f.frozen for f in told])
+    )
+
+    def seen(tests: Sequence[Any], k: int, before: int | None = None) -> Any:
+        values = np.stack([t[k].uvw_mm[ok] - (0.0 if before is None else t[before].uvw_mm[ok]) for t in tests])
+        return np.sqrt(values.var(axis=0, ddof=1).mean(axis=0))
+
+    # 12 draws at some hundred points, which share few pixels, know a standard deviation to some per cent; what a later
+    # reference adds stays below a tenth, and is told in both steps of a difference
+    for k in range(3):
+        np.testing.assert_allclose(seen(about_one, k), np.sqrt(own[k] - frozen[k]), rtol=0.12)
+        np.testing.assert_allclose(seen(about_many, k), np.sqrt(own[k]), rtol=0.12)
+    for a, b in ((0, 1), (1, 2), (0, 2)):
+        stated = np.sqrt(own[a] - frozen[a] + own[b] - frozen[b])
+        for tests in (about_one, about_many):
+            np.testing.assert_allclose(seen(tests, b, a), stated, rtol=0.15)
+        # as if all were new it would be 1.4 times that
+        assert (np.sqrt(own[a] + own[b]) > 1.25 * seen(about_many, b, a)).all()
+
+
+def test_what_later_references_added_is_no_noise_of_the_first_pair() -> None:
+    field = moved_field()
+    at_first = with_common_parts(field, None, pair()).frozen
+    assert at_first is not None
+    steps = np.ones(field.shape, np.int32)
+    none = np.zeros((*field.shape, 2, 2))
+
+    def frozen(share: float) -> Any:
+        added = np.broadcast_to(share * np.eye(3), (*field.shape, 3, 3))
+        later = replace(field, references=References(1, steps, none, none, added))
+        return with_common_parts(later, None, pair()).frozen
+
+    scale = np.nanmax(np.abs(at_first))
+    np.testing.assert_allclose(frozen(0.0), at_first, atol=1e-9 * scale)
+    # where a third was added, two thirds are as against the first reference; where all was, none is frozen
+    np.testing.assert_allclose(frozen(1.0 / 3.0), at_first * 2.0 / 3.0, atol=1e-9 * scale)
+    np.testing.assert_allclose(frozen(1.0), np.zeros_like(at_first) * at_first, atol=1e-9 * scale)
+    unknown = replace(field, references=References(1, steps, none, none))
+    assert with_common_parts(unknown, None, pair()).frozen is None
+
+
+@pytest.mark.parametrize(("stage_scale", "off_plane"), [(0.0, 0.03), (1e-2, 5e-3)])
+def test_a_wrong_pitch_scales_the_targets_plane_and_beyond_it_as_far_as_the_stage_lets_it(
+    stage_scale: float, off_plane: float
+) -> None:
+    pitch = 2e-5
+    target = GridTarget(pitch_mm=8.0, lines=(11, 11), line_width_mm=0.3, pitch_scale_sigma=pitch)
+    one, two = (NominalCamera((1024, 1024), 3535.0, 357.0, angle) for angle in (-12.5, 12.5))
+    options = CalibrationOptions(lens="paper", stage_scale_sigma=stage_scale)
+    planned = expect((0.0, 10.0, 20.0), target, (one, two), options)
+    source = ParameterCovariance(planned.pair, tuple(planned.parameters), planned.covariance, planned.by_cause)
+    L, causes = source.columns
+    assert causes.columns.count("target") == 1
+    points = np.array([[30.0, -20.0, 0.0], [-30.0, 25.0, 0.0], [10.0, 30.0, 8.0], [20.0, 20.0, -8.0]])
+    column = measured_derivatives(planned.pair, points, source.names) @ L[:, causes.columns.index("target")]
+    np.testing.assert_allclose(column[:2] / pitch, points[:2], atol=0.01)
+    off = np.linalg.norm(column[2:] / pitch - points[2:], axis=1) / np.linalg.norm(points[2:], axis=1)
+    assert (off < off_plane).all(), off
 
 
 @pytest.mark.deep

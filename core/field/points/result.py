@@ -31,12 +31,16 @@ class References:
         (r, c, 2, 2) propagated covariance, px^2, of the points' positions in camera 1's image of this step: the part
         that the noise of this step's images does not cancel if later steps are matched against them, from the cameras'
         noise and from changes of the surface's pattern.
+    added_share
+        (r, c, 3, 3) B with L B L' the part of the covariance of U, V, W that references after the first one added, and
+        L L' the whole, L a lower triangle; NaN without a point. None where it is not known: it is in no file.
     """
 
     step: int
     steps: NDArray[np.int32]
     noise_px2: Float
     pattern_px2: Float
+    added_share: Float | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -99,14 +99,14 @@ def totals_of(field: Field, pair: StereoPair) -> Totals:
         frame = tangent_frames(flat(field.normal_sys, 3))
         e11, e22, e12 = flat(field.stretch, 3).T
         right = np.stack([1.0 + e11, e12, e12, 1.0 + e22], axis=-1).reshape(-1, 2, 2)
-        turned = _rotations(flat(field.rotation_rad, 3)) @ frame
+        turned = rotations_of(flat(field.rotation_rad, 3)) @ frame
         after = turned[:, :, :2] @ right @ (np.swapaxes(frame[:, :, :2], 1, 2) @ before)
         first = rays + wk[:, :1] * (flat(field.uvw_mm, 3) @ R.T)
         G[at] = np.concatenate([first[:, :, None], R @ after + first[:, :, None] * slopes], axis=2)
     return Totals(every, w, G)
 
 
-def _rotations(vectors: Float) -> Float:
+def rotations_of(vectors: Float) -> Float:
     """Return rotation matrices (n, 3, 3) of rotation vectors (n, 3)."""
     angle = np.linalg.norm(vectors, axis=1)[:, None, None]
     K = np.zeros((len(vectors), 3, 3))

@@ -33,6 +33,7 @@ def find_again(
     segment: Segment,
     points: PointFits,
     propagated: Propagated,
+    added_px2: Float,
     steps: NDArray[np.int32],
     *,
     whole: FieldInputs,
@@ -49,8 +50,9 @@ def find_again(
     ----------
     segment
         The segment that the step was matched against.
-    points, propagated
-        The step's n points, in totals, and their propagated covariance, px^2; results are written there.
+    points, propagated, added_px2
+        The step's n points, in totals, and their covariances of :meth:`core.field.sequence.segment.Segment.total`;
+        results are written there.
     steps
         (n,) the newest reference that shows each point.
     whole, shape
@@ -109,7 +111,7 @@ def find_again(
         points.put(index, tried.take(index))
         good = np.flatnonzero(usable & own.ok)
         fits = own.take(good)
-        totals, known = older.total(
+        totals, known, added_px2[good] = older.total(
             fits, good, pattern_share(fits.zncc), pair=whole.pair, subset_px=whole.options.subset_px
         )
         points.put(good, totals)

@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 
 from core.arrays import Float
 from core.cameras.stereo import StereoPair
+from core.common.derivatives import inverse_of_lower, lower_root
 from core.field.points.result import Field
-from core.field.sequence.compose import Totals, common_share, image_slopes, in_step
+from core.field.sequence.compose import Totals, common_share, image_slopes, in_step, rotations_of
+from core.matching.geometry import tangent_frames
 
 _SMOOTHED = 5  # points across, over which the noise of a field is averaged
 _SURELY = 1.1  # times the noise between the cameras: any more is not noise
@@ -151,3 +153,33 @@ def first_propagated(field: Field, pair: StereoPair, totals: Totals, subset_px: 
         subset_px,
         slope_share,
     )
+
+
+def added_share(field: Field, pair: StereoPair, added_px2: Float) -> Float:
+    """Return what references between the first one and a step added to the noise of its displacement, over the whole.
+
+    Parameters
+    ----------
+    field
+        As it was measured.
+    pair
+        The cameras.
+    added_px2
+        (r, c, 2, 2) of the current positions in camera 1's image, along the surface.
+
+    Returns
+    -------
+    Float
+        (r, c, 3, 3) B with L B L' the part and L L' the covariance of U, V, W, L a lower triangle: smoothing, which
+        scales the noise, leaves it. NaN where there is no point.
+    """
+    assert field.uvw_mm is not None
+    assert field.rotation_rad is not None
+    ok = field.valid
+    surface = rotations_of(field.rotation_rad[ok]) @ tangent_frames(field.normal_sys[ok])[..., :2]
+    along = surface @ np.linalg.inv(pair.cam1.point_jacobian(field.xyz_mm[ok] + field.uvw_mm[ok]) @ surface)
+    part = along @ added_px2[ok] @ np.swapaxes(along, 1, 2)
+    inverse = inverse_of_lower(lower_root(field.covariance[ok][:, 3:, 3:]))
+    out = np.full((*field.shape, 3, 3), np.nan)
+    out[ok] = inverse @ part @ np.swapaxes(inverse, 1, 2)
+    return out

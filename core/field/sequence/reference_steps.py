@@ -24,7 +24,7 @@ from core.field.region.find_visible import with_visibility
 from core.field.region.region import PointGrid
 from core.field.sequence.compose import Totals
 from core.field.sequence.lost_points import OLDER, find_again
-from core.field.sequence.propagated import Propagated, pattern_share
+from core.field.sequence.propagated import Propagated, added_share, pattern_share
 from core.field.sequence.segment import Segment, begin_segment, measure_segment
 from core.field.sequence.still_visible import still_visible
 from core.field.settings import MeasureOptions
@@ -225,7 +225,9 @@ class Updating:
         n, subset = len(segment.has), self._options.subset_px
         zncc = np.where(state.points.ok[:, None], state.points.zncc, np.nan)
         share = pattern_share(zncc.reshape(*self._grid.shape, 3)).ravel()
-        points, propagated = segment.total(state.points, np.arange(n), share, pair=self._pair, subset_px=subset)
+        points, propagated, added_px2 = segment.total(
+            state.points, np.arange(n), share, pair=self._pair, subset_px=subset
+        )
         points.status[~segment.has] = segment.status[~segment.has]
         steps = segment.steps.copy()
         whole = self._inputs(
@@ -239,6 +241,7 @@ class Updating:
             segment,
             points,
             propagated,
+            added_px2,
             steps,
             whole=whole,
             shape=self._shape,
@@ -249,7 +252,11 @@ class Updating:
         field = assemble_field(whole, replace(state, points=points), self._shape)
         blocks = (*field.shape, 2, 2)
         references = References(
-            reference, steps.reshape(field.shape), propagated.noise.reshape(blocks), propagated.pattern.reshape(blocks)
+            reference,
+            steps.reshape(field.shape),
+            propagated.noise.reshape(blocks),
+            propagated.pattern.reshape(blocks),
+            added_share(field, self._pair, added_px2.reshape(blocks)),
         )
         return replace(field, references=references)
 

@@ -105,10 +105,11 @@ class Segment:
 
     def total(
         self, fits: PointFits, index: NDArray[np.intp], pattern: Float, *, pair: StereoPair, subset_px: int
-    ) -> tuple[PointFits, Propagated]:
-        """Return totals of points ``index`` fitted in this segment, and their propagated covariance, px^2.
+    ) -> tuple[PointFits, Propagated, Float]:
+        """Return totals of points ``index`` fitted in this segment, their propagated covariance, and what was added.
 
-        ``pattern`` (m,) is their :func:`pattern_share`.
+        ``pattern`` (m,) is their :func:`pattern_share`. Covariances are px^2; what was added (m, 2, 2) is the part of
+        that of the current positions in camera 1 that earlier references did not cancel.
         """
         start = self._at(index)
         w, G = self._own(fits, index)
@@ -118,11 +119,14 @@ class Segment:
             known = self.propagated.at(index).through(slopes)
             changed = pattern[:, None, None] * own
             together = in_step(known.pattern, changed)
-            covariance = follow_covariance(start, w, G, fits.covariance, known.noise + together - changed)
+            added = known.noise + together - changed
+            covariance = follow_covariance(start, w, G, fits.covariance, added)
             propagated = propagate(
                 pair, self.position_px[index], self.offset[index], G, own, known, pattern, subset_px, self.slope_share
             )
-        return replace(fits, w=after.w.copy(), G=after.G, covariance=covariance), propagated
+            to_px = pair.cam1.lens.image_jacobian(after.seen)
+        totals = replace(fits, w=after.w.copy(), G=after.G, covariance=covariance)
+        return totals, propagated, to_px @ added @ np.swapaxes(to_px, 1, 2)
 
     def _at(self, index: NDArray[np.intp]) -> Totals:
         return Totals(self.totals.rays[index], self.totals.w[index], self.totals.G[index])
