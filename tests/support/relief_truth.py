@@ -16,6 +16,7 @@ from tests.support.relief_parts import calibrated
 from tests.support.relief_rig import Body, Optics, ReliefCamera, Seen, exposed, picture, truth
 
 WRONG_SIGMAS = 5.0
+_ROUNDING_MM = 1e-9
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,8 @@ class Part:
         assert (x == grid.x_px).all()
         assert (y == grid.y_px).all()
         with np.errstate(invalid="ignore"):
-            off = np.abs(field.xyz_mm - seen.xyz_mm[y, x]) / field.sigma_mm[..., :3]
+            # where a ray is square to an axis its depth moves nothing along that: what is left is rounding's
+            off = np.abs(field.xyz_mm - seen.xyz_mm[y, x]) / np.maximum(field.sigma_mm[..., :3], _ROUNDING_MM)
         # a point whose centre sees nothing has no truth: valid, it is wrong
         off = np.where(field.valid[..., None], np.nan_to_num(off, nan=np.inf), np.nan)
         return Found(seen.one_face[y, x], seen.face[y, x], field.status, field.valid, off.max(axis=-1))

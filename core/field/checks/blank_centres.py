@@ -3,6 +3,9 @@
 Beside a hole or behind an outline before a plain background a subset matches by the part that lies on the surface. Its
 centre, which the result is for, may lie where there is no surface: in a plain area, as wide as a subset's centre, that
 holds points without a match. A coarse texture has such areas of its own, amid the field: what is wider tells.
+
+A hole that is little wider than a subset leaves no point without a match: every subset over it reaches its rim. There
+an area that is half a subset wide, and well wider than the texture's own, tells by itself.
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ _WINDOW_PX = 5  # of the variance about a pixel
 _RIM_PX = _WINDOW_PX // 2 + 2  # by which the plain area seems smaller than it is
 _OWN = 0.25  # share of the places amid the field with plain areas, beyond which these are the texture's own
 _PLACE = 2.0  # subsets
+_ALONE_SUBSETS, _ALONE_OWN = 0.5, 1.5  # width of an area that tells by itself, over the subset's and the texture's own
 
 
 def centre_px(subset_px: int) -> int:
@@ -43,7 +47,8 @@ def reject_blank_centres(
 ) -> int:
     """Reject points, LOW_TEXTURE, within a subset of points without a match whose centre is plain; return their number.
 
-    A centre is plain, too, that lies in a plain area, as wide as itself, together with points without a match.
+    A centre is plain, too, that lies in a plain area, as wide as itself, together with points without a match; in one
+    of half a subset no point without a match is needed.
 
     Parameters
     ----------
@@ -60,20 +65,32 @@ def reject_blank_centres(
     subset_px, spacing_px
         Width of the subset, distance of neighbouring points.
     """
-    beside = _beside_gaps(points.ok, shape, subset_px / spacing_px)
     noise = np.nan_to_num(points.noise) ** 2 + 1.0 / 12.0  # rounding's, too
     plain = (centre_texture < _NOISE * noise) & (centre_texture < _TEXTURE * texture)
-    level = float(np.median(noise[points.ok])) if points.ok.any() else 0.0
-    amid = points.ok & ~beside
+    if points.ok.all() and not plain.any():
+        return 0
+    before = int(points.ok.sum())
+    level = _NOISE * float(np.median(noise[points.ok])) if before else 0.0
+    amid = points.ok & ~_beside_gaps(points.ok, shape, subset_px / spacing_px)
+    own = _width_of_own(amid, image, level, xy_px, subset_px)
+    if own is None:
+        return 0
+    alone = max(_ALONE_SUBSETS * subset_px, _ALONE_OWN * own)
+    points.reject(points.ok & (_plain_areas(image, level, round(alone) | 1, xy_px) > 0), PointStatus.LOW_TEXTURE)
+    area = _plain_areas(image, level, own, xy_px)
+    inside = (area > 0) & np.isin(area, area[~points.ok])
+    beside = _beside_gaps(points.ok, shape, subset_px / spacing_px)
+    points.reject(points.ok & beside & (inside | (plain & (own == centre_px(subset_px)))), PointStatus.LOW_TEXTURE)
+    return before - int(points.ok.sum())
+
+
+def _width_of_own(amid: Bool, image: Float32, variance: float, xy_px: Float, subset_px: int) -> int | None:
+    """Return the least width, px, of plain areas that are not the texture's own; None if all are."""
+    place = xy_px[amid] / (_PLACE * subset_px)
     for width in range(centre_px(subset_px), subset_px + 1, 2):
-        area = _plain_areas(image, _NOISE * level, width, xy_px)
-        inside = (area > 0) & np.isin(area, area[~points.ok])
-        if not _of_the_texture((area > 0)[amid], xy_px[amid] / (_PLACE * subset_px)):
-            break
-        plain[:] = inside[:] = False
-    bad: Bool = points.ok & beside & (plain | inside)
-    points.reject(bad, PointStatus.LOW_TEXTURE)
-    return int(bad.sum())
+        if not _of_the_texture((_plain_areas(image, variance, width, xy_px) > 0)[amid], place):
+            return width
+    return None
 
 
 def _beside_gaps(ok: Bool, shape: tuple[int, int], reach: float) -> Bool:

@@ -57,8 +57,8 @@ def fill(inputs: FieldInputs, state: GrowthState) -> GrowthState:
 
 
 def check_edges(inputs: FieldInputs, state: GrowthState) -> None:
-    """Reject the points of a shape whose centre is plain beside the end of the surface; a motion measures none."""
-    if state.fitter.comparisons == 3 or state.points.ok.all():
+    """Reject the points of a shape whose centre is plain at the end of the surface; a motion measures none."""
+    if state.fitter.comparisons == 3:
         return
     options = inputs.options
     rejected = reject_blank_centres(

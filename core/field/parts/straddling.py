@@ -9,6 +9,9 @@ deviation; a point that is off by more is rejected.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -75,16 +78,14 @@ def reject_straddling(
     index = np.flatnonzero((edges | _suspects(fitter, points, shape, texture, spacing_px)) & points.ok)
     if len(index) == 0:
         return 0
-    usual = _usual_factors(fitter, points, xy_px, max(noise_factor, 1.0))
-    rejected = 0
+    usual = _Usual(fitter, points, xy_px, max(noise_factor, 1.0))
+    bad = np.zeros(len(points.status), bool)
     for start in range(0, len(index), _AT_ONCE):
         raise_if_cancelled(cancel)
         some = index[start : start + _AT_ONCE]
-        bad = np.zeros(len(points.status), bool)
         bad[some] = _pulled(fitter, points, some, xy_px, rays, edges[some], usual)
-        points.reject(bad, PointStatus.NEIGHBOUR_MISMATCH)
-        rejected += int(bad.sum())
-    return rejected
+    points.reject(bad, PointStatus.NEIGHBOUR_MISMATCH)
+    return int(bad.sum())
 
 
 def _suspects(fitter: Fitter, points: PointFits, shape: tuple[int, int], texture: Float, spacing_px: float) -> Bool:
@@ -113,6 +114,27 @@ def _suspects(fitter: Fitter, points: PointFits, shape: tuple[int, int], texture
     return np.asarray(out)
 
 
+@dataclass(frozen=True, eq=False)
+class _Usual:
+    """What parts change at the usual points of a field: measured where a point changes by more than noise can explain.
+
+    Attributes
+    ----------
+    least
+        Variance of a usual point's match over that by white noise, below which no factor lies.
+    """
+
+    fitter: Fitter
+    points: PointFits
+    xy_px: Float
+    least: float
+
+    @cached_property
+    def factors(self) -> Float:
+        """(o, 2) variances over those by white noise, by comparison and direction."""
+        return _usual_factors(self.fitter, self.points, self.xy_px, self.least)
+
+
 def _usual_factors(fitter: Fitter, points: PointFits, xy_px: Float, least: float) -> Float:
     """(o, 2) variance of what parts change at usual points over that by white noise, by comparison and direction.
 
@@ -131,7 +153,7 @@ def _usual_factors(fitter: Fitter, points: PointFits, xy_px: Float, least: float
 
 
 def _pulled(
-    fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, rays: Float, edges: Bool, usual: Float
+    fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, rays: Float, edges: Bool, usual: _Usual
 ) -> Bool:
     """Return (m,) True where a part of the subset is off by too much; what others change goes into the covariance."""
     least = np.where(edges, _EDGE_SIGMAS, _PART_SIGMAS)
@@ -143,13 +165,16 @@ def _pulled(
     bad = np.zeros(len(index), bool)
     for unknown, which, direction, before in _compared(pulls):
         pull = pulls[which]
+        sure = pull.significance[:, direction] / least
+        if not (sure > 1.0).any():  # nothing changes, whatever is usual
+            continue
         sd = np.sqrt(covariance[:, unknown, unknown]) * unit[:, unknown]
         # residuals that are correlated everywhere, as those of blur, are no single part's
-        noise_factor = usual[which, direction]
+        noise_factor = usual.factors[which, direction]
         most = max(_MOST_CORRELATED, noise_factor)
         correlated = np.clip((sd / pull.sigma_px[:, direction]) ** 2, noise_factor, most)
         shift = _change(pull, direction, before)
-        sure, far = pull.significance[:, direction] / least, np.abs(shift) > _FAR_SIGMAS * sd
+        far = np.abs(shift) > _FAR_SIGMAS * sd
         counts = (sure > np.sqrt(correlated)) | ((sure > np.sqrt(noise_factor)) & far)
         bad |= counts & (np.abs(shift) > np.maximum(_OFF_SIGMAS * sd, _OFF_PX))
         # beside a shape's edge a pull is expected: where all residuals are correlated it is doubtful, and is said

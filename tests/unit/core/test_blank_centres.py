@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from core.field.checks.blank_centres import centre_px, reject_blank_centres
 from core.field.points.fitter import PointFits
@@ -56,3 +57,24 @@ def test_points_over_a_hole_are_rejected_beside_those_that_found_no_match_there(
 def test_points_between_the_dots_of_a_coarse_texture_are_kept_beside_a_gap() -> None:
     out = rejected(picture(14), HOLE < 40.0)  # squares wider than a subset's centre
     assert not out.any()
+
+
+@pytest.mark.parametrize("hole_px", [26, 34])
+def test_points_over_a_hole_that_every_subset_reaches_across_are_rejected_though_all_matched(hole_px: int) -> None:
+    image = picture(3)
+    y, x = np.mgrid[:280, :280]
+    image[np.hypot(x - 140, y - 140) < hole_px / 2] = 30.0
+    out = rejected(image, np.zeros(COUNT * COUNT, bool))
+    beyond_rim = HOLE - hole_px / 2
+    assert out[beyond_rim < -3.0].all()
+    assert not out[beyond_rim > SUBSET_PX / 3.0].any()
+
+
+def test_a_plain_spot_that_is_narrower_than_half_a_subset_loses_no_point() -> None:
+    image = picture(3)
+    image[134:146, 134:146] = 30.0
+    assert not rejected(image, np.zeros(COUNT * COUNT, bool)).any()
+
+
+def test_a_coarse_texture_loses_no_point_where_all_matched() -> None:
+    assert not rejected(picture(14), np.zeros(COUNT * COUNT, bool)).any()
