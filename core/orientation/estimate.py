@@ -14,7 +14,7 @@ import numpy as np
 from core.arrays import Float
 from core.cameras.stereo import StereoPair
 from core.field.region.trend import smooth_terms
-from core.orientation.change import changed, offset_slopes, plausible_bump
+from core.orientation.change import ChangeSlopes, changed, offset_slopes, plausible_bump
 from core.orientation.matched import MatchedPoints
 from core.orientation.noise import blocks_of, effective_variance, robust_weights
 
@@ -67,6 +67,7 @@ def estimate_change(
     *,
     bump_rad: float | None = None,
     start: Float | None = None,
+    slopes: ChangeSlopes | None = None,
 ) -> OrientationEstimate:
     """Estimate the change of the relative orientation.
 
@@ -82,6 +83,8 @@ def estimate_change(
         Size of the bump, where it is known; else from the offsets.
     start
         (5,) a change to start from; none if left out.
+    slopes
+        Of these points, where they are known already; without a start.
 
     Returns
     -------
@@ -92,7 +95,7 @@ def estimate_change(
     unit, size = plausible_bump(pair), _FIRST_RAD if bump_rad is None else bump_rad
     blocks = blocks_of(xy1, points.step)
     change = np.zeros(5) if start is None else np.array(start, dtype=np.float64)
-    J = offset_slopes(pair, change, xy1, xy2)
+    J = offset_slopes(pair, change, xy1, xy2) if slopes is None or start is not None else slopes.offset
 
     def left_at(at: Float) -> Float:
         if offset_px is None:
