@@ -50,8 +50,9 @@ def changes_between(before: StereoPair, after: StereoPair) -> Float:
 def offset_slopes(pair: StereoPair, change: Float, xy1_px: Float, xy2_px: Float) -> Float:
     """Return d(epipolar offset of matched points, px) / d(change), (n, 5), at a change of the pair."""
     columns = []
+    rays = pair.cam1.rays_cam(xy1_px), pair.cam2.rays_cam(xy2_px)
     for step in np.eye(5) * _STEP_RAD:
-        ahead, back = (changed(pair, change + s).epipolar_residual_px(xy1_px, xy2_px) for s in (step, -step))
+        ahead, back = (changed(pair, change + s).epipolar_residual_of_rays(*rays) for s in (step, -step))
         columns.append((ahead - back) / (2.0 * _STEP_RAD))
     return np.stack(columns, axis=-1)
 
@@ -59,8 +60,9 @@ def offset_slopes(pair: StereoPair, change: Float, xy1_px: Float, xy2_px: Float)
 def point_slopes(pair: StereoPair, xy1_px: Float, xy2_px: Float) -> Float:
     """Return d(triangulated points of the system frame, mm) / d(change), (n, 3, 5)."""
     columns = []
+    rays = pair.cam1.rays_cam(xy1_px), pair.cam2.rays_cam(xy2_px)
     for step in np.eye(5) * _STEP_RAD:
-        ahead, back = (changed(pair, s).triangulate(xy1_px, xy2_px).xyz_mm for s in (step, -step))
+        ahead, back = (changed(pair, s).triangulate_rays(*rays).xyz_mm for s in (step, -step))
         columns.append((ahead - back) / (2.0 * _STEP_RAD))
     return np.stack(columns, axis=-1)
 

@@ -390,6 +390,12 @@ def test_what_cannot_be_used_is_refused():
     with pytest.raises(ImageError) as caught_size:
         fit_motion(pair, image, image, image[1:], image, XY, np.zeros((len(XY), 3)))
     assert caught_size.value.code == "image_size_mismatch"
-    for wrong in ({"subset_px": 3}, {"tolerance_px": 0.0}, {"patch": "bent"}, {"max_iterations": 0}, {"first_rate": 0.9}):
+    for wrong in (
+        {"subset_px": 3},
+        {"tolerance_px": 0.0},
+        {"patch": "bent"},
+        {"max_iterations": 0},
+        {"first_rate": 0.9},
+    ):
         with pytest.raises(InputError):
             MatchOptions(**wrong)
