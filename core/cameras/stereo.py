@@ -68,8 +68,10 @@ class StereoPair:
 
         To first order, through camera 2's lens Jacobian; NaN where a pixel has no ray.
         """
-        ray1 = self.cam1.rays_cam(xy1_px)
-        ray2 = self.cam2.rays_cam(xy2_px)
+        return self.epipolar_residual_of_rays(self.cam1.rays_cam(xy1_px), self.cam2.rays_cam(xy2_px))
+
+    def epipolar_residual_of_rays(self, ray1: SpacePoints, ray2: SpacePoints) -> Float:
+        """Return the same of rays in the cameras' own frames: a lens is inverted once for several poses."""
         R, t = self.cam2_from_cam1.rotation, self.cam2_from_cam1.translation_mm
         line = np.cross(t, ray1.xyz_mm @ R.T)  # plane through both pinholes and ray 1, in camera 2
         algebraic = np.sum(line * ray2.xyz_mm, axis=-1)
@@ -80,8 +82,10 @@ class StereoPair:
 
     def triangulate(self, xy1_px: ArrayLike, xy2_px: ArrayLike) -> SpacePoints:
         """Mid-point of the shortest segment between the two rays, in the system frame."""
-        ray1 = self.cam1.rays_cam(xy1_px)
-        ray2 = self.cam2.rays_cam(xy2_px)
+        return self.triangulate_rays(self.cam1.rays_cam(xy1_px), self.cam2.rays_cam(xy2_px))
+
+    def triangulate_rays(self, ray1: SpacePoints, ray2: SpacePoints) -> SpacePoints:
+        """Return the same of rays in the cameras' own frames: a lens is inverted once for several poses."""
         d1 = ray1.xyz_mm @ self.cam1.cam_from_sys.rotation
         d2 = ray2.xyz_mm @ self.cam2.cam_from_sys.rotation
         c1, c2 = self.cam1.centre_sys_mm, self.cam2.centre_sys_mm

@@ -135,6 +135,7 @@ def setting_of(options: MatchOptions, images: list[ImageData]) -> Setting:
         order=SPLINE_ORDER[options.interpolation],
         max_iterations=options.max_iterations,
         tolerance=options.tolerance_px,
+        first_rate=options.first_rate,
         max_sigma=max_sigma_px,
         max_step=options.max_step_px,
         slope_noise=images[0].slope_noise,

@@ -81,6 +81,8 @@ class MotionFit:
         (N, 3) correlation with camera 2's reference, camera 1's current and camera 2's current image.
     covariance
         (N, 5, 5) of (w0, G00, G10, G20, epipolar offset).
+    rate
+        (N,) the last step's motion over that of the one before; NaN after a single step.
     """
 
     w: Float
@@ -93,6 +95,7 @@ class MotionFit:
     iterations: Int
     status: Status
     variance: Float
+    rate: Float
 
 
 _Fit = TypeVar("_Fit", ShapeFit, MotionFit)
@@ -251,6 +254,7 @@ def fit_motion(
         iterations=iterations,
         status=status,
         variance=out[:, at + 30],
+        rate=out[:, at + 31],
     )
     if images[0].blur is None:
         return fit

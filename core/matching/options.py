@@ -11,6 +11,9 @@ from core.settings import DEFAULT_MAX_SIGMA_PX, SUBSET_PX, Interpolation
 Patch = Literal["rigid", "affine", "quadratic"]
 PATCHES: tuple[Patch, ...] = get_args(Patch)
 
+FIRST_RATE = 0.1
+"""Convergence rate assumed where nothing is known: what poor images show at worst in nine points of ten."""
+
 SPLINE_ORDER: dict[str, int] = {"cubic": 3, "quintic": 5}
 
 
@@ -32,6 +35,9 @@ class MatchOptions:
     tolerance_px
         Motion of the subset's corners that may remain unmade when the iteration stops, px. Its own noise is some ten
         times larger at the default.
+    first_rate
+        A step's motion over that of the step before, assumed after a point's first step: where the first moves little,
+        it is the only one. Below 0.9.
     max_sigma_px
         Points whose match has a larger predicted standard deviation, px, in any image and direction have too little
         texture: five times as much, half a pixel, is exceeded once in two million. A texture of stripes fails this test
@@ -45,6 +51,7 @@ class MatchOptions:
     interpolation: Interpolation = "quintic"
     max_iterations: int = 30
     tolerance_px: float = 1e-3
+    first_rate: float = FIRST_RATE
     max_sigma_px: float = DEFAULT_MAX_SIGMA_PX
     max_step_px: float = 4.0
 
@@ -63,6 +70,8 @@ class MatchOptions:
             raise InputError(
                 f"max_iterations is {self.max_iterations}, it must be 1 or more.", code="option_out_of_range"
             )
+        if not 0.0 <= self.first_rate < 0.9:
+            raise InputError(f"first_rate is {self.first_rate}, it must be in 0 to 0.9.", code="option_out_of_range")
         for name in ("tolerance_px", "max_sigma_px", "max_step_px"):
             value = getattr(self, name)
             if not 0.0 < value < float("inf"):

@@ -7,10 +7,13 @@ axis, then out of that plane. A turn of camera 1 is a change of both.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Float
+from core.arrays import Bool, Float
 from core.cameras.camera import Camera, RigidTransform
 from core.cameras.stereo import StereoPair
 
@@ -47,8 +50,9 @@ def changes_between(before: StereoPair, after: StereoPair) -> Float:
 def offset_slopes(pair: StereoPair, change: Float, xy1_px: Float, xy2_px: Float) -> Float:
     """Return d(epipolar offset of matched points, px) / d(change), (n, 5), at a change of the pair."""
     columns = []
+    rays = pair.cam1.rays_cam(xy1_px), pair.cam2.rays_cam(xy2_px)
     for step in np.eye(5) * _STEP_RAD:
-        ahead, back = (changed(pair, change + s).epipolar_residual_px(xy1_px, xy2_px) for s in (step, -step))
+        ahead, back = (changed(pair, change + s).epipolar_residual_of_rays(*rays) for s in (step, -step))
         columns.append((ahead - back) / (2.0 * _STEP_RAD))
     return np.stack(columns, axis=-1)
 
@@ -56,10 +60,42 @@ def offset_slopes(pair: StereoPair, change: Float, xy1_px: Float, xy2_px: Float)
 def point_slopes(pair: StereoPair, xy1_px: Float, xy2_px: Float) -> Float:
     """Return d(triangulated points of the system frame, mm) / d(change), (n, 3, 5)."""
     columns = []
+    rays = pair.cam1.rays_cam(xy1_px), pair.cam2.rays_cam(xy2_px)
     for step in np.eye(5) * _STEP_RAD:
-        ahead, back = (changed(pair, s).triangulate(xy1_px, xy2_px).xyz_mm for s in (step, -step))
+        ahead, back = (changed(pair, s).triangulate_rays(*rays).xyz_mm for s in (step, -step))
         columns.append((ahead - back) / (2.0 * _STEP_RAD))
     return np.stack(columns, axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class ChangeSlopes:
+    """What a change would do to matched points, made once for all the questions asked about them.
+
+    Attributes
+    ----------
+    pair
+        The cameras before a change.
+    xy1_px, xy2_px
+        (n, 2) the points in both cameras.
+    """
+
+    pair: StereoPair
+    xy1_px: Float
+    xy2_px: Float
+
+    @cached_property
+    def offset(self) -> Float:
+        """(n, 5) :func:`offset_slopes` at no change."""
+        return offset_slopes(self.pair, np.zeros(5), self.xy1_px, self.xy2_px)
+
+    @cached_property
+    def position(self) -> Float:
+        """(n, 3, 5) :func:`point_slopes`."""
+        return point_slopes(self.pair, self.xy1_px, self.xy2_px)
+
+    def of(self, which: Bool) -> ChangeSlopes:
+        """Return those of the points ``which`` (n,)."""
+        return self if which.all() else ChangeSlopes(self.pair, self.xy1_px[which], self.xy2_px[which])
 
 
 def plausible_bump(pair: StereoPair) -> Float:

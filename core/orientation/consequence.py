@@ -10,7 +10,7 @@ import numpy as np
 from core.arrays import Float
 from core.cameras.stereo import StereoPair
 from core.field.region.trend import smooth_terms
-from core.orientation.change import point_slopes
+from core.orientation.change import ChangeSlopes, point_slopes
 from core.orientation.matched import MatchedPoints
 from core.robust import spread_indices
 
@@ -47,7 +47,9 @@ class Consequence:
         return dict(vars(self))
 
 
-def consequence_of(pair: StereoPair, points: MatchedPoints, change: Float, covariance: Float) -> Consequence | None:
+def consequence_of(
+    pair: StereoPair, points: MatchedPoints, change: Float, covariance: Float, known: ChangeSlopes | None = None
+) -> Consequence | None:
     """Return what a change makes of points.
 
     Parameters
@@ -56,6 +58,8 @@ def consequence_of(pair: StereoPair, points: MatchedPoints, change: Float, covar
         The cameras and the points as matched.
     change, covariance
         (5,) and (5, 5), :data:`core.orientation.change.CHANGE_NAMES`.
+    known
+        Slopes of these points, where they are known already.
 
     Returns
     -------
@@ -67,7 +71,7 @@ def consequence_of(pair: StereoPair, points: MatchedPoints, change: Float, covar
     some = np.unique(spread_indices(len(points.xy1_px), _AT_MOST))
     xy1, xy2 = points.xy1_px[some], points.xy2_px[some]
     xyz = pair.triangulate(xy1, xy2).xyz_mm
-    slopes = point_slopes(pair, xy1, xy2)
+    slopes = point_slopes(pair, xy1, xy2) if known is None or len(some) < len(points.xy1_px) else known.position
     good = np.isfinite(xyz).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2))
     if good.sum() < 10:
         return None

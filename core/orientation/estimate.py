@@ -14,7 +14,7 @@ import numpy as np
 from core.arrays import Float
 from core.cameras.stereo import StereoPair
 from core.field.region.trend import smooth_terms
-from core.orientation.change import changed, offset_slopes, plausible_bump
+from core.orientation.change import ChangeSlopes, changed, offset_slopes, plausible_bump
 from core.orientation.matched import MatchedPoints
 from core.orientation.noise import blocks_of, effective_variance, robust_weights
 
@@ -67,6 +67,7 @@ def estimate_change(
     *,
     bump_rad: float | None = None,
     start: Float | None = None,
+    slopes: ChangeSlopes | None = None,
 ) -> OrientationEstimate:
     """Estimate the change of the relative orientation.
 
@@ -82,6 +83,8 @@ def estimate_change(
         Size of the bump, where it is known; else from the offsets.
     start
         (5,) a change to start from; none if left out.
+    slopes
+        Of these points, where they are known already; without a start.
 
     Returns
     -------
@@ -90,9 +93,9 @@ def estimate_change(
     """
     xy1, xy2 = points.xy1_px, points.xy2_px
     unit, size = plausible_bump(pair), _FIRST_RAD if bump_rad is None else bump_rad
-    blocks = blocks_of(xy1, points.step)
+    blocks, terms = blocks_of(xy1, points.step), smooth_terms(xy1)
     change = np.zeros(5) if start is None else np.array(start, dtype=np.float64)
-    J = offset_slopes(pair, change, xy1, xy2)
+    J = offset_slopes(pair, change, xy1, xy2) if slopes is None or start is not None else slopes.offset
 
     def left_at(at: Float) -> Float:
         if offset_px is None:
@@ -103,7 +106,7 @@ def estimate_change(
         residual = left_at(change)
         if offset_px is None:
             J = offset_slopes(pair, change, xy1, xy2)
-        weights, _ = robust_weights(residual - smooth_surface(xy1, residual))
+        weights, _ = robust_weights(residual - smooth_surface(terms, residual))
         variance = effective_variance(J, weights, residual, blocks)
         information = (J * weights[:, None]).T @ J / variance
         prior = np.linalg.inv(unit) / size**2
@@ -123,7 +126,7 @@ def estimate_change(
     prior = np.linalg.inv(unit) / size**2
     posterior = np.linalg.inv(information + prior)
     response = -posterior @ (J * weights[:, None]).T / variance
-    systematic = response @ smooth_terms(xy1) * SYSTEMATIC_PX
+    systematic = response @ terms * SYSTEMATIC_PX
     return OrientationEstimate(
         change=change,
         covariance=posterior + systematic @ systematic.T,
@@ -136,9 +139,8 @@ def estimate_change(
     )
 
 
-def smooth_surface(xy_px: Float, values: Float) -> Float:
-    """Quadratic surface through values with outliers: least squares twice, then without those far off."""
-    terms = smooth_terms(xy_px)
+def smooth_surface(terms: Float, values: Float) -> Float:
+    """Surface of :func:`smooth_terms` through values with outliers: least squares, then without those far off."""
     weights = np.ones(len(values))
     for _ in range(4):
         surface = terms @ np.linalg.lstsq(terms * weights[:, None], values * weights, rcond=1e-9)[0]

@@ -13,6 +13,7 @@ from core.calibration import COVARIANCE_NAMES
 from core.calibration.uncertainty import image_derivatives
 from core.cameras.stereo import StereoPair
 from core.field.region.trend import smooth_terms
+from core.orientation.change import ChangeSlopes
 from core.orientation.consequence import Consequence, consequence_of
 from core.orientation.estimate import estimate_change
 from core.orientation.matched import MatchedPoints, across_line
@@ -142,6 +143,7 @@ def judge_offsets(
     names: Sequence[str] = COVARIANCE_NAMES,
     own_px: float | None = None,
     imported: bool = False,
+    slopes: ChangeSlopes | None = None,
 ) -> OffsetFinding | None:
     """Judge the offsets of one step.
 
@@ -162,6 +164,8 @@ def judge_offsets(
         The calibration's own offset at most, where it is known.
     imported
         True for another program's calibration, whose own error is not known.
+    slopes
+        Of the step's points, where they are judged more than once.
 
     Returns
     -------
@@ -175,6 +179,7 @@ def judge_offsets(
     if good.sum() < MIN_POINTS:
         return None
     points, offset = MatchedPoints(points.xy1_px[good], points.xy2_px[good], points.step[good]), offset[good]
+    slopes = ChangeSlopes(pair, points.xy1_px, points.xy2_px) if slopes is None else slopes.of(good)
     earlier = None if before is None else _earlier(points, *before)
     if earlier is not None:
         offset = offset - earlier.offset_px
@@ -201,7 +206,7 @@ def judge_offsets(
             moved, known = moved and rms > own_px, True
         if imported or not known:
             moved = None
-    estimate = estimate_change(pair, points, offset)
+    estimate = estimate_change(pair, points, offset, slopes=slopes)
     parts = {name: float(np.sqrt(np.sum(c[part] ** 2))) for name, part in _PARTS.items()}
     finding = OffsetFinding(
         against=against,
@@ -218,7 +223,7 @@ def judge_offsets(
         change_deg=tuple(float(v) for v in np.degrees(estimate.change)),
         change_sigma_deg=tuple(float(v) for v in np.degrees(np.sqrt(np.diag(estimate.covariance)))),
         determined=estimate.determined,
-        consequence=consequence_of(pair, points, estimate.change, estimate.covariance),
+        consequence=consequence_of(pair, points, estimate.change, estimate.covariance, slopes),
         text="",
     )
     return _with_text(finding)

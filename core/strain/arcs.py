@@ -101,5 +101,8 @@ def missed_slope(slope: Float, second: Float, moments: Float) -> Float:
         axis=1,
     )
     metric = np.swapaxes(slope, -1, -2) @ slope
-    third = np.linalg.solve(metric[:, None], along[..., None])[..., 0] @ np.swapaxes(slope, -1, -2)  # (n, 4, 3)
+    (aa, ab), (_, bb) = np.moveaxis(metric[:, :, :, None], 0, 2)  # (n, 1): two by two, its inverse is written out
+    one, two = along[..., 0], along[..., 1]
+    raised = np.stack([bb * one - ab * two, aa * two - ab * one], axis=-1) / (aa * bb - ab * ab)[..., None]
+    third = raised @ np.swapaxes(slope, -1, -2)  # (n, 4, 3)
     return np.swapaxes(moments @ third, -1, -2)

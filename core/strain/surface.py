@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 from scipy import ndimage
 
@@ -136,11 +138,31 @@ def surface_slopes(
     if options.order != "auto":
         return slopes, surface, np.zeros((*field.shape, 3)), None
     slopes, left, raised = raise_order(slopes, surface, options.tensor)
-    return slopes, _on_surface(slopes, field, options) if raised.any() else surface, left, raised
+    return slopes, _replaced(surface, slopes, field, options, raised), left, raised
 
 
 def _on_surface(slopes: Slopes, field: Field, options: StrainOptions) -> OnSurface:
+    around = _mean_around(field.covariance, field.valid, options.window)
+    return _at(slopes.status == StrainStatus.OK, around, slopes, field, options)
+
+
+def _replaced(surface: OnSurface, slopes: Slopes, field: Field, options: StrainOptions, raised: Bool) -> OnSurface:
+    """Return what holds at all points, made anew where quadratics took the place of planes."""
     good = slopes.status == StrainStatus.OK
+    again = raised[good]
+    if not again.any():
+        return surface
+    around = np.empty((*field.shape, 6, 6))
+    around[good] = surface.around
+    part = _at(raised & good, around, slopes, field, options)
+    made = {f.name: getattr(surface, f.name).copy() for f in fields(surface)}
+    for name, values in made.items():
+        values[again] = getattr(part, name)
+    return OnSurface(**made)
+
+
+def _at(good: Bool, around: Float, slopes: Slopes, field: Field, options: StrainOptions) -> OnSurface:
+    """Windows' slopes on the surface at the points ``good``; ``around`` is (r, c, 6, 6) the mean covariance."""
     slope, second, moments = slopes.slope[good], slopes.second[good], slopes.moments[good]
     before = missed_slope(slope[:, :3], second[:, :3], moments)
     now = missed_slope(slope[:, :3] + slope[:, 3:], second[:, 3:], moments)
@@ -148,8 +170,7 @@ def _on_surface(slopes: Slopes, field: Field, options: StrainOptions) -> OnSurfa
     frame = _frames(slope[:, :3], field.normal_sys[good])
     per_mm = np.linalg.inv(np.swapaxes(frame, -1, -2) @ slope[:, :3])
     gradient = slope[:, 3:] @ per_mm
-    around = _mean_around(field.covariance, field.valid, options.window)[good]
-    return OnSurface(frame, per_mm, gradient, around, strain_of(frame, gradient, options.tensor))
+    return OnSurface(frame, per_mm, gradient, around[good], strain_of(frame, gradient, options.tensor))
 
 
 def _frames(tangents: Float, towards: Float) -> Float:

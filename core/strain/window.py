@@ -18,7 +18,7 @@ from scipy import ndimage
 from core.arrays import Bool, Float, Float32
 from core.field.points.shared_pixels import SharedPixels
 from core.field.region.cuts import Cuts
-from core.field.region.window import connected_points, fit_terms, steps_of, ways_cut, window_offsets
+from core.field.region.window import connected_points, distinct_windows, fit_terms, steps_of, ways_cut, window_offsets
 from core.strain.arcs import reduced_moments, second_moments, second_weights, third_moments, whole_second_derivatives
 from core.strain.options import StrainOptions
 from core.strain.result import StrainStatus
@@ -124,9 +124,12 @@ class ReducedWindows:
     def fitted(self, seen: Bool, data: Float, order: int) -> tuple[np.ndarray, Float, Float, Float, Float]:
         """Status, slope, spread, third moments and weights of windows' fits, as in :class:`Slopes`."""
         half = self.options.window // 2
-        found, weights = _weights(seen, half, order, self.options)
+        kinds, which = distinct_windows(seen)
+        found, by_kind = _weights(kinds, half, order, self.options)
+        spread, moments = self.correlation.spread(by_kind), reduced_moments(by_kind, kinds, half, order)
+        weights = by_kind[which]
         slope = np.einsum("man,mnb->mba", weights, data)
-        return found, slope, self.correlation.spread(weights), reduced_moments(weights, seen, half, order), weights
+        return found[which], slope, spread[which], moments[which], weights
 
     def quadratics(self, rows: np.ndarray, cols: np.ndarray, seen: Bool, planes: Float) -> Quadratics:
         """Return the quadratics of windows with these connected points (m, n) and weights (m, 2, n) of planes."""
@@ -226,14 +229,15 @@ def window_slopes(
         seen = connected_points(there, here, None if crossed is None else crossed[r, k], half)
         data = windows.data(r, k)
         there_now = np.concatenate([data[..., :3], data[..., :3] + data[..., 3:]], axis=-1)
-        bending = second_weights(seen, half)
-        second[r, k] = np.einsum("man,mnb->mba", bending, there_now)
+        kinds, which = distinct_windows(seen)
+        bending = second_weights(kinds, half)
+        second[r, k] = np.einsum("man,mnb->mba", bending[which], there_now)
         status[r, k], slope[r, k], spread[r, k], moments[r, k], weights = windows.fitted(
             seen, data, 2 if options.order == 2 else 1
         )
         reduced.append((r, k, weights))
         if second_spread is not None:
-            second_spread[r, k] = windows.correlation.spread(bending)
+            second_spread[r, k] = windows.correlation.spread(bending)[which]
             connected.append(seen)
     return Slopes(status, slope, spread, second, moments, reduced, windows, connected, second_spread)
 

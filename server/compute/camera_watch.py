@@ -15,6 +15,7 @@ from core.field.points.images import MeasureImage
 from core.field.points.result import Field
 from core.field.settings import MeasureOptions
 from core.orientation import judge_offsets
+from core.orientation.change import ChangeSlopes
 from core.orientation.coarse import features_off_px
 from core.orientation.finding import Against
 from core.orientation.matched import MatchedPoints, matched_points
@@ -104,9 +105,16 @@ class CameraWatch:
         points = self._of(n, lambda: (result, images))
         if points is None:
             return None
+        slopes = ChangeSlopes(self.pair, points.xy1_px, points.xy2_px)
         names, covariance = (COVARIANCE_NAMES, None) if self.covariance is None else self.covariance
         against_calibration = judge_offsets(
-            self.pair, points, covariance=covariance, names=names, own_px=self.own_px, imported=self.imported
+            self.pair,
+            points,
+            covariance=covariance,
+            names=names,
+            own_px=self.own_px,
+            imported=self.imported,
+            slopes=slopes,
         )
         if n == self.reference:
             return CameraMotion.of(against_calibration, None, None)
@@ -125,6 +133,7 @@ class CameraWatch:
                 against=name,
                 covariance=covariance,
                 names=names,
+                slopes=slopes,
             )
             for other, name in compared
         )

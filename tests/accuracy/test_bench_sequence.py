@@ -41,6 +41,7 @@ def test_stages_of_a_sequence_are_told_apart(tmp_path: Path, small: None) -> Non
     assert set(found["stages"]) == {stage for stage, _, _ in bench.STAGES}
     assert found["stages"]["fit"][0] > 0
     assert found["stages"]["write"][0] > 0
+    assert found["stages"]["strain"][0] > 0  # as every user has it, who does not turn it off
     assert (out / "summary.json").exists()
 
 

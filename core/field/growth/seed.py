@@ -153,9 +153,8 @@ def _go_on(inputs: FieldInputs, state: GrowthState, w: Float, G: Float, tried: N
     known &= ~_amid_failed(inputs.xy_px, tried, points.ok[tried])
     index = np.flatnonzero(inputs.usable & known & ~points.ok)
     inputs.progress("previous", 0, len(index))
-    fit_in_batches(
-        state.fitter, points, index, inputs.xy_px, w[index], G[index], far_px=SAMPLE_FAR_PX, cancel=inputs.cancel
-    )
+    fitter = state.fitter.converging(points.rate[sample])
+    fit_in_batches(fitter, points, index, inputs.xy_px, w[index], G[index], far_px=SAMPLE_FAR_PX, cancel=inputs.cancel)
     check(inputs, points)
     return replace(state, checked=True)
 

@@ -19,6 +19,7 @@ from core.status import PointStatus
 
 _MAX_EPIPOLAR_PX = 3.0
 _MAX_SHEAR = 4.0
+_RATE_FROM, _RATE_QUANTILE = 30, 0.9
 _KEPT = ("w", "G", "epipolar_px", "zncc")
 
 
@@ -40,6 +41,8 @@ class PointFits:
         (n,) int32.
     status
         (n,) int8.
+    rate
+        (n,) convergence rate of a motion, as the matching gives it.
     rejected_w, rejected_g, rejected_epipolar_px, rejected_zncc
         The same numbers as they were when a check rejected the point, NaN where none did; None: not kept.
     """
@@ -53,6 +56,7 @@ class PointFits:
     covariance: Float
     iterations: NDArray[np.int32]
     status: NDArray[np.int8]
+    rate: Float
     rejected_w: Float | None = None
     rejected_g: Float | None = None
     rejected_epipolar_px: Float | None = None
@@ -78,6 +82,7 @@ class PointFits:
             covariance=np.full((n, q, q), np.nan),
             iterations=np.zeros(n, np.int32),
             status=np.full(n, PointStatus.NOT_SEEDED, np.int8),
+            rate=np.full(n, np.nan),
         )
 
     @property
@@ -168,6 +173,18 @@ class Fitter:
         """Return the same matcher with curved patches."""
         return replace(self, options=replace(self.options, patch="quadratic"))
 
+    def converging(self, rate: Float) -> Fitter:
+        """Return the same matcher for points that converge as a sample (m,) of them did.
+
+        Nine in ten of the sample converged at least that fast; no slower rate is taken than what is assumed anyhow,
+        nor any from a few points.
+        """
+        known = rate[np.isfinite(rate)]
+        if len(known) < _RATE_FROM:
+            return self
+        first = min(float(np.quantile(known, _RATE_QUANTILE)), self.options.first_rate)
+        return replace(self, options=replace(self.options, first_rate=first))
+
     def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
         """Refine points from start values and reject those that fail the checks of a single point."""
         n = len(xy_px)
@@ -185,11 +202,21 @@ class Fitter:
                 s.covariance,
                 s.iterations,
                 s.status,
+                np.full(n, np.nan),
             )
         else:
             m = fit_motion(self.pair, self.ref1, self.ref2, self.cur1, self.cur2, xy_px, w, G, self.options, visible)
             fits = PointFits(
-                m.w, m.G, m.zncc, m.epipolar_px, m.epipolar_sigma_px, m.noise, m.covariance, m.iterations, m.status
+                m.w,
+                m.G,
+                m.zncc,
+                m.epipolar_px,
+                m.epipolar_sigma_px,
+                m.noise,
+                m.covariance,
+                m.iterations,
+                m.status,
+                m.rate,
             )
         if self.keep_rejected:
             fits.keep_rejected()

@@ -79,6 +79,16 @@ def connected_points(there: Bool, here: np.ndarray, crossed: Bool | None, half: 
     return np.asarray(seen.T)
 
 
+def distinct_windows(seen: Bool) -> tuple[Bool, np.ndarray]:
+    """Return (k, n) the different rows of ``seen`` (m, n), and (m,) the number of each row's own.
+
+    The rim of a field shows few ways in which a window can be cut off: its fits' weights are made once for each.
+    """
+    packed = np.ascontiguousarray(np.packbits(seen, axis=1))
+    _, first, which = np.unique(packed.view(f"V{packed.shape[1]}").ravel(), return_index=True, return_inverse=True)
+    return seen[first], which.ravel()
+
+
 def steps_of(xy_px: Float) -> tuple[float, float]:
     """Return the distances of neighbouring columns and rows in px; a single one takes the other's."""
     rows, cols = xy_px.shape[:2]

@@ -30,6 +30,7 @@ class Setting(NamedTuple):
     order: int
     max_iterations: int
     tolerance: float
+    first_rate: float
     max_sigma: float
     max_step: float
     slope_noise: float

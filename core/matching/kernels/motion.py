@@ -46,9 +46,10 @@ from core.matching.kernels.warp import lens_jacobian
 def n_motion_out(terms: int) -> int:
     """Numbers a point: ``terms`` of w, 3 x ``terms`` of G, e, zncc (3), noise, covariance (25) of (w0, G0, e).
 
-    Last the variance assumed in the covariance where the noise is not known.
+    Then the variance assumed in the covariance where the noise is not known, and last the rate of convergence: the
+    last step's motion over that of the one before, not set after a single step.
     """
-    return 4 * terms + 31
+    return 4 * terms + 32
 
 
 def make_motion(degree: int) -> FitKernels:
@@ -184,7 +185,7 @@ def make_motion(degree: int) -> FitKernels:
             e += cut * step[unknowns - 1]
             last = cut * motion
             moved += last
-            if settled(last, previous, tolerance):
+            if settled(last, previous, tolerance, setting.first_rate):
                 status = OK
                 break
             previous = last
@@ -211,6 +212,8 @@ def make_motion(degree: int) -> FitKernels:
         out[at + 4] = math.sqrt(variance)
         above = unlike_noise(levels, 3, seen.n_pixels, float(n))
         out[at + 30] = variance + above
+        if previous > 0.0:
+            out[at + 31] = last / previous
         if setting.known_noise:
             variance = variances[0]
         covariance = out[at + 5 : at + 30]

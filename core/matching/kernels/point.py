@@ -54,7 +54,6 @@ LOW_CORRELATION = int(PointStatus.LOW_CORRELATION)
 
 REFREEZE_PX = 0.5  # corner motion after which the frozen normal equations are set up anew
 PREDICTED_PX = 0.05  # last corner motion up to which the correlation at its end is predicted, not compared anew
-FIRST_RATE = 0.1  # convergence rate assumed before two steps have shown it
 FLAT = 1e-6  # squared contrast below which an image has no texture
 WHITE = 0.86  # squared differences of neighbours over twice the variance: one for white noise, which never matches
 
@@ -87,11 +86,14 @@ def epipolar_shift(lens2, R, t, xc, yc, w0):
 
 
 @inner
-def settled(motion, previous, tolerance):
-    """Return True if the remaining steps, as a geometric series, move no corner further than the tolerance."""
+def settled(motion, previous, tolerance, first_rate):
+    """Return True if the remaining steps, as a geometric series, move no corner further than the tolerance.
+
+    ``first_rate`` is the series' ratio before two steps have shown it.
+    """
     if motion < tolerance:
         return True
-    rate = FIRST_RATE if previous == 0.0 else motion / previous
+    rate = first_rate if previous == 0.0 else motion / previous
     return rate < 0.9 and motion * rate / (1.0 - rate) < tolerance
 
 

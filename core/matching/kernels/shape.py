@@ -121,7 +121,7 @@ def make_shape(degree: int) -> FitKernels:
             e += cut * step[few]
             last = cut * motion
             moved += last
-            if settled(last, previous, tolerance):
+            if settled(last, previous, tolerance, setting.first_rate):
                 status = OK
                 break
             previous = last

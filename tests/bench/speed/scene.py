@@ -88,8 +88,6 @@ class SequenceFiles:
             roi,
             "--out",
             str(out),
-            "--strain",
-            "off",
             *more,
         ]
 

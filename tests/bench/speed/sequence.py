@@ -46,10 +46,14 @@ STAGES = (
     ("fit", "core.field.points.fitter", "fit_motion"),
     ("checks", "core.field.growth.check", "apply_validity_checks"),
     ("assemble", "core.field.growth.field", "assemble"),
+    ("parts of subsets", "core.field.growth.check", "reject_straddling"),
+    ("cameras' offsets", "server.compute.camera_watch", "judge_offsets"),
+    ("systematic", "server.compute.sequence", "terms_of"),
+    ("strain", "server.compute.sequence", "strain_of_step"),
     ("summary", "server.compute.sequence", "summarise"),
     ("write", "server.compute.sequence", "write_field"),
 )
-BESIDE = ("read and decode", "splines", "summary", "write")  # on threads of their own
+BESIDE = ("read and decode", "splines", "strain", "summary", "write")  # on threads of their own
 _CHILD_TIMEOUT_S = 1800
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -271,6 +272,31 @@ def test_all_converge_from_a_pixel_off_in_any_direction():
         assert fit.iterations.mean() < 7
 
 
+def test_a_rate_that_is_known_saves_a_step_and_leaves_what_a_full_iteration_finds():
+    """Without a rate, a point a hundredth of a pixel off takes a second step that its own noise exceeds many times."""
+    rng = np.random.default_rng(11)
+    pair, four = paper_pair(), noisy("rest", 2.0, rng) + noisy("moved", 2.0, rng)
+    w, G = starts("moved")
+    options = MatchOptions(subset_px=33, interpolation="cubic", tolerance_px=1e-3)
+    full = fit_motion(pair, *four, XY, w, G, replace(options, tolerance_px=1e-6))
+    assert (full.iterations > 2).all()
+    assert np.isfinite(full.rate).all()
+    # a start as a prediction gives it: off by some hundredth of a pixel
+    near = full.G.copy()
+    near[:, :2, 0] += 1.2e-2 / 12_000.0 * rng.choice([-1.0, 1.0], (len(XY), 2))
+    slow = fit_motion(pair, *four, XY, full.w, near, options)
+    fast = fit_motion(pair, *four, XY, full.w, near, replace(options, first_rate=float(np.quantile(full.rate, 0.9))))
+    assert slow.iterations.mean() > 1.5
+    assert (fast.iterations == 1).mean() > 0.9
+    assert np.isnan(fast.rate[fast.iterations == 1]).all()
+    assert (fast.status == full.status).all()
+    sigma = np.sqrt(np.diagonal(full.covariance, axis1=1, axis2=2)[:, 1:4])
+    left = (fast.G - full.G)[..., 0] / sigma
+    # the start's 2.5 standard deviations, times the rate
+    assert np.sqrt((left**2).mean()) < 0.05
+    assert np.abs(left).max() < 0.3
+
+
 def test_gain_and_offset_of_the_images_change_nothing():
     pair = paper_pair()
     w, G = starts("moved")
@@ -364,6 +390,12 @@ def test_what_cannot_be_used_is_refused():
     with pytest.raises(ImageError) as caught_size:
         fit_motion(pair, image, image, image[1:], image, XY, np.zeros((len(XY), 3)))
     assert caught_size.value.code == "image_size_mismatch"
-    for wrong in ({"subset_px": 3}, {"tolerance_px": 0.0}, {"patch": "bent"}, {"max_iterations": 0}):
+    for wrong in (
+        {"subset_px": 3},
+        {"tolerance_px": 0.0},
+        {"patch": "bent"},
+        {"max_iterations": 0},
+        {"first_rate": 0.9},
+    ):
         with pytest.raises(InputError):
             MatchOptions(**wrong)

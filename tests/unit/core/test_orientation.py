@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 from core.cameras.camera import TEN_PARAMETER_NAMES, Camera
 from core.cameras.stereo import StereoPair
 from core.orientation import changed, changes_between, consequence_of, estimate_change, judge_offsets
+from core.orientation.change import ChangeSlopes
 from core.orientation.finding import calibration_slopes
 from core.orientation.matched import MatchedPoints
 from core.orientation.propagate import pose_parameters, repaired_covariance
@@ -190,6 +191,18 @@ def test_a_motion_in_depth_under_an_uncertain_calibration_is_no_camera_s() -> No
     told = judge_offsets(PAIR, bumped, before=held, against="reference", covariance=covariance)
     assert told is not None
     assert told.camera_moved
+
+
+def test_slopes_that_are_known_change_no_digit_of_a_finding() -> None:
+    points = matches(CAM1, CAM2, np.random.default_rng(8))
+    known = ChangeSlopes(PAIR, points.xy1_px, points.xy2_px)
+    alone, shared = judge_offsets(PAIR, points), judge_offsets(PAIR, points, slopes=known)
+    assert alone is not None
+    assert shared is not None
+    assert alone.document() == shared.document()
+    some = np.arange(len(points.xy1_px)) % 3 > 0
+    assert np.array_equal(known.of(some).offset, known.offset[some])
+    assert np.array_equal(known.of(some).position, known.position[some])
 
 
 def test_slopes_of_the_offset_are_its_differences() -> None:

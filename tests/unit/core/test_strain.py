@@ -12,8 +12,10 @@ from scipy.linalg import logm, sqrtm
 from core.errors import InputError
 from core.field.points.shared_pixels import SharedPixels
 from core.field.region.cuts import Cuts
+from core.field.region.window import distinct_windows
 from core.status import PointStatus
 from core.strain import StrainField, StrainOptions, StrainStatus, surface_strain
+from core.strain.arcs import missed_slope
 from core.strain.surface import surface_slopes
 from core.strain.tensors import strain_slopes
 from tests.support.strain_fields import cylinder, make_field, plane, sphere, turned
@@ -368,6 +370,32 @@ def test_no_window_reaches_over_empty_points(slant):
     assert (found.status[lost] == StrainStatus.NO_POINT).all()
     assert np.isnan(found.strain[lost]).all()
     assert found.valid.sum() > 700
+
+
+def test_windows_cut_off_alike_share_their_weights_and_no_other():
+    """Each window's rows as they were given come back from its kind, and the kinds are those that a set counts."""
+    rng = np.random.default_rng(5)
+    kinds = rng.random((7, 81)) < 0.6
+    seen = kinds[rng.integers(0, 7, 500)]
+    found, which = distinct_windows(seen.T.copy().T)  # as connected_points gives them: columns lie side by side
+    assert np.array_equal(found[which], seen)
+    assert len(found) == len({row.tobytes() for row in seen})
+
+
+def test_what_third_derivatives_add_to_a_slope_is_that_of_the_general_solution():
+    """The plain twin solves the metric's equations by LAPACK; rounding alone is between them."""
+    rng = np.random.default_rng(6)
+    slope, second = rng.normal(size=(40, 3, 2)), rng.normal(size=(40, 3, 3))
+    moments = rng.normal(size=(40, 2, 4))
+    for k in range(40):
+        x_s, x_t = slope[k].T
+        normal = np.cross(x_s, x_t) / np.linalg.norm(np.cross(x_s, x_t))
+        ss, st, tt = normal @ second[k]
+        along = -np.array([[ss * ss, ss * st], [ss * st, st * st], [st * st, tt * st], [tt * st, tt * tt]])
+        third = np.linalg.solve(slope[k].T @ slope[k], along.T).T @ slope[k].T
+        wanted = (moments[k] @ third).T
+        found = missed_slope(slope[k : k + 1], second[k : k + 1], moments[k : k + 1])[0]
+        assert found == pytest.approx(wanted, rel=1e-9, abs=1e-12 * np.abs(wanted).max())
 
 
 def test_islands_have_no_strain():
