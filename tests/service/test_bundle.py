@@ -298,13 +298,10 @@ def test_members_that_overlap_are_refused(bundle: Path, tmp_path: Path) -> None:
     content = bytearray(bundle.read_bytes())
     at = content.rfind(b"PK\x05\x06")
     start = struct.unpack_from("<I", content, at + 16)[0]
-    size = 0
-    for place in _entries(content, start, at):
-        size = max(size, struct.unpack_from("<I", content, place + 20)[0])
     for place in _entries(content, start, at):
         struct.pack_into("<I", content, place + 20, len(content) // 2)
     (tmp_path / "overlap.zip").write_bytes(bytes(content))
-    assert refused_with(tmp_path / "overlap.zip", tmp_path) in ("bundle_refused", "bundle_unreadable")
+    assert refused_with(tmp_path / "overlap.zip", tmp_path) == "bundle_refused"
 
 
 def _entries(content: bytearray, start: int, end: int) -> Iterator[int]:

@@ -52,7 +52,7 @@ def unpack(bundle: Path, data: Path) -> Opened:
     StateError
         ``test_exists`` if the test is there, or in the trash; ``data_folder_locked`` if a service runs there.
     StorageError
-        ``storage_full`` or ``storage_failed``. In every case the data folder is left as it was.
+        ``storage_full`` or ``storage_failed``. In every case the test is there whole, or not at all.
     """
     with _archive(bundle) as archive:
         manifest = _manifest(archive, bundle)
@@ -108,16 +108,16 @@ def _manifest(archive: zipfile.ZipFile, bundle: Path) -> Manifest:
     """Return the manifest, after everything that can be said without reading the files."""
     members = archive.infolist()
     size = bundle.stat().st_size
-    packed, whole = sum(one.compress_size for one in members), sum(one.file_size for one in members)
+    packed = sum(one.compress_size for one in members)
     if packed > size:
         raise refused(f"its members take {packed} bytes in a file of {size}: they overlap")
-    if whole > _MAX_GROWTH * size + _SMALL_BYTES:
-        raise refused(f"{size} bytes would become {whole}")
     for one in members:
+        name = one.filename[:120]
         if one.flag_bits & _ENCRYPTED or one.compress_type not in _METHODS:
-            raise refused(
-                f"{one.filename[:120]!r} is encrypted or packed by a method that is not used", file=one.filename
-            )
+            raise refused(f"{name!r} is encrypted or packed by a method that is not used", file=name)
+        most = min(_MAX_GROWTH * one.compress_size + _SMALL_BYTES, _MAX_TEXT_BYTES)
+        if one.compress_type != zipfile.ZIP_STORED and one.file_size > most:
+            raise refused(f"{one.compress_size} bytes of {name!r} would become {one.file_size}", file=name)
     names = [one.filename for one in members]
     if MANIFEST not in names:
         raise FileFormatError(
