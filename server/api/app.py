@@ -18,7 +18,7 @@ from server.api.protocol.auth import AccessRules, Door, Sessions
 from server.api.protocol.delivery import Delivery
 from server.api.protocol.guard import LOOPBACK_NAMES, Guard
 from server.api.protocol.old_addresses import OldAddresses
-from server.api.routes.analyses import analyses, exports, gauges, picking, previews, region, report, results
+from server.api.routes.analyses import analyses, exports, gauges, picking, previews, region, repetition, report, results
 from server.api.routes.calibrations import calibrations, guide, noise, repair, review
 from server.api.routes.calibrations import checks as calibration_checks
 from server.api.routes.calibrations import exports as calibration_exports
@@ -139,6 +139,7 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         analyses,
         picking,
         region,
+        repetition,
         results,
         gauges,
         exports,

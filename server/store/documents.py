@@ -37,7 +37,8 @@ class JobRecord(Document):
 
     id: str = Field(description="Id of the job.", examples=["j000007-a31f0c"])
     kind: str = Field(
-        description="`calibration`, `noise`, `analysis`, `burst`, `move`, `home`, `leave_configuration` or `reconnect`."
+        description="`calibration`, `noise`, `analysis`, `repetition`, `export`, `burst`, `move`, `home`, "
+        "`leave_configuration` or `reconnect`."
     )
     state: JobState = Field(description="State of the job.")
     subject: dict[str, object] = Field(description="Ids of what it works on.")

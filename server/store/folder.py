@@ -18,6 +18,8 @@ from server.formats.files import storage_error
 from server.store.durable import read_json, write_bytes, write_json
 
 FORMAT = 1
+#: begin of the name of a folder that something is opened into before it is shown; it ends in ``.part``
+STAGING = ".opening-"
 _ID = re.compile(r"[a-z]\d{6}-[0-9a-f]{6}")
 
 
@@ -188,7 +190,9 @@ class DataFolder:
         check_format(path)
 
     def _remove_temporaries(self) -> None:
-        # files that a kill left half written; only names that `written_temporary` makes
+        # what a kill left half written; only names that `written_temporary` makes, or that begin with STAGING
+        for path in self.root.glob(f"{STAGING}*.part"):
+            shutil.rmtree(path, ignore_errors=True)
         for folder, _, names in os.walk(self.root):  # a start goes through all folders: rglob takes twice as long
             for name in names:
                 if name.startswith(".") and name.endswith(".part"):

@@ -144,6 +144,18 @@ def rebuild(
     return catalog.replace_entries(entries) + trouble
 
 
+def reindex(folder: DataFolder) -> list[str]:
+    """Make the catalogue of a data folder anew that no service runs on; return what was different, a line each."""
+    catalog = Catalog(folder.root / "catalog.sqlite").open()
+    try:
+        was_reset = ["the catalogue could not be read; it was quarantined and begun anew"] if catalog.was_reset else []
+        noise = NoiseStore(folder)
+        noise.end_unfinished()
+        return was_reset + rebuild(catalog, folder, CalibrationStore(folder), TestStore(folder), noise)
+    finally:
+        catalog.close()
+
+
 def _check_trash(folder: DataFolder) -> list[str]:
     """Put the trash in order; its entries keep their ids."""
     trash = Trash(folder.root)

@@ -5,11 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from server.store.calibrations import CalibrationStore
-from server.store.catalog import Catalog
 from server.store.folder import DataFolder
-from server.store.index import rebuild
-from server.store.noise import NoiseStore
+from server.store.index import reindex
 from server.store.tests import TestStore, quarantine
 from server.store.verify import Verification, require_data_folder, verify
 
@@ -53,14 +50,7 @@ def repair(root: Path) -> Repair:
     try:
         tests = TestStore(folder)
         done += _tidy(root.absolute(), tests)
-        catalog = Catalog(folder.root / "catalog.sqlite").open()
-        try:
-            if catalog.was_reset:
-                done.append("the catalogue could not be read; it was quarantined and begun anew")
-            NoiseStore(folder).end_unfinished()
-            done += rebuild(catalog, folder, CalibrationStore(folder), tests)
-        finally:
-            catalog.close()
+        done += reindex(folder)
     finally:
         folder.close()
     return Repair(tuple(done), verify(root))

@@ -313,6 +313,22 @@ def verify(root: Path) -> Verification:
     return found
 
 
+def verify_test(root: Path, test_id: str) -> Verification:
+    """As `verify`, one test of a data folder alone; whether its files are ours is not asked of the folder itself.
+
+    Raises
+    ------
+    StorageError
+        When the disk does not let it be read.
+    """
+    walk = _Walk(root.absolute())
+    try:
+        walk.test(walk.root / "tests" / test_id)
+    except OSError as error:
+        raise _unreadable(error, root) from error
+    return Verification(walk.files, walk.unknown, tuple(walk.findings))
+
+
 def _check_all(root: Path) -> Verification:
     walk = _Walk(root)
     try:

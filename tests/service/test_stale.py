@@ -22,7 +22,7 @@ from server.cli import main
 from server.cli.measurement.measure import SOME_FAILED
 from server.formats.images import write_image
 from server.workflows.analysis import start as analysis_start
-from server.workflows.analysis.run import task_of
+from server.workflows.analysis.tasks import task_of
 from server.workflows.service import Service
 from sim.catalog import make_scene
 from sim.render import RenderOptions, render
@@ -272,13 +272,13 @@ def test_what_changes_between_asking_and_measuring_is_refused(
     made = service.tests.create_analysis(test_folder.name, document)
     spoil(test_folder, "the reference was taken again")
     with pytest.raises(FileFormatError) as caught:
-        task_of(service, made, 1, {}, None)
+        task_of(service.tests, made, 1, {}, None)
     assert caught.value.code == "step_changed"
     _, test_folder = copied_in(taken, service)
     made = service.tests.create_analysis(test_folder.name, document)
     spoil(test_folder, "the calibration was replaced")
     with pytest.raises(FileFormatError) as caught:
-        task_of(service, made.model_copy(update={"test_id": test_folder.name}), 1, {}, None)
+        task_of(service.tests, made.model_copy(update={"test_id": test_folder.name}), 1, {}, None)
     assert caught.value.code == "calibration_changed"
 
 

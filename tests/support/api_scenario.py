@@ -383,6 +383,7 @@ def _analysis(session: Session, test: str) -> str:
     call("get_analysis_recipe", test, made["analysis_id"])
     call("list_analyses", test)
     call("get_analysis", test, made["analysis_id"])
+    wait_for_job(client, call("reproduce_analysis", test, made["analysis_id"]).json()["job"])
     return str(made["analysis_id"])
 
 

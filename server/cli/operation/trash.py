@@ -8,13 +8,9 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from core.errors import InputError
-from server.store.calibrations import CalibrationStore
-from server.store.catalog import Catalog
 from server.store.documents import TrashEntry
 from server.store.folder import DataFolder
-from server.store.index import rebuild
-from server.store.noise import NoiseStore
-from server.store.tests import TestStore
+from server.store.index import reindex
 from server.store.trash import Trash
 from server.store.verify import require_data_folder
 
@@ -63,13 +59,7 @@ def _restore(data: Path, ids: list[str]) -> int:
         trash = Trash(folder.root)
         for trash_id in ids:
             print(f"restored {_description(trash.restore(trash_id))}")
-        catalog = Catalog(folder.root / "catalog.sqlite").open()
-        try:
-            noise = NoiseStore(folder)
-            noise.end_unfinished()
-            rebuild(catalog, folder, CalibrationStore(folder), TestStore(folder), noise)
-        finally:
-            catalog.close()
+        reindex(folder)
     finally:
         folder.close()
     return 0

@@ -23,6 +23,7 @@ from core.field.sequence.propagated import current_covariance
 from core.names import CAUSES
 from core.status import STATUS_MEANINGS, PointStatus
 from core.strain import StrainField
+from server.formats.environment import current_environment
 from server.formats.results.layout import (
     COLUMN_BY_COLUMN,
     COMPARISONS,
@@ -394,6 +395,7 @@ def _attributes(provenance: Provenance, *, moved: bool) -> dict[str, object]:
         "frame": _FRAMES.get(provenance.frame, provenance.frame),
         "settings": json.dumps(provenance.settings, sort_keys=True),
         "inputs_sha256": json.dumps(provenance.inputs, sort_keys=True),
+        "environment": current_environment().text(),
         **provenance.extra,
     }
 

@@ -12,11 +12,9 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from typing import Any
 
-from core.errors import Cancelled, FileFormatError, MeasurementError, StereorigError, StorageError
+from core.errors import Cancelled, MeasurementError, StereorigError, StorageError
 from server.base.json_values import without_nan
 from server.base.problem import problem_of
-from server.formats.files import sha256_of
-from server.formats.results.settings import stored_settings
 from server.formats.results.summary import SequenceSummary
 from server.formats.version import software_version
 from server.jobs.job import Job, Waiting
@@ -27,7 +25,8 @@ from server.store.index import analysis_entry
 from server.store.tests import StepFiles
 from server.worker.dask_cluster import ClusterError
 from server.worker.executor import WorkerDiedError
-from server.worker.tasks import StepImages, StepTask, averages_of, grey_from_of, measure_step
+from server.worker.tasks import StepTask, measure_step
+from server.workflows.analysis.tasks import is_independent, task_of
 from server.workflows.camera_identity import check_same_cameras
 from server.workflows.service import Service
 from server.workflows.waiting import run_side_by_side, run_task
@@ -38,21 +37,6 @@ class StepsFailedError(MeasurementError):
 
     code = "steps_failed"
     remedy = "Read each step's problem in the summary."
-
-
-def calibration_changed(where: str) -> FileFormatError:
-    """Return the error for a calibration that was replaced."""
-    return FileFormatError(
-        f"calibration.json {where} is not the one it was made with.",
-        code="calibration_changed",
-        remedy="Restore the file from a backup, or make a new test with the other calibration.",
-        file="calibration.json",
-    )
-
-
-def is_independent(document: AnalysisRecord) -> bool:
-    """Return True if the steps of an analysis need no step but the reference."""
-    return document.kind == "profile" or document.settings.get("start_from") == "reference"
 
 
 class AnalysisRun:
@@ -160,7 +144,7 @@ class AnalysisRun:
         started = time.monotonic()
         try:
             self._check_cameras(n)
-            task = task_of(service, document, n, self._done, steps[index + 1] if index + 1 < len(steps) else None)
+            task = task_of(service.tests, document, n, self._done, steps[index + 1] if index + 1 < len(steps) else None)
             summary = run_task(service.executor, job, measure_step, task, progress=progress)
         except StereorigError as error:
             self._note_failure(job, n, error)
@@ -183,7 +167,7 @@ class AnalysisRun:
             for n in open_steps:
                 try:
                     self._check_cameras(n)
-                    task = task_of(self._service, self._document, n, {}, None)
+                    task = task_of(self._service.tests, self._document, n, {}, None)
                 except StereorigError as error:
                     self._note_failure(job, n, error)
                     continue
@@ -264,62 +248,6 @@ class AnalysisRun:
         problems = {str(n): problem_of(error).plain() for n, error in self._failed.items()}
         found["warnings"] = [one.plain() for one in analysis_warnings(folder, failed=problems)]
         return found
-
-
-def task_of(
-    service: Service, document: AnalysisRecord, n: int, done: dict[int, StepFiles], following: int | None
-) -> StepTask:
-    """Return the task of one step, its inputs compared with those that the analysis was made of."""
-    test_id, displacement = document.test_id, document.kind == "displacement"
-    reference = document.steps[0] if displacement else n
-    ref, now = (service.tests.verified_step(test_id, k) for k in (reference, n))
-    for k, step in ((reference, ref), (n, now)):
-        if step.document.sha256 != document.inputs.steps.get(str(k)):
-            raise FileFormatError(
-                f"Step {k} of test {test_id} was replaced since the analysis was made.",
-                code="step_changed",
-                remedy="Start a new analysis.",
-            )
-    calibration = service.tests.calibration_file(test_id, document.inputs.calibration_sha256)
-    if sha256_of(calibration) != document.inputs.calibration_sha256:
-        raise calibration_changed(f"of test {test_id}, on which the analysis rests,")
-    settings = stored_settings(document.settings)
-    earlier: dict[int, StepFiles] = {}
-    if displacement and settings.reference_update != "never":
-        earlier = {k: step for k, step in done.items() if k != reference}
-    after = None
-    if following is not None and displacement:
-        with contextlib.suppress(StereorigError):  # what is wrong with it is said at its own turn
-            after = service.tests.step(test_id, following)
-    about = {"label": now.document.label or "", "test_step": str(n)}
-    if now.document.load_n is not None:
-        about["load_n"] = repr(now.document.load_n)
-    folder = service.tests.analysis_path(test_id, document.id)
-    return StepTask(
-        folder=folder,
-        calibration=calibration,
-        settings=settings,
-        reference=images_of(reference, ref),
-        step=images_of(n, now),
-        previous=next(reversed(done), None),
-        about=about,
-        following=None if after is None or following is None else images_of(following, after),
-        noise=folder / "noise.json" if settings.noise is not None else None,
-        earlier={k: images_of(k, step) for k, step in earlier.items()},
-        keeps_starts=displacement and (n == reference or not is_independent(document)),
-    )
-
-
-def images_of(n: int, step: StepFiles) -> StepImages:
-    """Return a stored step's images as the worker gets them."""
-    sha256 = step.document.sha256
-    return StepImages(
-        n=n,
-        files=(step.cam1, step.cam2),
-        sha256=(sha256["cam1"], sha256["cam2"]),
-        averages=averages_of(step.document.plain()),
-        grey_from=grey_from_of(step.document.plain()),
-    )
 
 
 def close(service: Service, job: Job, test_id: str, analysis_id: str, state: str) -> None:

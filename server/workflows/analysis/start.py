@@ -22,7 +22,8 @@ from server.results.images.projected_pattern import check_settings
 from server.results.staleness import stale_inputs
 from server.store.documents import AnalysisRecord
 from server.store.index import analysis_entry
-from server.workflows.analysis.run import AnalysisRun, calibration_changed, close
+from server.workflows.analysis.run import AnalysisRun, close
+from server.workflows.analysis.tasks import calibration_changed
 from server.workflows.camera_identity import check_same_cameras
 from server.workflows.service import Service
 from server.workflows.test_start import calibration_asked, give_calibration

@@ -215,7 +215,8 @@ def pages() -> dict[str, str]:
         "",
         "Smoothed displacements replace `u_mm`, `v_mm`, `w_mm`; `measured_*` hold them as measured, only where that differs. Attributes of",
         "the file: `kind` (`shape` or `displacement`), `step`, `reference_step`, `frame`, `settings` (JSON), `inputs_sha256`, `patch`,",
-        "`patch_reason`, `systematic` (as in `summary.json`, JSON), `software_version`, `created`, `format_version`.",
+        "`patch_reason`, `systematic` (as in `summary.json`, JSON), `software_version`, `environment` (versions, hash of the "
+        "code, processor, JSON), `created`, `format_version`.",
         "",
         "## Point status",
         "",

@@ -1,0 +1,1 @@
+"""Commands that show others what a result is worth: repetition, bundle, comparison with a model."""

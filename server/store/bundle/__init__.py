@@ -1,0 +1,1 @@
+"""A test in one file, with all that is needed to measure it again elsewhere."""

@@ -1,0 +1,1 @@
+"""Measuring an analysis again from what is stored, and comparing."""

@@ -1,0 +1,186 @@
+"""An analysis measured again from the stored images, settings and calibration, each step compared with its result."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from core.errors import Cancelled, FileFormatError, StateError, StereorigError, StorageError
+from server.formats.environment import Change
+from server.formats.files import sha256_of
+from server.results.repeated import WITHIN_U, StepRepetition, Verdict, changes_of, compare_results
+from server.store.documents import AnalysisRecord
+from server.store.tests import StepFiles, TestStore
+from server.worker.dask_cluster import ClusterError
+from server.worker.executor import WorkerDiedError
+from server.worker.tasks import StepTask
+from server.workflows.analysis.tasks import is_independent, task_of
+
+Measure = Callable[[StepTask], object]
+
+_ORDER: tuple[Verdict, ...] = ("equal", "within", "differs")
+
+
+@dataclass(frozen=True)
+class Repetition:
+    """An analysis beside its repetition.
+
+    Attributes
+    ----------
+    verdict
+        The worst of its steps, see :class:`server.results.repeated.StepRepetition`.
+    steps
+        Those that were compared.
+    not_measured
+        Steps that the analysis has not measured; they are not repeated.
+    changes
+        What is different since in program, libraries and processor.
+    """
+
+    test_id: str
+    analysis_id: str
+    steps: tuple[StepRepetition, ...]
+    not_measured: tuple[int, ...]
+    changes: tuple[Change, ...]
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst of the steps'."""
+        return max((step.verdict for step in self.steps), key=_ORDER.index)
+
+    def document(self) -> dict[str, object]:
+        """Return it as plain data."""
+        return {
+            "test_id": self.test_id,
+            "analysis_id": self.analysis_id,
+            "verdict": self.verdict,
+            "within_u": WITHIN_U,
+            "changes": [asdict(change) for change in self.changes],
+            "steps": [asdict(step) for step in self.steps],
+            "not_measured": list(self.not_measured),
+        }
+
+    def lines(self) -> list[str]:
+        """Return it as text, a line each; the verdict last."""
+        lines = [f"changed: {change.text()}" for change in self.changes]
+        for step in self.steps:
+            judged = [one for one in step.differences if one.over_u is not None]
+            worst = max(judged, key=lambda one: one.over_u or 0.0, default=None)
+            text = "equal to the last bit" if step.verdict == "equal" else "differs: " + "; ".join(step.reasons)
+            if step.verdict == "within":
+                most = "" if worst is None else f": {worst.name} by {worst.over_u:.1e} of it at most"
+                text = f"the same within its uncertainty{most}"
+            lines.append(f"step {step.n}: {text}")
+        if self.not_measured:
+            lines.append(f"not measured, so not repeated: steps {', '.join(map(str, self.not_measured))}")
+        return [*lines, f"{self.verdict}: {self.test_id}/{self.analysis_id}, {len(self.steps)} steps measured again"]
+
+
+def repeat(
+    tests: TestStore,
+    test_id: str,
+    analysis_id: str,
+    folder: Path,
+    measure: Measure,
+    *,
+    on_step: Callable[[int, int, int], None] = lambda _n, _k, _of: None,
+) -> Repetition:
+    """Measure an analysis again into another folder, and compare.
+
+    Parameters
+    ----------
+    folder
+        An empty folder for the results; the caller removes it.
+    measure
+        Measures a step's task; its result file is there when this returns.
+    on_step
+        Called before each step with its number, how many are done, and of how many.
+
+    Raises
+    ------
+    NotFoundError
+        There is no such test or analysis.
+    StateError
+        ``analysis_unmeasured`` if no step of it was measured.
+    FileFormatError
+        ``checksum_mismatch``, ``step_changed``, ``calibration_changed``: what it was measured from is not there any
+        more, so that nothing can be repeated.
+    """
+    document = tests.analysis(test_id, analysis_id)
+    finished, failed = tests.finished_steps(test_id, analysis_id), _failed(tests, test_id, analysis_id)
+    wanted = [n for n in document.steps if n in finished or n in failed]
+    if not set(wanted) & set(finished):
+        raise StateError(
+            f"Analysis {analysis_id} of test {test_id} has no measured step to repeat.",
+            code="analysis_unmeasured",
+            remedy="Continue the analysis first, or name another one.",
+        )
+    _copy_inputs(tests.analysis_path(test_id, analysis_id), document, folder)
+    done: dict[int, StepFiles] = {}
+    found: list[StepRepetition] = []
+    changes: dict[Change, None] = {}
+    for k, n in enumerate(wanted):
+        on_step(n, k, len(wanted))
+        before = tests.result_file(test_id, analysis_id, n) if n in finished else None
+        found.append(_one(tests, document, n, done, folder, measure, before, failed.get(n)))
+        if before is not None and n in done:
+            changes |= dict.fromkeys(changes_of(before, result_in(folder, n)))
+    rest = tuple(n for n in document.steps if n not in wanted)
+    return Repetition(test_id, analysis_id, tuple(found), rest, tuple(changes))
+
+
+def _one(
+    tests: TestStore,
+    document: AnalysisRecord,
+    n: int,
+    done: dict[int, StepFiles],
+    folder: Path,
+    measure: Measure,
+    before: Path | None,
+    failed_by: str | None,
+) -> StepRepetition:
+    earlier = {} if is_independent(document) else done
+    task = task_of(tests, document, n, earlier, None, folder)
+    try:
+        measure(task)
+    except (Cancelled, FileFormatError, StorageError, WorkerDiedError, ClusterError):
+        raise
+    except StereorigError as error:
+        if before is None and error.code == failed_by:
+            return StepRepetition(n, "equal")
+        if before is not None and n == document.steps[0]:
+            raise  # nothing can be measured after it
+        was = "was measured" if before is not None else f"had failed with {failed_by}"
+        return StepRepetition(n, "differs", (f"it {was}, and fails now: {error.code}: {error.cause}",))
+    done[n] = tests.step(document.test_id, n)
+    if before is None:
+        return StepRepetition(n, "differs", (f"it had failed with {failed_by}, and is measured now",))
+    return compare_results(before, result_in(folder, n), n)
+
+
+def result_in(folder: Path, n: int) -> Path:
+    """Path of the repeated result of a step."""
+    return folder / f"step_{n:04d}.nc"
+
+
+def _failed(tests: TestStore, test_id: str, analysis_id: str) -> dict[int, str]:
+    """Codes of the steps that failed."""
+    summary = tests.summary(test_id, analysis_id)
+    return {} if summary is None else {int(n): problem.code for n, problem in summary.steps_failed.items()}
+
+
+def _copy_inputs(analysis: Path, document: AnalysisRecord, folder: Path) -> None:
+    """Put mask and noise models, which the analysis has for itself, where its repetition finds them."""
+    for name in ("mask.png", "noise.json"):
+        if (analysis / name).is_file():
+            shutil.copyfile(analysis / name, folder / name)
+    recorded = document.plain().get("mask_sha256")
+    if recorded is not None and (not (folder / "mask.png").is_file() or sha256_of(folder / "mask.png") != recorded):
+        raise FileFormatError(
+            f"mask.png of analysis {document.id} does not match its checksum.",
+            code="checksum_mismatch",
+            remedy="Restore the file from a backup, or measure again.",
+            file=f"analyses/{document.id}/mask.png",
+        )
