@@ -199,7 +199,7 @@ def find_source(
         steps=steps,
         calibration=loaded,
         calibration_file=file,
-        metadata=_with_drawn_gauges(stated, home, doubts),
+        metadata=_with_drawn_gauges(stated, folder, home, doubts),
         stale=stale_results(list(files.values()), list(heads.values())),
         doubts=doubts,
         warnings=[one for one in analysis_warnings(folder) if one.code != "steps_failed"],  # they are among the doubts
@@ -207,9 +207,11 @@ def find_source(
     )
 
 
-def _with_drawn_gauges(stated: TestMetadata, home: Path | None, doubts: list[str]) -> TestMetadata:
-    """Add the gauges that were drawn over the test's results, where the metadata name none."""
-    drawn = None if home is None else known_json(home / "workspace.json").get("gauges")
+def _with_drawn_gauges(stated: TestMetadata, folder: Path, home: Path | None, doubts: list[str]) -> TestMetadata:
+    """Add the gauges of the recipe, or those drawn over the test's results, where the metadata name none."""
+    drawn = known_json(folder / "summary.json").get("gauges")  # of what stereorig measure --recipe wrote
+    if drawn is None and home is not None:
+        drawn = known_json(home / "workspace.json").get("gauges")
     if stated.gauges is not None or drawn is None:
         return stated
     try:

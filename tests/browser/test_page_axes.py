@@ -77,6 +77,8 @@ def test_a_tension_along_the_images_vertical_reads_as_one_and_files_keep_the_sys
         at = opened(page, bench, strip, name)
         reads(at, 1e6 * strain, 3.0)  # float32 of neighbours 0.14 mm apart
         expect(at.locator('[data-role="statistics"]')).to_contain_text("principal strains, mean")
+        axis = at.locator('[data-role="principal-axis"]').inner_text()  # the tension's, down the image
+        assert abs(float(axis.removesuffix("° from X").replace("\N{MINUS SIGN}", "-"))) == pytest.approx(90.0, abs=0.5)
         assert directions(at) == pytest.approx([1.0, 0.0, 0.0, 1.0], abs=0.01)
     system = bench.field(1, "eyy", strip, frame="system")
     assert 1e6 * np.nanmean(system) == pytest.approx(1e6 * (TENSION + LATERAL) / 2.0, abs=5.0)

@@ -121,6 +121,18 @@ def test_foreseen_run_and_seen(page: Watched, client: httpx.Client) -> None:
     assert before == pytest.approx(100 * found["residual_px"][0][0][0], rel=1e-6)
     slider.fill("3")
     assert first_arrow() == pytest.approx(10 * before, rel=1e-6)
+    # a mark that is not in the image is told beside it, before anything is sent
+    shown.get_by_text("Known distance", exact=True).first.click()
+    marks = shown.get_by_role("group", name="Marks in cam2, px")
+    first = shown.get_by_label("cam2, mark 1, x")
+    for text, told in (("256", "not 256\u00a0px"), ("-1", "not \N{MINUS SIGN}1\u00a0px")):
+        first.fill(text)
+        first.press("Tab")
+        expect(marks.get_by_role("alert")).to_have_text(
+            f"Mark 1, x, is not in the image. Give 0 to 255\u00a0px, {told}."
+        )
+    first.fill("255")
+    expect(marks.get_by_role("alert")).not_to_contain_text("not in the image")
     page.sound()
 
 

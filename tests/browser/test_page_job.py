@@ -25,6 +25,7 @@ from playwright.sync_api import Locator, Page, expect
 
 from core.cameras.camera import Camera
 from server.config.rig_file import parse_config
+from server.formats.results.netcdf import library
 from server.workflows.service import Service
 from tests.support.page_audit import in_every_size
 from tests.support.page_bench import Watched
@@ -295,7 +296,7 @@ def export_opens(shown: Page, client: httpx.Client, test_id: str) -> None:
             shown.get_by_role("button", name="Save the file").click()
         assert saved.value.suggested_filename.endswith(f".{form}")
         files[form] = Path(saved.value.path())
-    with xarray.open_dataset(files["nc"], engine="netcdf4") as opened:
+    with library, xarray.open_dataset(files["nc"], engine="netcdf4") as opened:
         assert opened["w_mm"].attrs["units"] == "mm"
         np.testing.assert_allclose(opened["w_mm"].values, w, atol=1e-12)
     text = files["csv"].read_text(encoding="utf-8-sig")

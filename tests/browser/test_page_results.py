@@ -17,6 +17,7 @@ from playwright.sync_api import Browser, Page, expect
 from core.cameras.camera import Camera
 from server.exports.mesh import triangles_of
 from server.formats.calibrations.recognise import load_calibration
+from server.formats.results.netcdf import library
 from server.formats.results.reading import read_field, read_head
 from server.formats.results.writing import Provenance, write_field
 from server.report.source import find_source
@@ -550,7 +551,7 @@ def test_settings_checks_and_files(page: Watched, bench: Bench) -> None:
         at.get_by_role("button", name="Save the file").click()
     assert saved.value.suggested_filename.endswith(".nc")
     stored = bench.service.tests.result_file(bench.test_id, bench.analysis_id, 2)
-    with xarray.open_dataset(saved.value.path()) as one, xarray.open_dataset(stored) as other:
+    with library, xarray.open_dataset(saved.value.path()) as one, xarray.open_dataset(stored) as other:
         xarray.testing.assert_identical(one[list(other.variables)].drop_attrs(), other.drop_attrs())
         # what was recorded with the step stands beside its result
         assert set(one.variables) - set(other.variables) <= {"load_n", "time_s", "channel_stroke_mm"}

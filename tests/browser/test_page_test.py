@@ -107,7 +107,14 @@ def test_make_tell_capture(page: Watched, client: httpx.Client, calibration: str
 def test_the_path_leads_back_to_the_test_and_its_parts_and_ticks_what_is_done(page: Watched, plate: str) -> None:
     shown = page.open(f"#/test/{plate}")
     screens = shown.get_by_role("navigation", name="Screens")
-    for name, done in (("Rig", True), ("Test", True), ("Capture", True), ("Measure", False), ("Results", False)):
+    for name, done in (
+        ("Rig", True),
+        ("Test", True),
+        ("Capture", True),
+        ("Region", False),
+        ("Measure", False),
+        ("Results", False),
+    ):
         link = screens.get_by_role("link", name=name, exact=True)
         expect(link).to_have_attribute("title", re.compile("^Done" if done else "^Not yet"))
     expect(screens.get_by_role("link", name="Test", exact=True)).to_have_attribute("aria-current", "page")
@@ -119,6 +126,9 @@ def test_the_path_leads_back_to_the_test_and_its_parts_and_ticks_what_is_done(pa
     Editor(shown).drag((90, 80), (170, 160))
     drawn = shown.get_by_text("Draw a region to rate its speckle quality")
     expect(drawn).to_have_count(0)
+    # a region that is drawn is kept, and that is the step's end; nothing was measured yet
+    expect(screens.get_by_role("link", name="Region", exact=True)).to_have_attribute("title", re.compile("^Done"))
+    expect(screens.get_by_role("link", name="Measure", exact=True)).to_have_attribute("title", re.compile("^Not yet"))
     screens.get_by_role("link", name="Measure", exact=True).click()
     expect(shown.get_by_role("button", name="Measure", exact=True)).to_be_in_viewport()
     expect(drawn).to_have_count(0)

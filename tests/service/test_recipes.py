@@ -12,6 +12,8 @@ import pytest
 
 from server.api.models.recipes import RECIPE_VERSION
 from server.cli import main
+from server.report.source import find_source
+from server.results.gauges.request import GaugeRequest
 from server.store.verify import verify
 from server.workflows.service import Service
 from tests.support.copied_tests import write_test_folder
@@ -184,6 +186,7 @@ def test_the_command_line_takes_the_same_file_and_its_options_override_it(
     recipe = {
         **stated({"image_size_px": [160, 144]}),
         "region": {"polygon": [[50, 50], [95, 51], [80, 92.5]], "holes": [[[60, 60], [64, 60], [64, 64]]]},
+        "gauges": {"points": [{"name": "middle", "xy_px": [75, 62]}]},
         "settings": {
             "subset_px": 25,
             "spacing_px": 12,
@@ -197,6 +200,9 @@ def test_the_command_line_takes_the_same_file_and_its_options_override_it(
     arguments = ["measure", str(folder), "--recipe", str(file), "--out", str(tmp_path / "out")]
     assert main([*arguments, "--subset", "21", "--interpolation", "cubic"]) == 0
     settings = json.loads((tmp_path / "out" / "summary.json").read_text())["settings"]
+    # the report of this folder reads the gauges without being told of the recipe
+    (point,) = (find_source(tmp_path / "out").metadata.gauges or GaugeRequest()).points
+    assert (point.name, point.xy_px) == ("middle", (75.0, 62.0))
     assert (settings["subset_px"], settings["interpolation"]) == (21, "cubic")  # of the command line
     assert (settings["spacing_px"], settings["max_sigma_px"], settings["pattern"]) == (12, 0.2, "projected")
     assert settings["region"]["polygon"] == recipe["region"]["polygon"]

@@ -315,6 +315,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         noise=noise,
         failed=failed,
         specimen=specimen,
+        gauges=None if recipe is None else recipe.gauges,
     )
 
 

@@ -38,6 +38,7 @@ from server.worker.tasks import StepImages
 if TYPE_CHECKING:
     from core.field.seeding.specimen import Specimen
     from server.compute.sequence import Pair, SequenceMeasurement
+    from server.results.gauges.request import GaugeRequest
 
 _MIN_OF_STATED, _MAX_OF_STATED = 0.75, 1.5  # residuals hold interpolation error besides noise, never less
 _SEEDS_SHARE = 0.15  # of a step's time, as a rule
@@ -82,6 +83,7 @@ class MeasureJob:
 
     ``steps`` are those that can be measured, the reference first; ``failed`` has the error of each other one.
     ``specimen`` is what was found where no region was given; its mask is then to be written to ``mask_file``.
+    ``gauges`` are the recipe's: they are kept beside the results, and the report reads them.
     """
 
     calibration: LoadedCalibration
@@ -93,6 +95,7 @@ class MeasureJob:
     noise: LoadedNoise | None = None
     failed: Mapping[int, StereorigError] = field(default_factory=dict)
     specimen: Specimen | None = None
+    gauges: GaugeRequest | None = None
 
     @property
     def last(self) -> int:
@@ -183,6 +186,8 @@ def _write_summary(runner: _Runner, seconds: float, error: BaseException | None)
         steps_failed={str(n): problem_of(runner.failed[n]).plain() for n in sorted(runner.failed)},
         region_found=None if job.specimen is None else region_found(job.specimen),
     ).document()
+    if job.gauges is not None:
+        summary["gauges"] = job.gauges.model_dump(mode="json", exclude_none=True)
     summary["problem"] = problem_of(error).plain() if isinstance(error, StereorigError) else None
     write_bytes(job.out / "summary.json", to_json(summary))
     return summary

@@ -8,6 +8,8 @@ import { h, replace } from "./dom.js";
 
 const LATER_MS = 300;
 const AGAIN_MS = 2000;
+/** Told to the window once something drawn or set was saved. */
+export const SAVED = "workspacesaved";
 // browsers send no more than this for a page that is being closed
 const CLOSING_BYTES = 60_000;
 
@@ -103,6 +105,7 @@ export class Workspace {
     const { value, etag } = await api.putTagged(this.path, body, this.etag === null ? {} : { "If-Match": this.etag }, keepalive);
     this.stored = /** @type {Kept} */ (value);
     this.etag = etag;
+    window.dispatchEvent(new Event(SAVED));
   }
 
   /**

@@ -2,12 +2,13 @@
 import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
 import { comparedInSpace, distanceCheck } from "./calibrate/checks.js";
+import { correlations } from "./calibrate/correlations.js";
 import { guidePanel } from "./calibrate/guide.js";
 import { geometryOf, statusBadge } from "./calibrate/summary.js";
 import { calibrationViews } from "./calibrate/views.js";
 import { allRight, numberWithin, numbersWithin, rule } from "../lib/fields.js";
 import { wayBackNote } from "../widgets/way_back.js";
-import { h, numeric, pen, replace, field, number, select, action, table, definitions, badge, num, count, quantity, when, notify, problemText, ask } from "../lib/dom.js";
+import { h, numeric, replace, field, number, select, action, table, definitions, badge, num, count, quantity, when, notify, problemText, ask } from "../lib/dom.js";
 
 /** @import { Here } from "../main.js" */
 /** @import { Ends, Part } from "#dom" */
@@ -420,34 +421,6 @@ function nominal(document_, name) {
   const [a, b] = [of("cam1"), of("cam2")];
   if (a === null && b === null) return "";
   return a === b ? num(a, 5) : `${num(a, 4)}; ${num(b, 4)}`;
-}
-
-/** @param {Calibration} document_ */
-function correlations(document_) {
-  const { covariance } = document_;
-  if (!covariance?.matrix) return null;
-  const { names, matrix } = covariance;
-  const r = matrix.map((row, i) => row.map((value, k) => value / Math.sqrt(matrix[i][i] * matrix[k][k])));
-  /** @type {[one: string, other: string, correlation: number][]} */
-  const strongest = [];
-  names.forEach((a, i) => names.forEach((b, k) => { if (k > i && Math.abs(r[i][k]) > 0.9) strongest.push([a, b, r[i][k]]); }));
-  strongest.sort((a, b) => Math.abs(b[2]) - Math.abs(a[2]));
-  const SIZE = 14;
-  const canvas = h("canvas", { width: names.length * SIZE, height: names.length * SIZE, role: "img", "aria-label": "Correlation of all parameters: blue negative, orange positive", style: { maxWidth: "100%", display: "block" } });
-  const context = pen(canvas);
-  r.forEach((row, i) => row.forEach((value, k) => {
-    context.fillStyle = value < 0 ? `rgba(40, 120, 220, ${Math.abs(value)})` : `rgba(230, 120, 0, ${Math.abs(value)})`;
-    context.fillRect(k * SIZE, i * SIZE, SIZE - 1, SIZE - 1);
-  }));
-  const under = h("p.quiet", { role: "status" }, "Point at a square to read its value.");
-  canvas.addEventListener("pointermove", (event) => {
-    const box = canvas.getBoundingClientRect();
-    const [k, i] = [Math.floor(((event.clientX - box.left) / box.width) * names.length), Math.floor(((event.clientY - box.top) / box.height) * names.length)];
-    if (r[i]?.[k] !== undefined) under.textContent = `${names[i]} and ${names[k]}: ${num(r[i][k], 4)}`;
-  });
-  return h("details", h("summary", "Correlation of the parameters"),
-    h("p.quiet", "The effects of strongly correlated parameters nearly cancel; assess a calibration by the uncertainty of points."), canvas, under,
-    table([["One", (row) => row[0]], ["Other", (row) => row[1]], ["Correlation", (row) => row[2].toFixed(5).replace("-", "−"), { numeric: true }]], strongest.slice(0, 12), { caption: "Strongest, above 0.9", empty: "None above 0.9." }));
 }
 
 /** @param {HTMLElement} list */

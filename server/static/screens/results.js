@@ -17,6 +17,7 @@ import { interval } from "./results/uncertainty.js";
 import { live, usualField } from "./results/live.js";
 import { stateBadge, warningsBox, warningsCell } from "./results/warnings.js";
 import { amount, shown as shown_, strainUnit, useStrainUnit } from "../lib/units.js";
+import { seenPicture } from "../widgets/seen_picture.js";
 import { h, replace, table, when, num, count, quantity, field, select, definitions, notify, problemText } from "../lib/dom.js";
 
 /** @import { Here } from "../main.js" */
@@ -24,19 +25,35 @@ import { h, replace, table, when, num, count, quantity, field, select, definitio
 /** @import { Over } from "../widgets/field_map.js" */
 /** @import { Shown } from "./results/analysis.js" */
 /** @import { Overlay } from "./results/overlay.js" */
+/** @import { Seen } from "../widgets/seen_picture.js" */
 /** @import { Interval } from "./results/uncertainty.js" */
 /** @typedef {"image" | "surface" | "compare"} Mode */
 /** @typedef {{ step: number | null, field: string | null, chosen: boolean, image: Over, mode: Mode, info: Shown | null, playing: object | null, pinned?: number }} State */
 /** @typedef {{ result: Result, state: State, map: FieldMap, scale: Scale, interval: Interval, workspace: Workspace, overlay: Overlay, ends: Ends, probe: HTMLElement, message: HTMLElement, readonly step: number | null,
- *   readonly info: Shown | null, onpick: (x: number, y: number, event: Event) => unknown, drawn: Set<() => unknown>, landed: Set<() => unknown> }} Viewer shared by the parts of the screen;
- *   `drawn` is called after each change of step, field or scale, `landed` once more steps are finished */
-/** @typedef {{ root: HTMLElement, update: () => Promise<void>, close: () => void, attach?: () => void }} OtherView shown instead of the map */
+ *   readonly info: Shown | null, picture: (width: number) => string, onpick: (x: number, y: number, event: Event) => unknown, drawn: Set<() => unknown>, landed: Set<() => unknown> }} Viewer shared by the parts of the screen;
+ *   `picture`: what is seen, as SVG; `drawn` is called after each change of step, field or scale, `landed` once more steps are finished */
+/** @typedef {{ root: HTMLElement, update: () => Promise<void>, close: () => void, attach?: () => void, seen?: () => Seen }} OtherView shown instead of the map */
 
 /**
  * Which axes a step's frame has, in a few words.
  * @param {string | undefined} frame
  */
 const axesText = (frame) => (frame?.startsWith("aligned") ? `the specimen's (${frame.split("; before:")[0].replace(/^aligned by /, "").replace(/^plane/, "best plane")})` : "the calibration's (system frame)");
+
+/**
+ * Direction of the larger principal strain of the mean; none where the points scatter more than the two strains differ.
+ * @param {Float64Array} exx of the points with a value
+ * @param {Float64Array} eyy
+ * @param {Float64Array} exy
+ */
+function axisText(exx, eyy, exy) {
+  const mean = (/** @type {Float64Array} */ of) => of.reduce((sum, v) => sum + v, 0) / of.length;
+  const [x, y, shear] = [exx, eyy, exy].map(mean);
+  const differences = exx.map((v, i) => v - eyy[i] - (x - y));
+  const scatter = Math.sqrt(mean(differences.map((v) => v * v)));
+  if (!(Math.hypot(x - y, 2 * shear) > scatter)) return "none stands out";
+  return `${num((90 / Math.PI) * Math.atan2(2 * shear, x - y), 3)}° from X`;
+}
 
 /** @type {[Mode, string][]} */
 const MODES = [["image", "Image"], ["surface", "3-D surface"], ["compare", "Side by side"]];
@@ -145,6 +162,10 @@ async function show(root, testId, analysisId, query) {
     result, state, map, scale, workspace, ends, probe, message, interval: /** @type {any} */ (null), overlay: /** @type {any} */ (null),
     get step() { return state.step; },
     get info() { return state.info; },
+    picture: (width) => seenPicture([other?.seen?.() ?? { frame: map.view.frame, within: map.view.content }], {
+      title: `${result.test.name || testId}: ${state.info?.text ?? state.field}, ${state.step === null ? "" : result.stepText(state.step)}`, scale, width,
+      notes: [`axes of the ${result.frame === "system" ? "calibration" : "specimen"}; ${other?.seen ? "the surface in space" : `over the image: ${imageChoice.selectedOptions[0].textContent}`}; ${message.textContent}`, `test ${testId}, analysis ${analysisId}, calibration ${result.analysis.calibration_id ?? result.test.calibration_id ?? "not stated"}`],
+    }),
     onpick: (x, y) => pick(x, y),
     drawn: new Set(),
     landed: new Set(),
@@ -239,11 +260,11 @@ async function show(root, testId, analysisId, query) {
     if (step === null || info?.group !== "Strain" || !map.now) return;
     const { all } = await result.fields(step);
     if (!all.has("e1") || !all.has("e2")) return;
-    const [e1, e2] = await Promise.all(["e1", "e2"].map((name) => result.values(step, name)));
+    const [e1, e2, exx, eyy, exy] = await Promise.all(["e1", "e2", "exx", "eyy", "exy"].map((name) => result.values(step, name)));
     if (state.step !== step || state.info !== info || !map.now) return;
     const { grid } = map.now;
     const mean = (/** @type {ArrayLike<number>} */ of) => { const known = measured(grid, of); return known.length ? known.reduce((sum, v) => sum + v, 0) / known.length : null; };
-    statistics.append(...definitions([["principal strains, mean", h("span.whole", `${amount(mean(e1), "µm/m")}, ${amount(mean(e2), "µm/m")}`)]]).children);
+    statistics.append(...definitions([["principal strains, mean", h("span.whole", `${amount(mean(e1), "µm/m")}, ${amount(mean(e2), "µm/m")}`)], ["axis of the larger", h("span.whole", { "data-role": "principal-axis", title: "of the mean strain, from X towards Y: a specimen that stands askew in the picture has shear in axes along the image's rows" }, axisText(measured(grid, exx), measured(grid, eyy), measured(grid, exy)))]]).children);
   }
 
   /** @param {number | null} n */
@@ -305,6 +326,7 @@ async function show(root, testId, analysisId, query) {
       other = null;
     }
     replace(stage, map.view.root);
+    filesPanel.dispatchEvent(new Event("seen"));
     if (name === "image") {
       map.view.fit();
       return;

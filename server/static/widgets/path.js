@@ -2,6 +2,7 @@
 import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
 import { h } from "../lib/dom.js";
+import { SAVED } from "../lib/workspace.js";
 
 /** @import { Here } from "../main.js" */
 /** @typedef {"rig" | "calibrate" | "test" | "capture" | "region" | "measure" | "results"} Name */
@@ -39,11 +40,12 @@ async function look() {
   const id = lastTest();
   const known = id && tests.some((one) => one.id === id) ? id : null;
   if (id && !known) localStorage.removeItem(KEPT);
-  const test = known ? await api.get(`/tests/${known}`) : null;
+  const [test, drawn] = known ? await Promise.all([api.get(`/tests/${known}`), api.get(`/tests/${known}/workspace`)]) : [null, null];
   const measured = Boolean(test?.analyses?.length);
   return {
     rig: rig.connected && !rig.fault && !Object.values(rig.cameras).some((one) => one.fault), calibrated: calibrations.length > 0, test: known,
-    steps: test ? test.steps?.length ?? 0 : 0, region: measured, measured, seen: measured && localStorage.getItem(SEEN) === known,
+    steps: test ? test.steps?.length ?? 0 : 0, region: Boolean(drawn?.region) || measured, measured, // what was measured had a region, kept or not
+    seen: measured && localStorage.getItem(SEEN) === known,
   };
 }
 
@@ -101,6 +103,7 @@ export function path(others) {
     }, PAUSE_MS);
   }
   for (const name of /** @type {const} */ (["calibration", "test", "step", "camera"])) events.on(name, refresh);
+  window.addEventListener(SAVED, refresh);
   events.on("job", (job) => !["queued", "running", "cancelling"].includes(job.state) && refresh());
 
   const root = h("nav", { "aria-label": "Screens" }, h("ol.path", [...links.values()].map((link) => h("li", link))), others);

@@ -1,5 +1,6 @@
 // A plot's numbers as CSV, and the plot as SVG and PNG: light, with axes, units, bands and names, whatever the screen's colours.
-import { h, num, svg, tick } from "../lib/dom.js";
+import { num, svg, tick } from "../lib/dom.js";
+import { cell, saveButtons, svgText } from "./saving.js";
 
 /** @typedef {{ label: string, points?: boolean, dots?: boolean, edge?: boolean, colour?: number, u?: (number | null)[] }} Series */
 /** @typedef {{ x: string, y: string, series: Series[], data: readonly ArrayLike<number | null | undefined>[], bars?: boolean | boolean[], bands?: number[][], label?: string, file?: string, said?: string }} Plot
@@ -11,9 +12,6 @@ const EDGE = { left: 84, right: 24, top: 40, bottom: 92 };
 
 /** @param {Series} one @param {number} index */
 export const colourOf = (one, index) => COLOURS[(one.colour ?? index) % COLOURS.length];
-
-/** @param {string} text */
-const cell = (text) => (/[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
 
 /**
  * The plot's numbers: a column for each series, and for its uncertainty; nothing for a value that is missing.
@@ -76,7 +74,7 @@ export function svgOf({ x, y, series, data, bars = false, bands = [], label, sai
   };
   const text = (/** @type {string} */ what, /** @type {Record<string, string | number>} */ more) => Object.assign(svg("text", { fill: "#333", "font-size": 14, ...more }), { textContent: what });
   /** @type {SVGElement[]} */
-  const parts = [svg("rect", { width: WIDTH, height: HEIGHT, fill: "#fff" }), text(label ?? `${y} over ${x}`, { x: EDGE.left, y: 24, "font-size": 15, fill: "#111" })];
+  const parts = [text(label ?? `${y} over ${x}`, { x: EDGE.left, y: 24, "font-size": 15, fill: "#111" })];
   for (const v of roundTicks(x0, x1, 8)) parts.push(svg("path", { d: `M${px(v)} ${EDGE.top}V${HEIGHT - EDGE.bottom}`, stroke: "#e3e3e3" }), text(tick(v), { x: px(v), y: HEIGHT - EDGE.bottom + 19, "text-anchor": "middle" }));
   for (const v of roundTicks(y0, y1)) parts.push(svg("path", { d: `M${EDGE.left} ${py(v)}H${WIDTH - EDGE.right}`, stroke: v === 0 ? "#9a9a9a" : "#e3e3e3" }), text(tick(v), { x: EDGE.left - 7, y: py(v) + 5, "text-anchor": "end" }));
   parts.push(text(x, { x: (EDGE.left + WIDTH - EDGE.right) / 2, y: HEIGHT - EDGE.bottom + 42, "text-anchor": "middle" }),
@@ -100,44 +98,14 @@ export function svgOf({ x, y, series, data, bars = false, bands = [], label, sai
     from += 44 + 7.4 * one.label.length;
   });
   if (said) parts.push(text(said, { x: EDGE.left, y: HEIGHT - 8, "font-size": 11, fill: "#666" }));
-  const root = svg("svg", { xmlns: "http://www.w3.org/2000/svg", viewBox: `0 0 ${WIDTH} ${HEIGHT}`, width: WIDTH, height: HEIGHT, "font-family": "DejaVu Sans, Arial, sans-serif" }, parts);
-  return new XMLSerializer().serializeToString(root);
-}
-
-/** @param {Plot} plot */
-async function pngOf(plot) {
-  const image = new Image();
-  image.src = `data:image/svg+xml;charset=utf-8,${encodeURIComponent(svgOf(plot))}`;
-  await image.decode();
-  const canvas = h("canvas", { width: 2 * WIDTH, height: 2 * HEIGHT });
-  canvas.getContext("2d")?.drawImage(image, 0, 0, canvas.width, canvas.height);
-  return /** @type {Promise<Blob>} */ (new Promise((done, fail) => canvas.toBlob((blob) => (blob ? done(blob) : fail(new Error("This browser makes no PNG."))), "image/png")));
-}
-
-/**
- * Save something under a name.
- * @param {Blob | string} what a blob, or the address of a file
- * @param {string} name
- */
-export function saveAs(what, name) {
-  const link = h("a", { href: typeof what === "string" ? what : URL.createObjectURL(what), download: name });
-  document.body.append(link);
-  link.click();
-  link.remove();
-  if (typeof what !== "string") setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+  return svgText(WIDTH, HEIGHT, parts);
 }
 
 /**
  * Buttons that save a plot.
  * @param {() => Plot} now
  */
-export function plotButtons(now) {
-  const name = () => (now().file ?? now().label ?? "plot").replace(/[^\p{L}\p{N}]+/gu, "_").replace(/^_|_$/g, "");
-  /** @type {[string, (plot: Plot) => Blob | Promise<Blob>][]} */
-  const forms = [["CSV", (plot) => new Blob([csvOf(plot)], { type: "text/csv" })], ["PNG", pngOf], ["SVG", (plot) => new Blob([svgOf(plot)], { type: "image/svg+xml" })]];
-  return h("div.row.plot-files", { role: "group", "aria-label": "Save this plot" }, h("span.quiet", "Save"),
-    forms.map(([form, make]) => h("button", { type: "button", "aria-label": `Save as ${form}`, onclick: async () => saveAs(await make(now()), `${name()}.${form.toLowerCase()}`) }, form)));
-}
+export const plotButtons = (now) => saveButtons("Save this plot", () => now().file ?? now().label ?? "plot", { csv: () => csvOf(now()), svg: () => svgOf(now()) });
 
 /**
  * A value with its uncertainty: as many digits as the uncertainty warrants.

@@ -20,6 +20,8 @@ export class Scale {
     /** @type {MapName} */
     this.name = "viridis";
     this.rgb = colours(this.name);
+    /** numbers at the bar: where, from 0 to 1, and their texts */
+    this.marked = { shares: /** @type {number[]} */ ([]), texts: /** @type {string[]} */ ([]), unit: "" };
     this.map = select(MAPS, "auto");
     this.limits = select([["auto", "by percentiles"], ["given", "given limits"]], "auto");
     this.span = select([["step", "each step"], ["all", "all steps"]], "step");
@@ -160,6 +162,7 @@ export class Scale {
     const at = (/** @type {number[]} */ shares) => ({ shares, texts: evenMarks(shares.map((share) => factor * (this.low + share * (this.high - this.low)))) });
     let { shares, texts } = at([0, 0.25, 0.5, 0.75, 1]);
     if (texts.some((text) => text.length > 6)) ({ shares, texts } = at([0, 0.5, 1])); // long numbers need room
+    this.marked = { shares, texts, unit };
     replace(this.marks, shares.map((share, k) => h("span", { style: { left: `${100 * share}%` } }, texts[k])), h("span.of", unit));
     for (const one of this.limitUnits) one.textContent = this.unit;
     this.legend.setAttribute("aria-label", `Colour bar from ${amount(this.low, this.unit)} to ${amount(this.high, this.unit)}`);

@@ -45,6 +45,8 @@ export class View {
     this.onleave = null;
     /** @type {(() => Position | null) | null} */
     this.aimFrom = null;
+    /** Take a finger that a drawing tool had, so that a second one zooms. @type {(pointerId: number, at: [number, number]) => void} */
+    this.hold = () => {};
 
     this.image = h("img", { alt: label, draggable: "false" });
     this.canvas = h("canvas", { "aria-hidden": "true" });
@@ -306,6 +308,7 @@ export class View {
     /** @type {Spot | null} */
     let start = null;
     let moved = false;
+    this.hold = (id, at) => { down.set(id, at); moved = true; };
     this.frame.addEventListener("pointerdown", (event) => {
       if (event.button !== 0 || onGrab(event)) return;
       this.frame.setPointerCapture(event.pointerId);
@@ -324,6 +327,9 @@ export class View {
         const [other] = [...down].filter(([id]) => id !== event.pointerId).map(([, position]) => position);
         const span = (/** @type {Spot} */ a) => Math.hypot(a[0] - other[0], a[1] - other[1]);
         const box = this.frame.getBoundingClientRect();
+        // what lies between the two fingers stays there
+        this.left += (now[0] - before[0]) / 2;
+        this.top += (now[1] - before[1]) / 2;
         if (span(before) > 5) this.zoom(span(now) / span(before), (now[0] + other[0]) / 2 - box.left, (now[1] + other[1]) / 2 - box.top);
       } else if (moved) {
         this.left += now[0] - before[0];

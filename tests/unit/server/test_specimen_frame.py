@@ -23,7 +23,10 @@ from server.results.gauges.frames import SPECIMEN, frame_asked, frame_of_test
 from server.results.gauges.readings import read_gauges
 from server.results.gauges.request import Alignment, AreaGauge, GaugeRequest, PlaneAlignment, PointGauge
 from server.workflows.analysis.framed import FramedResults
+from sim.rig import SimRig
+from sim.scene import UPRIGHT
 from tests.support.gauge_field import SUBSET, make_field
+from tests.support.requirements import ROOT
 from tests.support.tension import LATERAL, SHIFT, SYS_FROM_IMAGE, TENSION, pulled, shape
 
 # the file holds positions and displacements as float32: 3e-6 of 2 um between neighbours 0.14 mm apart
@@ -107,6 +110,38 @@ def test_every_way_to_lay_the_frame_gives_the_same_strain(
     assert asked is not None
     made = write_framed(files, asked, tmp_path / "out")
     assert mean_strain(made[1]) == pytest.approx([LATERAL, TENSION, 0.0], abs=TOLERANCE)
+
+
+def test_shear_of_a_specimen_askew_in_the_picture_is_the_cameras_roll_and_goes_with_a_line_along_it(
+    tmp_path: Path,
+) -> None:
+    """The simulated strip is pulled along its own axis; camera 1 of that rig is rolled against it by design."""
+    camera = SimRig.from_toml(ROOT / "config" / "sim_paper.toml").cam1.camera
+    along, across = UPRIGHT.rotation[:, 1], UPRIGHT.rotation[:, 0]
+    stretch = np.eye(3) + 2000e-6 * np.outer(along, along) - 660e-6 * np.outer(across, across)
+    made = []
+    for n, motion in enumerate((None, lambda x: np.asarray(x @ stretch))):
+        field = make_field(motion, shape=lambda x, y: camera.back_project_to_plane(np.stack([x, y], axis=-1)).xyz_mm)
+        field = replace(field, normal_sys=-field.normal_sys)  # away from these cameras, which lie at negative Z
+        strain = None if motion is None else surface_strain(field, StrainOptions(window=5), subset_px=SUBSET)
+        given = Provenance({"subset_px": SUBSET}, {"calibration": "aa", "reference_cam1": "bb"}, "1", step=n)
+        write_field(tmp_path / f"step_{n:04d}.nc", field, given, strain)
+        made.append(tmp_path / f"step_{n:04d}.nc")
+    # the direction of a row through the middle of the points, on the strip
+    ends = camera.back_project_to_plane([[95.0, 105.5], [97.0, 105.5], [96.0, 104.5], [96.0, 106.5]]).xyz_mm
+    right = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    roll = np.arctan2(right @ along, right @ across)
+    assert 0.005 < abs(roll) < 0.05
+    green = 0.5 * (stretch @ stretch - np.eye(3))
+    down = np.cross([0.0, 0.0, 1.0], right)
+    down *= np.sign(down @ (ends[3] - ends[2]))  # as Y runs in the picture
+    expected = [right @ green @ right, down @ green @ down, right @ green @ down]
+    assert abs(expected[2]) > 20e-6
+    assert mean_strain(write_framed(made, SPECIMEN, tmp_path / "rows")[1]) == pytest.approx(expected, abs=TOLERANCE)
+    own = frame_asked(json.dumps({"kind": "plane", "x_direction": across.tolist()}), SPECIMEN)
+    assert own is not None
+    unsheared = [across @ green @ across, along @ green @ along, 0.0]
+    assert mean_strain(write_framed(made, own, tmp_path / "own")[1]) == pytest.approx(unsheared, abs=TOLERANCE)
 
 
 def test_a_frame_is_named_system_specimen_or_written_out() -> None:

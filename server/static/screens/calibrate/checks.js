@@ -43,7 +43,11 @@ function distanceFound(kept) {
 export function distanceCheck(document_) {
   const kept = document_.kept_checks?.known_distance;
   const found = h("div", { "aria-live": "polite", "data-role": "known-distance" }, kept ? distanceFound(kept) : null);
-  const marks = /** @type {const} */ (["cam1", "cam2"]).map((cam) => ({ cam, xy: [0, 1].map((k) => ({ x: number(null, { step: "any", "aria-label": `${cam}, mark ${k + 1}, x` }), y: number(null, { step: "any", "aria-label": `${cam}, mark ${k + 1}, y` }) })) }));
+  const marks = /** @type {const} */ (["cam1", "cam2"]).map((cam) => {
+    const most = document_.image_size_px?.[cam]?.map((px) => px - 1);
+    const place = (/** @type {number} */ k, /** @type {"x" | "y"} */ axis) => number(null, { step: "any", min: 0, max: most?.[axis === "x" ? 0 : 1], "aria-label": `${cam}, mark ${k + 1}, ${axis}` });
+    return { cam, xy: [0, 1].map((k) => ({ x: place(k, "x"), y: place(k, "y") })) };
+  });
   const distance = number(null, { min: 0, step: "any" });
   const sigma = number(0, { min: 0, step: "any" });
   const rules = /** @type {[HTMLInputElement, import("../../lib/fields.js").Rule][]} */ ([
@@ -67,16 +71,26 @@ export function distanceCheck(document_) {
 }
 
 /**
- * The rule of both marks in an image: one error for the four numbers, at the first that is missing.
+ * The rule of both marks in an image: one error for the four numbers, at the first that is missing or beyond the image.
  * @param {HTMLInputElement[]} inputs
  * @returns {[HTMLInputElement, import("../../lib/fields.js").Rule]}
  */
 function marked(inputs) {
-  const check = () => {
-    const missing = inputs.find((input) => input.value === "" || input.validity.badInput);
-    for (const input of inputs) tell(input, input === missing ? `Give ${input.getAttribute("aria-label")?.split(", ").slice(1).join(", ")}, in px.` : "");
-    return !missing;
+  const wrong = (/** @type {HTMLInputElement} */ input) => {
+    const name = input.getAttribute("aria-label")?.split(", ").slice(1).join(", ");
+    if (input.value === "" || input.validity.badInput) return `Give ${name}, in px.`;
+    const beyond = numberWithin({ low: 0, high: input.max === "" ? null : Number(input.max), unit: "px" })(input.value);
+    return beyond && `${name?.[0].toUpperCase()}${name?.slice(1)}, is not in the image. ${beyond}`;
   };
-  for (const input of inputs) input.addEventListener("input", () => inputs.some((one) => one.getAttribute("aria-invalid") === "true") && check());
+  const check = () => {
+    const first = inputs.find((input) => wrong(input));
+    for (const input of inputs) tell(input, input === first ? wrong(input) : "");
+    return !first;
+  };
+  for (const input of inputs) {
+    input.addEventListener("input", () => inputs.some((one) => one.getAttribute("aria-invalid") === "true") && check());
+    // one that is left with a number beyond the image is told at once, one that is still empty is not
+    input.addEventListener("change", () => input.value !== "" && wrong(input) && tell(input, wrong(input)));
+  }
   return [inputs[0], check];
 }

@@ -1,6 +1,8 @@
 // The views of a calibration with the lines and intersections found in them, and residual arrows.
 import * as api from "../../lib/api.js";
 import { View, stroke } from "../../widgets/view.js";
+import { cell, saveButtons } from "../../widgets/saving.js";
+import { seenPicture } from "../../widgets/seen_picture.js";
 import { h, replace, svg, field, select, num, quantity } from "../../lib/dom.js";
 
 const COLOUR = { lines: "#33c6ff", node: "#ffd23e", arrow: "#ff4d3d" };
@@ -11,6 +13,9 @@ const MAX_ARROW = 0.15; // of the picture's width
 
 /** @type {Record<string, string>} */
 const ROLE = { fitted: "fitted", held_out: "held out", zero: "zero", zero_again: "zero, again" };
+
+/** @param {TakenView} view */
+const fileOf = (view) => view.file.split("/").pop() ?? "";
 
 /**
  * Both cameras' views of one position side by side; {root, close}, or null where none were taken.
@@ -42,7 +47,7 @@ export function calibrationViews(calibration, residuals) {
     for (const { cam, view, caption, layer } of views) {
       const index = Number(position.value);
       const taken_ = at(index, cam);
-      const name = taken_?.file.split("/").pop();
+      const name = taken_ && fileOf(taken_);
       // the repeated view at zero is compared, not fitted: it has no residuals
       const found = residuals?.find((one) => one.name === name);
       caption.textContent = taken_ ? `${ROLE[taken_.role] ?? taken_.role}, dZ ${quantity(taken_.dz_mm, "mm", 6)} as read back, ${taken_.frames} frames averaged${found ? `; RBE ${quantity(found.rbe_px, "px", 3)}, RAZ ${quantity(found.raz_mm && 1000 * found.raz_mm, "µm", 3)}` : ""}` : "no view";
@@ -58,11 +63,19 @@ export function calibrationViews(calibration, residuals) {
   position.addEventListener("change", load);
   for (const input of [magnification, lines, arrows]) input.addEventListener("input", draw);
   load();
+  const shownText = () => text(Number(position.value));
+  const files = saveButtons("Save these views", () => `${calibration.id} views ${shownText()}`, {
+    csv: residuals ? () => residualTable(taken.filter((view) => view.index === Number(position.value)), residuals) : undefined,
+    svg: () => seenPicture(views.map(({ cam, view }) => ({ frame: view.frame, within: view.image, title: cam })), {
+      title: `Calibration ${calibration.id}, ${shownText()}`, width: 1600,
+      notes: [...views.map(({ cam, caption }) => `${cam}: ${caption.textContent}`), ...(residuals && arrows.checked ? [`residual arrows ${timesText.textContent}`] : [])],
+    }),
+  });
   const root = h("div",
     h("div.fields", field("Position", position),
       residuals ? [field("Magnification of arrows", h("span.control", Object.assign(magnification, { id: "magnification" }), timesText)),
         h("label.check", { style: { alignSelf: "center" } }, lines, "lines and intersections"), h("label.check", { style: { alignSelf: "center" } }, arrows, "residual arrows")] : null),
-    h("div.grid.two.views", views.map((one) => one.root)));
+    h("div.grid.two.views", views.map((one) => one.root)), files);
   magnification.setAttribute("aria-label", "Magnification of the residual arrows");
   return { root, close: () => views.forEach((one) => one.view.close()) };
 }
@@ -121,4 +134,21 @@ function drawing({ found_px: found, residual_px: residual }, times, lines, arrow
     parts.push(svg("path", { ...stroke(COLOUR.arrow, 1.5), d: path.join(""), "data-role": "arrows" }));
   }
   return parts;
+}
+
+/**
+ * Found intersections and residuals of the views of a position; nothing for one that was not found.
+ * @param {readonly TakenView[]} taken
+ * @param {readonly Found[]} residuals
+ */
+function residualTable(taken, residuals) {
+  const lines = ["camera,view,row,column,x (px),y (px),residual x (px),residual y (px)"];
+  for (const view of taken) {
+    const found = residuals.find((one) => one.name === fileOf(view));
+    found?.found_px.forEach((row, i) => row.forEach((xy, k) => {
+      const numbers = [...xy, ...(found.residual_px?.[i]?.[k] ?? [null, null])].map((v) => (v === null || !Number.isFinite(v) ? "" : String(v)));
+      lines.push([view.camera, cell(found.name), i, k, ...numbers].join(","));
+    }));
+  }
+  return `${lines.join("\n")}\n`;
 }

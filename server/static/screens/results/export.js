@@ -1,7 +1,7 @@
 // Export: the picture as it is shown, a film of it, the numbers for other programs, the report.
 import * as api from "../../lib/api.js";
 import { h, replace, action, badge, field, number, select, notify, tick } from "../../lib/dom.js";
-import { saveAs } from "../../widgets/plot_files.js";
+import { pngOf, saveAs, svgFile } from "../../widgets/saving.js";
 import { shownUnit } from "./analysis.js";
 
 /** @import { Viewer } from "../results.js" */
@@ -51,6 +51,9 @@ export function files(screen) {
   const fields_ = select([["all", "all"], ["seen", "the one shown"]], "all");
   const course = h("div", { "data-role": "export-course", role: "status" });
 
+  /** Whether only the page has the picture: the deformed image, lines over the colours, the surface in space. */
+  const here = () => screen.state.mode === "surface" || screen.state.image !== "reference" || screen.overlay.on;
+
   function tell() {
     const { info, scale } = screen;
     const asked = seen(screen, over.checked);
@@ -60,7 +63,7 @@ export function files(screen) {
     }
     const unit = scale.unit ? ` ${scale.unit}` : "";
     what.textContent = `${info.text}, ${result.stepText(screen.step)}${scale.flags ? "" : `; ${MAPS[scale.name]} from ${tick(Number(scale.low.toPrecision(4)))} to ${tick(Number(scale.high.toPrecision(4)))}${unit}${Number(scale.levels.value) > 1 ? `, ${asked.levels} levels` : ""}`}; `
-      + `axes of the ${result.frame === "system" ? "calibration" : "specimen"}; ${over.checked ? "over the reference image" : "without an image"}.`;
+      + `axes of the ${result.frame === "system" ? "calibration" : "specimen"}; ${here() ? `as it is seen, ${screen.state.mode === "surface" ? "in space" : "its lines and its image included"}; a film of it ${over.checked ? "is over the reference image" : "has no image"}` : over.checked ? "over the reference image" : "without an image"}.`;
   }
   over.addEventListener("change", tell);
 
@@ -75,7 +78,10 @@ export function files(screen) {
   async function picture(format) {
     const asked = seen(screen, over.checked);
     if (!asked || screen.step === null) throw new Error("Choose a field with one number a point: its picture can be saved.");
-    await direct({ ...asked, format, step: screen.step, width_px: size() });
+    const width_px = size();
+    if (!here()) return direct({ ...asked, format, step: screen.step, width_px });
+    const drawn = screen.picture(width_px);
+    return saveAs(format === "svg" ? svgFile(drawn) : await pngOf(drawn, 1), `${result.testId}_${result.analysisId}_step${screen.step}_${asked.variables}_as_seen.${format}`);
   }
 
   /** A file that the service makes at once. @param {Asked} asked */
@@ -152,7 +158,8 @@ export function files(screen) {
     h("div.row", field("Width", width, "px"), h("label.check", over, "over the reference image"), action("Save as PNG", () => picture("png"), { "data-role": "save-png" }), action("Save as SVG", () => picture("svg"))),
     h("h3", "A film of it over the steps"), h("div.row", field("Film as", film), field("Steps a second", pace), action("Make the film", makeFilm)), course,
     h("h3", "Numbers for other programs"), h("div.row", field("Form", form), field("Steps", which), field("Fields", fields_), action("Save the file", saveNumbers, { kind: "primary" })), report());
-  root.addEventListener("toggle", tell);
+  for (const name of ["toggle", "seen"]) root.addEventListener(name, tell);
+  screen.overlay.changed.add(tell);
   screen.drawn.add(tell);
   return root;
 }

@@ -78,21 +78,27 @@ export function gauges(screen) {
     state.first = null;
     made(state.tool, from, [x, y]);
   };
-  /** @type {{ from: Spot, to: Spot, at: Spot, moved: boolean } | null} */
+  /** @type {{ id: number, from: Spot, to: Spot, at: Spot, last: [number, number], moved: boolean } | null} `at`, `last`: in the window */
   let drag = null;
   view.frame.addEventListener("pointerdown", (event) => {
     if (state.tool === "probe" || event.button !== 0 || !inReference() || onGrab(event)) return;
+    if (drag) { // a second finger: both move and zoom the picture, nothing is drawn
+      view.hold(drag.id, drag.last);
+      drag = null;
+      return draw();
+    }
     event.stopImmediatePropagation();
     event.preventDefault();
     view.frame.focus();
     view.frame.setPointerCapture(event.pointerId);
     const { x, y } = view.at(event);
-    drag = { from: [x, y], to: [x, y], at: [event.clientX, event.clientY], moved: false };
+    drag = { id: event.pointerId, from: [x, y], to: [x, y], at: [event.clientX, event.clientY], last: [event.clientX, event.clientY], moved: false };
   }, true);
   view.frame.addEventListener("pointermove", (event) => {
     const { x, y } = view.at(event);
     if (drag) {
       drag.to = [x, y];
+      drag.last = [event.clientX, event.clientY];
       if (Math.hypot(event.clientX - drag.at[0], event.clientY - drag.at[1]) > 4) drag.moved = true;
       draw();
     } else if (state.first) draw([x, y]);

@@ -133,7 +133,7 @@ export function overlay(screen) {
   for (const control of [lines, count, kind, every, length]) control.addEventListener("change", () => tell().catch(notify));
   view.root.addEventListener("viewchange", () => legend.again());
   screen.drawn.add(draw);
-  return { root, levels, vectors, changed };
+  return { root, levels, vectors, changed, /** Whether any are asked for. */ get on() { return lines.checked || kind.value !== "none"; } };
 }
 
 /** @typedef {ReturnType<typeof overlay>} Overlay */

@@ -3,6 +3,7 @@ import { h, replace, field, number, action, tick } from "../../lib/dom.js";
 import { ENTRIES } from "../../lib/colour.js";
 import { marks, round125 } from "../../lib/even.js";
 import { trianglesOf } from "../../lib/isolines.js";
+import { pngOf, saveAs } from "../../widgets/saving.js";
 import { drawTriad3 } from "../../widgets/triad.js";
 import { spaceOverlay } from "./surface_overlay.js";
 
@@ -283,14 +284,14 @@ export async function surface(screen) {
     });
   }
 
-  async function save() {
+  /** What is in the frame, for a picture that is made at once: WebGL's canvas forgets what was drawn. */
+  function seen() {
     renderer.render(scene, camera);
-    /** @type {Blob | null} */
-    const blob = await new Promise((resolve) => renderer.domElement.toBlob(resolve, "image/png"));
-    if (!blob || !map.now) return;
-    const link = h("a", { href: URL.createObjectURL(blob), download: `${result.testId}_${result.analysisId}_step${map.now.n}_surface.png` });
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+    return { frame: space, title: note.textContent ?? "" };
+  }
+
+  async function save() {
+    if (map.now) saveAs(await pngOf(screen.picture(1200)), `${result.testId}_${result.analysisId}_step${map.now.n}_surface.png`);
   }
 
   async function update() {
@@ -357,5 +358,5 @@ export async function surface(screen) {
     renderer.dispose();
     renderer.forceContextLoss();
   };
-  return { root, update, close };
+  return { root, update, close, seen };
 }

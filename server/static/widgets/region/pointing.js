@@ -117,7 +117,7 @@ export function pickInTwo(editor, x, y, event) {
 export function listen(editor) {
   const { one } = editor;
   const frame = one.frame;
-  /** @type {{ id: number, points: Spot[] } | null} */
+  /** @type {{ id: number, points: Spot[], at: [number, number] } | null} `at`: in the window */
   let held = null;
   const spotOf = (/** @type {PointerEvent} */ event) => {
     const { x, y } = one.at(event);
@@ -132,12 +132,15 @@ export function listen(editor) {
   frame.addEventListener("pointerdown", (event) => {
     const painted = PAINTED.includes(editor.tool);
     if (!(painted || DRAGGED.includes(editor.tool)) || event.button !== 0 || onGrab(event) || !one.width) return;
+    if (held) { // a second finger: both move and zoom the picture, nothing is drawn
+      one.hold(held.id, held.at);
+      return drop();
+    }
     event.stopImmediatePropagation();
     event.preventDefault();
-    if (held) return drop(); // a second finger: it was not meant
     frame.focus();
     frame.setPointerCapture(event.pointerId);
-    held = { id: event.pointerId, points: [spotOf(event)] };
+    held = { id: event.pointerId, points: [spotOf(event)], at: [event.clientX, event.clientY] };
     const [from] = held.points;
     if (!painted) editor.draft = { kind: editor.tool === "circle" ? "circle" : "rectangle", points: [from, from] };
     else if (!editor.painting.begin()) held = null;
@@ -153,6 +156,7 @@ export function listen(editor) {
     }
     if (event.pointerId !== held.id) return;
     const spot = spotOf(event);
+    held.at = [event.clientX, event.clientY];
     if (editor.draft) editor.draft.points[1] = spot;
     else editor.painting.strokeTo(held.points[held.points.length - 1], spot);
     held.points.push(spot);

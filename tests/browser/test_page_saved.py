@@ -1,0 +1,144 @@
+"""What the page saves as files is what is seen: deformed images, the surface in space, a calibration's views."""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Locator, Page, expect
+
+from tests.support import results_page
+from tests.support.page_bench import Watched
+from tests.support.results_page import API, Bench, shown
+
+bench, page = results_page.bench, results_page.page  # fixtures
+
+pytestmark = pytest.mark.timeout(600)
+expect.set_options(timeout=30_000)  # the machine may be busy
+
+EDGE = 12  # px, white about the picture's frame
+TOP = {False: 40, True: 62}  # px, where the frame begins; with a name above it
+
+
+def saved(at: Page, press: Locator) -> Path:
+    with at.expect_download() as file:
+        press.click()
+    return Path(file.value.path())
+
+
+def pixels(data: bytes | Path) -> np.ndarray:
+    with Image.open(data if isinstance(data, Path) else io.BytesIO(data)) as image:
+        return np.asarray(image.convert("RGB")).astype(float)
+
+
+def difference(at: Page, seen: Locator, picture: np.ndarray, *, named: bool, times: int = 1) -> tuple[float, float]:
+    """Return the mean difference, grey levels, of what is seen and the same place of a picture; and of it mirrored."""
+    at.mouse.move(2, 2)
+    looked = Image.open(io.BytesIO(seen.screenshot())).convert("RGB")
+    wide = picture.shape[1] // times - 2 * EDGE
+    high = round(wide * looked.height / looked.width)
+    expected = np.asarray(looked.resize((times * wide, times * high), Image.Resampling.BILINEAR)).astype(float)
+    top = times * TOP[named]
+    found = picture[top : top + times * high, times * EDGE : times * (EDGE + wide)]
+    expected = expected[: found.shape[0]]
+    return float(np.abs(found - expected).mean()), float(np.abs(found[:, ::-1] - expected).mean())
+
+
+def bar_below(at: Page, picture: np.ndarray, times: int = 1) -> None:
+    """Assert that the colour bar's own colours stand in one row below the frame, from the left to the right."""
+    colours = at.evaluate(
+        "() => { const bar = document.querySelector('.colourbar canvas');"
+        " return [...bar.getContext('2d').getImageData(0, 0, bar.width, 1).data] }"
+    )
+    bar = np.array(colours, dtype=float).reshape(-1, 4)[:, :3]
+    wide = picture.shape[1] - 2 * times * (EDGE + 30)
+    samples = [0.1, 0.5, 0.9]
+    columns = [int(times * (EDGE + 30) + share * wide) for share in samples]
+    wanted = np.array([bar[int(share * len(bar))] for share in samples])
+    rows = np.abs(picture[:, columns] - wanted).max(axis=(1, 2)) <= 6
+    assert times * 8 < rows.sum() < times * 20, "no row has the bar's colours"
+
+
+def test_a_deformed_picture_is_saved_as_it_is_seen_with_its_bar(page: Watched, bench: Bench) -> None:
+    at = shown(page, bench)
+    at.get_by_text("Export and report").click()
+    at.get_by_label("Image", exact=True).select_option("cam2")
+    at.wait_for_selector('canvas[data-role="map"][data-shown="2 w_mm cam2"]', state="attached")
+    at.get_by_label("contour lines, about").check()
+    expect(at.locator(".overlay[data-lines]")).not_to_have_attribute("data-lines", "0")
+    expect(at.locator('[data-role="seen"]')).to_contain_text("its lines and its image included")
+    picture = pixels(saved(at, at.get_by_role("button", name="Save as PNG").last))
+    assert picture.shape[1] == 1200
+    content = at.locator(".view .content").first
+    own, mirrored = difference(at, content, picture, named=False)
+    assert own < 0.4 * mirrored, (own, mirrored)
+    assert own < 0.1 * 255  # speckles at another size, and a pixel at the edges
+    bar_below(at, picture)
+    drawing = saved(at, at.get_by_role("button", name="Save as SVG").last).read_text()
+    for words in ("over the image: this step, camera 2", bench.analysis_id, "689.0 kPa", 'data-role="bar"'):
+        assert words in drawing, words
+    assert "var(--" not in drawing  # another program has no style sheet of the page
+    page.sound()
+
+
+def test_the_surface_is_saved_with_its_axes_and_its_bar(page: Watched, bench: Bench) -> None:
+    at = shown(page, bench)
+    at.get_by_role("button", name="3-D surface").click()
+    space = at.locator(".space")
+    expect(space).to_have_attribute("data-drawn", "2 w_mm")
+    at.wait_for_timeout(500)
+    picture = pixels(saved(at, at.get_by_role("button", name="Save picture")))
+    assert picture.shape[1] == 2400
+    own, mirrored = difference(at, space, picture, named=True, times=2)
+    assert own < 0.4 * mirrored, (own, mirrored)
+    bar_below(at, picture, times=2)
+    at.get_by_text("Export and report").click()
+    expect(at.locator('[data-role="seen"]')).to_contain_text("as it is seen, in space")
+    drawing = saved(at, at.get_by_role("button", name="Save as SVG").last).read_text()
+    unit = at.locator('[data-role="colourbar"] .of').inner_text()
+    for words in ("X (mm)", "Y (mm)", "displacement ×", "the surface in space", f">{unit}<"):
+        assert words in drawing, words
+    page.sound()
+
+
+def test_a_calibrations_plots_are_saved_as_numbers_and_pictures(page: Watched, bench: Bench) -> None:
+    at = page.open("#/calibrate")
+    expect(at.get_by_role("region", name="Views")).to_be_visible()
+    at.wait_for_function("() => [...document.querySelectorAll('.views .view img')].every(one => one.naturalWidth > 0)")
+    calibration = bench.client.get(f"{API}/calibrations").json()["calibrations"][-1]["id"]
+    views = at.get_by_role("group", name="Save these views")
+    head, *lines = saved(at, views.get_by_role("button", name="Save as CSV")).read_text().splitlines()
+    assert head == "camera,view,row,column,x (px),y (px),residual x (px),residual y (px)"
+    known = bench.client.get(f"{API}/calibrations/{calibration}/residuals").json()
+    residuals = {one["name"]: one for one in (known if isinstance(known, list) else known["views"])}
+    seen = set()
+    for camera, name, row, column, *numbers in (line.split(",") for line in lines):
+        seen.add(camera)
+        one = residuals[name]
+        wanted = [*one["found_px"][int(row)][int(column)], *one["residual_px"][int(row)][int(column)]]
+        assert [float(text) if text else None for text in numbers] == wanted
+    assert seen == {"cam1", "cam2"}
+    drawing = saved(at, views.get_by_role("button", name="Save as SVG")).read_text()
+    for words in ('data-role="nodes"', 'data-role="arrows"', ">cam1<", "residual arrows", "data:image/png"):
+        assert words in drawing, words
+    assert "var(--" not in drawing
+    picture = pixels(saved(at, views.get_by_role("button", name="Save as PNG")))
+    yellow = (picture[..., 0] > 200) & (picture[..., 1] > 170) & (picture[..., 2] < 120)
+    assert yellow[:, : yellow.shape[1] // 2].sum() > 100  # intersections of camera 1
+    assert yellow[:, yellow.shape[1] // 2 :].sum() > 100
+    at.get_by_text("Correlation of the parameters").click()
+    group = at.get_by_role("group", name="Save the correlations")
+    table = saved(at, group.get_by_role("button", name="Save as CSV")).read_text().splitlines()
+    covariance = bench.client.get(f"{API}/calibrations/{calibration}").json()["covariance"]
+    matrix = np.array(covariance["matrix"])
+    sigma = np.sqrt(np.diag(matrix))
+    assert table[0].split(",")[1:] == covariance["names"]
+    found = np.array([[float(v) for v in line.split(",")[1:]] for line in table[1:]])
+    np.testing.assert_allclose(found, matrix / np.outer(sigma, sigma), rtol=1e-12)
+    drawing = saved(at, group.get_by_role("button", name="Save as SVG")).read_text()
+    assert len(re.findall("fill-opacity", drawing)) == matrix.size
+    page.sound()
