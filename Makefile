@@ -15,7 +15,7 @@ ARGS ?=
 # only compile the same kernels again
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n > 3 ? 4 : n + 1)))
 
-.PHONY: help demo quick test test-deep serve check check-page kernels bench format accuracy coverage fuzz load openapi reference docs torture pagespeed pagepictures clean
+.PHONY: help wheel demo quick test test-deep serve check check-page kernels bench format accuracy coverage fuzz load openapi reference docs torture pagespeed pagepictures clean
 
 help:
 	@echo "make demo    start the service on the simulated paper rig and run the plate experiment over HTTP"
@@ -28,6 +28,7 @@ help:
 	@echo "make load    ten minutes of captures, readers, slow streams, analyses and stops; writes docs/explanation/reliability.md (ARGS='--minutes N')"
 	@echo "make torture  kill the service 1,000 times at work, look each time that nothing is lost, write docs/explanation/reliability.md (ARGS='--kills N')"
 	@echo "make fuzz    schema fuzzing of the whole API on a simulated rig (ARGS='--each N --seed S --only OPERATION')"
+	@echo "make wheel   build the wheel into dist/, with its bill of materials (CycloneDX) inside and beside"
 	@echo "make docs    build the site into build/site, offline, and check every link in it"
 	@echo "make openapi write docs/openapi.json, the description of the API, the list of problems and the reference, after a change of either"
 	@echo "make reference  write the pages of docs/reference that are made from the program"
@@ -115,6 +116,11 @@ bench: $(STAMP) $(PEER_STAMP)
 
 accuracy: $(STAMP)
 	$(BIN)/python -m tests.bench.accuracy.accuracy $(ARGS)
+
+# with its bill of materials inside and beside
+wheel: $(STAMP)
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps -w dist .
+	$(BIN)/python -m tests.bench.documents.bill_of_materials dist/stereorig-*.whl
 
 coverage: $(STAMP)
 	$(BIN)/python -m tests.bench.coverage.coverage $(ARGS)

@@ -53,6 +53,32 @@ def _in_utc(value: datetime) -> datetime:
         raise ValueError("is outside the calendar in UTC") from error
 
 
+#: what a line of text may hold, as browsers and schemas read it: no control character, no break of a line, nothing that
+#: turns the direction of what follows (which shows one name as another)
+ONE_LINE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]*$"
+_NO_LINE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
+_NO_TEXT = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")
+
+
+def _without(forbidden: re.Pattern[str], value: str) -> str:
+    found = forbidden.search(value)
+    if found is not None:
+        raise ValueError(
+            f"must have no control characters, has U+{ord(found[0]):04X} as its character {found.start() + 1}"
+        )
+    return value
+
+
+def one_line(value: str) -> str:
+    """Return a name or label as it is; raise ValueError where it holds a control character."""
+    return _without(_NO_LINE, value)
+
+
+def plain_text(value: str) -> str:
+    """Return text of several lines as it is; raise ValueError where it holds another control character."""
+    return _without(_NO_TEXT, value)
+
+
 def utc_text(value: datetime) -> str:
     """Write a time as it is stored: ISO 8601 in UTC, to the microsecond."""
     return value.isoformat(timespec="microseconds").replace("+00:00", "Z")
@@ -61,7 +87,10 @@ def utc_text(value: datetime) -> str:
 #: true or false, and no number or text that could be read so
 Switch = Annotated[bool, Field(strict=True)]
 Number = Annotated[Real, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
-Label = Annotated[str, StringConstraints(max_length=300)]
+#: a name or label
+OneLine = Annotated[str, AfterValidator(one_line), Field(json_schema_extra={"pattern": ONE_LINE})]
+Label = Annotated[OneLine, StringConstraints(max_length=300)]
+Notes = Annotated[str, StringConstraints(max_length=20_000), AfterValidator(plain_text)]
 StepNumber = Annotated[Whole, Field(ge=0, le=9999)]
 #: a number for each of some axes
 AxisValues = Annotated[
@@ -80,7 +109,16 @@ AxisValues = Annotated[
 #: a number in a form, where everything is text
 FormNumber = Annotated[float, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
 Channels = Annotated[
-    dict[Annotated[str, StringConstraints(min_length=1, max_length=100)], Number], Field(max_length=50)
+    dict[Annotated[str, StringConstraints(min_length=1, max_length=100), AfterValidator(one_line)], Number],
+    Field(max_length=50),
+    WithJsonSchema(
+        {
+            "type": "object",
+            "propertyNames": {"minLength": 1, "maxLength": 100, "pattern": ONE_LINE},
+            "additionalProperties": {"type": "number", "minimum": -1e9, "maximum": 1e9},
+            "maxProperties": 50,
+        }
+    ),
 ]
 Timestamp = Annotated[
     AwareDatetime,

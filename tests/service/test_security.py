@@ -150,6 +150,57 @@ def test_pages_of_others_move_nothing_and_read_nothing(client: httpx.Client, por
         assert not any(secret in answer.body for secret in SECRETS)
 
 
+# what browsers send for an image, a script, a frame, a fetch without CORS and an object of another site's page
+@pytest.mark.parametrize(
+    ("mode", "destination"),
+    [("no-cors", "image"), ("no-cors", "script"), ("navigate", "iframe"), ("no-cors", "empty"), ("navigate", "object")],
+)
+def test_what_another_sites_page_embeds_is_refused(client: httpx.Client, mode: str, destination: str) -> None:
+    fetched = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": mode, "Sec-Fetch-Dest": destination}
+    for path in (f"{API}/rig", f"{API}/rig/cameras/cam1/preview", "/"):
+        answer = client.get(path, headers=fetched)
+        assert (answer.status_code, answer.json()["code"]) == (403, "foreign_site")
+    # from the page itself, typed into the address, or by a program
+    for site in ("same-origin", "none", None):
+        own = {} if site is None else {**fetched, "Sec-Fetch-Site": site}
+        assert client.get(f"{API}/rig", headers=own).status_code == 200
+
+
+def test_a_link_on_another_sites_page_opens_the_page_and_sends_nothing(client: httpx.Client) -> None:
+    followed = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}
+    assert client.get("/", headers=followed).status_code == 200
+    answer = client.post(f"{API}/stage:stop", headers=followed)
+    assert (answer.status_code, answer.json()["code"]) == (403, "foreign_site")
+
+
+@pytest.mark.parametrize(
+    "bad", ["bell\x07", "two\nlines", "nul\x00", "\x1b[31mred", "del\x7f", "turned \u202egpj.exe", "\x85"]
+)
+def test_names_with_control_characters_are_refused_by_name(client: httpx.Client, bad: str) -> None:
+    test_id = new_test(client)
+    before = client.get(f"{API}/tests/{test_id}").json()
+    for method, path, body, field in (
+        ("POST", "/tests", {"name": bad}, "name"),
+        ("PATCH", f"/tests/{test_id}", {"specimen": bad}, "specimen"),
+        ("POST", f"/tests/{test_id}/steps", {"label": bad}, "label"),
+        ("POST", f"/tests/{test_id}/steps", {"channels": {bad: 1.0}}, "channels"),
+        ("POST", "/recipes", {"name": bad}, "name"),
+    ):
+        answer = client.request(method, API + path, json=body)
+        assert answer.status_code == 422, (path, answer.text)
+        assert field in answer.text
+        assert "must have no control characters, has U+" in answer.text
+    assert client.get(f"{API}/tests/{test_id}").json() == before
+
+
+def test_names_in_any_script_and_notes_of_several_lines_are_taken(client: httpx.Client) -> None:
+    named = {"name": "Zugversuch Öß 試験 \U0001f527", "notes": "one\r\n\ttwo\n", "specimen": "a\u00a0b \u200fعينة"}
+    made = client.post(f"{API}/tests", json=named).json()
+    assert {key: made[key] for key in named} == named
+    answer = client.patch(f"{API}/tests/{made['id']}", json={"notes": "a\x00b"})
+    assert answer.status_code == 422
+
+
 @pytest.mark.fault(45)
 def test_the_name_in_the_target_counts_as_little_as_a_second_host(port: int) -> None:
     # a proxy's form of target must not smuggle another name past the check

@@ -9,7 +9,7 @@ from pydantic import Field, StringConstraints
 from core.settings import Real, Whole
 from server.api.models.jobs import Accepted
 from server.api.models.warnings import AnalysisWarning
-from server.base.models import Channels, Label, Listing, Number, Reply, Request, Timestamp
+from server.base.models import Channels, Label, Listing, Notes, Number, OneLine, Reply, Request, Timestamp
 
 
 class TestRequest(Request):
@@ -17,14 +17,16 @@ class TestRequest(Request):
 
     __test__ = False
 
-    name: Annotated[str, StringConstraints(min_length=1, max_length=300)] = Field(description="Name, any characters.")
+    name: Annotated[OneLine, StringConstraints(min_length=1, max_length=300)] = Field(
+        description="Name, in any script; on one line, without control characters."
+    )
     calibration_id: str | None = Field(
         None,
         description="Calibration to measure with, copied into the test; `latest`: the newest one accepted.",
         max_length=40,
     )
     specimen: Label = Field("", description="The specimen, free text.")
-    notes: Annotated[str, StringConstraints(max_length=20000)] = Field("", description="Free text.")
+    notes: Notes = Field("", description="Free text.")
 
 
 class TestPatch(Request):
@@ -32,9 +34,9 @@ class TestPatch(Request):
 
     __test__ = False
 
-    name: Annotated[str, StringConstraints(min_length=1, max_length=300)] | None = Field(None, description="Name.")
+    name: Annotated[OneLine, StringConstraints(min_length=1, max_length=300)] | None = Field(None, description="Name.")
     specimen: Label | None = Field(None, description="The specimen.")
-    notes: Annotated[str, StringConstraints(max_length=20000)] | None = Field(None, description="Free text.")
+    notes: Notes | None = Field(None, description="Free text.")
     calibration_id: Annotated[str, StringConstraints(max_length=40)] | None = Field(
         None,
         description="Calibration that new analyses are measured with; `latest`: the newest one accepted. Analyses that "
@@ -235,7 +237,7 @@ class BurstAccepted(Accepted):
 class WatchRequest(Request):
     """Which channel is watched, and what makes a step."""
 
-    channel: Annotated[str, StringConstraints(min_length=1, max_length=100)] = Field(
+    channel: Annotated[OneLine, StringConstraints(min_length=1, max_length=100)] = Field(
         description="Name of a channel of the readings; `load_n` for the load.", examples=["load_n"]
     )
     threshold: Annotated[Number, Field(ge=0.0)] = Field(

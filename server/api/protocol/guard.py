@@ -1,8 +1,9 @@
-"""At the door: Host and Origin, and the size of bodies."""
+"""At the door: Host, Origin and site, and the size of bodies."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -24,11 +25,23 @@ def host_name(value: str) -> str | None:
     return None if found is None else found[1].strip("[]").lower()
 
 
+def _reads_from_another_site(method: str, headers: Mapping[bytes, str]) -> bool:
+    """Return True where a browser says that a page of another site reads, and that no link was followed.
+
+    An image, script, frame or fetch without CORS bears no Origin; Sec-Fetch-Site, which a page cannot set, tells it.
+    Programs that are no browser send none.
+    """
+    if headers.get(b"sec-fetch-site") != "cross-site" or b"origin" in headers:
+        return False
+    followed = headers.get(b"sec-fetch-mode") == "navigate" and headers.get(b"sec-fetch-dest") == "document"
+    return not (followed and method in {"GET", "HEAD"})
+
+
 class Guard:
     """Refuse requests that come by a foreign name or from a foreign page, and bodies without end.
 
-    A page of another site can reach a service on loopback through the user's browser; its Origin (or, after DNS
-    rebinding, the Host) gives it away.
+    A page of another site can reach a service on loopback through the user's browser; its Origin, its Sec-Fetch-Site
+    (or, after DNS rebinding, the Host) gives it away.
     """
 
     def __init__(self, app: ASGIApp, allowed: frozenset[str] = LOOPBACK_NAMES) -> None:
@@ -54,6 +67,15 @@ class Guard:
                 )
                 await response(scope, receive, send)
                 return
+        if _reads_from_another_site(scope["method"], headers):
+            response = problem_response(
+                403,
+                "foreign_site",
+                "A page of another site asked for this.",
+                "Open it in a tab of its own, or add that site's host to `allowed_hosts` and fetch with CORS.",
+            )
+            await response(scope, receive, send)
+            return
         if b"transfer-encoding" in headers and b"content-length" in headers:
             # two lengths: a proxy in front may believe the other one, and see another request than we do
             response = problem_response(

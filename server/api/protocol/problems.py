@@ -203,7 +203,7 @@ def errors(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Return the ``responses`` of an operation: its problems, for OpenAPI."""
     texts = {
         401: "No key, or a wrong one",
-        403: "Foreign Host or Origin, or a role that may not",
+        403: "Foreign Host, Origin or site, or a role that may not",
         429: "Too many requests",
         404: "No such thing",
         409: "Wrong moment: busy hardware or wrong state",

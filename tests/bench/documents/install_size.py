@@ -37,7 +37,8 @@ _SHOWN = 12
 _NAME = re.compile(r"^[A-Za-z0-9._-]+")
 
 
-def _key(name: str) -> str:
+def key(name: str) -> str:
+    """Return a distribution's name as package indexes normalise it."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
@@ -48,13 +49,13 @@ def needed() -> list[str]:
     found: dict[str, str] = {}
     while waiting:
         name = waiting.pop()
-        if _key(name) in found:
+        if key(name) in found:
             continue
         try:
             requires = metadata.requires(name) or []
         except metadata.PackageNotFoundError:
             continue  # for another platform or version of Python
-        found[_key(name)] = name
+        found[key(name)] = name
         waiting += [_NAME.match(one)[0] for one in requires if "extra ==" not in one]  # type: ignore[index]
     return sorted(found)
 
