@@ -16,7 +16,7 @@ from pathlib import Path
 
 _SERVICE_NICE = -10
 _WORKER_NICE = 5
-BELOW_WORKER = 10
+BELOW_WORKER = 19
 """For what the worker itself need not wait for."""
 _SWITCH_S = 0.001
 _PR_SET_PDEATHSIG = 1

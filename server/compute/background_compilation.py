@@ -2,7 +2,8 @@
 
 numba compiles one kernel at a time in a process, and keeps it on disk for every other. A displacement's kernels are
 compiled while another process compiles those of a shape, which a measurement needs first. A service has both compiled
-aside when it starts: its worker calibrates meanwhile, and waits only where it is to measure.
+aside when it starts, after those that find a line grid: its worker calibrates meanwhile, and waits only where it is to
+measure.
 """
 
 from __future__ import annotations
@@ -74,14 +75,21 @@ class Task(Protocol):
 
 
 class KernelsAside:
-    """All kernels of a first measurement, compiled at a low priority while this process does other work."""
+    """Kernels compiled at a low priority while this process does other work.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    what
+        ``grid``: those that find a line grid. ``all``: those of a first measurement.
+    """
+
+    def __init__(self, what: str) -> None:
+        self._what = what
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
         """Start; the processes end with this one."""
-        self._process = _start("all")
+        self._process = _start(self._what)
 
     def wait(self, task: Task) -> None:
         """Return once the kernels are there, or will have to be compiled here.
@@ -124,6 +132,13 @@ def _compile_all() -> None:
     compile_here(1)
 
 
+def _compile_grid() -> None:
+    lower_worker()
+    from server.compute.grid_kernels import find_drawn_grid
+
+    find_drawn_grid()
+
+
 def _compile_motion(patch: Any) -> None:
     """Fit one point that has no start, and compute its covariance: this compiles all kernels of a displacement."""
     from core.cameras.camera import Camera
@@ -155,12 +170,14 @@ def _compile_motion(patch: Any) -> None:
 
 
 def main() -> int:
-    """Compile a displacement's kernels for plane or quadratic patches, or all that a first measurement needs."""
+    """Compile a displacement's kernels for plane or quadratic patches, those of a grid, or of a first measurement."""
     end_with_parent()
     what = sys.argv[1]
     with no_collection():
         if what == "all":
             _compile_all()
+        elif what == "grid":
+            _compile_grid()
         else:
             _compile_motion("quadratic" if what == "quadratic" else "affine")
     return 0

@@ -25,6 +25,7 @@ from core.measure import MeasureOptions, ReferencePair
 from core.systematic.interpolation import SmoothSlopes, interpolation_term
 from core.threads import available_threads, set_threads
 from server.compute.background_compilation import BackgroundCompilation, KernelsAside
+from server.compute.grid_kernels import find_drawn_grid, grid_aside
 from server.compute.sequence import Pair, SequenceMeasurement
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import read_mask
@@ -50,7 +51,7 @@ class _Kept:
 
 
 _kept: OrderedDict[str, _Kept] = OrderedDict()
-_aside = KernelsAside()
+_aside = KernelsAside("all")
 _reader = ThreadPoolExecutor(1, thread_name_prefix="stereorig-read")
 
 
@@ -112,11 +113,12 @@ def warm_up(threads: int) -> None:
     if available_threads() < 2:  # a single processor has no time to spare
         compile_here(threads)
         return
-    try:
-        with refuse_compiling():
-            _run_once()
-    except NotCompiledError:
-        _aside.start()
+    for aside, run in ((grid_aside, find_drawn_grid), (_aside, _run_once)):
+        try:
+            with refuse_compiling():
+                run()
+        except NotCompiledError:
+            aside.start()
 
 
 def await_kernels() -> None:
