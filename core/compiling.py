@@ -6,6 +6,7 @@ numba raises an event when it compiles, none for kernels that it finds on disk.
 from __future__ import annotations
 
 import contextlib
+import gc
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -41,3 +42,31 @@ def report_compiling(report: Callable[[], None]) -> Iterator[None]:
         yield
     finally:
         event.unregister("numba:compile", listener)  # type: ignore[no-untyped-call]
+
+
+class NotCompiledError(Exception):
+    """A kernel is neither loaded nor on disk, where none may be compiled."""
+
+
+def refuse_compiling() -> contextlib.AbstractContextManager[None]:
+    """Raise :class:`NotCompiledError` inside the block where a kernel would have to be compiled."""
+
+    def refuse() -> None:
+        raise NotCompiledError
+
+    return report_compiling(refuse)
+
+
+@contextlib.contextmanager
+def no_collection() -> Iterator[None]:
+    """Let no garbage be collected inside the block: the compiler makes millions of objects that stay.
+
+    For a process that does nothing but compile: an eighth less of its time, half as much again of its memory.
+    """
+    was = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()

@@ -16,6 +16,8 @@ from pathlib import Path
 
 _SERVICE_NICE = -10
 _WORKER_NICE = 5
+BELOW_WORKER = 19
+"""For what the worker itself need not wait for."""
 _SWITCH_S = 0.001
 _PR_SET_PDEATHSIG = 1
 _AUTOGROUP = Path("/proc/self/autogroup")
@@ -28,11 +30,11 @@ def raise_service() -> None:
     _set_nice(_SERVICE_NICE)
 
 
-def lower_worker() -> None:
+def lower_worker(nice: int = _WORKER_NICE) -> None:
     """Lower this process' priority, in a session of its own: it would use up the share of the service's."""
     with contextlib.suppress(OSError, AttributeError):
         os.setsid()
-    _set_nice(_WORKER_NICE)
+    _set_nice(nice)
 
 
 def _set_nice(nice: int) -> None:

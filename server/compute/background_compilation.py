@@ -1,7 +1,9 @@
-"""Compile the kernels of a motion in a process of their own while this one compiles those of a shape.
+"""Compile kernels in processes of their own, beside the work that does not need them yet.
 
-numba compiles one kernel at a time in a process, and keeps it on disk for every other. A first measurement needs the
-shape's kernels first; by the time it needs the motion's, they are there.
+numba compiles one kernel at a time in a process, and keeps it on disk for every other. A displacement's kernels are
+compiled while another process compiles those of a shape, which a measurement needs first. A service has both compiled
+aside when it starts, after those that find a line grid: its worker calibrates meanwhile, and waits only where it is to
+measure.
 """
 
 from __future__ import annotations
@@ -10,12 +12,15 @@ import os
 import subprocess
 import sys
 from types import TracebackType
+from typing import Any, Protocol
 
 import numpy as np
 
-from server.base.priority import end_with_parent
+from core.compiling import COMPILING, no_collection
+from server.base.priority import BELOW_WORKER, end_with_parent, lower_worker
 
 _MAX_WAIT_S = 300.0
+_POLL_S = 0.05
 
 
 class BackgroundCompilation:
@@ -39,14 +44,7 @@ class BackgroundCompilation:
         if not self._wanted:
             return
         self._wanted = False
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", __name__, self._degree],
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
+        self._process = _start(self._degree)
 
     def wait(self) -> None:
         """Return once the kernels are there, or will have to be compiled here; :meth:`start` does nothing any more."""
@@ -66,9 +64,83 @@ class BackgroundCompilation:
             self._process.wait()
 
 
-def main() -> int:
-    """Fit one point that has no start, and compute its covariance: this compiles all kernels."""
-    end_with_parent()
+class Task(Protocol):
+    """What waits: a task of the worker, told of its progress and asked whether to go on."""
+
+    def check(self) -> None:
+        """Raise where it is to stop."""
+
+    def progress(self, phase: str, done: int, total: int) -> None:
+        """Report progress."""
+
+
+class KernelsAside:
+    """Kernels compiled at a low priority while this process does other work.
+
+    Parameters
+    ----------
+    what
+        ``grid``: those that find a line grid. ``all``: those of a first measurement.
+    """
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        """Start; the processes end with this one."""
+        self._process = _start(self._what)
+
+    def wait(self, task: Task) -> None:
+        """Return once the kernels are there, or will have to be compiled here.
+
+        Raises
+        ------
+        Cancelled
+            The task was asked to stop.
+        """
+        if self._process is None:
+            return
+        told = False
+        while self._process.poll() is None:
+            if not told:
+                task.progress(COMPILING, 0, 1)
+                told = True
+            task.check()
+            try:
+                self._process.wait(_POLL_S)
+            except subprocess.TimeoutExpired:
+                continue
+        self._process = None
+
+
+def _start(what: str) -> subprocess.Popen[bytes]:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    return subprocess.Popen(
+        [sys.executable, "-m", __name__, what],
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+
+
+def _compile_all() -> None:
+    lower_worker(BELOW_WORKER)
+    from server.compute.measurement import compile_here
+
+    compile_here(1)
+
+
+def _compile_grid() -> None:
+    lower_worker()
+    from server.compute.grid_kernels import find_drawn_grid
+
+    find_drawn_grid()
+
+
+def _compile_motion(patch: Any) -> None:
+    """Fit one point that has no start, and compute its covariance: this compiles all kernels of a displacement."""
     from core.cameras.camera import Camera
     from core.cameras.stereo import StereoPair
     from core.matching.cluster_robust import cluster_robust_covariance
@@ -89,12 +161,25 @@ def main() -> int:
         z0_mm=100.0,
     )
     picture = np.random.default_rng(1).normal(128.0, 20.0, (64, 64))
-    options = MatchOptions(subset_px=21, patch="quadratic" if sys.argv[1] == "quadratic" else "affine")
+    options = MatchOptions(subset_px=21, patch=patch)
     pair, xy, start = StereoPair(camera, camera), [[32.0, 32.0]], [[np.nan] * 3]
     fit_motion(pair, picture, picture, picture, picture, xy, start, None, options)
-    terms = 6 if options.patch == "quadratic" else 3
+    terms = 6 if patch == "quadratic" else 3
     w, G = np.full((1, terms), np.nan), np.full((1, 3, terms), np.nan)
     cluster_robust_covariance(pair, [picture] * 4, xy, w, G, 0.0, options)
+
+
+def main() -> int:
+    """Compile a displacement's kernels for plane or quadratic patches, those of a grid, or of a first measurement."""
+    end_with_parent()
+    what = sys.argv[1]
+    with no_collection():
+        if what == "all":
+            _compile_all()
+        elif what == "grid":
+            _compile_grid()
+        else:
+            _compile_motion("quadratic" if what == "quadratic" else "affine")
     return 0
 
 

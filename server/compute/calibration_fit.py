@@ -18,6 +18,7 @@ from core.errors import CalibrationError, CalibrationInputError
 from core.grid import GridOptions, GridView
 from core.names import CAMERAS
 from server.compute.calibration_inputs import nominals_of, options_of, target_of
+from server.compute.grid_kernels import await_grid_kernels
 from server.formats.calibrations.native import calibration_content, view_record
 from server.formats.images import GrayImage, read_image
 from server.formats.results.netcdf import written_dataset
@@ -54,6 +55,7 @@ def fit_calibration(task: FitTask) -> dict[str, Any]:
     folder = Path(task.folder)
     rig, plan = task.plan["rig"], task.plan
     target = target_of(rig["target"])
+    await_grid_kernels(target)
     measured = [view for view in task.views if view["role"] in ("fitted", "held_out", "free")]
     # averages are scaled: the type's maximum is not the level at which the sensor saturates
     if not task.views:

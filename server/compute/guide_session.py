@@ -26,6 +26,7 @@ from core.target import GridTarget
 from server.base.json_values import without_nan
 from server.base.problem import problem_of
 from server.compute.calibration_inputs import nominals_of, options_of, target_of
+from server.compute.grid_kernels import await_grid_kernels
 from server.formats.images import GrayImage, read_image
 from server.worker.tasks import GuideTask, LookTask
 
@@ -60,6 +61,7 @@ def find_in_pair(task: LookTask) -> dict[str, int]:
         ``camera`` names the image.
     """
     target = target_of(task.rig["target"])
+    await_grid_kernels(target)
     localiser: Localiser = "paper" if task.localiser == "paper" else "profile"
     found: dict[str, int] = {}
     for cam in CAMERAS:
@@ -150,6 +152,7 @@ def _session(task: GuideTask) -> _Session:
             localiser=plan["localiser"],
             rest_px=plan["rest_px"],
         )
+        await_grid_kernels(session.target)
         _known.clear()
         _known[task.folder] = session
     return session

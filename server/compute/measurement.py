@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections import OrderedDict
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -17,13 +18,14 @@ import numpy as np
 
 from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
-from core.compiling import report_compiling
+from core.compiling import NotCompiledError, refuse_compiling, report_compiling
 from core.field.region.region import PointGrid
 from core.field.seeding.seeds import Seed
 from core.measure import MeasureOptions, ReferencePair
 from core.systematic.interpolation import SmoothSlopes, interpolation_term
-from core.threads import set_threads
-from server.compute.background_compilation import BackgroundCompilation
+from core.threads import available_threads, set_threads
+from server.compute.background_compilation import BackgroundCompilation, KernelsAside
+from server.compute.grid_kernels import find_drawn_grid, grid_aside
 from server.compute.sequence import Pair, SequenceMeasurement
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import read_mask
@@ -49,6 +51,7 @@ class _Kept:
 
 
 _kept: OrderedDict[str, _Kept] = OrderedDict()
+_aside = KernelsAside("all")
 _reader = ThreadPoolExecutor(1, thread_name_prefix="stereorig-read")
 
 
@@ -105,8 +108,39 @@ def _begin(task: StepTask) -> SequenceMeasurement:
 
 
 def warm_up(threads: int) -> None:
-    """Load the kernels of the default settings and run them once on a small pair of images."""
+    """Load the kernels of the default settings; what is not on disk is compiled aside, see :func:`await_kernels`."""
     set_threads(threads)
+    if available_threads() < 2:  # a single processor has no time to spare
+        compile_here(threads)
+        return
+    for aside, run in ((grid_aside, find_drawn_grid), (_aside, _run_once)):
+        try:
+            with refuse_compiling():
+                run()
+        except NotCompiledError:
+            aside.start()
+
+
+def await_kernels() -> None:
+    """Return once the kernels are there that :func:`warm_up` has compiled aside.
+
+    Raises
+    ------
+    Cancelled
+        The service asked for it.
+    """
+    _aside.wait(current_task())
+
+
+def compile_here(threads: int) -> None:
+    """Load the kernels of the default settings, or compile them: a displacement's in a process beside this one."""
+    set_threads(threads)
+    with BackgroundCompilation("affine") as compilation, report_compiling(compilation.start):
+        _run_once(compilation.wait)
+
+
+def _run_once(before_motion: Callable[[], None] = lambda: None) -> None:
+    """Measure a small pair of images, and a displacement of nothing."""
     # a plane imaged by two cameras side by side: camera 2's image is camera 1's, shifted by 6 px
     rng = np.random.default_rng(1)
     noise = cv2.GaussianBlur(rng.normal(size=(128, 150)), (0, 0), 1.3)
@@ -129,10 +163,9 @@ def warm_up(threads: int) -> None:
     seeds = [Seed(xy_px=(64.0, 64.0), xy2_px=(58.0, 64.0))]
     # other patches and the other interpolation compile when first asked for; compiled kernels are kept on disk
     options = MeasureOptions(subset_px=21, patch="affine")
-    with BackgroundCompilation(options.patch) as compilation, report_compiling(compilation.start):
-        reference = ReferencePair(pair, left, right)
-        shape = reference.shape(grid, options, seeds=seeds)
-        compilation.wait()
-        reference.motion(left.copy(), right.copy(), grid, options, shape=shape)
-        one, two = (image.prepared(options.interpolation) for image in (reference.image1, reference.image2))
-        interpolation_term(shape, pair, SmoothSlopes.of(one), [two], subset_px=options.subset_px)
+    reference = ReferencePair(pair, left, right)
+    shape = reference.shape(grid, options, seeds=seeds)
+    before_motion()
+    reference.motion(left.copy(), right.copy(), grid, options, shape=shape)
+    one, two = (image.prepared(options.interpolation) for image in (reference.image1, reference.image2))
+    interpolation_term(shape, pair, SmoothSlopes.of(one), [two], subset_px=options.subset_px)

@@ -32,8 +32,12 @@ def check_disk(book: Notebook, root: Path, *, image_bytes: int, pairs_per_s: flo
         Rate at which this rig delivers pairs; None if it is not known.
     """
     folder = root.absolute()
-    while not folder.is_dir() and folder.parent != folder:
-        folder = folder.parent
+    try:
+        while not folder.is_dir() and folder.parent != folder:
+            folder = folder.parent
+    except PermissionError:  # a folder above it may not be entered
+        book.fail("disk", "writing", _not_ours(folder))
+        return
     _check_lock(book, root)
     with book.guard("disk", "writing"):
         times = _write(folder, image_bytes)
@@ -91,9 +95,18 @@ def _write(folder: Path, image_bytes: int) -> list[float]:
                 start = time.monotonic()
                 write_bytes(Path(temporary) / f"image_{len(times) % 4}.bin", data)
                 times.append(time.monotonic() - start)
+    except PermissionError as error:
+        raise _not_ours(folder) from error
     except OSError as error:
         raise storage_error(error, folder) from error
     return times
+
+
+def _not_ours(folder: Path) -> StorageError:
+    return StorageError(
+        f"This user (id {os.geteuid()}) may not write in {folder}.",
+        remedy="Give the folder to the user that runs the service (chown), or name another with --data.",
+    )
 
 
 def _check_room(book: Notebook, folder: Path, image_bytes: int) -> None:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import ctypes
 import os
+import pickle
 import platform
 import re
+import sys
 import time
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
-import core
+from server.base.kernel_folder import can_write, kernel_folders, named_folder
 from server.doctor.report import Notebook
 from server.formats.version import software_version
 
@@ -19,8 +22,6 @@ _PACKAGES = ("numpy", "scipy", "opencv-python-headless", "numba", "pyserial", "f
 #: what more can be done with packages that need not be there
 _EXTRAS = {"xarray": ("xarray", "data sets"), "progress": ("rich", "progress bars"), "aravis": ("PyGObject", "GenICam")}
 _NAME = re.compile(r"^[A-Za-z0-9._-]+")
-# their compiled forms lie beside them where they can; the package itself takes seconds to load
-_KERNELS = Path(core.__file__).parent / "matching" / "kernels"
 _MEMORY_GIB = 1.0
 # of the wall clock against the monotonic one while the doctor runs; slewing by NTP stays below 0.5 ms a second
 _STEP_S = 0.05
@@ -61,27 +62,47 @@ def check_software(book: Notebook) -> None:
     book.note("software", "extras", "ok", text)
 
 
-def check_kernels(book: Notebook, kernels: Path = _KERNELS) -> None:
+def check_kernels(book: Notebook, folders: list[Path] | None = None) -> None:
     """Note where compiled kernels are kept; where nothing can be kept, every start compiles them anew."""
-    own = os.environ.get("NUMBA_CACHE_DIR")
-    places = [Path(own)] if own else [kernels / "__pycache__", Path.home() / ".cache" / "numba"]
-    place = next((p for p in places if _can_write(p)), None)
-    named = " and ".join(map(str, places))
+    named = named_folder()
+    folders = folders or ([named] if named else kernel_folders())
+    place = next((p for p in folders if can_write(p)), None)
     if place is None:
-        found = f"cannot be kept: {named} cannot be written"
+        found = f"cannot be kept: {' and '.join(map(str, folders))} cannot be written"
         remedy = "Set NUMBA_CACHE_DIR to a folder that this user may write: else each start compiles for half a minute."
         book.note("software", "compiled kernels", "warning", found, remedy=remedy)
         return
-    compiled = any(place.rglob("*.nbi")) if place.is_dir() else False
-    when = "there already" if compiled else "none yet: the first measurement compiles them, half a minute"
-    book.note("software", "compiled kernels", "ok", f"{when} ({place})")
+    book.note("software", "compiled kernels", "ok", f"{_age_of(place)} ({place})")
 
 
-def _can_write(folder: Path) -> bool:
-    """Whether a file could be made in a folder that is there, or that would have to be made."""
-    while not folder.exists() and folder != folder.parent:
-        folder = folder.parent
-    return folder.is_dir() and os.access(folder, os.W_OK)
+def _age_of(place: Path) -> str:
+    """Say whether the fit's kernels are there, and whether this Python and numba would take them."""
+    found = [*place.glob("drivers.run_*.nbi"), *place.glob("kernels_*/drivers.run_*.nbi")]
+    later = "the first start compiles them, half a minute, while it calibrates"
+    if not found:
+        return f"none yet: {later}"
+    python = f".py{sys.version_info.major}{sys.version_info.minor}"
+    numba = metadata.version("numba") if _installed("numba") else ""
+    if any(python in index.name and _numba_of(index) == numba for index in found):
+        return "there already"
+    return f"of another version of Python or numba: {later}"
+
+
+def _numba_of(index: Path) -> str | None:
+    """Return the version of numba that wrote an index: a pickled text, its first item."""
+    try:
+        with index.open("rb") as file:
+            version = _Texts(file).load()
+    except (OSError, pickle.UnpicklingError, EOFError, ValueError, IndexError, AttributeError):
+        return None
+    return version if isinstance(version, str) else None
+
+
+class _Texts(pickle.Unpickler):
+    """Reads plain values alone."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        raise pickle.UnpicklingError(f"{module}.{name} is no text")
 
 
 def required() -> list[str]:

@@ -10,6 +10,7 @@ from core.errors import StereorigError
 from core.names import CAMERAS
 from drivers.stages.serial_ports import port_problem
 from server.config.rig_file import RigConfig, load_config
+from server.doctor.access import check_service_port, check_usb_cameras
 from server.doctor.cameras import check_frames, check_identity, check_pairs, check_settings, watch
 from server.doctor.disk import check_disk
 from server.doctor.link import check_link, check_network
@@ -26,6 +27,8 @@ def examine(
     *,
     seconds: float = 5.0,
     data: Path = Path("data"),
+    host: str = "127.0.0.1",
+    port: int = 8000,
     move: bool = False,
     home: bool = False,
     record: Path | None = None,
@@ -41,6 +44,8 @@ def examine(
         How long pairs are captured for.
     data
         The data folder, whose disk is timed.
+    host, port
+        Where the service is to listen.
     move, home
         Allow a small move of each axis, and the search for home; a simulated stage does both anyway.
     record
@@ -53,6 +58,7 @@ def examine(
     check_software(book)
     check_kernels(book)
     check_machine(book)
+    check_service_port(book, host, port)
     config = _read(book, path)
     if config is not None:
         _check_drivers(book, config)
@@ -93,6 +99,8 @@ def _check_drivers(book: Notebook, config: RigConfig) -> None:
     if not wanted:
         book.note("software", "camera drivers", "ok", "simulated cameras need none")
         return
+    if "aravis" in wanted:
+        check_usb_cameras(book)
     listing = DeviceFinder(wanted).find()
     for driver in listing.drivers:
         if driver.name in wanted:

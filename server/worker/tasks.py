@@ -266,13 +266,13 @@ class GuideTask:
 
 
 def warm_up(threads: int) -> None:
-    """Load and compile every kernel once, before the first task needs them."""
+    """Load every kernel once, before the first task needs them; those that are not on disk are compiled aside."""
     _heavy("server.compute.measurement").warm_up(threads)
 
 
 def measure_step(task: StepTask) -> dict[str, Any]:
     """Measure one step; its result file is readable when this returns. Returns the step's summary."""
-    summary: dict[str, Any] = _heavy("server.compute.measurement").measure_step(task)
+    summary: dict[str, Any] = _measuring("server.compute.measurement").measure_step(task)
     return summary
 
 
@@ -284,7 +284,7 @@ def fit_calibration(task: FitTask) -> dict[str, Any]:
 
 def repair_calibration(task: RepairTask) -> dict[str, Any]:
     """Estimate the cameras' orientation anew; the new ``calibration.json`` is there when this returns."""
-    summary: dict[str, Any] = _heavy("server.compute.orientation_repair").repair_calibration(task)
+    summary: dict[str, Any] = _measuring("server.compute.orientation_repair").repair_calibration(task)
     return summary
 
 
@@ -296,7 +296,7 @@ def find_in_pair(task: LookTask) -> dict[str, int]:
 
 def check_live(task: LiveCheckTask) -> LiveFinding:
     """Say how far a live pair's points lie off their epipolar lines."""
-    seen: LiveFinding = _heavy("server.compute.live_check").check_live(task)
+    seen: LiveFinding = _measuring("server.compute.live_check").check_live(task)
     return seen
 
 
@@ -316,6 +316,12 @@ def fit_noise(task: NoiseTask) -> dict[str, Any]:
     """Fit both cameras' noise models; ``noise.json`` is there when this returns."""
     summary: dict[str, Any] = _heavy("server.compute.noise_fit").fit_noise(task)
     return summary
+
+
+def _measuring(module: str) -> Any:
+    """Return a module that matches images, once the kernels are there."""
+    _heavy("server.compute.measurement").await_kernels()
+    return _heavy(module)
 
 
 def _heavy(module: str) -> Any:

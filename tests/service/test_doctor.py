@@ -22,7 +22,7 @@ from drivers.stages.protocol import AxisOptions
 from server.cli import main
 from server.doctor import Check, Report, examine
 from server.doctor.disk import check_disk
-from server.doctor.machine import check_kernels, check_machine
+from server.doctor.machine import check_machine
 from server.doctor.report import Notebook, line_of, percentile
 from server.doctor.stage import check_stage
 from server.store.folder import DataFolder
@@ -33,7 +33,13 @@ from tests.support.service_rig import TINY, tiny_config
 from tests.support.stage_bench import CONTROLLERS, Bench, bench
 
 # the machine's own matters, which depend on where the tests run
-HERE = {("machine", "processors"), ("machine", "load"), ("machine", "memory"), ("machine", "clock")}
+HERE = {
+    ("service", "port"),
+    ("machine", "processors"),
+    ("machine", "load"),
+    ("machine", "memory"),
+    ("machine", "clock"),
+}
 
 
 @pytest.fixture
@@ -393,26 +399,6 @@ def test_the_machine_says_what_it_has() -> None:
     check_machine(book)
     assert check_of(book.checks, "machine", "processors").figures["processors"] >= 1  # type: ignore[operator]
     assert check_of(book.checks, "machine", "memory").figures["available_gib"] > 0  # type: ignore[operator]
-
-
-def test_it_says_where_compiled_kernels_are_kept_and_where_they_cannot_be(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def state() -> tuple[str, str]:
-        book = Notebook()
-        check_kernels(book)
-        check = check_of(book.checks, "software", "compiled kernels")
-        return check.state, check.found
-
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    assert state() == ("ok", f"none yet: the first measurement compiles them, half a minute ({tmp_path / 'cache'})")
-    (tmp_path / "cache" / "kernels").mkdir(parents=True)
-    (tmp_path / "cache" / "kernels" / "one.nbi").touch()
-    assert state()[1].startswith("there already")
-    # a file in the folder's place: not even root can make anything in it
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "cache"))
-    assert state()[0] == "warning"
 
 
 def test_percentiles_are_values_that_were_measured() -> None:

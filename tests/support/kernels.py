@@ -23,7 +23,7 @@ def measure() -> None:
     import server.compute.measurement
     from core.field.region.cuts import Cuts, crosses
 
-    server.compute.measurement.warm_up(1)
+    server.compute.measurement.compile_here(1)
     crosses([[1.0, 5.0]], [[5.0, 1.0]], Cuts([[[0.0, 0.0], [9.0, 9.0]]]))
 
 

@@ -78,3 +78,19 @@ def warm_up(threads: int) -> None:
     time.sleep(0.5)  # so that a task is waiting
     compile_something()
     time.sleep(0.5)
+
+
+def compiled_while_waiting() -> list[int]:
+    """Wait for the kernels that are compiled aside, measure, and return what was compiled here all the same."""
+    import server.compute.measurement
+    from core.compiling import report_compiling
+    from core.target import GridTarget
+    from server.compute.grid_kernels import await_grid_kernels, find_drawn_grid
+
+    await_grid_kernels(GridTarget(pitch_mm=1.0, lines=(9, 9), line_width_mm=0.05))
+    server.compute.measurement.await_kernels()
+    compiled: list[int] = []
+    with report_compiling(lambda: compiled.append(1)):
+        find_drawn_grid()
+        server.compute.measurement._run_once()
+    return compiled

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from core.errors import InputError
-from server.cli.operation.serve import check_record, default_config
+from server.cli.operation.serve import DEFAULT_PORT, check_record, default_config
 from server.doctor import Check, examine
 from server.doctor.report import line_of
 
@@ -23,6 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--config", type=Path, help="rig file (default: the simulated paper rig)")
     add("--data", type=Path, default=Path("data"), help="data folder, whose disk is timed (default: ./data)")
+    add("--host", default="127.0.0.1", help="address that the service is to listen on (default: 127.0.0.1)")
+    add("--port", type=int, default=DEFAULT_PORT, help=f"its port (default: {DEFAULT_PORT})")
     add("--seconds", type=float, default=5.0, help="how long pairs are captured for (default: 5)")
     add(
         "--move",
@@ -59,6 +61,8 @@ def run(args: argparse.Namespace) -> int:
         path,
         seconds=args.seconds,
         data=args.data,
+        host=args.host,
+        port=args.port,
         move=args.move,
         home=args.home,
         record=args.record,

@@ -37,7 +37,7 @@ def load() -> None:
     import server.compute.measurement
     import server.compute.noise_fit
 
-    server.compute.measurement.warm_up(1)
+    server.compute.measurement.compile_here(1)
 
 
 def fork_workers() -> None:

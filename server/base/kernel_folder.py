@@ -1,0 +1,48 @@
+"""Where compiled kernels are kept: beside their sources, in the user's cache, or where ``NUMBA_CACHE_DIR`` says.
+
+numba refuses to load a kernel that it may keep where none of these can be written, as under a user without a home on
+an installation that is another's. The command line then keeps them for as long as it runs.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+import core
+
+# the package itself takes seconds to load
+_KERNELS = Path(core.__file__).parent / "matching" / "kernels"
+_temporary: Path | None = None
+
+
+def kernel_folders(kernels: Path = _KERNELS) -> list[Path]:
+    """Return the folders that numba tries, in its order; the first one that can be written is taken."""
+    own = named_folder()
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path(os.path.expanduser("~")) / ".cache")  # noqa: PTH111 - no error
+    return [*([] if own is None else [own]), kernels / "__pycache__", home / "numba"]
+
+
+def named_folder() -> Path | None:
+    """Return the folder that the user named."""
+    own = os.environ.get("NUMBA_CACHE_DIR")
+    return Path(own) if own and Path(own) != _temporary else None
+
+
+def can_write(folder: Path) -> bool:
+    """Whether a file could be made in a folder that is there, or that would have to be made."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder.is_dir() and os.access(folder, os.W_OK)
+
+
+def ensure_kernel_folder() -> None:
+    """Have kernels kept in a folder of this process, taken away at its end, where they can be kept nowhere else."""
+    global _temporary
+    if _temporary is None and not any(map(can_write, kernel_folders())):
+        _temporary = Path(tempfile.mkdtemp(prefix="stereorig-kernels-"))
+        os.environ["NUMBA_CACHE_DIR"] = str(_temporary)
+        atexit.register(shutil.rmtree, _temporary, ignore_errors=True)
