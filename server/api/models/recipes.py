@@ -67,7 +67,10 @@ class Recipe(Request):
 
     format: Literal["stereorig recipe"] = Field(RECIPE_FORMAT, description="What the document is.")
     version: Annotated[Whole, Field(ge=1)] = Field(
-        RECIPE_VERSION, description="Version of the document; a later one is refused."
+        RECIPE_VERSION,
+        description="Version of the document; a later one is refused.",
+        # said in the validator's place, with what helps
+        json_schema_extra={"maximum": RECIPE_VERSION},
     )
     image_size_px: tuple[Side, Side] | None = Field(
         None,

@@ -103,13 +103,13 @@ def get_cameras(service: ServiceDep) -> CamerasReply:
     return CamerasReply(cameras=[service.rig.describe_camera(cam) for cam in CAMERAS])
 
 
-@router.get("/cameras/{cam}", summary="One camera", response_model_exclude_unset=True, responses=errors(422))
+@router.get("/cameras/{cam:plain_id}", summary="One camera", response_model_exclude_unset=True, responses=errors(422))
 def get_camera(service: ServiceDep, cam: Camera, response: Response) -> CameraReply:
     """Return nominal data, the device's own description and its settings."""
     return tagged(response, service.rig.describe_camera(cam))
 
 
-@router.patch("/cameras/{cam}", summary="Change a camera's settings", responses=errors(409, 412, 422, 503))
+@router.patch("/cameras/{cam:plain_id}", summary="Change a camera's settings", responses=errors(409, 412, 422, 503))
 def patch_camera(
     service: ServiceDep, cam: Camera, body: SettingsPatch, response: Response, if_match: IfMatch = None
 ) -> CameraSet:
