@@ -130,7 +130,10 @@ def residual_test(
     if len(alone) == 0:
         return TestedResiduals(factor=factor, one_by_one=0, rejected=rejected)
     # noise alone, where there are points that show nothing else
-    quiet = (usual_energy / np.maximum(energy[unusual], usual_energy)).min(axis=1) * (len(usual) > 0)
+    most = np.maximum(energy[unusual], usual_energy)
+    # a comparison without any residual, as of an image with itself, is as quiet as usual
+    share = np.divide(usual_energy, most, out=np.ones_like(most), where=most > 0)
+    quiet = share.min(axis=1) * (len(usual) > 0)
     alike = _robust(fitter, points, alone[np.unique(spread_indices(len(alone), _SAMPLE))], xy_px)
     structure = _Structure.of(alike) if len(alike.independent) >= _MIN_POINTS else None
     kind = np.full((len(alone), q), np.nan)
