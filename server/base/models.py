@@ -56,8 +56,9 @@ def _in_utc(value: datetime) -> datetime:
 #: what a line of text may hold, as browsers and schemas read it: no control character, no break of a line, nothing that
 #: turns the direction of what follows (which shows one name as another)
 ONE_LINE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]*$"
-_NO_LINE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
-_NO_TEXT = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")
+# halves of a character too, which no file and no answer could hold
+_NO_LINE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+_NO_TEXT = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 def _without(forbidden: re.Pattern[str], value: str) -> str:

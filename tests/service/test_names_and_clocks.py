@@ -26,7 +26,7 @@ API = "/api/v1"
 
 NAMES = [
     "Zugprobe №7 – 45° / Öl, 東京, 🧪, עברית",
-    "  leading, trailing and\ttabbed  ",
+    "  leading, trailing and  doubled  ",
     "x" * 300,
     "東" * 300,
     "..",
@@ -39,9 +39,6 @@ NAMES = [
     "-rf",
     "~root",
     "$(reboot) `id` %s {0} ; DROP TABLE jobs; --",
-    "two\nlines",
-    "a\u0000b",
-    "\u202eright to left",
     "e\u0301 beside \u00e9",
     "<script>alert(1)</script>",
     "step.json",
@@ -73,11 +70,10 @@ def test_every_label_is_kept_to_the_letter_and_names_no_file(service: Service, c
         step = client.post(f"{API}/tests/{test_id}/steps", json={"label": name, "channels": {name[:100]: 1.0}})
         assert step.status_code == 201, (name, step.text)
         assert client.get(f"{API}/tests/{test_id}/steps/0").json()["label"] == name
-        if "\u0000" not in name and "\n" not in name:  # a form has lines of its own
-            files = {cam: (f"{name[:50]}.tif", content) for cam, content in pair.items()}
-            sent = client.post(f"{API}/tests/{test_id}/steps:import", files=files, data={"label": name})
-            assert sent.status_code == 201, (name, sent.text)
-            assert sent.json()["label"] == name
+        files = {cam: (f"{name[:50]}.tif", content) for cam, content in pair.items()}
+        sent = client.post(f"{API}/tests/{test_id}/steps:import", files=files, data={"label": name})
+        assert sent.status_code == 201, (name, sent.text)
+        assert sent.json()["label"] == name
         document = json.loads((root / "tests" / test_id / "test.json").read_text(encoding="utf-8"))
         assert document["name"] == name
         steps = {"0000", "0001"} & {p.name for p in (root / "tests" / test_id / "steps").iterdir()}
@@ -94,7 +90,13 @@ def test_every_label_is_kept_to_the_letter_and_names_no_file(service: Service, c
 
 @pytest.mark.fault(9)
 @pytest.mark.fault(48)
-@pytest.mark.parametrize("raw", ['"' + "x" * 301 + '"', '"\\ud800"', '"\\udfff\\ud800"', "7", "null", "[]"])
+@pytest.mark.parametrize(
+    "raw",
+    [
+        *('"' + "x" * 301 + '"', '"\\ud800"', '"\\udfff\\ud800"', "7", "null", "[]"),
+        *('"two\\nlines"', '"a\\u0000b"', '"\\u202eright to left"'),
+    ],
+)
 def test_what_is_no_label_is_refused(client: httpx.Client, raw: str) -> None:
     headers = {"Content-Type": "application/json"}
     made = client.post(f"{API}/tests", json={"name": "a test"}).json()["id"]

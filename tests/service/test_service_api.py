@@ -232,7 +232,7 @@ def test_a_board_in_a_hand_is_put_before_the_cameras_and_a_bumped_camera_stays_s
 
 def test_step_is_on_disk_with_its_checksums_when_it_is_acknowledged(client: httpx.Client, service: Service) -> None:
     client.put(f"{API}/sim/scene", json={"scene": "steel"})
-    test_id = new_test(client, name="Prüfung / .. \\ 1\u202e", specimen="x" * 300)
+    test_id = new_test(client, name="Prüfung / .. \\ 1\u200f", specimen="x" * 300)
     step = client.post(f"{API}/tests/{test_id}/steps", json={"label": "../../etc", "load_n": 12.5})
     assert step.status_code == 201, step.text
     body = step.json()
@@ -248,7 +248,7 @@ def test_step_is_on_disk_with_its_checksums_when_it_is_acknowledged(client: http
     image = client.get(f"{API}/tests/{test_id}/steps/0/cam1")
     assert image.content == (folder / "cam1.tif").read_bytes()
     shown = client.get(f"{API}/tests/{test_id}").json()
-    assert shown["name"] == "Prüfung / .. \\ 1\u202e"
+    assert shown["name"] == "Prüfung / .. \\ 1\u200f"
     assert [s["n"] for s in shown["steps"]] == [0]
 
 
