@@ -13,11 +13,15 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
     PlainSerializer,
     StringConstraints,
     WithJsonSchema,
 )
 from pydantic.config import JsonDict
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import core_schema
 
 from core.settings import Real, Whole
 
@@ -80,6 +84,16 @@ def plain_text(value: str) -> str:
     return _without(_NO_TEXT, value)
 
 
+class _OneLine:
+    """Mark of a name or label, after its length: no control characters, which the schema says too."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        return core_schema.no_info_after_validator_function(one_line, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        return {**handler(schema), "pattern": ONE_LINE}
+
+
 def utc_text(value: datetime) -> str:
     """Write a time as it is stored: ISO 8601 in UTC, to the microsecond."""
     return value.isoformat(timespec="microseconds").replace("+00:00", "Z")
@@ -88,9 +102,10 @@ def utc_text(value: datetime) -> str:
 #: true or false, and no number or text that could be read so
 Switch = Annotated[bool, Field(strict=True)]
 Number = Annotated[Real, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
-#: a name or label
-OneLine = Annotated[str, AfterValidator(one_line), Field(json_schema_extra={"pattern": ONE_LINE})]
-Label = Annotated[OneLine, StringConstraints(max_length=300)]
+
+
+ON_ONE_LINE = _OneLine()
+Label = Annotated[str, StringConstraints(max_length=300), ON_ONE_LINE]
 Notes = Annotated[str, StringConstraints(max_length=20_000), AfterValidator(plain_text)]
 StepNumber = Annotated[Whole, Field(ge=0, le=9999)]
 #: a number for each of some axes

@@ -15,7 +15,7 @@ from core import settings
 from core.errors import InputError, RegionError
 from core.settings import Whole
 from server.api.models.analyses import Region, StrainRequest
-from server.base.models import Label, Listing, Number, OneLine, Reply, Request, Switch
+from server.base.models import ON_ONE_LINE, Label, Listing, Number, Reply, Request, Switch
 from server.results.gauges.request import GaugeRequest
 from server.wording import problems_in
 
@@ -26,7 +26,7 @@ RECIPE_FORMAT: Literal["stereorig recipe"] = "stereorig recipe"
 WORKSPACE = "workspace"
 Side = Annotated[Whole, Field(ge=1, le=65_536)]
 Percent = Annotated[Number, Field(ge=0.0, le=100.0)]
-RecipeName = Annotated[OneLine, StringConstraints(min_length=1, max_length=120)]
+RecipeName = Annotated[str, StringConstraints(min_length=1, max_length=120), ON_ONE_LINE]
 
 
 class RecipeSettings(settings.AnalysisSettings):

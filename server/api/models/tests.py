@@ -9,7 +9,9 @@ from pydantic import Field, StringConstraints
 from core.settings import Real, Whole
 from server.api.models.jobs import Accepted
 from server.api.models.warnings import AnalysisWarning
-from server.base.models import Channels, Label, Listing, Notes, Number, OneLine, Reply, Request, Timestamp
+from server.base.models import ON_ONE_LINE, Channels, Label, Listing, Notes, Number, Reply, Request, Timestamp
+
+TestName = Annotated[str, StringConstraints(min_length=1, max_length=300), ON_ONE_LINE]
 
 
 class TestRequest(Request):
@@ -17,9 +19,7 @@ class TestRequest(Request):
 
     __test__ = False
 
-    name: Annotated[OneLine, StringConstraints(min_length=1, max_length=300)] = Field(
-        description="Name, in any script; on one line, without control characters."
-    )
+    name: TestName = Field(description="Name, in any script; on one line, without control characters.")
     calibration_id: str | None = Field(
         None,
         description="Calibration to measure with, copied into the test; `latest`: the newest one accepted.",
@@ -34,7 +34,9 @@ class TestPatch(Request):
 
     __test__ = False
 
-    name: Annotated[OneLine, StringConstraints(min_length=1, max_length=300)] | None = Field(None, description="Name.")
+    name: Annotated[str, StringConstraints(min_length=1, max_length=300), ON_ONE_LINE] | None = Field(
+        None, description="Name."
+    )
     specimen: Label | None = Field(None, description="The specimen.")
     notes: Notes | None = Field(None, description="Free text.")
     calibration_id: Annotated[str, StringConstraints(max_length=40)] | None = Field(
@@ -237,7 +239,7 @@ class BurstAccepted(Accepted):
 class WatchRequest(Request):
     """Which channel is watched, and what makes a step."""
 
-    channel: Annotated[OneLine, StringConstraints(min_length=1, max_length=100)] = Field(
+    channel: Annotated[str, StringConstraints(min_length=1, max_length=100), ON_ONE_LINE] = Field(
         description="Name of a channel of the readings; `load_n` for the load.", examples=["load_n"]
     )
     threshold: Annotated[Number, Field(ge=0.0)] = Field(
