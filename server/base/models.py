@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
@@ -60,6 +62,7 @@ def _in_utc(value: datetime) -> datetime:
 #: what a line of text may hold, as browsers and schemas read it: no control character, no break of a line, nothing that
 #: turns the direction of what follows (which shows one name as another)
 ONE_LINE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]*$"
+SOME_LINES = r"^[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]*$"
 # halves of a character too, which no file and no answer could hold
 _NO_LINE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _NO_TEXT = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
@@ -84,14 +87,18 @@ def plain_text(value: str) -> str:
     return _without(_NO_TEXT, value)
 
 
-class _OneLine:
-    """Mark of a name or label, after its length: no control characters, which the schema says too."""
+@dataclass(frozen=True)
+class _WithoutControl:
+    """Mark of a text, after its length: no control characters, which the schema says too."""
+
+    check: Callable[[str], str]
+    pattern: str
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
-        return core_schema.no_info_after_validator_function(one_line, handler(source))
+        return core_schema.no_info_after_validator_function(self.check, handler(source))
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        return {**handler(schema), "pattern": ONE_LINE}
+        return {**handler(schema), "pattern": self.pattern}
 
 
 def utc_text(value: datetime) -> str:
@@ -104,9 +111,9 @@ Switch = Annotated[bool, Field(strict=True)]
 Number = Annotated[Real, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
 
 
-ON_ONE_LINE = _OneLine()
+ON_ONE_LINE = _WithoutControl(one_line, ONE_LINE)
 Label = Annotated[str, StringConstraints(max_length=300), ON_ONE_LINE]
-Notes = Annotated[str, StringConstraints(max_length=20_000), AfterValidator(plain_text)]
+Notes = Annotated[str, StringConstraints(max_length=20_000), _WithoutControl(plain_text, SOME_LINES)]
 StepNumber = Annotated[Whole, Field(ge=0, le=9999)]
 #: a number for each of some axes
 AxisValues = Annotated[
