@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal, get_args
 
 from core.errors import InputError
@@ -23,7 +24,15 @@ MEDIA_TYPES: dict[ExportFormat, str] = {
     "gif": "image/gif",
     "mp4": "video/mp4",
 }
+#: as a description of the API lists them
+MEDIA_CONTENT: dict[int | str, object] = {media.split(";")[0]: {} for media in MEDIA_TYPES.values()}
 _MAX_STEP = 9999
+
+
+def media_type_of(made: Path) -> str:
+    """Return the media type of an export's file."""
+    form = made.suffix.removeprefix(".")
+    return next((media for name, media in MEDIA_TYPES.items() if name == form), "application/zip")
 
 
 @dataclass(frozen=True)

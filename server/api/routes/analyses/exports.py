@@ -19,7 +19,7 @@ from server.api.models import Accepted
 from server.api.protocol.dependencies import AnalysisId, CoverageDep, FrameText, ServiceDep, TestId
 from server.api.protocol.problems import errors
 from server.base.errors import NotFoundError
-from server.exports.request import MEDIA_TYPES, ExportFormat, ExportRequest, steps_in
+from server.exports.request import MEDIA_CONTENT, MEDIA_TYPES, ExportFormat, ExportRequest, media_type_of, steps_in
 from server.formats.figures.options import COLOURS, MAX_LEVELS, WIDTHS_PX, FigureStyle
 from server.results.channels import has_more
 from server.worker.executor import TaskFuture
@@ -138,12 +138,7 @@ AskedDep = Annotated[_Asked, Depends(_asked)]
     summary="Results in the forms that other programs read",
     response_class=FileResponse,
     responses=errors(404, 409, 422, 503, 507)
-    | {
-        200: {
-            "description": "The file; several are one ZIP archive.",
-            "content": {media.split(";")[0]: {} for media in MEDIA_TYPES.values()},
-        }
-    },
+    | {200: {"description": "The file; several are one ZIP archive.", "content": MEDIA_CONTENT}},
 )
 async def export(
     request: Request, service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, asked: AskedDep
@@ -186,12 +181,6 @@ def begin_export(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, 
     service.require_room()
     job = start_export(service, test_id, analysis_id, files, asked.request, asked.frame)
     return Accepted.model_validate({"job": job.document().plain()})
-
-
-def media_type_of(made: Path) -> str:
-    """Return the media type of an export's file."""
-    form = made.suffix.removeprefix(".")
-    return next((media for name, media in MEDIA_TYPES.items() if name == form), "application/zip")
 
 
 def _prepared(

@@ -17,6 +17,7 @@ from server.api.protocol.paging import ShortPageDep
 from server.api.protocol.problems import errors
 from server.api.routes.service.system import EventStream, LastEventId
 from server.base.errors import NotFoundError
+from server.exports.request import MEDIA_CONTENT, media_type_of
 from server.jobs.events import Event
 from server.jobs.job import FINAL
 from server.store.documents import JobRecord
@@ -57,7 +58,7 @@ async def cancel_job(request: Request, service: ServiceDep, job_id: JobId, wait:
     "/{job_id}/file",
     summary="What an export made",
     response_class=FileResponse,
-    responses=errors(404, 422) | {200: {"description": "The file.", "content": {"application/octet-stream": {}}}},
+    responses=errors(404, 422) | {200: {"description": "The file.", "content": MEDIA_CONTENT}},
 )
 def job_file(service: ServiceDep, job_id: JobId) -> FileResponse:
     """Answer with the file of an export that was a job; of other jobs there is none."""
@@ -67,7 +68,7 @@ def job_file(service: ServiceDep, job_id: JobId) -> FileResponse:
         raise NotFoundError(
             f"Job {job_id} ({state}) has no file, or has none any more.", remedy="Wait for its end, or export again."
         )
-    return FileResponse(kept, filename=kept.name)
+    return FileResponse(kept, filename=kept.name, media_type=media_type_of(kept))
 
 
 @router.get(
