@@ -15,7 +15,7 @@ ARGS ?=
 # only compile the same kernels again
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n > 3 ? 4 : n + 1)))
 
-.PHONY: help wheel demo quick test test-deep serve check check-page kernels bench format accuracy coverage fuzz load openapi reference docs torture pagespeed pagepictures clean
+.PHONY: help wheel demo quick test test-deep serve check check-page kernels bench format accuracy coverage fuzz load openapi reference docs torture powerloss pagespeed pagepictures clean
 
 help:
 	@echo "make demo    start the service on the simulated paper rig and run the plate experiment over HTTP"
@@ -27,6 +27,7 @@ help:
 	@echo "make bench   time everything on this machine, beside pyvale, and write docs/explanation/performance.md (ARGS=--quick: a few minutes)"
 	@echo "make load    ten minutes of captures, readers, slow streams, analyses and stops; writes docs/explanation/reliability.md (ARGS='--minutes N')"
 	@echo "make torture  kill the service 1,000 times at work, look each time that nothing is lost, write docs/explanation/reliability.md (ARGS='--kills N')"
+	@echo "make powerloss  open 100,000 states in which a lost power may leave the data folder, write docs/explanation/reliability.md (ARGS='--states N')"
 	@echo "make fuzz    schema fuzzing of the whole API on a simulated rig (ARGS='--each N --seed S --only OPERATION')"
 	@echo "make wheel   build the wheel into dist/, with its bill of materials (CycloneDX) inside and beside"
 	@echo "make docs    build the site into build/site, offline, and check every link in it"
@@ -147,6 +148,9 @@ docs: $(STAMP)
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+powerloss: $(STAMP)
+	$(BIN)/python -m tests.bench.reliability.power_loss --write $(ARGS)
 
 torture: $(STAMP)
 	$(BIN)/python -m tests.bench.reliability.torture --write $(ARGS)

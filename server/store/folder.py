@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import IO, Self
 
 from core.errors import FileFormatError, StateError, StorageError
-from server.formats.files import storage_error
+from server.formats import disk as _disk
+from server.formats.files import fsync_path, storage_error
 from server.store.durable import read_json, write_bytes, write_json
 
 FORMAT = 1
@@ -92,7 +93,7 @@ class DataFolder:
         """
         try:
             for folder in (self.root, self.calibrations, self.tests):
-                folder.mkdir(parents=True, exist_ok=True)
+                _make_with_parents(folder)
         except OSError as error:
             raise _unusable(self.root, error) from error
         self._take_lock()
@@ -221,6 +222,13 @@ def _keeps_out(path: Path) -> bool:
         except OSError:
             return False
     return False
+
+
+def _make_with_parents(folder: Path) -> None:
+    """Make a folder durably, with those above it that are not there."""
+    for missing in reversed([path for path in (folder, *folder.parents) if not path.exists()]):
+        _disk.disk.make_folder(missing)
+        fsync_path(missing.parent)
 
 
 def _unusable(root: Path, error: OSError) -> StorageError:

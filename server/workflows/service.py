@@ -119,15 +119,7 @@ class Service:
             As `server.store.folder.DataFolder.open` and `server.store.catalog.Catalog.open`.
         """
         with contextlib.ExitStack() as parts:  # closed from the last to the first
-            self.folder.open()
-            parts.callback(self.folder.close)
-            self.catalog.open()
-            parts.callback(self.catalog.close)
-            self.noise.end_unfinished()
-            self.recipes.reserve_ids()
-            self.differences = rebuild(self.catalog, self.folder, self.calibrations, self.tests, self.noise)
-            for line in self.differences:
-                _log.info("catalogue: %s", line)
+            self.open_data(parts)
             # the clock alone may step back, and the catalogue alone may be lost
             self.hub.number_from(_EVENTS_A_START * self.catalog.count_up("starts", int(time.time())))
             parts.callback(self.abort_thread.shutdown, wait=False)
@@ -212,6 +204,29 @@ class Service:
                     return
             except StereorigError as error:  # the job closes the rig just now, or the line was lost
                 _log.debug("stopping again failed: %s", error)
+
+    def open_data(self, parts: contextlib.ExitStack) -> None:
+        """Open folder and catalogue, and put in order what an end at any instant left there.
+
+        Parameters
+        ----------
+        parts
+            Gets what closes them again.
+
+        Raises
+        ------
+        StateError, StorageError, FileFormatError
+            As `start`.
+        """
+        self.folder.open()
+        parts.callback(self.folder.close)
+        self.catalog.open()
+        parts.callback(self.catalog.close)
+        self.noise.end_unfinished()
+        self.recipes.reserve_ids()
+        self.differences = rebuild(self.catalog, self.folder, self.calibrations, self.tests, self.noise)
+        for line in self.differences:
+            _log.info("catalogue: %s", line)
 
     def is_alive(self) -> bool:
         """Return True if the threads that everything waits for run."""

@@ -1,0 +1,86 @@
+"""Opens every state in which a lost power may leave the data folder, and writes what was found.
+
+Days of work are recorded on the service itself, each in another order (tests/support/power_loss). At every instant of a
+day, the states are made that a file system may hold then, and the service starts on each.
+
+    python -m tests.bench.reliability.power_loss [--states 100000] [--seed N] [--write]
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import shutil
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+from tests.bench.documents.prose import wrapped
+from tests.bench.reliability.torture_lab import Pictures
+from tests.bench.reliability.torture_page import PAGE, table
+from tests.support.power_loss.check import CATALOGS, Verdict, crash_states, look_at_all
+from tests.support.power_loss.recording import record
+
+BEGIN, END = "<!-- power loss: begin -->", "<!-- power loss: end -->"
+_MEMORY = Path("/dev/shm")  # states are made and removed by the ten thousand
+_OF_AN_INSTANT = 200
+
+
+def run(states: int, seed: int, folder: Path) -> tuple[Verdict, Counter[str]]:
+    """Record days, and look at the states of each, until so many were seen.
+
+    Returns
+    -------
+    tuple
+        What was found; the number of days, changes and acknowledged requests.
+    """
+    total, size, pictures = Verdict(), Counter[str](), Pictures(4)
+    while total.states < states:
+        day = size["days"]
+        top = folder / f"day{day}"
+        top.mkdir(parents=True)
+        recording = record(top, pictures, seed + day)
+        tried = crash_states(recording, random.Random(seed + day), _OF_AN_INSTANT)
+        found = look_at_all(recording, folder / f"states{day}", tried, print)
+        total = Verdict(total.states + found.states, total.wrong + found.wrong, total.counts + found.counts)
+        size.update({"days": 1, "changes": len(recording.journal.changes), "requests": len(recording.answers)})
+        print(f"day {day + 1}: {found.states} states, {len(found.wrong)} things wrong", flush=True)
+        for done in (top, folder / f"states{day}"):
+            shutil.rmtree(done)
+    return total, size
+
+
+def section(found: Verdict, size: Counter[str], wall_s: float) -> str:
+    """Write the section of the page."""
+    text = (
+        f"{found.states:,} states of {size['days']} recorded days ({size['requests']:,} acknowledged requests, "
+        f"{size['changes']:,} changes of the data folder): {len(found.wrong)} in which something acknowledged was lost, "
+        f"something half was shown, or `stereorig verify` disagreed. {wall_s / 60:.0f} minutes."
+    )
+    return "\n".join(
+        [wrapped(text), "", table(["states", "catalogue"], [[f"{found.counts[name]:,}", name] for name in CATALOGS])]
+    )
+
+
+def main() -> int:
+    """Run, and write the section if asked."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--states", type=int, default=100_000, help="at least so many (100000)")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--write", action="store_true", help="write the section of docs/explanation/reliability.md")
+    asked = parser.parse_args()
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="power-loss-", dir=_MEMORY if _MEMORY.is_dir() else None) as folder:
+        found, size = run(asked.states, asked.seed, Path(folder))
+    text = section(found, size, time.monotonic() - began)
+    print(text)
+    if asked.write:
+        before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
+        PAGE.write_text(f"{before}{BEGIN}\n{text}\n{END}{rest.partition(END)[2]}", encoding="utf-8")
+    return bool(found.wrong)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
