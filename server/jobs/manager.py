@@ -63,8 +63,9 @@ class JobManager:
         self._thread.start()
 
     def _interrupt_left_overs(self) -> None:
-        for document in self._catalog.jobs():
-            self._ids.reserve(document.id)
+        newest = self._catalog.newest_job()
+        if newest is not None:
+            self._ids.reserve(newest)
         for document in self._catalog.jobs(states=ACTIVE):
             self._catalog.put_job(document.ended("interrupted", now_utc(), problem_of(RESTART)))
 
@@ -173,6 +174,11 @@ class JobManager:
         """Number of jobs that are not finished."""
         with self._lock:
             return len(self._active)
+
+    def is_idle(self) -> bool:
+        """Return True if no job goes on, and the state of each is on disk."""
+        with self._lock:
+            return not self._active and not self._unsaved
 
     def waiting_count(self) -> int:
         """Number of jobs that wait for the compute lane."""

@@ -13,7 +13,7 @@ import os
 import re
 import shutil
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -88,6 +88,8 @@ class TestStore:
         self._folder = folder
         self._lock = threading.Lock()
         self._commits = 0
+        #: called with a test's id before anything in its folder is changed
+        self.before_change: Callable[[str], None] | None = None
 
     # tests ------------------------------------------------------------------------------------------------------
 
@@ -103,6 +105,12 @@ class TestStore:
         if path is None or not (path / "test.json").is_file():
             raise NotFoundError(f"There is no test {test_id[:40]!r}.", kind="test")
         return path
+
+    def _to_change(self, test_id: str) -> Path:
+        """As `path`, of a test that is about to be changed."""
+        if self.before_change is not None:
+            self.before_change(test_id)
+        return self.path(test_id)
 
     def ids(self) -> list[str]:
         """Ids of all tests, in the order of their making."""
@@ -129,7 +137,7 @@ class TestStore:
 
     def update(self, test_id: str, changes: Mapping[str, object]) -> TestRecord:
         """Change fields of ``test.json``."""
-        path = self.path(test_id) / "test.json"
+        path = self._to_change(test_id) / "test.json"
         with self._lock:
             document = {**read_json(path), **changes}
             write_json(path, document)
@@ -161,6 +169,7 @@ class TestStore:
         StateError
             ``metadata_changed`` if they are not what was expected.
         """
+        self._to_change(test_id)
         with self._lock:
             if expected is not None and self.metadata(test_id) != expected:
                 raise StateError(
@@ -179,7 +188,7 @@ class TestStore:
 
     def put_workspace(self, test_id: str, document: Mapping[str, object]) -> None:
         """Replace what is drawn and set for a test; durable when this returns."""
-        write_json(self.path(test_id) / "workspace.json", document)
+        write_json(self._to_change(test_id) / "workspace.json", document)
 
     def is_calibrated(self, test_id: str) -> bool:
         """Return True if the test has a calibration to measure with."""
@@ -197,7 +206,7 @@ class TestStore:
         in_force
             New analyses are measured with it, unless they name another one.
         """
-        test = self.path(test_id)
+        test = self._to_change(test_id)
         sha256 = hashlib.sha256(content).hexdigest()
         with self._lock:
             document = read_json(test / "test.json")
@@ -234,7 +243,31 @@ class TestStore:
 
     def step_numbers(self, test_id: str) -> list[int]:
         """Numbers of the complete steps, ascending."""
-        return sorted(int(p.parent.name) for p in (self.path(test_id) / "steps").glob("[0-9]*/step.json"))
+        return list(self._complete(test_id, sorted(self._step_names(test_id))))
+
+    def first_step(self, test_id: str) -> int | None:
+        """Number of the first complete step; None without any."""
+        return next(self._complete(test_id, sorted(self._step_names(test_id))), None)
+
+    def newest_steps(self, test_id: str) -> Iterator[int]:
+        """Numbers of the complete steps, descending; looked up as they are asked for."""
+        return self._complete(test_id, sorted(self._step_names(test_id), reverse=True))
+
+    def _step_names(self, test_id: str) -> list[str]:
+        """Names of the folders of steps, complete or not."""
+        return [name for name in self._names(test_id) if len(name) == 4 and name.isdecimal()]
+
+    def _names(self, test_id: str) -> list[str]:
+        """Names in a test's folder of steps: with ten thousand of them, each object of a path counts."""
+        steps = str(self.path(test_id) / "steps")
+        try:
+            return os.listdir(steps)  # noqa: PTH208 - names, not paths
+        except FileNotFoundError:
+            return []
+
+    def _complete(self, test_id: str, names: list[str]) -> Iterator[int]:
+        steps = str(self.path(test_id) / "steps")
+        return (int(name) for name in names if os.path.isfile(f"{steps}/{name}/step.json"))  # noqa: PTH113
 
     def steps_mark(self, test_id: str) -> tuple[int, int]:
         """Return something cheap that differs whenever the steps of a test may have changed."""
@@ -246,10 +279,7 @@ class TestStore:
         A start reads them all: with ten thousand steps, each access of a path counts.
         """
         steps = str(self.path(test_id) / "steps")
-        names = sorted(os.listdir(steps)) if Path(steps).is_dir() else []  # noqa: PTH208 - names, not paths
-        for name in names:
-            if len(name) != 4 or not name.isdecimal():
-                continue
+        for name in sorted(self._step_names(test_id)):
             path = Path(f"{steps}/{name}/step.json")
             try:
                 document = json.loads(path.read_bytes())
@@ -267,27 +297,30 @@ class TestStore:
 
     def incomplete_steps(self, test_id: str) -> list[int]:
         """Numbers of step folders without their commit mark, quarantined ones among them."""
-        steps = self.path(test_id) / "steps"
+        steps = str(self.path(test_id) / "steps")
+        found = ((name, number_of(name)) for name in self._names(test_id))
         return sorted(
-            n for p in steps.iterdir() if (n := number_of(p.name)) is not None and not (p / "step.json").is_file()
+            n
+            for name, n in found
+            if n is not None and not os.path.isfile(f"{steps}/{name}/step.json")  # noqa: PTH113
         )
 
     def deleted_steps(self, test_id: str) -> list[int]:
         """Numbers of the steps that lie in the trash, or that were removed for good."""
-        steps = self.path(test_id) / "steps"
-        marks = {int(found[1]) for p in steps.iterdir() if (found := _DELETED.fullmatch(p.name)) is not None}
-        return sorted(marks.difference(self.step_numbers(test_id)))
+        marks = sorted(found[1] for name in self._names(test_id) if (found := _DELETED.fullmatch(name)) is not None)
+        there = set(self._complete(test_id, marks))
+        return [n for n in map(int, marks) if n not in there]
 
     def add_step(self, test_id: str, images: dict[str, bytes], metadata: Mapping[str, object]) -> StepRecord:
         """Commit a step: both images, then ``step.json`` with their checksums.
 
         Returns when it is durable. A number is never used twice, also not that of an incomplete step.
         """
+        steps = self._to_change(test_id) / "steps"
         with self._lock:
-            steps = self.path(test_id) / "steps"
             deleted = self.deleted_steps(test_id)
-            if deleted or self.step_numbers(test_id):
-                n = 1 + max([*deleted, *(n for p in steps.iterdir() if (n := number_of(p.name)) is not None)])
+            if deleted or self.first_step(test_id) is not None:
+                n = 1 + max([*deleted, *(n for name in self._names(test_id) if (n := number_of(name)) is not None)])
             else:
                 # an incomplete reference would leave the test without step 0 for good
                 for folder in [p for p in steps.iterdir() if p.name.isdigit()]:
@@ -322,6 +355,7 @@ class TestStore:
 
     def update_step(self, test_id: str, n: int, changes: Mapping[str, object]) -> StepRecord:
         """Change fields of a step's ``step.json``; its images and their checksums stay."""
+        self._to_change(test_id)
         with self._lock:
             path = self.step(test_id, n).cam1.with_name("step.json")
             document = {**read_json(path), **changes}
@@ -356,6 +390,10 @@ class TestStore:
             raise NotFoundError(f"Test {test_id} has no analysis {analysis_id[:40]!r}.", kind="analysis")
         return path
 
+    def _analysis_to_change(self, test_id: str, analysis_id: str) -> Path:
+        self._to_change(test_id)
+        return self.analysis_path(test_id, analysis_id)
+
     def analysis_ids(self, test_id: str) -> list[str]:
         """Ids of a test's analyses, in the order of their making."""
         folder = self.path(test_id) / "analyses"
@@ -374,7 +412,7 @@ class TestStore:
         ``run`` is the job that will work on it, see `add_analysis_job`.
         """
         analysis_id = self._folder.ids.new("a")
-        path = self.path(test_id) / "analyses" / analysis_id
+        path = self._to_change(test_id) / "analyses" / analysis_id
         make_folder(path)
         if mask is not None:
             document = {**document, "mask_sha256": write_bytes(path / "mask.png", mask)}
@@ -401,7 +439,7 @@ class TestStore:
 
     def add_analysis_job(self, test_id: str, analysis_id: str, run: Mapping[str, object]) -> None:
         """Note that another job goes on with an analysis."""
-        path = self.analysis_path(test_id, analysis_id) / "jobs.json"
+        path = self._analysis_to_change(test_id, analysis_id) / "jobs.json"
         jobs = read_json(path)["jobs"] if path.is_file() else []
         write_json(path, {"jobs": [*jobs, {**run, "created_utc": now_utc()}]})
 
@@ -409,7 +447,7 @@ class TestStore:
         self, test_id: str, analysis_id: str, steps: list[int], sha256: dict[str, dict[str, str]]
     ) -> AnalysisRecord:
         """Make further steps, with their images' checksums, part of an analysis that follows its test."""
-        path = self.analysis_path(test_id, analysis_id) / "analysis.json"
+        path = self._analysis_to_change(test_id, analysis_id) / "analysis.json"
         document = read_json(path)
         document["steps"] = [*document["steps"], *steps]
         document["inputs"]["steps"] |= sha256
@@ -418,7 +456,7 @@ class TestStore:
 
     def put_step_summary(self, test_id: str, analysis_id: str, n: int, summary: Mapping[str, object]) -> None:
         """Write the summary of one step beside its result."""
-        write_json(self.analysis_path(test_id, analysis_id) / f"step_{n:04d}.json", summary)
+        write_json(self._analysis_to_change(test_id, analysis_id) / f"step_{n:04d}.json", summary)
 
     def step_summaries(self, test_id: str, analysis_id: str) -> dict[int, StepOutcome]:
         """Return the summaries by step; only of steps whose result is there."""
@@ -460,7 +498,7 @@ class TestStore:
 
     def drop_starts(self, test_id: str, analysis_id: str) -> None:
         """Remove files that only an unfinished analysis needs, see :mod:`server.formats.results.starts`."""
-        for path in self.analysis_path(test_id, analysis_id).glob("starts_[0-9]*.npz"):
+        for path in self._analysis_to_change(test_id, analysis_id).glob("starts_[0-9]*.npz"):
             path.unlink(missing_ok=True)
 
     def drop_half_written(self, test_id: str, analysis_id: str) -> list[Path]:
@@ -468,7 +506,7 @@ class TestStore:
 
         Nothing may write into the analysis meanwhile. Returns the removed files.
         """
-        folder = self.analysis_path(test_id, analysis_id)
+        folder = self._analysis_to_change(test_id, analysis_id)
         lone = [path for path in folder.glob("step_[0-9]*.nc.sha256") if not path.with_suffix("").exists()]
         removed = sorted([*folder.glob(".*.part"), *lone])
         for path in removed:
@@ -477,7 +515,7 @@ class TestStore:
 
     def put_summary(self, test_id: str, analysis_id: str, document: Mapping[str, object]) -> None:
         """Write the analysis' summary, step by step."""
-        path = self.analysis_path(test_id, analysis_id) / "summary.json"
+        path = self._analysis_to_change(test_id, analysis_id) / "summary.json"
         write_json(path, document)
 
     def summary(self, test_id: str, analysis_id: str) -> SummaryRecord | None:
