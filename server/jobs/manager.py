@@ -30,6 +30,10 @@ from server.store.folder import IdMaker, is_id, now_utc
 _log = logging.getLogger("stereorig.jobs")
 
 
+#: entries of each list in a result that an event holds; further ones are asked for
+_SHOWN = 100
+
+
 class JobManager:
     """Runs jobs, keeps their table.
 
@@ -399,9 +403,9 @@ class JobManager:
             _log.exception("the state of job %s could not be written", job.id)
 
     def _show(self, job: Job, change: str) -> None:
-        document = {**job.document().plain(), "change": change}
+        document = {**job.document().bounded(_SHOWN).plain(), "change": change}
         if change == "progress":
-            del document["result"]  # it may hold thousands of steps, and progress comes ten times a second
+            del document["result"]  # progress comes ten times a second
         self._hub.publish("job", document)
 
     def begin_close(self) -> None:

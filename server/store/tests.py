@@ -13,7 +13,8 @@ import os
 import re
 import shutil
 import threading
-from collections.abc import Callable, Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,10 +34,21 @@ from server.store.documents import (
     SummaryRecord,
     TestRecord,
 )
-from server.store.durable import make_folder, read_json, read_record, record_of, write_bytes, write_json
+from server.store.durable import (
+    kept_while_unchanged,
+    make_folder,
+    read_json,
+    read_record,
+    record_of,
+    write_bytes,
+    write_json,
+)
 from server.store.folder import DataFolder, is_id, now_utc
+from server.store.indexing.names import names_in
 
 MAX_STEPS = 9999
+#: a step's document may be taken away by hand, which the folder of the steps does not show
+_LOOK_AGAIN_S = 2.0
 _STEP_FOLDER = re.compile(r"(?:incomplete-\d+-)?(\d{4})")
 _DELETED = re.compile(r"(\d{4})\.deleted")
 
@@ -88,6 +100,8 @@ class TestStore:
         self._folder = folder
         self._lock = threading.Lock()
         self._commits = 0
+        # of the test that was asked for last: names in its folder, when that was, and what was found
+        self._incomplete: dict[str, tuple[tuple[str, ...], float, list[int]]] = {}
         #: called with a test's id before anything in its folder is changed
         self.before_change: Callable[[str], None] | None = None
 
@@ -243,27 +257,22 @@ class TestStore:
 
     def step_numbers(self, test_id: str) -> list[int]:
         """Numbers of the complete steps, ascending."""
-        return list(self._complete(test_id, sorted(self._step_names(test_id))))
+        return list(self._complete(test_id, self._step_names(test_id)))
 
     def first_step(self, test_id: str) -> int | None:
         """Number of the first complete step; None without any."""
-        return next(self._complete(test_id, sorted(self._step_names(test_id))), None)
+        return next(self._complete(test_id, self._step_names(test_id)), None)
 
     def newest_steps(self, test_id: str) -> Iterator[int]:
         """Numbers of the complete steps, descending; looked up as they are asked for."""
-        return self._complete(test_id, sorted(self._step_names(test_id), reverse=True))
+        return self._complete(test_id, self._step_names(test_id)[::-1])
 
     def _step_names(self, test_id: str) -> list[str]:
-        """Names of the folders of steps, complete or not."""
+        """Names of the folders of steps, complete or not, in order."""
         return [name for name in self._names(test_id) if len(name) == 4 and name.isdecimal()]
 
-    def _names(self, test_id: str) -> list[str]:
-        """Names in a test's folder of steps: with ten thousand of them, each object of a path counts."""
-        steps = str(self.path(test_id) / "steps")
-        try:
-            return os.listdir(steps)  # noqa: PTH208 - names, not paths
-        except FileNotFoundError:
-            return []
+    def _names(self, test_id: str) -> tuple[str, ...]:
+        return names_in(self.path(test_id) / "steps")
 
     def _complete(self, test_id: str, names: list[str]) -> Iterator[int]:
         steps = str(self.path(test_id) / "steps")
@@ -279,7 +288,7 @@ class TestStore:
         A start reads them all: with ten thousand steps, each access of a path counts.
         """
         steps = str(self.path(test_id) / "steps")
-        for name in sorted(self._step_names(test_id)):
+        for name in self._step_names(test_id):
             path = Path(f"{steps}/{name}/step.json")
             try:
                 document = json.loads(path.read_bytes())
@@ -297,13 +306,19 @@ class TestStore:
 
     def incomplete_steps(self, test_id: str) -> list[int]:
         """Numbers of step folders without their commit mark, quarantined ones among them."""
+        names = self._names(test_id)
+        known = self._incomplete.get(test_id)
+        if known is not None and known[0] is names and time.monotonic() - known[1] < _LOOK_AGAIN_S:
+            return known[2]
         steps = str(self.path(test_id) / "steps")
-        found = ((name, number_of(name)) for name in self._names(test_id))
-        return sorted(
+        of_steps = ((name, number_of(name)) for name in names)
+        found = sorted(
             n
-            for name, n in found
+            for name, n in of_steps
             if n is not None and not os.path.isfile(f"{steps}/{name}/step.json")  # noqa: PTH113
         )
+        self._incomplete = {test_id: (names, time.monotonic(), found)}
+        return found
 
     def deleted_steps(self, test_id: str) -> list[int]:
         """Numbers of the steps that lie in the trash, or that were removed for good."""
@@ -426,7 +441,7 @@ class TestStore:
 
     def analysis(self, test_id: str, analysis_id: str) -> AnalysisRecord:
         """Return ``analysis.json``, with the id of its calibration where an earlier version did not write it."""
-        found = read_record(AnalysisRecord, self.analysis_path(test_id, analysis_id) / "analysis.json")
+        found = kept_while_unchanged(self.analysis_path(test_id, analysis_id) / "analysis.json", _analysis_in)
         if found.calibration_id is not None:
             return found
         known = calibration_id_in(self.read(test_id).model_dump(), found.inputs.calibration_sha256)
@@ -458,10 +473,14 @@ class TestStore:
         """Write the summary of one step beside its result."""
         write_json(self._analysis_to_change(test_id, analysis_id) / f"step_{n:04d}.json", summary)
 
-    def step_summaries(self, test_id: str, analysis_id: str) -> dict[int, StepOutcome]:
-        """Return the summaries by step; only of steps whose result is there."""
+    def step_summaries(
+        self, test_id: str, analysis_id: str, only: Sequence[int] | None = None
+    ) -> dict[int, StepOutcome]:
+        """Return the summaries by step, of all steps or of these; only of steps whose result is there."""
         path = self.analysis_path(test_id, analysis_id)
-        files = {n: path / f"step_{n:04d}.json" for n in self.finished_steps(test_id, analysis_id)}
+        there = self.finished_steps(test_id, analysis_id)
+        wanted = there if only is None else sorted(set(there).intersection(only))
+        files = {n: path / f"step_{n:04d}.json" for n in wanted}
         return {
             n: record_of(StepOutcome, current_step(read_json(file)), file)
             for n, file in files.items()
@@ -470,7 +489,9 @@ class TestStore:
 
     def finished_steps(self, test_id: str, analysis_id: str) -> list[int]:
         """Numbers of the steps whose result file is there."""
-        return sorted(int(p.stem[5:]) for p in self.analysis_path(test_id, analysis_id).glob("step_[0-9]*.nc"))
+        names = names_in(self.analysis_path(test_id, analysis_id))
+        ours = (name[5:-3] for name in names if name.endswith(".nc") and name.startswith("step_"))
+        return [int(n) for n in ours if n.isdecimal()]
 
     def result_file(self, test_id: str, analysis_id: str, n: int) -> Path:
         """Result file of one step, its checksum verified where it is known.
@@ -521,4 +542,12 @@ class TestStore:
     def summary(self, test_id: str, analysis_id: str) -> SummaryRecord | None:
         """Return ``summary.json``, or None while it is not there."""
         path = self.analysis_path(test_id, analysis_id) / "summary.json"
-        return record_of(SummaryRecord, current_summary(read_json(path)), path) if path.exists() else None
+        return kept_while_unchanged(path, _summary_in) if path.exists() else None
+
+
+def _analysis_in(path: Path) -> AnalysisRecord:
+    return read_record(AnalysisRecord, path)
+
+
+def _summary_in(path: Path) -> SummaryRecord:
+    return record_of(SummaryRecord, current_summary(read_json(path)), path)

@@ -39,6 +39,7 @@ from server.store.trash import Trash
 from server.worker.dask_cluster import ClusterExecutor
 from server.worker.embedded import ComputeWorker, make_worker
 from server.worker.executor import TaskExecutor
+from server.workflows.analysis.checks import AnalysisChecks
 from server.workflows.analysis.framed import FramedResults
 
 _log = logging.getLogger("stereorig.service")
@@ -95,6 +96,7 @@ class Service:
             )
         self.rig = Rig(config, self.hardware, self.hub.publish, record=record)
         self.finder = DeviceFinder()
+        self.checks = AnalysisChecks(self.tests)
         self.exports = ExportProcess(self.folder.root)
         self.framed = FramedResults(self.folder.root / ".exports" / "frames")  # removed with the exports
         # stopping must not wait behind forty slow requests
@@ -136,6 +138,7 @@ class Service:
             self.index.start()
             # the clock alone may step back, and the catalogue alone may be lost
             self.hub.number_from(_EVENTS_A_START * self.catalog.count_up("starts", int(time.time())))
+            parts.callback(self.checks.close)
             parts.callback(self.abort_thread.shutdown, wait=False)
             parts.callback(self.stop_thread.shutdown, wait=False)
             parts.callback(self.rig.close)
