@@ -26,16 +26,16 @@ export function windowOfList(box, draw, { what, name }) {
   const wanted = number(null, { min: 0, step: 1, "aria-label": `Number of the ${what} to show` });
   /** @type {(text: string, label: string, to: () => number) => HTMLButtonElement} */
   const button = (shown, label, to) => h("button", { type: "button", "aria-label": label, onclick: () => go(to()) }, shown);
-  const first = button("⏮", `First ${what}s`, () => 0);
-  const earlier = button("◀", `Earlier ${what}s`, () => begin - MOST);
-  const later = button("▶", `Later ${what}s`, () => begin + MOST);
-  const newest = button("⏭", `Newest ${what}s`, () => entries.length);
+  const first = button("First", `First ${what}s`, () => 0);
+  const earlier = button("◀ Earlier", `Earlier ${what}s`, () => begin - MOST);
+  const later = button("Later ▶", `Later ${what}s`, () => begin + MOST);
+  const newest = button("Newest", `Newest ${what}s`, () => entries.length);
   wanted.addEventListener("change", () => {
     const n = Number(wanted.value);
     const at = entries.findIndex((entry) => name(entry) >= n);
     if (wanted.value !== "") go(at < 0 ? entries.length : at);
   });
-  const bar = h("div.row", { "data-role": `${what}s-window`, hidden: true }, first, earlier, text, later, newest, h("label", `${what} `, wanted));
+  const bar = h("div.row", { "data-role": `${what}s-window`, hidden: true }, first, earlier, text, later, newest, h("label", `go to ${what} `, wanted));
 
   /** @param {number} to */
   function go(to) {

@@ -1,21 +1,24 @@
 """Data folders of years: one real test, multiplied into many tests of many steps.
 
-The images, result files and checksums of the copies are hard links to those of the real test; documents are written anew
-with their own ids and numbers. What comes out is what captures and analyses leave on disk, at some kilobytes a step.
+The images, result files and checksums of a test's steps are hard links to those of its first; documents are written anew with
+their own ids and numbers. What comes out is what captures and analyses leave on disk, at some kilobytes a step.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
 
-def links(source: Path, target: Path, names: list[str]) -> None:
-    """Link files of one folder into another."""
-    for name in names:
-        os.link(source / name, target / name)
+def _same(true: Path, first: Path, name: Path) -> None:
+    """Give a file's content another name: a copy for the first in its folder, links to that for the others."""
+    if name == first:
+        shutil.copyfile(true, name)
+    else:
+        os.link(first, name)  # a file has 65,000 names at most
 
 
 class TrueTest:
@@ -34,7 +37,8 @@ class TrueTest:
         (path / "steps").mkdir(parents=True)
         (path / "analyses").mkdir()
         others = [one.name for one in self.path.iterdir() if one.is_file() and one.name != "test.json"]
-        links(self.path, path, others)
+        for name in others:
+            shutil.copyfile(self.path / name, path / name)
         self.add_steps(path, range(steps))
         if analysed and self.analyses:
             self._analyse(path, number, steps)
@@ -47,7 +51,8 @@ class TrueTest:
         for n in numbers:
             folder = path / "steps" / f"{n:04d}"
             folder.mkdir()
-            links(self.path / "steps" / "0001", folder, ["cam1.tif", "cam2.tif"])
+            for name in ("cam1.tif", "cam2.tif"):
+                _same(self.path / "steps" / "0001" / name, folder.parent / "0000" / name, folder / name)
             request = {"scope": f"tests/{path.name}/steps", "key": f"{path.name}-{n}", "body_sha256": "0" * 64}
             own = {"n": n, "test_id": path.name, "label": f"{n / 10:.1f} kN", "load_n": 100.0 * n, "request": request}
             self._write(folder / "step.json", self.step | own)
@@ -61,7 +66,7 @@ class TrueTest:
         summary = json.loads((source / "step_0001.json").read_bytes())
         for n in range(steps):
             for suffix in (".nc", ".nc.sha256"):
-                os.link(source / f"step_0001{suffix}", folder / f"step_{n:04d}{suffix}")
+                _same(source / f"step_0001{suffix}", folder / f"step_0000{suffix}", folder / f"step_{n:04d}{suffix}")
             self._write(folder / f"step_{n:04d}.json", summary | {"n": n})
         document = json.loads((source / "analysis.json").read_bytes())
         sha256 = document["inputs"]["steps"]["1"]
