@@ -15,7 +15,7 @@ ARGS ?=
 # only compile the same kernels again
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n > 3 ? 4 : n + 1)))
 
-.PHONY: help wheel demo quick test test-deep serve check check-page kernels bench format accuracy coverage fuzz load openapi reference docs torture powerloss pagespeed pagepictures clean
+.PHONY: help wheel demo quick test test-deep serve check check-page kernels bench format accuracy coverage fuzz load years soak openapi reference docs torture powerloss pagespeed pagepictures clean
 
 help:
 	@echo "make demo    start the service on the simulated paper rig and run the plate experiment over HTTP"
@@ -28,6 +28,8 @@ help:
 	@echo "make load    ten minutes of captures, readers, slow streams, analyses and stops; writes docs/explanation/reliability.md (ARGS='--minutes N')"
 	@echo "make torture  kill the service 1,000 times at work, look each time that nothing is lost, write docs/explanation/reliability.md (ARGS='--kills N')"
 	@echo "make powerloss  open 100,000 states in which a lost power may leave the data folder, write docs/explanation/reliability.md (ARGS='--states N')"
+	@echo "make years   cost of a start and of answers over the size of the data folder; writes docs/explanation/years.md (ARGS='--sizes TESTS/STEPS ...')"
+	@echo "make soak    an hour of captures, measurement, exports and page: does anything grow? (ARGS='--minutes N --write')"
 	@echo "make fuzz    schema fuzzing of the whole API on a simulated rig (ARGS='--each N --seed S --only OPERATION')"
 	@echo "make wheel   build the wheel into dist/, with its bill of materials (CycloneDX) inside and beside"
 	@echo "make docs    build the site into build/site, offline, and check every link in it"
@@ -128,6 +130,12 @@ coverage: $(STAMP)
 
 load: $(STAMP)
 	$(BIN)/python -m tests.bench.reliability.load --page $(ARGS)
+
+years: $(STAMP)
+	$(BIN)/python -m tests.bench.years.measure --page $(ARGS)
+
+soak: $(STAMP)
+	$(BIN)/python -m tests.bench.years.soak $(ARGS)
 
 fuzz: $(STAMP)
 	$(BIN)/python -m tests.support.api_fuzz $(ARGS)

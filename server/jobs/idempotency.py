@@ -58,6 +58,11 @@ class OneEffect:
         # made, but the catalogue could not take it: good until the next start, which finds it in the folders
         self._unwritten: dict[tuple[str, str], tuple[str, Ids]] = {}
 
+    @property
+    def all_written(self) -> bool:
+        """True if the catalogue has every key."""
+        return not self._unwritten
+
     def once(self, mark: RequestMark, make: Callable[[], Ids]) -> tuple[Ids, bool]:
         """Run ``make`` once per key; return what it made and whether it was made before.
 

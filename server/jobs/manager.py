@@ -30,6 +30,10 @@ from server.store.folder import IdMaker, is_id, now_utc
 _log = logging.getLogger("stereorig.jobs")
 
 
+#: entries of each list in a result that an event holds; further ones are asked for
+_SHOWN = 100
+
+
 class JobManager:
     """Runs jobs, keeps their table.
 
@@ -63,8 +67,9 @@ class JobManager:
         self._thread.start()
 
     def _interrupt_left_overs(self) -> None:
-        for document in self._catalog.jobs():
-            self._ids.reserve(document.id)
+        newest = self._catalog.newest_job()
+        if newest is not None:
+            self._ids.reserve(newest)
         for document in self._catalog.jobs(states=ACTIVE):
             self._catalog.put_job(document.ended("interrupted", now_utc(), problem_of(RESTART)))
 
@@ -173,6 +178,11 @@ class JobManager:
         """Number of jobs that are not finished."""
         with self._lock:
             return len(self._active)
+
+    def is_idle(self) -> bool:
+        """Return True if no job goes on, and the state of each is on disk."""
+        with self._lock:
+            return not self._active and not self._unsaved
 
     def waiting_count(self) -> int:
         """Number of jobs that wait for the compute lane."""
@@ -393,9 +403,9 @@ class JobManager:
             _log.exception("the state of job %s could not be written", job.id)
 
     def _show(self, job: Job, change: str) -> None:
-        document = {**job.document().plain(), "change": change}
+        document = {**job.document().bounded(_SHOWN).plain(), "change": change}
         if change == "progress":
-            del document["result"]  # it may hold thousands of steps, and progress comes ten times a second
+            del document["result"]  # progress comes ten times a second
         self._hub.publish("job", document)
 
     def begin_close(self) -> None:

@@ -21,8 +21,12 @@ from server.base.models import Ids
 from server.store.documents import JobRecord
 
 T = TypeVar("T")
+#: kind, parent, id, document
+Entry = tuple[str, str, str, Mapping[str, object]]
 _log = logging.getLogger("stereorig.store")
 _PATIENCE_S = 30.0
+#: of an analysis' job; they were megabytes, to be read with every list of jobs
+_KEPT_STEPS = 20
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS jobs (
@@ -47,32 +51,43 @@ class Catalog:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self.path = path
         self._work: queue.SimpleQueue[tuple[Callable[[sqlite3.Connection], Any], Future[Any]] | None] = (
             queue.SimpleQueue()
         )
         self.was_reset = False
+        #: something that was to be written was not: the index may lack it
+        self.write_failed = False
+        #: called with a test's id before its steps or analyses are listed, so that the index is right about them
+        self.before_parts: Callable[[str], None] | None = None
+        self._sound = False
         self._opened: Future[None] = Future()
         self._thread = threading.Thread(target=self._run, name="catalog", daemon=True)
 
-    def open(self) -> Self:
+    def open(self, *, sound: bool = False) -> Self:
         """Open the file and start the writer.
+
+        Parameters
+        ----------
+        sound
+            The file is known to be the one that was closed, bit for bit, and need not be checked.
 
         Raises
         ------
         StorageError
             If it cannot be opened, nor begun anew.
         """
+        self._sound = sound
         self._thread.start()
         self._opened.result()
         return self
 
     def _open(self) -> sqlite3.Connection:
-        connection = sqlite3.connect(self._path, isolation_level=None)
+        connection = sqlite3.connect(self.path, isolation_level=None)
         try:
             connection.execute("PRAGMA journal_mode=WAL")
             connection.execute("PRAGMA synchronous=FULL")
-            if connection.execute("PRAGMA quick_check").fetchone()[0] != "ok":
+            if not self._sound and connection.execute("PRAGMA quick_check").fetchone()[0] != "ok":
                 raise sqlite3.DatabaseError("quick_check failed")
             connection.executescript(_SCHEMA)
         except sqlite3.Error:
@@ -84,10 +99,10 @@ class Catalog:
         try:
             return self._open()
         except sqlite3.DatabaseError:
-            number = len(list(self._path.parent.glob("catalog.corrupt-*.sqlite"))) + 1
-            self._path.rename(self._path.with_name(f"catalog.corrupt-{number}.sqlite"))
+            number = len(list(self.path.parent.glob("catalog.corrupt-*.sqlite"))) + 1
+            self.path.rename(self.path.with_name(f"catalog.corrupt-{number}.sqlite"))
             for suffix in ("-wal", "-shm"):
-                self._path.with_name(self._path.name + suffix).unlink(missing_ok=True)
+                self.path.with_name(self.path.name + suffix).unlink(missing_ok=True)
             self.was_reset = True
             return self._open()
 
@@ -111,6 +126,7 @@ class Catalog:
                         connection.execute("ROLLBACK")
                     raise
             except sqlite3.Error as error:
+                self.write_failed = True
                 full = "full" in str(error)
                 future.set_exception(
                     StorageError(f"The catalogue was not written: {error}.", code="storage_full" if full else None)
@@ -144,7 +160,7 @@ class Catalog:
 
     def put_job(self, job: JobRecord, request: tuple[str, str, str, Ids] | None = None) -> None:
         """Insert or update a job; with the request (scope, key, body_sha256, made) that asked for it, both or none."""
-        text = json.dumps(job.plain())
+        text = _job_text(job)
 
         def write(c: sqlite3.Connection) -> None:
             c.execute("INSERT OR REPLACE INTO jobs (id, state, document) VALUES (?, ?, ?)", (job.id, job.state, text))
@@ -186,14 +202,42 @@ class Catalog:
             lambda c: c.execute("INSERT OR REPLACE INTO entries VALUES (?, ?, ?, ?)", (kind, parent, entry_id, text))
         )
 
-    def entries(self, kind: str, parent: str = "") -> list[dict[str, object]]:
-        """Return the index entries of a kind, in order of their ids."""
-        rows = self.transact(
-            lambda c: c.execute(
-                "SELECT document FROM entries WHERE kind = ? AND parent = ? ORDER BY id", (kind, parent)
-            ).fetchall()
-        )
+    def entries(
+        self, kind: str, parent: str = "", *, after: str | None = None, limit: int | None = None
+    ) -> list[dict[str, object]]:
+        """Return the index entries of a kind, in order of their ids; ``after``: only those with a larger id."""
+        self._complete(parent)
+        query = "SELECT document FROM entries WHERE kind = ? AND parent = ? AND id > ? ORDER BY id LIMIT ?"
+        rows = self.transact(lambda c: c.execute(query, (kind, parent, after or "", limit or -1)).fetchall())
         return [json.loads(row[0]) for row in rows]
+
+    def entry(self, kind: str, parent: str, entry_id: str) -> dict[str, object] | None:
+        """Return one index entry; None where there is none."""
+        self._complete(parent)
+        query = "SELECT document FROM entries WHERE kind = ? AND parent = ? AND id = ?"
+        row = self.transact(lambda c: c.execute(query, (kind, parent, entry_id)).fetchone())
+        return None if row is None else dict(json.loads(row[0]))
+
+    def count_entries(self, kind: str, parent: str = "") -> int:
+        """Return the number of index entries of a kind."""
+        self._complete(parent)
+        query = "SELECT COUNT(*) FROM entries WHERE kind = ? AND parent = ?"
+        return int(self.transact(lambda c: c.execute(query, (kind, parent)).fetchone()[0]))
+
+    def last_entry(self, kind: str, parent: str = "") -> dict[str, object] | None:
+        """Return the index entry with the largest id; None where there is none."""
+        self._complete(parent)
+        query = "SELECT document FROM entries WHERE kind = ? AND parent = ? ORDER BY id DESC LIMIT 1"
+        row = self.transact(lambda c: c.execute(query, (kind, parent)).fetchone())
+        return None if row is None else dict(json.loads(row[0]))
+
+    def entry_ids(self, kind: str) -> set[str]:
+        """Return the ids of the index entries of a kind that has no parents."""
+        return self.transact(lambda c: {row[0] for row in c.execute("SELECT id FROM entries WHERE kind = ?", (kind,))})
+
+    def _complete(self, parent: str) -> None:
+        if parent and self.before_parts is not None:
+            self.before_parts(parent)
 
     def remove_entry(self, kind: str, parent: str, entry_id: str) -> None:
         """Remove something from the index; with a test, its steps and analyses."""
@@ -205,22 +249,31 @@ class Catalog:
 
         self.transact(write)
 
-    def replace_entries(self, entries: list[tuple[str, str, str, Mapping[str, object]]]) -> list[str]:
-        """Make the index hold exactly ``entries`` (kind, parent, id, document); return the differences found."""
-        wanted = {(k, p, i): json.dumps(d) for k, p, i, d in entries}
+    def replace_tests(self, calibrations: list[Entry], tests: list[Entry], *, gone: set[str]) -> list[str]:
+        """Make the index hold exactly these calibrations, and these tests beside those that it has.
+
+        ``gone``: tests that it holds no longer. Returns the differences found.
+        """
 
         def write(c: sqlite3.Connection) -> list[str]:
-            rows = c.execute("SELECT kind, parent, id, document FROM entries").fetchall()
-            had = {(k, p, i): d for k, p, i, d in rows}
-            differences = [
-                f"{k} {p + '/' if p else ''}{i} was not in the catalogue" for k, p, i in wanted.keys() - had.keys()
+            differences = [f"test {test_id} has no folder" for test_id in gone]
+            for test_id in gone:
+                c.execute("DELETE FROM entries WHERE kind = 'test' AND id = ?", (test_id,))
+                c.execute("DELETE FROM entries WHERE parent = ?", (test_id,))
+            differences += _replace(c, "kind = 'calibration'", (), calibrations)
+            had = {row[0] for row in c.execute("SELECT id FROM entries WHERE kind = 'test'")}
+            differences += [
+                f"test {test_id} was not in the catalogue" for _, _, test_id, _ in tests if test_id not in had
             ]
-            differences += [f"{k} {p + '/' if p else ''}{i} has no folder" for k, p, i in had.keys() - wanted.keys()]
-            c.execute("DELETE FROM entries")
-            c.executemany("INSERT INTO entries VALUES (?, ?, ?, ?)", [(*key, text) for key, text in wanted.items()])
+            c.executemany("INSERT OR REPLACE INTO entries VALUES (?, ?, ?, ?)", _rows(tests))
             return sorted(differences)
 
         return self.transact(write)
+
+    def replace_test(self, test_id: str, entries: list[Entry]) -> list[str]:
+        """Make the index hold exactly ``entries`` of a test; return the differences found."""
+        where = "(kind = 'test' AND id = ?) OR parent = ?"
+        return self.transact(lambda c: sorted(_replace(c, where, (test_id, test_id), entries)))
 
     def put_request(self, scope: str, key: str, body_sha256: str, made: Ids) -> None:
         """Record the result of a request with an Idempotency-Key."""
@@ -238,17 +291,14 @@ class Catalog:
         )
         return None if row is None else (row[0], json.loads(row[1]))
 
-    def request_keys(self) -> set[tuple[str, str]]:
-        """Return (scope, key) of every request that is remembered."""
-        return self.transact(lambda c: set(c.execute("SELECT scope, key FROM requests").fetchall()))
-
-    def job_ids(self) -> set[str]:
-        """Return the id of every job."""
-        return self.transact(lambda c: {row[0] for row in c.execute("SELECT id FROM jobs")})
+    def newest_job(self) -> str | None:
+        """Return the largest id of a job."""
+        found = self.transact(lambda c: c.execute("SELECT MAX(id) FROM jobs").fetchone()[0])
+        return None if found is None else str(found)
 
     def restore(self, jobs: list[JobRecord], requests: list[tuple[str, str, str, Ids]]) -> None:
         """Take over jobs and requests (scope, key, body_sha256, made) that were found elsewhere."""
-        job_rows = [(job.id, job.state, json.dumps(job.plain())) for job in jobs]
+        job_rows = [(job.id, job.state, _job_text(job)) for job in jobs]
         request_rows = [(scope, key, digest, json.dumps(made)) for scope, key, digest, made in requests]
 
         def write(c: sqlite3.Connection) -> None:
@@ -268,3 +318,24 @@ class Catalog:
             return value
 
         return self.transact(write)
+
+
+def _job_text(job: JobRecord) -> str:
+    """Return a job as it is kept; the figures of an analysis' steps lie beside their results."""
+    return json.dumps((job.bounded(_KEPT_STEPS) if job.kind == "analysis" else job).plain())
+
+
+def _rows(entries: list[Entry]) -> list[tuple[str, str, str, str]]:
+    return [(kind, parent, entry_id, json.dumps(document)) for kind, parent, entry_id, document in entries]
+
+
+def _replace(c: sqlite3.Connection, where: str, values: tuple[str, ...], entries: list[Entry]) -> list[str]:
+    """Make the entries that fulfil a condition exactly these; return the differences."""
+    rows = _rows(entries)
+    wanted = {row[:3] for row in rows}
+    had = set(c.execute(f"SELECT kind, parent, id FROM entries WHERE {where}", values).fetchall())
+    differences = [f"{k} {p + '/' if p else ''}{i} was not in the catalogue" for k, p, i in wanted - had]
+    differences += [f"{k} {p + '/' if p else ''}{i} has no folder" for k, p, i in had - wanted]
+    c.execute(f"DELETE FROM entries WHERE {where}", values)
+    c.executemany("INSERT OR REPLACE INTO entries VALUES (?, ?, ?, ?)", rows)
+    return differences

@@ -49,6 +49,16 @@ class JobRecord(Document):
     result: dict[str, object] | None = Field(None, description="Result, when it succeeded.")
     problem: JobProblem | None = Field(None, description="Problem that left no result.")
 
+    def bounded(self, most: int) -> JobRecord:
+        """Return the record with so many entries of each list in its result at most; ``n_<list>`` counts them all."""
+        cut: dict[str, object] = {}
+        for name, value in (self.result or {}).items():
+            if isinstance(value, list) and len(value) > most:
+                cut |= {name: value[:most], f"n_{name}": len(value)}
+            elif isinstance(value, dict) and len(value) > most:
+                cut |= {name: dict(list(value.items())[:most]), f"n_{name}": len(value)}
+        return self if not cut else self.model_copy(update={"result": {**(self.result or {}), **cut}})
+
     def ended(self, state: JobState, finished_utc: str, problem: JobProblem | None) -> JobRecord:
         """Return the record of the job's end."""
         progress = self.progress.model_copy(update={"eta_s": None})

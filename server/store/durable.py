@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -88,6 +91,40 @@ def record_of(kind: type[Record], document: object, path: Path) -> Record:
 def read_record(kind: type[Record], path: Path) -> Record:
     """Read a record; see :func:`read_json` and :func:`record_of`."""
     return record_of(kind, read_json(path), path)
+
+
+_Kept = TypeVar("_Kept")
+_kept: OrderedDict[tuple[str, object], tuple[tuple[int, int, int], object]] = OrderedDict()
+_keeping = threading.Lock()
+#: smaller files are read in less time than it takes to notice
+_LARGE_BYTES = 40_000
+_MAX_KEPT = 16
+
+
+def kept_while_unchanged(path: Path, read: Callable[[Path], _Kept]) -> _Kept:
+    """Return what ``read`` makes of a file; of a large one, what it made last, unless the file was touched since.
+
+    What is returned is shared: nobody may change it.
+    """
+    try:
+        stat = path.stat()
+    except OSError:
+        return read(path)
+    if stat.st_size < _LARGE_BYTES:
+        return read(path)
+    # the time of the inode's change, which no program can set
+    mark, key = (stat.st_ino, stat.st_ctime_ns, stat.st_size), (str(path), read)
+    with _keeping:
+        if (known := _kept.get(key)) is not None and known[0] == mark:
+            _kept.move_to_end(key)
+            return known[1]  # type: ignore[return-value]
+    made = read(path)
+    with _keeping:
+        _kept[key] = mark, made
+        _kept.move_to_end(key)
+        if len(_kept) > _MAX_KEPT:
+            _kept.popitem(last=False)
+    return made
 
 
 def known_json(path: Path) -> dict[str, Any]:

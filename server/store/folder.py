@@ -9,6 +9,7 @@ import secrets
 import shutil
 import socket
 import threading
+from collections.abc import Set
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Self
@@ -191,19 +192,29 @@ class DataFolder:
         check_format(path)
 
     def _remove_temporaries(self) -> None:
-        # what a kill left half written; only names that `written_temporary` makes, or that begin with STAGING
+        # what a kill left half written; those of tests and trash are removed where they are read (`indexing.build`)
         for path in self.root.glob(f"{STAGING}*.part"):
             shutil.rmtree(path, ignore_errors=True)
-        for folder, _, names in os.walk(self.root):  # a start goes through all folders: rglob takes twice as long
-            for name in names:
-                if name.startswith(".") and name.endswith(".part"):
-                    Path(folder, name).unlink(missing_ok=True)
+        remove_temporaries(self.root, beside={self.tests, self.root / "trash"})
 
     def close(self) -> None:
         """Release the lock."""
         if self._lock_file is not None:
             self._lock_file.close()
             self._lock_file = None
+
+
+def remove_temporaries(root: Path, *, beside: Set[Path] = frozenset()) -> None:
+    """Remove the files that a kill left half written, but for those in the folders ``beside``.
+
+    Nothing may write there meanwhile. Only names that `server.formats.files.written_temporary` makes are removed.
+    """
+    left = {str(path) for path in beside}
+    for folder, folders, names in os.walk(root):  # rglob takes twice as long
+        folders[:] = [name for name in folders if os.path.join(folder, name) not in left]  # noqa: PTH118
+        for name in names:
+            if name.startswith(".") and name.endswith(".part"):
+                Path(folder, name).unlink(missing_ok=True)
 
 
 def is_in_use(root: Path) -> bool:

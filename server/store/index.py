@@ -1,23 +1,19 @@
-"""The catalogue's index, rebuilt from the folders at every start."""
+"""Entries of the catalogue's index, as the folders' documents give them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 from core.errors import FileFormatError
 from server.base.errors import NotFoundError
-from server.base.problem import RESTART, problem_of
 from server.store.calibrations import CalibrationStore
-from server.store.catalog import Catalog
+from server.store.catalog import Entry
 from server.store.documents import AnalysisRecord, StepRecord, TestRecord
 from server.store.folder import DataFolder, is_id
 from server.store.lost_jobs import LostJobs
-from server.store.noise import NoiseStore
 from server.store.tests import TestStore
 from server.store.trash import Trash
-
-Entry = tuple[str, str, str, Mapping[str, object]]  # kind, parent, id, document
 
 
 def calibration_entry(store: CalibrationStore, calibration_id: str) -> dict[str, object]:
@@ -100,63 +96,7 @@ def entries_of_test(tests: TestStore, test_id: str, lost: LostJobs, trouble: lis
     return entries
 
 
-def rebuild(
-    catalog: Catalog,
-    folder: DataFolder,
-    calibrations: CalibrationStore,
-    tests: TestStore,
-    noise: NoiseStore | None = None,
-) -> list[str]:
-    """Make the index agree with the folders; also take over ids, Idempotency-Keys and ended jobs found there.
-
-    Returns
-    -------
-    list of str
-        Differences between index and folders, and files that cannot be read.
-    """
-    entries: list[Entry] = []
-    trouble = _check_trash(folder)
-    lost = LostJobs()
-    for calibration_id in calibrations.ids():
-        folder.ids.reserve(calibration_id)
-        try:
-            if calibrations.read(calibration_id).state == "unfinished":
-                # no job works on it any more: the job that did ended with the last service
-                calibrations.put_failure(calibration_id, problem_of(RESTART).plain())
-            lost.calibration(calibrations.read(calibration_id))
-            entries.append(("calibration", "", calibration_id, calibration_entry(calibrations, calibration_id)))
-        except (FileFormatError, KeyError) as error:
-            trouble.append(f"calibration {calibration_id}: {error}")
-    if noise is not None:
-        for noise_id in noise.ids():
-            try:
-                lost.noise(noise.read(noise_id))
-            except (FileFormatError, KeyError) as error:
-                trouble.append(f"noise measurement {noise_id}: {error}")
-    for test_id in tests.ids():
-        folder.ids.reserve(test_id)
-        found = entries_of_test(tests, test_id, lost, trouble)
-        entries += found
-        for kind, _, name, _ in found:
-            if kind == "analysis":
-                folder.ids.reserve(name)
-    lost.restore(catalog, folder.ids)
-    return catalog.replace_entries(entries) + trouble
-
-
-def reindex(folder: DataFolder) -> list[str]:
-    """Make the catalogue of a data folder anew that no service runs on; return what was different, a line each."""
-    catalog = Catalog(folder.root / "catalog.sqlite").open()
-    try:
-        was_reset = ["the catalogue could not be read; it was quarantined and begun anew"] if catalog.was_reset else []
-        noise = NoiseStore(folder)
-        noise.end_unfinished()
-        return was_reset + rebuild(catalog, folder, CalibrationStore(folder), TestStore(folder), noise)
-    finally:
-        catalog.close()
-
-
-def _check_trash(folder: DataFolder) -> list[str]:
+def check_trash(folder: DataFolder) -> list[str]:
     """Put the trash in order; its entries keep their ids."""
     trash = Trash(folder.root)
     done = trash.tidy()

@@ -122,14 +122,9 @@ class LostJobs:
     def restore(self, catalog: Catalog, ids: IdMaker) -> None:
         """Add the jobs and requests that the catalogue lacks."""
         self._end_bursts()
-        known_jobs, known_keys = catalog.job_ids(), catalog.request_keys()
         for job_id in self._jobs:
             ids.reserve(job_id)
         catalog.restore(
-            [document for job_id, document in self._jobs.items() if job_id not in known_jobs],
-            [
-                (scope, key, digest, made)
-                for (scope, key), (digest, made) in self._requests.items()
-                if (scope, key) not in known_keys
-            ],
+            list(self._jobs.values()),
+            [(scope, key, digest, made) for (scope, key), (digest, made) in self._requests.items()],
         )

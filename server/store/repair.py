@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from server.store.folder import DataFolder
-from server.store.index import reindex
+from server.store.indexing.build import reindex
 from server.store.tests import TestStore, quarantine
 from server.store.verify import Verification, require_data_folder, verify
 

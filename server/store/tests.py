@@ -13,7 +13,8 @@ import os
 import re
 import shutil
 import threading
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,10 +34,21 @@ from server.store.documents import (
     SummaryRecord,
     TestRecord,
 )
-from server.store.durable import make_folder, read_json, read_record, record_of, write_bytes, write_json
+from server.store.durable import (
+    kept_while_unchanged,
+    make_folder,
+    read_json,
+    read_record,
+    record_of,
+    write_bytes,
+    write_json,
+)
 from server.store.folder import DataFolder, is_id, now_utc
+from server.store.indexing.names import names_in
 
 MAX_STEPS = 9999
+#: a step's document may be taken away by hand, which the folder of the steps does not show
+_LOOK_AGAIN_S = 2.0
 _STEP_FOLDER = re.compile(r"(?:incomplete-\d+-)?(\d{4})")
 _DELETED = re.compile(r"(\d{4})\.deleted")
 
@@ -88,6 +100,10 @@ class TestStore:
         self._folder = folder
         self._lock = threading.Lock()
         self._commits = 0
+        # of the test that was asked for last: names in its folder, when that was, and what was found
+        self._incomplete: dict[str, tuple[tuple[str, ...], float, list[int]]] = {}
+        #: called with a test's id before anything in its folder is changed
+        self.before_change: Callable[[str], None] | None = None
 
     # tests ------------------------------------------------------------------------------------------------------
 
@@ -103,6 +119,12 @@ class TestStore:
         if path is None or not (path / "test.json").is_file():
             raise NotFoundError(f"There is no test {test_id[:40]!r}.", kind="test")
         return path
+
+    def _to_change(self, test_id: str) -> Path:
+        """As `path`, of a test that is about to be changed."""
+        if self.before_change is not None:
+            self.before_change(test_id)
+        return self.path(test_id)
 
     def ids(self) -> list[str]:
         """Ids of all tests, in the order of their making."""
@@ -129,7 +151,7 @@ class TestStore:
 
     def update(self, test_id: str, changes: Mapping[str, object]) -> TestRecord:
         """Change fields of ``test.json``."""
-        path = self.path(test_id) / "test.json"
+        path = self._to_change(test_id) / "test.json"
         with self._lock:
             document = {**read_json(path), **changes}
             write_json(path, document)
@@ -161,6 +183,7 @@ class TestStore:
         StateError
             ``metadata_changed`` if they are not what was expected.
         """
+        self._to_change(test_id)
         with self._lock:
             if expected is not None and self.metadata(test_id) != expected:
                 raise StateError(
@@ -179,7 +202,7 @@ class TestStore:
 
     def put_workspace(self, test_id: str, document: Mapping[str, object]) -> None:
         """Replace what is drawn and set for a test; durable when this returns."""
-        write_json(self.path(test_id) / "workspace.json", document)
+        write_json(self._to_change(test_id) / "workspace.json", document)
 
     def is_calibrated(self, test_id: str) -> bool:
         """Return True if the test has a calibration to measure with."""
@@ -197,7 +220,7 @@ class TestStore:
         in_force
             New analyses are measured with it, unless they name another one.
         """
-        test = self.path(test_id)
+        test = self._to_change(test_id)
         sha256 = hashlib.sha256(content).hexdigest()
         with self._lock:
             document = read_json(test / "test.json")
@@ -234,7 +257,26 @@ class TestStore:
 
     def step_numbers(self, test_id: str) -> list[int]:
         """Numbers of the complete steps, ascending."""
-        return sorted(int(p.parent.name) for p in (self.path(test_id) / "steps").glob("[0-9]*/step.json"))
+        return list(self._complete(test_id, self._step_names(test_id)))
+
+    def first_step(self, test_id: str) -> int | None:
+        """Number of the first complete step; None without any."""
+        return next(self._complete(test_id, self._step_names(test_id)), None)
+
+    def newest_steps(self, test_id: str) -> Iterator[int]:
+        """Numbers of the complete steps, descending; looked up as they are asked for."""
+        return self._complete(test_id, self._step_names(test_id)[::-1])
+
+    def _step_names(self, test_id: str) -> list[str]:
+        """Names of the folders of steps, complete or not, in order."""
+        return [name for name in self._names(test_id) if len(name) == 4 and name.isdecimal()]
+
+    def _names(self, test_id: str) -> tuple[str, ...]:
+        return names_in(self.path(test_id) / "steps")
+
+    def _complete(self, test_id: str, names: list[str]) -> Iterator[int]:
+        steps = str(self.path(test_id) / "steps")
+        return (int(name) for name in names if os.path.isfile(f"{steps}/{name}/step.json"))  # noqa: PTH113
 
     def steps_mark(self, test_id: str) -> tuple[int, int]:
         """Return something cheap that differs whenever the steps of a test may have changed."""
@@ -246,10 +288,7 @@ class TestStore:
         A start reads them all: with ten thousand steps, each access of a path counts.
         """
         steps = str(self.path(test_id) / "steps")
-        names = sorted(os.listdir(steps)) if Path(steps).is_dir() else []  # noqa: PTH208 - names, not paths
-        for name in names:
-            if len(name) != 4 or not name.isdecimal():
-                continue
+        for name in self._step_names(test_id):
             path = Path(f"{steps}/{name}/step.json")
             try:
                 document = json.loads(path.read_bytes())
@@ -267,27 +306,36 @@ class TestStore:
 
     def incomplete_steps(self, test_id: str) -> list[int]:
         """Numbers of step folders without their commit mark, quarantined ones among them."""
-        steps = self.path(test_id) / "steps"
-        return sorted(
-            n for p in steps.iterdir() if (n := number_of(p.name)) is not None and not (p / "step.json").is_file()
+        names = self._names(test_id)
+        known = self._incomplete.get(test_id)
+        if known is not None and known[0] is names and time.monotonic() - known[1] < _LOOK_AGAIN_S:
+            return known[2]
+        steps = str(self.path(test_id) / "steps")
+        of_steps = ((name, number_of(name)) for name in names)
+        found = sorted(
+            n
+            for name, n in of_steps
+            if n is not None and not os.path.isfile(f"{steps}/{name}/step.json")  # noqa: PTH113
         )
+        self._incomplete = {test_id: (names, time.monotonic(), found)}
+        return found
 
     def deleted_steps(self, test_id: str) -> list[int]:
         """Numbers of the steps that lie in the trash, or that were removed for good."""
-        steps = self.path(test_id) / "steps"
-        marks = {int(found[1]) for p in steps.iterdir() if (found := _DELETED.fullmatch(p.name)) is not None}
-        return sorted(marks.difference(self.step_numbers(test_id)))
+        marks = sorted(found[1] for name in self._names(test_id) if (found := _DELETED.fullmatch(name)) is not None)
+        there = set(self._complete(test_id, marks))
+        return [n for n in map(int, marks) if n not in there]
 
     def add_step(self, test_id: str, images: dict[str, bytes], metadata: Mapping[str, object]) -> StepRecord:
         """Commit a step: both images, then ``step.json`` with their checksums.
 
         Returns when it is durable. A number is never used twice, also not that of an incomplete step.
         """
+        steps = self._to_change(test_id) / "steps"
         with self._lock:
-            steps = self.path(test_id) / "steps"
             deleted = self.deleted_steps(test_id)
-            if deleted or self.step_numbers(test_id):
-                n = 1 + max([*deleted, *(n for p in steps.iterdir() if (n := number_of(p.name)) is not None)])
+            if deleted or self.first_step(test_id) is not None:
+                n = 1 + max([*deleted, *(n for name in self._names(test_id) if (n := number_of(name)) is not None)])
             else:
                 # an incomplete reference would leave the test without step 0 for good
                 for folder in [p for p in steps.iterdir() if p.name.isdigit()]:
@@ -322,6 +370,7 @@ class TestStore:
 
     def update_step(self, test_id: str, n: int, changes: Mapping[str, object]) -> StepRecord:
         """Change fields of a step's ``step.json``; its images and their checksums stay."""
+        self._to_change(test_id)
         with self._lock:
             path = self.step(test_id, n).cam1.with_name("step.json")
             document = {**read_json(path), **changes}
@@ -356,6 +405,10 @@ class TestStore:
             raise NotFoundError(f"Test {test_id} has no analysis {analysis_id[:40]!r}.", kind="analysis")
         return path
 
+    def _analysis_to_change(self, test_id: str, analysis_id: str) -> Path:
+        self._to_change(test_id)
+        return self.analysis_path(test_id, analysis_id)
+
     def analysis_ids(self, test_id: str) -> list[str]:
         """Ids of a test's analyses, in the order of their making."""
         folder = self.path(test_id) / "analyses"
@@ -374,7 +427,7 @@ class TestStore:
         ``run`` is the job that will work on it, see `add_analysis_job`.
         """
         analysis_id = self._folder.ids.new("a")
-        path = self.path(test_id) / "analyses" / analysis_id
+        path = self._to_change(test_id) / "analyses" / analysis_id
         make_folder(path)
         if mask is not None:
             document = {**document, "mask_sha256": write_bytes(path / "mask.png", mask)}
@@ -388,7 +441,7 @@ class TestStore:
 
     def analysis(self, test_id: str, analysis_id: str) -> AnalysisRecord:
         """Return ``analysis.json``, with the id of its calibration where an earlier version did not write it."""
-        found = read_record(AnalysisRecord, self.analysis_path(test_id, analysis_id) / "analysis.json")
+        found = kept_while_unchanged(self.analysis_path(test_id, analysis_id) / "analysis.json", _analysis_in)
         if found.calibration_id is not None:
             return found
         known = calibration_id_in(self.read(test_id).model_dump(), found.inputs.calibration_sha256)
@@ -401,7 +454,7 @@ class TestStore:
 
     def add_analysis_job(self, test_id: str, analysis_id: str, run: Mapping[str, object]) -> None:
         """Note that another job goes on with an analysis."""
-        path = self.analysis_path(test_id, analysis_id) / "jobs.json"
+        path = self._analysis_to_change(test_id, analysis_id) / "jobs.json"
         jobs = read_json(path)["jobs"] if path.is_file() else []
         write_json(path, {"jobs": [*jobs, {**run, "created_utc": now_utc()}]})
 
@@ -409,7 +462,7 @@ class TestStore:
         self, test_id: str, analysis_id: str, steps: list[int], sha256: dict[str, dict[str, str]]
     ) -> AnalysisRecord:
         """Make further steps, with their images' checksums, part of an analysis that follows its test."""
-        path = self.analysis_path(test_id, analysis_id) / "analysis.json"
+        path = self._analysis_to_change(test_id, analysis_id) / "analysis.json"
         document = read_json(path)
         document["steps"] = [*document["steps"], *steps]
         document["inputs"]["steps"] |= sha256
@@ -418,12 +471,16 @@ class TestStore:
 
     def put_step_summary(self, test_id: str, analysis_id: str, n: int, summary: Mapping[str, object]) -> None:
         """Write the summary of one step beside its result."""
-        write_json(self.analysis_path(test_id, analysis_id) / f"step_{n:04d}.json", summary)
+        write_json(self._analysis_to_change(test_id, analysis_id) / f"step_{n:04d}.json", summary)
 
-    def step_summaries(self, test_id: str, analysis_id: str) -> dict[int, StepOutcome]:
-        """Return the summaries by step; only of steps whose result is there."""
+    def step_summaries(
+        self, test_id: str, analysis_id: str, only: Sequence[int] | None = None
+    ) -> dict[int, StepOutcome]:
+        """Return the summaries by step, of all steps or of these; only of steps whose result is there."""
         path = self.analysis_path(test_id, analysis_id)
-        files = {n: path / f"step_{n:04d}.json" for n in self.finished_steps(test_id, analysis_id)}
+        there = self.finished_steps(test_id, analysis_id)
+        wanted = there if only is None else sorted(set(there).intersection(only))
+        files = {n: path / f"step_{n:04d}.json" for n in wanted}
         return {
             n: record_of(StepOutcome, current_step(read_json(file)), file)
             for n, file in files.items()
@@ -432,7 +489,9 @@ class TestStore:
 
     def finished_steps(self, test_id: str, analysis_id: str) -> list[int]:
         """Numbers of the steps whose result file is there."""
-        return sorted(int(p.stem[5:]) for p in self.analysis_path(test_id, analysis_id).glob("step_[0-9]*.nc"))
+        names = names_in(self.analysis_path(test_id, analysis_id))
+        ours = (name[5:-3] for name in names if name.endswith(".nc") and name.startswith("step_"))
+        return [int(n) for n in ours if n.isdecimal()]
 
     def result_file(self, test_id: str, analysis_id: str, n: int) -> Path:
         """Result file of one step, its checksum verified where it is known.
@@ -460,7 +519,7 @@ class TestStore:
 
     def drop_starts(self, test_id: str, analysis_id: str) -> None:
         """Remove files that only an unfinished analysis needs, see :mod:`server.formats.results.starts`."""
-        for path in self.analysis_path(test_id, analysis_id).glob("starts_[0-9]*.npz"):
+        for path in self._analysis_to_change(test_id, analysis_id).glob("starts_[0-9]*.npz"):
             path.unlink(missing_ok=True)
 
     def drop_half_written(self, test_id: str, analysis_id: str) -> list[Path]:
@@ -468,7 +527,7 @@ class TestStore:
 
         Nothing may write into the analysis meanwhile. Returns the removed files.
         """
-        folder = self.analysis_path(test_id, analysis_id)
+        folder = self._analysis_to_change(test_id, analysis_id)
         lone = [path for path in folder.glob("step_[0-9]*.nc.sha256") if not path.with_suffix("").exists()]
         removed = sorted([*folder.glob(".*.part"), *lone])
         for path in removed:
@@ -477,10 +536,18 @@ class TestStore:
 
     def put_summary(self, test_id: str, analysis_id: str, document: Mapping[str, object]) -> None:
         """Write the analysis' summary, step by step."""
-        path = self.analysis_path(test_id, analysis_id) / "summary.json"
+        path = self._analysis_to_change(test_id, analysis_id) / "summary.json"
         write_json(path, document)
 
     def summary(self, test_id: str, analysis_id: str) -> SummaryRecord | None:
         """Return ``summary.json``, or None while it is not there."""
         path = self.analysis_path(test_id, analysis_id) / "summary.json"
-        return record_of(SummaryRecord, current_summary(read_json(path)), path) if path.exists() else None
+        return kept_while_unchanged(path, _summary_in) if path.exists() else None
+
+
+def _analysis_in(path: Path) -> AnalysisRecord:
+    return read_record(AnalysisRecord, path)
+
+
+def _summary_in(path: Path) -> SummaryRecord:
+    return record_of(SummaryRecord, current_summary(read_json(path)), path)

@@ -40,6 +40,7 @@ class Trash:
     def __init__(self, root: Path) -> None:
         self._data = root
         self.root = root / "trash"
+        self._sizes: dict[str, int] = {}
 
     # its entries -------------------------------------------------------------------------------------------
 
@@ -78,7 +79,9 @@ class Trash:
                 continue  # emptied meanwhile
             except FileFormatError as error:
                 entry = TrashEntry(id=trash_id, kind="unknown", name=error.cause)
-            size_bytes = _size_bytes(self.root / trash_id / _CONTENT)
+            if trash_id not in self._sizes:  # nothing changes in the trash, and a test has thousands of files
+                self._sizes[trash_id] = _size_bytes(self.root / trash_id / _CONTENT)
+            size_bytes = self._sizes[trash_id]
             found.append(entry.model_copy(update={"size_bytes": size_bytes}))
         return found
 

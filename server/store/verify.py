@@ -25,7 +25,15 @@ Level = Literal["damaged", "incomplete", "index", "foreign"]
 
 # Files beside the data: made and removed by a running service
 _OURS = frozenset(
-    {"format.json", "service.lock", "catalog.sqlite", "catalog.sqlite-wal", "catalog.sqlite-shm", "keys.json"}
+    {
+        "format.json",
+        "service.lock",
+        "catalog.sqlite",
+        "catalog.sqlite-wal",
+        "catalog.sqlite-shm",
+        "catalog.sqlite.clean",
+        "keys.json",
+    }
 )
 # Names that the service writes into a folder of each kind
 _KNOWN = {

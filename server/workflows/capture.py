@@ -155,9 +155,9 @@ def _check_content(images: dict[str, GrayImage]) -> None:
 def _check_sizes(service: Service, test_id: str, sizes: dict[str, list[int]]) -> None:
     """Refuse images that cannot be measured with the test's calibration, or with its other images."""
     known: dict[str, tuple[str, list[int]]] = {}
-    numbers = service.tests.step_numbers(test_id)
-    if numbers:
-        first = service.tests.step(test_id, numbers[0]).document.image_size_px
+    number = service.tests.first_step(test_id)
+    if number is not None:
+        first = service.tests.step(test_id, number).document.image_size_px
         known |= {cam: ("the test's others are", list(size)) for cam, size in first.items()}
     if service.tests.is_calibrated(test_id):
         calibration = load_calibration(service.tests.calibration_file(test_id))

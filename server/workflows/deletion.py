@@ -34,6 +34,8 @@ def delete(service: Service, kind: Kind, ids: Ids, *, by: str) -> TrashEntry:
     StorageError
         When the disk fails.
     """
+    if "test_id" in ids:
+        service.index.read(str(ids["test_id"]))
     name = _name(service, kind, ids)  # that it exists
     with service.tests.still():
         _check_unused(service, kind, ids)

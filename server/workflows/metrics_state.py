@@ -53,6 +53,7 @@ class StateCollector(Collector):
         yield info
         yield _gauge("uptime_seconds", "Time since the service began.", time.monotonic() - service.started_monotonic)
         yield _gauge("ready", "1 if it can capture and compute (/readyz).", not service.not_ready())
+        yield _gauge("tests_to_read", "Tests that are still to be read into the catalogue.", service.index.waiting())
         yield _gauge("rig_fault", "1 if the rig could not be opened.", service.rig.fault is not None)
         yield _gauge("hardware_held", "1 while a job holds the hardware.", service.hardware.holder is not None)
 

@@ -30,7 +30,8 @@ from server.rig.devices import DeviceFinder
 from server.store.calibrations import CalibrationStore
 from server.store.catalog import Catalog
 from server.store.folder import DataFolder
-from server.store.index import rebuild
+from server.store.indexing.build import Index
+from server.store.indexing.clean_stop import take_mark
 from server.store.noise import NoiseStore
 from server.store.recipes import RecipeStore
 from server.store.tests import TestStore
@@ -38,10 +39,13 @@ from server.store.trash import Trash
 from server.worker.dask_cluster import ClusterExecutor
 from server.worker.embedded import ComputeWorker, make_worker
 from server.worker.executor import TaskExecutor
+from server.workflows.analysis.checks import AnalysisChecks
 from server.workflows.analysis.framed import FramedResults
 
 _log = logging.getLogger("stereorig.service")
 _OPEN_WAIT_S = 5.0
+#: a small data folder is read by then; of a large one the rest is read behind the service
+_INDEX_WAIT_S = 1.0
 # numbers stay below 2^53, which JavaScript can hold, for some centuries
 _EVENTS_A_START = 1_000_000
 _END_MOTION_S = 2.0
@@ -74,7 +78,7 @@ class Service:
         self.noise = NoiseStore(self.folder)
         self.recipes = RecipeStore(self.folder)
         self.trash = Trash(self.folder.root)
-        self.differences: list[str] = []
+        self.index = Index(self.catalog, self.folder, self.calibrations, self.tests, self.noise)
         self.metrics = Metrics()
         self.hub = EventHub()
         self.hub.listen(self.metrics.on_event)
@@ -92,6 +96,7 @@ class Service:
             )
         self.rig = Rig(config, self.hardware, self.hub.publish, record=record)
         self.finder = DeviceFinder()
+        self.checks = AnalysisChecks(self.tests)
         self.exports = ExportProcess(self.folder.root)
         self.framed = FramedResults(self.folder.root / ".exports" / "frames")  # removed with the exports
         # stopping must not wait behind forty slow requests
@@ -103,6 +108,7 @@ class Service:
         self.changes = threading.Lock()
         self.continuing = threading.Lock()
         self._effects = OneEffect(self.catalog)
+        self._ended_well = False
         self._end: queue.SimpleQueue[bool] = queue.SimpleQueue()
         self._end_thread = threading.Thread(target=self._await_end, name="end", daemon=True)
         self._parts = contextlib.ExitStack()
@@ -122,6 +128,7 @@ class Service:
             self.open_data(parts)
             # the clock alone may step back, and the catalogue alone may be lost
             self.hub.number_from(_EVENTS_A_START * self.catalog.count_up("starts", int(time.time())))
+            parts.callback(self.checks.close)
             parts.callback(self.abort_thread.shutdown, wait=False)
             parts.callback(self.stop_thread.shutdown, wait=False)
             parts.callback(self.rig.close)
@@ -139,6 +146,7 @@ class Service:
             parts.callback(self.begin_end)
             parts.callback(self.stop_streams)
             self._open_rig()
+            self.index.wait(_INDEX_WAIT_S)
             self._parts = parts.pop_all()
         return self
 
@@ -162,6 +170,20 @@ class Service:
 
         self.hardware.start(open_rig)
         opened.wait(timeout=_OPEN_WAIT_S)
+
+    def _end_index(self) -> None:
+        """End the reading; note whether the next start may believe the index."""
+        whole = self.index.close()
+        self._ended_well = whole and self.jobs.is_idle() and self._effects.all_written and not self.hardware.holder
+
+    def _leave_mark(self) -> None:
+        """Say that the index may be believed, once the catalogue is closed."""
+        if not self._ended_well or self.catalog.write_failed:
+            return
+        try:
+            self.index.leave_mark()
+        except (StorageError, OSError) as error:
+            _log.warning("the next start reads all tests again: %s", error)
 
     def require_room(self) -> None:
         """Refuse with ``storage_full`` when less than the reserve is left on the disk."""
@@ -220,13 +242,15 @@ class Service:
         """
         self.folder.open()
         parts.callback(self.folder.close)
-        self.catalog.open()
+        known = take_mark(self.catalog.path)
+        parts.callback(self._leave_mark)
+        self.catalog.open(sound=known is not None)
         parts.callback(self.catalog.close)
         self.noise.end_unfinished()
         self.recipes.reserve_ids()
-        self.differences = rebuild(self.catalog, self.folder, self.calibrations, self.tests, self.noise)
-        for line in self.differences:
-            _log.info("catalogue: %s", line)
+        self.index.begin(known)
+        parts.callback(self._end_index)
+        self.index.start()
 
     def is_alive(self) -> bool:
         """Return True if the threads that everything waits for run."""
@@ -268,4 +292,6 @@ class Service:
 
     def once(self, scope: str, key: str | None, body_sha256: str, make: Callable[[], Ids]) -> tuple[Ids, bool]:
         """Run ``make`` once per Idempotency-Key, see :meth:`server.jobs.idempotency.OneEffect.once`."""
+        if scope.startswith("tests/"):
+            self.index.read(scope.split("/")[1])  # its folder may know of keys that the catalogue lacks
         return self._effects.once(RequestMark(scope, key, body_sha256), make)

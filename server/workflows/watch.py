@@ -119,7 +119,7 @@ class Watches:
 
     def _newest(self, test_id: str, channel: str) -> tuple[int, float] | None:
         tests = self._service.tests
-        for n in reversed(tests.step_numbers(test_id)):
+        for n in tests.newest_steps(test_id):
             value = value_of(tests.step(test_id, n).document, channel)
             if value is not None:
                 return n, value

@@ -26,7 +26,7 @@ from server.api.models import (
 )
 from server.api.models.calibrations import CalibrationEntry
 from server.api.models.channels import ChannelsImported
-from server.api.models.tests import TestEntry
+from server.api.models.tests import StepEntry, TestEntry
 from server.results.gauges.request import GaugeRequest
 from stereorig.client import datasets, operations
 from stereorig.client.errors import checked, no_answer
@@ -209,6 +209,10 @@ class AsyncTest:
     async def document(self) -> TestReply:
         """Do as :meth:`Test.document`."""
         return await self._client._run(operations.get(f"/tests/{self.id}", TestReply))
+
+    async def steps(self) -> list[StepEntry]:
+        """Do as :meth:`Test.steps`."""
+        return await self._client._run(operations.steps(self.id))
 
     async def step(self, n: int) -> StepReply:
         """Do as :meth:`Test.step`."""

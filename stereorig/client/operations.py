@@ -21,6 +21,7 @@ from server.api.models import (
     AnalysisAccepted,
     AnalysisReply,
     AnalysisRequest,
+    AnalysisStepList,
     CalibrationAccepted,
     CalibrationReply,
     CalibrationRequest,
@@ -36,7 +37,9 @@ from server.api.models import (
 )
 from server.api.models.calibrations import CalibrationEntry, CalibrationList
 from server.api.models.channels import ChannelsImported
-from server.api.models.tests import TestEntry, TestList
+from server.api.models.jobs import JobStepList
+from server.api.models.tests import StepEntry, StepList, TestEntry, TestList
+from server.base.models import Listing
 from server.results.gauges.request import GaugeRequest
 from server.wording import problems_in
 from stereorig.client.errors import error_of
@@ -44,6 +47,8 @@ from stereorig.client.progress import OnProgress
 
 Model = TypeVar("Model", bound=BaseModel)
 Result = TypeVar("Result")
+Page = TypeVar("Page", bound=Listing)
+Thing = TypeVar("Thing")
 #: seconds that one request waits for a job; shorter where somebody looks at its progress
 _WAIT_S, _LOOK_S = 30.0, 0.5
 _FINAL = ("succeeded", "failed", "cancelled", "interrupted")
@@ -111,6 +116,17 @@ def _read(response: httpx.Response, answer: type[Model]) -> Model:
 def get(path: str, answer: type[Model], **params: Any) -> Operation[Model]:
     """Read one document."""
     return _read((yield Ask("GET", path, params=params)), answer)
+
+
+def _all(path: str, answer: type[Page], things: Callable[[Page], list[Thing]], **asked: Any) -> Operation[list[Thing]]:
+    """Read a list page by page."""
+    found: list[Thing] = []
+    while True:
+        page = yield from get(path, answer, **asked)
+        found += things(page)
+        if page.next_cursor is None:
+            return found
+        asked["cursor"] = page.next_cursor
 
 
 # jobs ----------------------------------------------------------------------------------------------------------------
@@ -187,13 +203,7 @@ def calibrations(accepted: bool | None, state: str | None) -> Operation[list[Cal
     """List calibrations, oldest first."""
     asked: dict[str, Any] = {"accepted": accepted, "state": state}
     asked = {name: value for name, value in asked.items() if value is not None}
-    found: list[CalibrationEntry] = []
-    while True:
-        page = yield from get("/calibrations", CalibrationList, **asked)
-        found += page.calibrations
-        if page.next_cursor is None:
-            return found
-        asked["cursor"] = page.next_cursor
+    return (yield from _all("/calibrations", CalibrationList, lambda page: page.calibrations, **asked))
 
 
 # tests ---------------------------------------------------------------------------------------------------------------
@@ -206,14 +216,12 @@ def new_test(request: TestRequest) -> Operation[TestReply]:
 
 def tests() -> Operation[list[TestEntry]]:
     """List tests, oldest first."""
-    found: list[TestEntry] = []
-    asked: dict[str, Any] = {}
-    while True:
-        page = yield from get("/tests", TestList, **asked)
-        found += page.tests
-        if page.next_cursor is None:
-            return found
-        asked["cursor"] = page.next_cursor
+    return (yield from _all("/tests", TestList, lambda page: page.tests))
+
+
+def steps(test_id: str) -> Operation[list[StepEntry]]:
+    """List a test's complete steps, in order."""
+    return (yield from _all(f"/tests/{test_id}/steps", StepList, lambda page: page.steps))
 
 
 def capture(test_id: str, request: StepRequest, on_progress: OnProgress | None) -> Operation[list[StepReply]]:
@@ -222,11 +230,11 @@ def capture(test_id: str, request: StepRequest, on_progress: OnProgress | None) 
     if request.count == 1:
         return [_read(answer, StepReply)]
     job = yield from ended(JobReply.model_validate(answer.json()["job"]), on_progress)
-    taken: Any = (job.result or {}).get("steps", [])
-    steps = []
+    taken = yield from _all(f"/jobs/{job.id}/steps", JobStepList, lambda page: page.steps)
+    found = []
     for one in taken:
-        steps.append((yield from get(f"/tests/{test_id}/steps/{one['n']}", StepReply)))
-    return steps
+        found.append((yield from get(f"/tests/{test_id}/steps/{one.n}", StepReply)))
+    return found
 
 
 def step_form(fields: Mapping[str, Any]) -> dict[str, Any]:
@@ -277,7 +285,8 @@ def finish(path: str, on_progress: OnProgress | None) -> Operation[JobReply]:
 
 def finished_steps(path: str) -> Operation[list[int]]:
     """Return the numbers of the steps whose results can be read."""
-    return (yield from get(path, AnalysisReply)).steps_finished
+    each = yield from _all(f"{path}/steps", AnalysisStepList, lambda page: page.steps, figures=False)
+    return [one.n for one in each if one.state == "finished"]
 
 
 def netcdf_of(path: str, name: str | None, step: int | None) -> Operation[dict[int, bytes]]:

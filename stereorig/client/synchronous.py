@@ -26,7 +26,7 @@ from server.api.models import (
 )
 from server.api.models.calibrations import CalibrationEntry
 from server.api.models.channels import ChannelsImported
-from server.api.models.tests import TestEntry
+from server.api.models.tests import StepEntry, TestEntry
 from server.results.gauges.request import GaugeRequest
 from stereorig.client import datasets, operations
 from stereorig.client.errors import checked, no_answer
@@ -238,6 +238,10 @@ class Test:
     def document(self) -> TestReply:
         """Return name, steps and analyses."""
         return self._client._run(operations.get(f"/tests/{self.id}", TestReply))
+
+    def steps(self) -> list[StepEntry]:
+        """Return a short entry of each complete step, in order; the test's document holds the first 100."""
+        return self._client._run(operations.steps(self.id))
 
     def step(self, n: int) -> StepReply:
         """Return one step."""

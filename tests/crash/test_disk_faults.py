@@ -16,7 +16,7 @@ from server.formats.images import encode_tiff
 from server.store.calibrations import CalibrationStore
 from server.store.catalog import Catalog
 from server.store.folder import DataFolder
-from server.store.index import rebuild
+from server.store.indexing.build import rebuild
 from server.store.noise import NoiseStore
 from server.store.repair import repair
 from server.store.tests import TestStore

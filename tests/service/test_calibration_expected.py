@@ -15,7 +15,7 @@ from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
 from core.errors import CalibrationInputError
 from core.target import GridTarget
-from server.store.index import rebuild
+from server.store.indexing.build import rebuild
 from server.workflows.service import Service
 from tests.support.calibration_truth import PAPER, Grid, nodes, project
 

@@ -260,7 +260,7 @@ def test_index_is_rebuilt_and_keys_still_count_after_the_catalogue_is_lost(tmp_p
     (half / "cam1.tif").write_bytes(b"half a step")
     service = Service(tiny_config(), tmp_path / "data").start()
     try:
-        assert any("was not in the catalogue" in line for line in service.differences)
+        assert any("was not in the catalogue" in line for line in service.index.differences)
         with served(service) as client:
             wait_for_rig(client)
             shown = client.get(f"/api/v1/tests/{test_id}").json()
@@ -426,7 +426,7 @@ def test_a_start_that_fails_closes_what_was_opened_before(tmp_path: Path, monkey
     def broken(*_: object) -> list[str]:
         raise StorageError("The index cannot be made.")
 
-    monkeypatch.setattr("server.workflows.service.rebuild", broken)
+    monkeypatch.setattr("server.workflows.service.Index.begin", broken)
     threads = threading.active_count()
     with pytest.raises(StorageError), Service(tiny_config(), tmp_path / "data"):
         pass

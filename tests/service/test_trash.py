@@ -20,7 +20,7 @@ from server.jobs.job import Phase
 from server.store.calibrations import CalibrationStore
 from server.store.catalog import Catalog
 from server.store.folder import DataFolder
-from server.store.index import rebuild
+from server.store.indexing.build import rebuild
 from server.store.tests import TestStore
 from server.store.trash import Trash
 from server.store.verify import verify

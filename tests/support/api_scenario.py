@@ -295,7 +295,8 @@ def _test(session: Session, calibration: str) -> str:
     call("put_scene", summary="A clamped plate under 20 kPa", body={"scene": "plate", "load": 20.0})
     call("create_step", test, body={"label": "20 kPa", "load_n": 1250.0})
     burst = {"label": "cycle 3", "count": 2, "interval_ms": 500.0}
-    wait_for_job(client, call("create_step", test, summary="Two steps, two a second", body=burst).json()["job"])
+    taken = wait_for_job(client, call("create_step", test, summary="Two steps, two a second", body=burst).json()["job"])
+    call("job_steps", taken["id"])
     form = {"label": "from another program", "load_n": 1300.0, "channels": '{"stroke_mm": 0.42}'}
     files = {cam: image(k) for k, cam in enumerate(("cam1", "cam2"))}
     imported = call("import_images", test, summary="A pair of image files", form=form, files=files).json()["n"]
@@ -383,6 +384,7 @@ def _analysis(session: Session, test: str) -> str:
     call("get_analysis_recipe", test, made["analysis_id"])
     call("list_analyses", test)
     call("get_analysis", test, made["analysis_id"])
+    call("list_analysis_steps", test, made["analysis_id"])
     wait_for_job(client, call("reproduce_analysis", test, made["analysis_id"]).json()["job"])
     return str(made["analysis_id"])
 

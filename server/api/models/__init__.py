@@ -6,6 +6,7 @@ from server.api.models.analyses import (
     AnalysisList,
     AnalysisReply,
     AnalysisRequest,
+    AnalysisStepList,
     ContinueRequest,
     FieldList,
     FieldReply,
@@ -25,7 +26,7 @@ from server.api.models.calibrations import (
     ResidualsReply,
     ViewList,
 )
-from server.api.models.jobs import Accepted, JobList, JobProblem, JobReply, Progress
+from server.api.models.jobs import Accepted, JobList, JobProblem, JobReply, JobStepList, Progress
 from server.api.models.noise import NoiseAccepted, NoiseList, NoiseModelReply, NoiseReply, NoiseRequest
 from server.api.models.rig import (
     AxesRequest,
@@ -68,6 +69,7 @@ __all__ = [
     "AnalysisList",
     "AnalysisReply",
     "AnalysisRequest",
+    "AnalysisStepList",
     "AxesRequest",
     "BurstAccepted",
     "CalibrationAccepted",
@@ -96,6 +98,7 @@ __all__ = [
     "JobProblem",
     "JobReply",
     "JobState",
+    "JobStepList",
     "Label",
     "LiveCheckReply",
     "MoveRequest",

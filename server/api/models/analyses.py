@@ -196,7 +196,15 @@ class AnalysisReply(Reply):
     state: JobState = Field(description="State of its job.")
     job_id: str | None = Field(None, description="Its job; the last one, where it was continued.")
     follow: bool = Field(False, description="True if it goes on with each step that lands.")
-    steps: list[int] = Field(default_factory=list, description="Steps that it measures, the reference first.")
+    n_steps: int = Field(0, description="Number of the steps that it measures.")
+    n_finished: int = Field(0, description="Number of the steps whose results can be read now.")
+    n_failed: int = Field(0, description="Number of the steps that could not be measured.")
+    steps: list[int] = Field(
+        default_factory=list,
+        description="Steps that it measures, the reference first. Of this list, of `steps_finished` and of "
+        "`steps_failed` the first 100 are here, of `summary.steps` the first 50; the others come from "
+        "GET .../analyses/{analysis_id}/steps.",
+    )
     calibration_id: str | None = Field(None, description="Calibration that it is measured with; null: not known.")
     calibration_sha256: str | None = Field(None, description="Checksum of that calibration's file.")
     settings: StoredSettings = Field(description="Settings, fixed.")
@@ -213,6 +221,27 @@ class AnalysisReply(Reply):
         default_factory=list,
         description="What must be known before the results are used: failed checks first, each with its remedy.",
     )
+
+
+class AnalysisStep(Reply):
+    """A step of an analysis."""
+
+    n: int = Field(description="Number of the step.")
+    state: Literal["finished", "failed", "waiting"] = Field(
+        description="`finished`: its results can be read; `failed`: see `problem`; `waiting`: not measured yet, or not "
+        "at all once the analysis' job has ended."
+    )
+    problem: JobProblem | None = Field(None, description="The reason why it could not be measured.")
+    figures: StepFigures | None = Field(
+        None, description="Counts, residuals and timings; null: not finished, or not asked for."
+    )
+    sha256: dict[str, str] | None = Field(None, description="Checksums of the images that it is measured from.")
+
+
+class AnalysisStepList(Listing):
+    """Steps of an analysis, in order of their numbers."""
+
+    steps: list[AnalysisStep] = Field(description="Entry of each.")
 
 
 class AnalysisList(Listing):

@@ -21,6 +21,18 @@ class JobList(Listing):
     jobs: list[JobReply] = Field(description="Jobs, newest first.")
 
 
+class JobStep(Reply):
+    """A step that a job has taken or measured; further entries depend on the kind of job."""
+
+    n: int = Field(description="Number of the step.")
+
+
+class JobStepList(Listing):
+    """Steps of a job, in order."""
+
+    steps: list[JobStep] = Field(description="Entry of each, as in the job's result.")
+
+
 class Accepted(Reply):
     """A job was accepted."""
 

@@ -234,4 +234,4 @@ class LiveCheckReply(Reply):
 class StageMessages(Reply):
     """Messages of the controller, oldest first."""
 
-    messages: list[StageMessage] = Field(description="The last 200 at most.")
+    messages: list[StageMessage] = Field(description="The last 100 at most.")

@@ -102,7 +102,15 @@ class TestReply(Reply):
         "by their checksum.",
     )
     created_utc: str = Field(description="Time at which it was made.")
-    steps: list[StepEntry] = Field(default_factory=list, description="Its complete steps.")
+    n_steps: int = Field(0, description="Number of its complete steps.")
+    steps: list[StepEntry] = Field(
+        default_factory=list,
+        description="Its complete steps, in order; the first 100 where there are more, see `steps_next_cursor`.",
+    )
+    steps_next_cursor: str | None = Field(
+        None, description="Of GET /tests/{id}/steps for the steps after these; null: these are all."
+    )
+    newest_step: StepEntry | None = Field(None, description="The complete step with the largest number.")
     incomplete_steps: list[int] = Field(default_factory=list, description="Step folders without their commit mark.")
     analyses: list[AnalysisEntry] = Field(default_factory=list, description="Its analyses.")
 

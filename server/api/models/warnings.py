@@ -21,4 +21,7 @@ class AnalysisWarning(Reply):
     )
     text: str = Field(description="The finding, with its figures.")
     remedy: str = Field(description="What to do.")
-    steps: list[int] = Field(default_factory=list, description="Steps that it holds for; empty: all of it.")
+    steps: list[int] = Field(
+        default_factory=list, description="Steps that it holds for, 100 at most; empty: all of it."
+    )
+    n_steps: int | None = Field(None, description="Number of those steps, where there are more than 100.")

@@ -10,6 +10,7 @@ from typing import Annotated
 from fastapi import Query, Request
 
 from core.errors import StateError
+from server.api.protocol.paging import WHOLE
 from server.jobs.job import FINAL
 from server.workflows.service import Service
 
@@ -58,4 +59,4 @@ async def job_reply(
                 await asyncio.get_running_loop().run_in_executor(service.stop_thread, service.jobs.cancel, job_id)
             break
         await asyncio.sleep(_ATTEND_S)
-    return {"job": service.jobs.document(job_id).plain()}
+    return {"job": service.jobs.document(job_id).bounded(WHOLE).plain()}

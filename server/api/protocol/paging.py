@@ -12,6 +12,15 @@ from fastapi import Depends, Query, Request, Response
 from core.errors import InputError
 
 MAX_LIMIT = 1000
+#: a document holds so many steps itself; further ones come page by page
+WHOLE = 100
+#: and the figures, of some kilobytes, of so many
+FIGURES = 50
+
+
+def cursor_of(key: str) -> str:
+    """Return the cursor of the page that begins after the thing with this key."""
+    return base64.urlsafe_b64encode(key.encode()).decode().rstrip("=")
 
 
 class Page:
@@ -36,7 +45,7 @@ class Page:
         """Return the page at the beginning of what is left."""
         page = list(rest[: self.limit])
         if len(rest) > len(page):
-            cursor = base64.urlsafe_b64encode(key(page[-1]).encode()).decode().rstrip("=")
+            cursor = cursor_of(key(page[-1]))
             url = self._request.url.include_query_params(cursor=cursor)
             self._response.headers["Link"] = f'<{url.path}?{url.query}>; rel="next"'
             self._response.headers["X-Next-Cursor"] = cursor

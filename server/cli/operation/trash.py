@@ -10,7 +10,7 @@ from pathlib import Path
 from core.errors import InputError
 from server.store.documents import TrashEntry
 from server.store.folder import DataFolder
-from server.store.index import reindex
+from server.store.indexing.build import reindex
 from server.store.trash import Trash
 from server.store.verify import require_data_folder
 
@@ -59,7 +59,7 @@ def _restore(data: Path, ids: list[str]) -> int:
         trash = Trash(folder.root)
         for trash_id in ids:
             print(f"restored {_description(trash.restore(trash_id))}")
-        reindex(folder)
+        reindex(folder, believe=True)
     finally:
         folder.close()
     return 0

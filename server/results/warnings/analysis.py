@@ -18,6 +18,8 @@ _Steps = Mapping[int, _Summary]
 
 #: share of the region's points with values below which a step warns, and fails
 COVERAGE_WARNING, COVERAGE_FAILED = 0.8, 0.5
+#: steps that a warning names one by one
+_NAMED = 100
 _QUALITY = {
     "saturated": "an image is too bright: whole speckles are at full scale",
     "dark": "an image is too dark",
@@ -53,13 +55,14 @@ class ResultWarning:
 
     def plain(self) -> dict[str, object]:
         """Return it as plain values."""
-        return {
+        plain: dict[str, object] = {
             "code": self.code,
             "level": self.level,
             "text": self.text,
             "remedy": self.remedy,
-            "steps": list(self.steps),
+            "steps": list(self.steps[:_NAMED]),
         }
+        return plain if len(self.steps) <= _NAMED else {**plain, "n_steps": len(self.steps)}
 
 
 def analysis_warnings(

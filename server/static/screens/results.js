@@ -81,7 +81,7 @@ async function list(root, testId) {
     try {
       const whole = await api.get(`/tests/${test.id}`);
       replace(detail, h("div.spread", h("h2", whole.name), h("a", { href: `#/test/${whole.id}` }, "the test")),
-        definitions([["specimen", whole.specimen || "–"], ["made", when(whole.created_utc)], ["steps", count(whole.steps?.length)], ["calibration", whole.calibration_id ?? "–"]]),
+        definitions([["specimen", whole.specimen || "–"], ["made", when(whole.created_utc)], ["steps", count(whole.n_steps)], ["calibration", whole.calibration_id ?? "–"]]),
         h("h3", "Analyses"),
         table([
           ["Analysis", (one) => h("a", { href: `#/results/${test.id}/${one.id}` }, one.label || one.id)],
@@ -206,7 +206,7 @@ async function show(root, testId, analysisId, query) {
   async function refresh() {
     nothing();
     if (state.step === null) return;
-    replace(cameras, camerasNote(result.analysis.summary?.steps?.find((one) => one.n === state.step)));
+    replace(cameras, camerasNote(/** @type {import("#routes").StepSummary | undefined} */ (await result.figures(state.step))));
     counter();
     await drawFields();
     const address = `#/results/${testId}/${analysisId}?step=${state.step}${state.chosen ? `&field=${encodeURIComponent(state.field ?? "")}` : ""}${result.frame === "system" ? "&frame=system" : ""}`;

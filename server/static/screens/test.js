@@ -1,6 +1,7 @@
 // Tests: make one, capture or import its steps, state its metadata, draw the region, start an analysis.
 import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
+import { readTest } from "../lib/steps.js";
 import { stepsPanel } from "./test/steps.js";
 import { metadataPanel } from "./test/metadata.js";
 import { measurePanel } from "./test/measure.js";
@@ -70,7 +71,7 @@ async function all(root) {
 async function one(root, id) {
   /** @type {Ends} */
   const ends = [];
-  let test = await api.get(`/tests/${id}`);
+  let test = await readTest(id);
   const head = h("section.panel");
   const analyses = h("section.panel", { "aria-label": "Analyses" });
 
@@ -121,8 +122,8 @@ async function one(root, id) {
     ], (test.analyses ?? []).toReversed(), { caption: "Newest first", empty: "None yet." }));
   }
   const title = h("h1", test.name);
-  const steps = await stepsPanel(id, test, ends, async () => { test = await api.get(`/tests/${id}`); return test; });
-  const measure = await measurePanel(id, test, ends, async () => { test = await api.get(`/tests/${id}`); drawAnalyses(); });
+  const steps = await stepsPanel(id, test, ends, async () => { test = await readTest(id); return test; });
+  const measure = await measurePanel(id, test, ends, async () => { test = await readTest(id); drawAnalyses(); });
   steps.onchange((/** @type {typeof test} */ fresh) => { test = fresh; measure.steps(fresh); });
   drawHead();
   drawAnalyses();

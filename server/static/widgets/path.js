@@ -44,7 +44,7 @@ async function look() {
   const measured = Boolean(test?.analyses?.length);
   return {
     rig: rig.connected && !rig.fault && !Object.values(rig.cameras).some((one) => one.fault), calibrated: calibrations.length > 0, test: known,
-    steps: test ? test.steps?.length ?? 0 : 0, region: Boolean(drawn?.region) || measured, measured, // what was measured had a region, kept or not
+    steps: test?.n_steps ?? 0, region: Boolean(drawn?.region) || measured, measured, // what was measured had a region, kept or not
     seen: measured && localStorage.getItem(SEEN) === known,
   };
 }

@@ -20,7 +20,7 @@ from server.formats.files import fsync_path, storage_error
 from server.store.bundle.content import FORMAT, MANIFEST, BundleFile, Manifest, altered, check_names, refused
 from server.store.durable import record_of
 from server.store.folder import STAGING, DataFolder
-from server.store.index import reindex
+from server.store.indexing.build import reindex
 from server.store.trash import Trash
 from server.store.verify import verify_test
 
@@ -76,7 +76,7 @@ def unpack(bundle: Path, data: Path) -> Opened:
             raise storage_error(error, folder.root) from error
         finally:
             shutil.rmtree(staging, ignore_errors=True)
-        reindex(folder)
+        reindex(folder, believe=True)
     finally:
         folder.close()
         if new:

@@ -53,6 +53,7 @@ class AnalysisRun:
         self._test_id = test_id
         self._loaded: AnalysisRecord | None = None
         self._summaries: dict[int, StepOutcome] = {}  # of the steps that are finished
+        self._plain: dict[int, tuple[StepOutcome, dict[str, object]]] = {}
         self._failed: dict[int, StereorigError] = {}  # in this run
         self._done: dict[int, StepFiles] = {}  # in their order: what the next step is measured from
         self._next = 0  # index of that step
@@ -110,13 +111,20 @@ class AnalysisRun:
             "analysis_id": self._document.id,
             "test_id": self._test_id,
             "steps_finished": [found.n for found in finished],
-            "steps": [found.plain() for found in finished],
+            "steps": [self._plain_of(found) for found in finished],
         }
         if self._failed:
             problems = {str(n): problem_of(self._failed[n]).plain() for n in sorted(self._failed)}
             found["steps_failed"] = problems
         job.result = found
         return found
+
+    def _plain_of(self, found: StepOutcome) -> dict[str, object]:
+        """Return a step's figures as plain values, made once: they are published anew after every step."""
+        known = self._plain.get(found.n)
+        if known is None or known[0] is not found:
+            self._plain[found.n] = known = found, found.plain()
+        return known[1]
 
     def _measure(self, job: Job) -> None:
         steps = self._document.steps

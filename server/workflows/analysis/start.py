@@ -11,7 +11,7 @@ from core.field.region.lay_points import make_grid
 from core.settings import AnalysisSettings, NoiseRecord, StoredSettings
 from server.base.models import Ids
 from server.compute.seeds import check_seeds
-from server.formats.calibrations.in_test import calibration_id_in, calibration_in
+from server.formats.calibrations.in_test import calibration_id_in
 from server.formats.files import sha256_of
 from server.formats.images import decode_mask, read_image
 from server.formats.noise_json import load_noise
@@ -19,9 +19,9 @@ from server.formats.version import software_version
 from server.jobs.idempotency import RequestMark
 from server.jobs.job import Job, Phase
 from server.results.images.projected_pattern import check_settings
-from server.results.staleness import stale_inputs
 from server.store.documents import AnalysisRecord
 from server.store.index import analysis_entry
+from server.workflows.analysis import checks
 from server.workflows.analysis.run import AnalysisRun, close
 from server.workflows.analysis.tasks import calibration_changed
 from server.workflows.camera_identity import check_same_cameras
@@ -76,14 +76,7 @@ def inputs_of(service: Service, test_id: str, steps: list[int], calibration: Pat
 
 def stale_reasons(service: Service, test_id: str, document: AnalysisRecord) -> list[str]:
     """Return what is gone or was replaced since an analysis was made; see :func:`stale_inputs`."""
-    test, inputs = service.tests.path(test_id), document.inputs
-    return stale_inputs(
-        test,
-        {int(n): hashes for n, hashes in inputs.steps.items()},
-        calibration=calibration_in(test, inputs.calibration_sha256),
-        calibration_sha256=inputs.calibration_sha256,
-        reference=document.steps[0],
-    )
+    return checks.stale_reasons(service.tests.path(test_id), document)
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from tests.support.tiny_rig import TINY
 DATA = "data"
 #: files that a running service keeps for itself; their loss costs nothing
 _OURS = ("service.lock", ".probe", ".exports")
+_READ_S = 60.0
 CATALOGS = ("as it was", "a request older", "torn", "gone")
 
 
@@ -164,7 +165,9 @@ def problems_of(state: State, data: Path, config: RigConfig) -> list[str]:
     try:
         with contextlib.ExitStack() as parts:
             service.open_data(parts)
-            listed = {key for _, key in service.catalog.request_keys()}
+            service.index.wait(_READ_S)
+            rows = service.catalog.transact(lambda c: c.execute("SELECT key FROM requests").fetchall())
+            listed = {key for (key,) in rows}
     except Exception as error:  # noqa: BLE001 - any is what is looked for
         return [f"the start failed: {error!r}"]
     finally:

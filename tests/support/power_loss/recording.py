@@ -149,7 +149,22 @@ class _Day:
         urls = [f"/noise/{noise}", f"/calibrations/{calibration}", *sorted(made, key=len, reverse=True)]
         for url in [urls[i] for i in self._order(urls)]:
             self._delete(url)
+
+    def stopped(self) -> None:
+        """Note an orderly stop; the catalogue is closed, and the mark that stands beside it names it as it is."""
+        key = f"catalog {len(self.recording.answers)}"
+        self.recording.journal.blobs[key] = (self.data / "catalog.sqlite").read_bytes()
+        self.recording.answers.append(
+            Answer("an orderly stop", len(self.recording.journal.changes), frozenset(self.keys), key)
+        )
+
+    def run_on(self) -> None:
+        """Do some more after the next start."""
+        self.answered("start after an orderly stop")
         self.ask("POST", f"/tests/{COPIED}/steps:import", files=self.plate_pair())
+        self.ask("PATCH", f"/tests/{COPIED}", json={"name": "copied and renamed"})
+        url = f"/tests/{self.ask('POST', '/tests', json={'name': 'two'})['id']}"
+        self.ask("POST", f"{url}/steps:import", files=self.plate_pair())
 
     def _order(self, urls: list[str]) -> list[int]:
         order = list(range(len(urls)))
@@ -225,7 +240,14 @@ def record(top: Path, pictures: Pictures, seed: int) -> Recording:
         service = Service(parse_config(_RIG), data, worker=ThreadWorker())  # type: ignore[arg-type] - as the service uses it
         with service, served(service) as client:
             wait_for_rig(client)
-            _Day(client, data, recording, pictures, seed).run()
+            day = _Day(client, data, recording, pictures, seed)
+            day.run()
+        day.stopped()
+        service = Service(parse_config(_RIG), data, worker=ThreadWorker())  # type: ignore[arg-type]
+        with service, served(service) as client:
+            wait_for_rig(client)
+            day.client = client
+            day.run_on()
     finally:
         journal.stop()
         server.formats.disk.disk = real

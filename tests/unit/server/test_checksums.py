@@ -12,7 +12,7 @@ from server.formats.noise_json import write_noise
 from server.store.calibrations import CalibrationStore
 from server.store.catalog import Catalog
 from server.store.folder import DataFolder
-from server.store.index import rebuild
+from server.store.indexing.build import rebuild
 from server.store.noise import NoiseStore
 from server.store.tests import TestStore
 from server.store.verify import verify

@@ -3,24 +3,38 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import islice
+from typing import Annotated
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Query, Request
 from fastapi.concurrency import run_in_threadpool
 
 from core.errors import InputError, RegionError
-from server.api.models import AnalysisAccepted, AnalysisList, AnalysisReply, AnalysisRequest, ContinueRequest, Region
+from server.api.models import (
+    AnalysisAccepted,
+    AnalysisList,
+    AnalysisReply,
+    AnalysisRequest,
+    AnalysisStepList,
+    ContinueRequest,
+    Region,
+)
 from server.api.models.recipes import WORKSPACE, recipe_in
 from server.api.protocol.attached import Wait, job_reply
 from server.api.protocol.dependencies import AnalysisId, KeyHeader, ServiceDep, TestId, mark
-from server.api.protocol.paging import PageDep
+from server.api.protocol.paging import FIGURES, WHOLE, PageDep
 from server.api.protocol.problems import errors
 from server.api.routes.tests.recipes import check_against_test
 from server.base.errors import NotFoundError
 from server.base.models import Ids, JobState
+from server.base.problem import JobProblem
 from server.jobs.idempotency import RequestMark
-from server.store.documents import Finished
+from server.store.documents import Finished, SummaryRecord
+from server.store.tests import MAX_STEPS
 from server.workflows.analysis import start as analysis_start
-from server.workflows.analysis.warnings import warnings_of, with_warnings
+from server.workflows.analysis.warnings import with_warnings
 from server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}/analyses", tags=["analyses"])
@@ -119,21 +133,26 @@ def mask_of(region: Region) -> bytes | None:
         ) from error
 
 
-def analysis_reply(service: Service, test_id: str, analysis_id: str) -> AnalysisReply:
-    """Return an analysis as the API shows it."""
-    document = service.tests.analysis(test_id, analysis_id)
+@dataclass(frozen=True)
+class _Course:
+    """Course of an analysis: its last job, and what became of its steps."""
+
+    job_id: str | None
+    state: JobState
+    problem: JobProblem | None
+    failed: Mapping[str, JobProblem]
+    summary: SummaryRecord | None
+
+
+def _course(service: Service, test_id: str, analysis_id: str) -> _Course:
     summary = service.tests.summary(test_id, analysis_id)
-    entries = service.catalog.entries("analysis", test_id)
-    job_id = next((e.get("job_id") for e in entries if e["id"] == analysis_id), None)
+    entry = service.catalog.entry("analysis", test_id, analysis_id) or {}
+    job_id = entry.get("job_id")
     state: JobState = "interrupted" if summary is None else summary.state
-    shown = None if summary is None else summary.plain()
     problem = None if summary is None else summary.problem
-    failed = {} if summary is None else summary.steps_failed
+    failed: Mapping[str, JobProblem] = {} if summary is None else summary.steps_failed
     if summary is None or (summary.job_id or job_id) != job_id:  # killed, or at work, perhaps once more
-        known = service.tests.step_summaries(test_id, analysis_id)
-        steps = [known[n].plain() for n in document.steps if n in known]
-        shown = {"analysis_id": analysis_id, "state": state, "job_id": job_id, "steps": steps} if steps else None
-        problem, failed = None, {}
+        summary, problem, failed = None, None, {}
     if job_id is not None:
         try:
             job = service.jobs.document(str(job_id))
@@ -141,36 +160,88 @@ def analysis_reply(service: Service, test_id: str, analysis_id: str) -> Analysis
             failed = failed or Finished.model_validate(job.result or {}).steps_failed
         except NotFoundError:
             job_id = None  # the catalogue was lost with its jobs; the files hold the rest
-    stale = analysis_start.stale_reasons(service, test_id, document)
+    return _Course(None if job_id is None else str(job_id), state, problem, failed, summary)
+
+
+def analysis_reply(service: Service, test_id: str, analysis_id: str) -> AnalysisReply:
+    """Return an analysis as the API shows it, with its first steps."""
+    document = service.tests.analysis(test_id, analysis_id)
+    course = _course(service, test_id, analysis_id)
+    first = document.steps[:WHOLE]
+    if course.summary is not None:
+        shown: dict[str, object] | None = course.summary.model_copy(
+            update={"steps": course.summary.steps[:FIGURES], "steps_failed": _first(course.summary.steps_failed)}
+        ).plain()
+    else:
+        known = service.tests.step_summaries(test_id, analysis_id, first[:FIGURES])
+        steps = [known[n].plain() for n in first[:FIGURES] if n in known]
+        about = {"analysis_id": analysis_id, "state": course.state, "job_id": course.job_id}
+        shown = {**about, "steps": steps} if steps else None
+    finished = service.tests.finished_steps(test_id, analysis_id)
+    checks = service.checks.of(test_id, analysis_id, course.failed)
+    inputs = document.inputs.model_copy(update={"steps": dict(islice(document.inputs.steps.items(), WHOLE))})
     reply = {
-        **document.shown(),
+        **document.model_copy(update={"steps": first, "inputs": inputs}).shown(),
         "calibration_sha256": document.inputs.calibration_sha256,
-        "state": state,
-        "job_id": job_id,
-        "problem": None if problem is None else problem.plain(),
-        "steps_finished": service.tests.finished_steps(test_id, analysis_id),
-        "steps_failed": {n: one.plain() for n, one in failed.items()},
+        "state": course.state,
+        "job_id": course.job_id,
+        "problem": None if course.problem is None else course.problem.plain(),
+        "n_steps": len(document.steps),
+        "n_finished": len(finished),
+        "n_failed": len(course.failed),
+        "steps_finished": finished[:WHOLE],
+        "steps_failed": {n: one.plain() for n, one in _first(course.failed).items()},
         "summary": shown,
-        "stale": bool(stale),
-        "stale_reasons": stale,
-        "warnings": warnings_of(service, test_id, analysis_id, stale=stale, failed=failed),
+        "stale": bool(checks.stale),
+        "stale_reasons": list(checks.stale[:WHOLE]),
+        "warnings": checks.plain_warnings(),
     }
     return AnalysisReply.model_validate(reply)
+
+
+def _first(failed: Mapping[str, JobProblem]) -> dict[str, JobProblem]:
+    return dict(islice(failed.items(), WHOLE))
 
 
 @router.get("", summary="A test's analyses, oldest first", responses=errors(404, 422))
 def list_analyses(service: ServiceDep, test_id: TestId, page: PageDep) -> AnalysisList:
     """Return the analyses of a test."""
     service.tests.path(test_id)
-    analyses_page = page.of(service.catalog.entries("analysis", test_id), lambda a: str(a["id"]))
+    rest = service.catalog.entries("analysis", test_id, after=page.after, limit=page.limit + 1)
+    analyses_page = page.cut(rest, lambda a: str(a["id"]))
     shown = with_warnings(service, test_id, analyses_page)
     return AnalysisList.model_validate({"analyses": shown, "next_cursor": page.next_cursor})
 
 
 @router.get("/{analysis_id:plain_id}", summary="One analysis", responses=errors(404))
 def get_analysis(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId) -> AnalysisReply:
-    """Return settings, state and summary."""
+    """Return settings, state and summary, with the first 100 steps; see `GET .../analyses/{analysis_id}/steps`."""
     return analysis_reply(service, test_id, analysis_id)
+
+
+@router.get("/{analysis_id}/steps", summary="An analysis' steps, in order", responses=errors(404, 422))
+def list_analysis_steps(
+    service: ServiceDep,
+    test_id: TestId,
+    analysis_id: AnalysisId,
+    page: PageDep,
+    figures: Annotated[bool, Query(description="With the figures of each step's field.")] = True,
+    first: Annotated[int, Query(ge=0, le=MAX_STEPS, description="Number of the first step in the answer.")] = 0,
+) -> AnalysisStepList:
+    """Return a page of the steps that an analysis measures, each with what became of it."""
+    document = service.tests.analysis(test_id, analysis_id)
+    failed = _course(service, test_id, analysis_id).failed
+    numbers = page.of(sorted(n for n in document.steps if n >= first), lambda n: f"{n:04d}")
+    finished = set(service.tests.finished_steps(test_id, analysis_id))
+    known = service.tests.step_summaries(test_id, analysis_id, numbers) if figures else {}
+    steps = []
+    for n in numbers:
+        state = "finished" if n in finished else "failed" if str(n) in failed else "waiting"
+        problem = failed[str(n)].plain() if state == "failed" else None
+        own = known[n].plain() if n in known else None
+        sha256 = document.inputs.steps.get(str(n))
+        steps.append({"n": n, "state": state, "problem": problem, "figures": own, "sha256": sha256})
+    return AnalysisStepList.model_validate({"steps": steps, "next_cursor": page.next_cursor})
 
 
 @router.post(

@@ -10,10 +10,10 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
-from server.api.models import JobList, JobReply
+from server.api.models import JobList, JobReply, JobStepList
 from server.api.protocol.attached import Wait, waited
 from server.api.protocol.dependencies import JobId, ServiceDep
-from server.api.protocol.paging import ShortPageDep
+from server.api.protocol.paging import WHOLE, PageDep, ShortPageDep
 from server.api.protocol.problems import errors
 from server.api.routes.service.system import EventStream, LastEventId
 from server.base.errors import NotFoundError
@@ -23,6 +23,8 @@ from server.jobs.job import FINAL
 from server.store.documents import JobRecord
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
+#: of each list in the result of a job that is listed with others
+LISTED = 5
 
 
 def known_job(service: ServiceDep, job_id: JobId) -> JobRecord:
@@ -34,14 +36,29 @@ def known_job(service: ServiceDep, job_id: JobId) -> JobRecord:
 def list_jobs(service: ServiceDep, page: ShortPageDep) -> JobList:
     """Return a page of the jobs of this and earlier runs of the service."""
     jobs = page.cut(service.jobs.documents(page.limit + 1, before=page.after), lambda j: j.id)
-    return JobList.model_validate({"jobs": [job.plain() for job in jobs], "next_cursor": page.next_cursor})
+    return JobList.model_validate(
+        {"jobs": [job.bounded(LISTED).plain() for job in jobs], "next_cursor": page.next_cursor}
+    )
 
 
 @router.get("/{job_id:plain_id}", summary="One job", responses=errors(404, 422))
 async def get_job(request: Request, service: ServiceDep, job_id: JobId, wait: Wait = 0.0) -> JobReply:
     """Return state, progress, and result or problem; with `wait`, once the job has ended or that time is over."""
     await waited(request, service, job_id, wait)
-    return JobReply.model_validate((await run_in_threadpool(service.jobs.document, job_id)).plain())
+    return JobReply.model_validate((await run_in_threadpool(service.jobs.document, job_id)).bounded(WHOLE).plain())
+
+
+@router.get("/{job_id}/steps", summary="The steps that a job has taken", responses=errors(404, 422))
+def job_steps(service: ServiceDep, job_id: JobId, page: PageDep) -> JobStepList:
+    """Return the steps in a job's `result`, in order of their numbers; the job's document holds the first 100.
+
+    An analysis has its steps, with what became of each, at `GET /tests/{id}/analyses/{analysis_id}/steps`.
+    """
+    result = service.jobs.document(job_id).result or {}
+    found = result.get("steps")
+    steps = [one for one in found if isinstance(one, dict)] if isinstance(found, list) else []
+    steps = page.of(steps, lambda one: f"{one['n']:04d}")
+    return JobStepList.model_validate({"steps": steps, "next_cursor": page.next_cursor})
 
 
 @router.post("/{job_id}:cancel", summary="Cancel a job", status_code=202, responses=errors(404, 409, 422))
@@ -51,7 +68,7 @@ async def cancel_job(request: Request, service: ServiceDep, job_id: JobId, wait:
     if wait:
         await waited(request, service, job_id, wait)
         cancelled = service.jobs.document(job_id)
-    return JobReply.model_validate(cancelled.plain())
+    return JobReply.model_validate(cancelled.bounded(WHOLE).plain())
 
 
 @router.get(
@@ -91,7 +108,7 @@ async def job_events(
     def shown() -> ServerSentEvent:
         # the number first: what happens meanwhile is sent twice rather than not at all
         number = hub.last_number
-        return ServerSentEvent(data=service.jobs.document(job_id).plain(), event="job", id=str(number))
+        return ServerSentEvent(data=service.jobs.document(job_id).bounded(WHOLE).plain(), event="job", id=str(number))
 
     if last_event_id is None:
         begin = shown()

@@ -40,6 +40,11 @@ class HealthReply(BaseModel):
         description="`ok`: cameras and stage are open; `fault`: the reason is in GET /rig."
     )
     worker: Literal["ready", "starting"] = Field(description="`ready` to compute, or still `starting`.")
+    tests_to_read: int = Field(
+        0,
+        description="Tests that are still to be read into the catalogue, after a start that no clean stop came before; "
+        "one that is asked for is read at once.",
+    )
 
 
 @router.get("/healthz", summary="Liveness")
@@ -51,6 +56,7 @@ def healthz(service: ServiceDep) -> HealthReply:
             "version": software_version(),
             "uptime_s": round(time.monotonic() - service.started_monotonic, 1),
             "rig": "fault" if service.rig.fault else "ok",
+            "tests_to_read": service.index.waiting(),
             "worker": "ready" if service.worker.ready.is_set() else "starting",
         }
     )

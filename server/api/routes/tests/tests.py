@@ -30,7 +30,7 @@ from server.api.models import (
 from server.api.protocol.attached import Attached, Wait, job_reply
 from server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
 from server.api.protocol.dependencies import Camera, KeyHeader, ServiceDep, StepNumber, TestId, get_service, mark
-from server.api.protocol.paging import PageDep
+from server.api.protocol.paging import WHOLE, PageDep, cursor_of
 from server.api.protocol.problems import errors
 from server.base.models import FormNumber, Ids
 from server.formats.images import read_image
@@ -49,9 +49,14 @@ _CHANNELS: TypeAdapter[dict[str, float]] = TypeAdapter(Channels)
 
 
 def _reply(service: Service, test_id: str) -> dict[str, object]:
+    steps = service.catalog.entries("step", test_id, limit=WHOLE)
+    n_steps = len(steps) if len(steps) < WHOLE else service.catalog.count_entries("step", test_id)
     return {
         **service.tests.read(test_id).shown(),
-        "steps": service.catalog.entries("step", test_id),
+        "n_steps": n_steps,
+        "steps": steps,
+        "steps_next_cursor": None if n_steps <= WHOLE else cursor_of(f"{steps[-1]['n']:04d}"),
+        "newest_step": service.catalog.last_entry("step", test_id),
         "incomplete_steps": service.tests.incomplete_steps(test_id),
         "analyses": service.catalog.entries("analysis", test_id),
     }
@@ -77,14 +82,16 @@ def create_test(service: ServiceDep, body: TestRequest, key: KeyHeader = None) -
 @router.get("", summary="Tests, oldest first", responses=errors(422))
 def list_tests(service: ServiceDep, page: PageDep) -> TestList:
     """Return a page of the tests."""
-    return TestList.model_validate(
-        {"tests": page.of(service.catalog.entries("test"), lambda t: str(t["id"])), "next_cursor": page.next_cursor}
-    )
+    rest = service.catalog.entries("test", after=page.after, limit=page.limit + 1)
+    return TestList.model_validate({"tests": page.cut(rest, lambda t: str(t["id"])), "next_cursor": page.next_cursor})
 
 
 @router.get("/{test_id:plain_id}", summary="One test", responses=errors(404))
 def get_test(service: ServiceDep, test_id: TestId, response: Response) -> TestReply:
-    """Return a test with its steps and analyses; the header ETag names this state of it."""
+    """Return a test with its analyses and its first 100 steps; the header ETag names this state of it.
+
+    `n_steps` says how many there are; the others come from `GET /tests/{id}/steps`, beginning with `steps_next_cursor`.
+    """
     return _shown(service, test_id, tagged(response, _reply(service, test_id)))
 
 
@@ -247,7 +254,8 @@ def import_images(
 def list_steps(service: ServiceDep, test_id: TestId, page: PageDep) -> StepList:
     """Return the complete steps."""
     service.tests.path(test_id)
-    steps = page.of(service.catalog.entries("step", test_id), lambda s: f"{s['n']:04d}")
+    rest = service.catalog.entries("step", test_id, after=page.after, limit=page.limit + 1)
+    steps = page.cut(rest, lambda s: f"{s['n']:04d}")
     return StepList.model_validate({"steps": steps, "next_cursor": page.next_cursor})
 
 

@@ -57,7 +57,7 @@ export function about(screen) {
         ["Strain noise floor", (one) => quantity(one.strain?.noise_floor_microstrain?.exx, "µm/m", 3), { numeric: true }],
         ["Patch", (one) => h("span", { title: one.patch?.reason ?? "" }, one.patch?.patch ?? "–")],
         ["Time", (one) => quantity(one.wall_s, "s", 3), { numeric: true }],
-      ], steps, { caption: `Summary of each step; σ are medians of the reported standard uncertainties (k = 1)${steps.some((one) => !one.sigma_calibration_median_mm) ? `, ${NOT_INCLUDED}` : ""}`, empty: "No step is finished yet." }),
+      ], steps, { caption: `Summary of ${(analysis.n_finished ?? 0) > steps.length ? `the first ${steps.length} steps of ${count(analysis.n_finished)}` : "each step"}; σ are medians of the reported standard uncertainties (k = 1)${steps.some((one) => !one.sigma_calibration_median_mm) ? `, ${NOT_INCLUDED}` : ""}`, empty: "No step is finished yet." }),
       definitions(steps.length ? [["epipolar check of the last step", steps.at(-1)?.epipolar_check?.reason ?? "–"], ["cameras at the last step", steps.at(-1)?.camera_motion?.text ?? "–"], ["patch of the last step", steps.at(-1)?.patch?.reason ?? "–"]] : []));
   }
   draw();

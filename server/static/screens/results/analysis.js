@@ -1,5 +1,6 @@
 // One analysis' results: answers are cached, so that stepping and playing request each once.
 import * as api from "../../lib/api.js";
+import { figuresOf, readAnalysis, readTest } from "../../lib/steps.js";
 import { Grid } from "../../lib/point_grid.js";
 import { axesOf } from "../../widgets/triad.js";
 
@@ -47,6 +48,15 @@ export function groupOf(name) {
 }
 
 export class Result {
+  /** @type {Model<"AnalysisReply"> | null} */
+  #sortedOf = null;
+  /** @type {number[]} */
+  #sorted = [];
+  /** @type {Model<"TestReply"> | null} */
+  #entriesOf = null;
+  /** @type {Map<number, Model<"StepEntry">>} */
+  #entries = new Map();
+
   /**
    * @param {Model<"TestReply">} test
    * @param {Model<"AnalysisReply">} analysis
@@ -97,7 +107,7 @@ export class Result {
    * @param {string} analysisId
    */
   static #read(testId, analysisId) {
-    return Promise.all([api.get(`/tests/${testId}`), api.get(`/tests/${testId}/analyses/${analysisId}`)]);
+    return Promise.all([readTest(testId), readAnalysis(testId, analysisId)]);
   }
 
   async refresh() {
@@ -110,7 +120,33 @@ export class Result {
 
   /** Steps that are finished, in their order. */
   get steps() {
-    return this.analysis.steps_finished.toSorted((a, b) => a - b);
+    if (this.#sortedOf !== this.analysis) {
+      this.#sortedOf = this.analysis;
+      this.#sorted = this.analysis.steps_finished.toSorted((a, b) => a - b);
+    }
+    return this.#sorted;
+  }
+
+  /**
+   * A step's entry in its test's list.
+   * @param {number} n
+   */
+  entry(n) {
+    if (this.#entriesOf !== this.test) {
+      this.#entriesOf = this.test;
+      this.#entries = new Map((this.test.steps ?? []).map((one) => [one.n, one]));
+    }
+    return this.#entries.get(n);
+  }
+
+  /**
+   * Figures of a step's field, where it is finished.
+   * @param {number} n
+   */
+  async figures(n) {
+    const known = this.analysis.summary?.steps?.find((one) => one.n === n);
+    if (known || (this.analysis.n_finished ?? 0) <= (this.analysis.summary?.steps?.length ?? 0)) return known;
+    return this.#keep(`${n} figures`, async () => /** @type {object} */ ((await figuresOf(this.testId, this.analysisId, n)) ?? {}));
   }
 
   get reference() {
@@ -122,7 +158,7 @@ export class Result {
    * @param {number} n
    */
   stepText(n) {
-    const step = (this.test.steps ?? []).find((one) => one.n === n);
+    const step = this.entry(n);
     return `step ${n}${step?.label ? `: ${step.label}` : ""}${n === this.reference ? " (reference)" : ""}`;
   }
 

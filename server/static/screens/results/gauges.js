@@ -352,7 +352,7 @@ export function gauges(screen) {
     const name = what.value;
     const steps = answers.extensometer.filter((one) => !one.problem);
     const start = isRelative(name) ? result.reference : null; // where it is zero, though nothing was measured there
-    const label = (result.test.steps ?? []).find((one) => one.n === start)?.label ?? "";
+    const label = (start === null ? undefined : result.entry(start))?.label ?? "";
     const rows = [...(start === null || steps.some((one) => one.n === start) ? [] : [{ n: start, label, extensometers: [] }]), ...steps]
       .map((one) => ({ n: one.n, label: one.label, x: against.at(one.n) ?? NaN, each: one.extensometers ?? [] })).filter((one) => Number.isFinite(one.x)).sort((p, q) => p.x - q.x);
     const strain = name.endsWith("strain");

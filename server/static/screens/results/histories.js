@@ -55,7 +55,7 @@ export function abscissas(result) {
    * @returns {number | null}
    */
   function at(n) {
-    const listed = (/** @type {number} */ k) => (result.test.steps ?? []).find((one) => one.n === k);
+    const listed = (/** @type {number} */ k) => result.entry(k);
     const step = listed(n);
     const time = (/** @type {typeof step} */ one) => Date.parse(one?.timestamp_utc ?? one?.captured_utc ?? "");
     if (choice.value === "n") return n;

@@ -8,7 +8,7 @@ import { h, badge, STATE_KIND } from "../../lib/dom.js";
 const WORDS = {
   epipolar_check_failed: "epipolar check failed", epipolar_check_warning: "epipolar check warns", cameras_off_zero: "cameras off their place", low_coverage: "few points have values",
   calibration_discarded: "calibration discarded", calibration_failed: "calibration failed its checks", calibration_warning: "calibration warns", camera_moved: "a camera moved",
-  steps_failed: "some steps failed", image_quality: "poor images", out_of_date: "out of date",
+  steps_failed: "some steps failed", image_quality: "poor images", out_of_date: "out of date", not_checked_yet: "being checked",
 };
 const word = (/** @type {Warning} */ one) => WORDS[one.code] ?? one.code.replace(/_/g, " ");
 

@@ -17,6 +17,8 @@ import { h, replace, svg, field, number, select, action, table, badge, num, coun
 /** @typedef {Model<"Recipe">} Recipe */
 /** @typedef {Model<"TestReply">} Test */
 
+/** A list to choose from is no place for thousands of steps: the first ones can be the reference, or the one that is. */
+const MOST_REFERENCES = 200;
 /** @type {Record<string, string>} */
 const LEVEL = { good: "good", usable: "warn", poor: "bad" };
 
@@ -337,7 +339,7 @@ export async function measurePanel(id, test, ends, done) {
       steps() {
         const kept = String(chosen ?? reference.value);
         chosen = undefined;
-        replace(reference, (test.steps ?? []).map((one) => h("option", { value: one.n, selected: String(one.n) === kept }, `${one.n} ${one.label ?? ""}`)));
+        replace(reference, (test.steps ?? []).filter((one, k) => k < MOST_REFERENCES || String(one.n) === kept).map((one) => h("option", { value: one.n, selected: String(one.n) === kept }, `${one.n} ${one.label ?? ""}`)));
         if (reference.selectedIndex < 0) reference.selectedIndex = 0;
         showReference();
       },

@@ -3,6 +3,7 @@ import * as api from "../../lib/api.js";
 import { livePanel } from "./live.js";
 import { allRight, numberWithin, rule } from "../../lib/fields.js";
 import { backToZero } from "../../widgets/way_back.js";
+import { windowOfList } from "../../widgets/window_of_list.js";
 import { h, replace, field, number, action, table, badge, num, quantity, when, notify, problemText, ask } from "../../lib/dom.js";
 
 /** @import { Ends } from "#dom" */
@@ -23,6 +24,8 @@ const WORDS = { ok: "good", dark: "too dark", blurred: "blurred", low_texture: "
  */
 export async function stepsPanel(id, test, ends, reread) {
   const thumbs = h("div.thumbs", { "data-role": "thumbnails", style: { maxHeight: "22rem", overflow: "auto" }, tabindex: 0, role: "region", "aria-label": "Thumbnails" });
+  const incomplete = h("div");
+  const part = windowOfList(thumbs, thumbnail, { what: "step", name: (/** @type {Model<"StepEntry">} */ step) => step.n });
   const detail = h("div", { role: "status", "data-role": "quality" });
   /** @type {number | null} */
   let chosen = null;
@@ -37,15 +40,17 @@ export async function stepsPanel(id, test, ends, reread) {
 
   function draw() {
     const steps = test.steps ?? [];
-    if (!steps.length) {
-      replace(thumbs, h("p.quiet", "No steps yet. The first one is the reference: capture it with the specimen unloaded, or import pairs."));
-      return;
-    }
-    replace(thumbs, steps.map((step) => h("figure", { "data-step": step.n },
+    part.lay(steps);
+    if (!steps.length) replace(thumbs, h("p.quiet", "No steps yet. The first one is the reference: capture it with the specimen unloaded, or import pairs."));
+    replace(incomplete, test.incomplete_steps?.length ? h("p.quiet", `Incomplete: ${test.incomplete_steps.join(", ")}.`) : null);
+  }
+
+  /** @param {Model<"StepEntry">} step */
+  function thumbnail(step) {
+    return h("figure", { "data-step": step.n },
       h("button.plain", { type: "button", style: { padding: 0, display: "block", width: "100%" }, "aria-pressed": String(step.n === chosen), "aria-label": `Step ${step.n}${step.label ? `, ${step.label}` : ""}`, onclick: () => show(step.n).catch(notify) },
         h("img", { loading: "lazy", alt: "", width: 132, src: api.address(`/tests/${id}/steps/${step.n}/cam1/preview`, { width_px: 132 }) })),
-      h("figcaption", h("strong", `${step.n}`), ` ${step.label ?? ""} `, step.load_n !== null && step.load_n !== undefined ? `${quantity(step.load_n, "N", 4)} ` : "", step.quality && step.quality !== "ok" ? badge(WORDS[step.quality] ?? step.quality, KIND[step.quality] ?? "warn") : null))),
-    test.incomplete_steps?.length ? h("p.quiet", `Incomplete: ${test.incomplete_steps.join(", ")}.`) : null);
+      h("figcaption", h("strong", `${step.n}`), ` ${step.label ?? ""} `, step.load_n !== null && step.load_n !== undefined ? `${quantity(step.load_n, "N", 4)} ` : "", step.quality && step.quality !== "ok" ? badge(WORDS[step.quality] ?? step.quality, KIND[step.quality] ?? "warn") : null));
   }
 
   /** @param {number} n */
@@ -93,7 +98,7 @@ export async function stepsPanel(id, test, ends, reread) {
 
   const live = await livePanel(ends); // before anything is shown: it would push the region away from under a drawing hand
   const root = h("section.panel", { "aria-label": "Steps" }, h("h2", "Steps"),
-    h("div.grid.side", h("div", live.root, thumbs, detail, importPairs(id, refresh, ends)), capture(id, async (step) => { chosen = step.n; drawDetail(step); await refresh(); }, ends, refresh)));
+    h("div.grid.side", h("div", live.root, part.bar, thumbs, incomplete, detail, importPairs(id, refresh, ends)), capture(id, async (step) => { chosen = step.n; drawDetail(step); await refresh(); }, ends, refresh)));
   draw();
   return { root, refresh, onchange: (/** @type {typeof changed} */ listener) => { changed = listener; } };
 }

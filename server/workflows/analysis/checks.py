@@ -1,0 +1,168 @@
+"""What must be known before an analysis' results are used, kept from one question to the next for those of many steps.
+
+Of an analysis of few steps it is found anew with every question. Of one of many, which takes a second for some thousand
+steps, it is found beside the requests; until it is known for the first time, a warning says so.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import threading
+import time
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from core.errors import StereorigError
+from server.base.problem import JobProblem
+from server.formats.calibrations.in_test import calibration_in
+from server.results.staleness import stale_inputs
+from server.results.warnings.analysis import ResultWarning, analysis_warnings
+from server.store.documents import AnalysisRecord
+from server.store.tests import TestStore
+
+_log = logging.getLogger("stereorig.service")
+#: an ``analysis.json`` of more bytes is of many steps: each takes some 190
+_MANY_BYTES = 8_000
+#: for the first answer, and for one that replaces an earlier one
+_WAIT_FIRST_S, _WAIT_S = 0.25, 0.02
+#: files may be replaced in place, which no folder's time shows
+_FRESH_S = 30.0
+#: share of a processor that the checks may take
+_SHARE = 0.2
+
+
+@dataclass(frozen=True)
+class Checks:
+    """Findings about an analysis.
+
+    Attributes
+    ----------
+    stale
+        Inputs that are gone or were replaced since.
+    warnings
+        Failed checks first.
+    """
+
+    stale: tuple[str, ...]
+    warnings: tuple[ResultWarning, ...]
+
+    def plain_warnings(self) -> list[dict[str, object]]:
+        """Return the warnings as plain values."""
+        return [one.plain() for one in self.warnings]
+
+
+@dataclass
+class _Kept:
+    mark: object = None
+    checks: Checks | None = None
+    at: float = 0.0
+    took_s: float = 0.0
+    running: Future[None] | None = field(default=None, repr=False)
+
+
+class AnalysisChecks:
+    """Checks of the analyses of one service."""
+
+    def __init__(self, tests: TestStore) -> None:
+        self._tests = tests
+        self._lock = threading.Lock()
+        self._kept: dict[tuple[str, str, bool], _Kept] = {}
+        self._beside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="checks")
+
+    def close(self) -> None:
+        """End what runs beside."""
+        self._beside.shutdown(wait=False, cancel_futures=True)
+
+    def of(self, test_id: str, analysis_id: str, failed: Mapping[str, JobProblem] | None = None) -> Checks:
+        """Return what is known of an analysis.
+
+        Parameters
+        ----------
+        failed
+            Steps that could not be measured, where more is known than ``summary.json`` has.
+
+        Raises
+        ------
+        FileFormatError, NotFoundError
+            Of an analysis of few steps that is not there, or cannot be read.
+        """
+        folder = self._tests.analysis_path(test_id, analysis_id)
+        problems = None if failed is None else {n: one.plain() for n, one in failed.items()}
+        if (folder / "analysis.json").stat().st_size <= _MANY_BYTES:
+            return self._find(test_id, analysis_id, problems)
+        mark = self._mark(test_id, folder, problems)
+        with self._lock:
+            kept = self._kept.setdefault((test_id, analysis_id, problems is None), _Kept())
+            age_s = time.monotonic() - kept.at
+            current = kept.checks is not None and kept.mark == mark and age_s < _FRESH_S
+            rested = kept.checks is None or age_s > kept.took_s / _SHARE
+            if not current and rested and kept.running is None:
+                kept.running = self._beside.submit(self._renew, kept, test_id, analysis_id, problems, mark)
+            running = kept.running if kept.mark != mark else None
+        if running is not None:
+            with contextlib.suppress(TimeoutError):
+                running.result(timeout=_WAIT_FIRST_S if kept.checks is None else _WAIT_S)
+        return kept.checks or _NOT_YET
+
+    def _renew(
+        self, kept: _Kept, test_id: str, analysis_id: str, problems: Mapping[str, object] | None, mark: object
+    ) -> None:
+        began = time.monotonic()
+        found: Checks | None = None
+        try:
+            found = self._find(test_id, analysis_id, problems)
+        except (StereorigError, OSError) as error:
+            _log.info("analysis %s cannot be checked: %s", analysis_id, error)
+        finally:
+            with self._lock:
+                kept.running, kept.at, kept.took_s = None, time.monotonic(), time.monotonic() - began
+                kept.mark, kept.checks = mark, found or Checks((), ())
+
+    def _mark(self, test_id: str, folder: Path, problems: Mapping[str, object] | None) -> object:
+        """Return something cheap that differs whenever the checks may find something else."""
+        test = folder.parent.parent
+        places = (folder, folder / "analysis.json", folder / "summary.json", test / "test.json")
+        return (*map(_changed_ns, places), self._tests.steps_mark(test_id), tuple(problems or ()))
+
+    def _find(self, test_id: str, analysis_id: str, problems: Mapping[str, object] | None) -> Checks:
+        test = self._tests.path(test_id)
+        document = self._tests.analysis(test_id, analysis_id)
+        stale = stale_reasons(test, document)
+        folder = self._tests.analysis_path(test_id, analysis_id)
+        return Checks(tuple(stale), tuple(analysis_warnings(folder, stale=stale, failed=problems)))
+
+
+def stale_reasons(test: Path, document: AnalysisRecord) -> list[str]:
+    """Return what is gone or was replaced since an analysis was made; see :func:`stale_inputs`."""
+    inputs = document.inputs
+    return stale_inputs(
+        test,
+        {int(n): hashes for n, hashes in inputs.steps.items()},
+        calibration=calibration_in(test, inputs.calibration_sha256),
+        calibration_sha256=inputs.calibration_sha256,
+        reference=document.steps[0],
+    )
+
+
+def _changed_ns(path: Path) -> int:
+    try:
+        return os.stat(path).st_mtime_ns  # noqa: PTH116
+    except OSError:
+        return 0
+
+
+_NOT_YET = Checks(
+    (),
+    (
+        ResultWarning(
+            "not_checked_yet",
+            "warning",
+            "The checks of its steps are being made.",
+            "Read it again in some seconds, before its results are used.",
+        ),
+    ),
+)
