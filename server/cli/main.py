@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from core.errors import Cancelled, StereorigError
+from server.base.library_threads import one_library_thread
 from server.formats.version import software_version
 
 # name -> (module, one-line help); each module has add_arguments(parser) and run(args) -> int,
@@ -42,6 +43,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "export": ("server.cli.measurement.export", "results as NetCDF, CSV, VTU, MATLAB, HDF5, figures and films"),
 }
 
+#: commands that measure: their libraries compute on one thread each
+_MANY_SMALL = ("measure", "reproduce")
 _NEGATIVE_LIST = re.compile(r"-[\d.]+(e[-+]?\d+)?,")
 
 
@@ -72,6 +75,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, (module, text) in COMMANDS.items():
         sub = subparsers.add_parser(name, help=text, description=text)
         if arguments and arguments[0] == name:
+            if name in _MANY_SMALL:
+                one_library_thread()
             command = importlib.import_module(module)
             command.add_arguments(sub)
             sub.set_defaults(run=command.run)

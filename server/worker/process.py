@@ -23,6 +23,7 @@ from typing import Any
 
 from core.compiling import COMPILING, report_compiling
 from core.errors import Cancelled
+from server.base.library_threads import one_library_thread
 from server.base.memory import settle
 from server.base.priority import end_with_parent, lower_worker
 
@@ -60,8 +61,7 @@ def current_task() -> TaskChannel:
 
 def pin_threads(threads: int) -> None:
     """Set the thread counts of every numerical library; before they are imported."""
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = "1"
+    one_library_thread(asked=False)
     os.environ["NUMBA_NUM_THREADS"] = str(threads)
 
 
