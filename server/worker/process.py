@@ -32,12 +32,21 @@ _current: TaskChannel | None = None
 
 
 class TaskChannel:
-    """A running task's way back to whoever asked for it: progress out, cancellation in."""
+    """A running task's way back to whoever asked for it: progress out, cancellation in.
 
-    def __init__(self, send: Callable[[tuple[Any, ...]], None], task_id: int, cancel: Event | None) -> None:
+    Attributes
+    ----------
+    keeps_going
+        True where the next task comes to this process too, so that it can be begun before it is asked for.
+    """
+
+    def __init__(
+        self, send: Callable[[tuple[Any, ...]], None], task_id: int, cancel: Event | None, *, keeps_going: bool = False
+    ) -> None:
         self._send = send
         self._task_id = task_id
         self._cancel = cancel
+        self.keeps_going = keeps_going
 
     @property
     def cancelled(self) -> bool:
@@ -118,7 +127,7 @@ def serve(
             task_id, function, args, kwargs = connection.recv()
         except (EOFError, OSError):
             return  # the service is gone
-        _current = channel = TaskChannel(send, task_id, cancel)
+        _current = channel = TaskChannel(send, task_id, cancel, keeps_going=True)
         try:
             with report_compiling(lambda channel=channel: channel.progress(COMPILING, 0, 1)):  # type: ignore[misc]
                 result = function(*args, **kwargs)
