@@ -14,11 +14,12 @@ from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
 from core.matching.geometry import tangent_frames
 from core.strain.arcs import missed_slope
+from core.strain.common_part import common_part
 from core.strain.one_sided import OnSurface, raise_order
 from core.strain.options import StrainOptions
 from core.strain.result import StrainField, StrainStatus
 from core.strain.tensors import strain_of, strain_of_stretch, strain_slopes
-from core.strain.window import Slopes, slopes_of, window_slopes
+from core.strain.window import Slopes, window_slopes
 
 
 def surface_strain(field: Field, options: StrainOptions | None = None, *, subset_px: int) -> StrainField:
@@ -98,15 +99,13 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
 def _common_part(field: Field, slopes: Slopes, surface: OnSurface, options: StrainOptions) -> Float:
     """(n, 3, k) common factor of the strain: that of the points through the windows' weights."""
     assert field.common is not None
-    k, good = field.common.shape[-1], slopes.status == StrainStatus.OK
+    good = slopes.status == StrainStatus.OK
     by_slope = np.zeros((*field.shape, 3, 12), np.float32)
     by_slope[good] = strain_slopes(
         surface.frame, surface.gradient, options.tensor, surface.per_mm, surface.strain
     ).reshape(-1, 3, 12)
-    out = np.empty((*field.shape, 3, k))
-    for at, moved in slopes_of(field.common.reshape(*field.shape, 6 * k), field.valid, slopes, options.window // 2):
-        out[at] = by_slope[at] @ moved.reshape(*moved.shape[:-2], 12, k)
-    return np.asarray(out[good])
+    part = common_part(field.common, field.valid, slopes, by_slope, options.window // 2)
+    return np.asarray(part[good], dtype=np.float64)
 
 
 def surface_slopes(

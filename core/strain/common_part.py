@@ -1,0 +1,121 @@
+"""The common factor of a strain: that of the points through the weights of the windows, compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arrays import Bool, Float, Float32
+from core.field.region.window import window_offsets
+from core.matching.kernels.naming import entry, inner
+from core.strain.result import StrainStatus
+from core.strain.window import Slopes
+
+
+@inner
+def _through(slopes, by_slope, out):
+    """Strain's rows ``out`` (3, k) of slopes (2, 6 k) and the strain's derivatives over them (3, 12)."""
+    k = out.shape[1]
+    for i in range(3):
+        for j in range(k):
+            out[i, j] = 0.0
+        for a in range(2):
+            for q in range(6):
+                d = by_slope[i, 6 * a + q]
+                for j in range(k):
+                    out[i, j] += d * slopes[a, q * k + j]
+
+
+@entry
+def _whole(padded, by_slope, good, half, out):
+    """Rows ``out`` (r, c, 3, k) of points ``good`` as if all windows were whole; ``padded`` (r + 2 half, ..., 6 k)."""
+    rows, cols = good.shape
+    m = padded.shape[2]
+    even, line = np.empty((cols + 2 * half, m), np.float32), np.empty((cols + 2 * half, m), np.float32)
+    slopes = np.empty((2, m), np.float32)
+    squares = 0
+    for k in range(-half, half + 1):
+        squares += k * k
+    scale = np.float32(1.0 / (squares * (2 * half + 1)))
+    for r in range(rows):
+        for c in range(cols + 2 * half):
+            for j in range(m):
+                even[c, j] = padded[r + half, c, j]
+                line[c, j] = 0.0
+            for k in range(1, half + 1):
+                far = np.float32(k)
+                for j in range(m):
+                    ahead, behind = padded[r + half + k, c, j], padded[r + half - k, c, j]
+                    even[c, j] += ahead + behind
+                    line[c, j] += far * (ahead - behind)
+        for c in range(cols):
+            if not good[r, c]:
+                continue
+            for j in range(m):
+                slopes[0, j] = 0.0
+                slopes[1, j] = line[c + half, j]
+            for k in range(1, half + 1):
+                far = np.float32(k)
+                for j in range(m):
+                    slopes[0, j] += far * (even[c + half + k, j] - even[c + half - k, j])
+                    slopes[1, j] += line[c + half + k, j] + line[c + half - k, j]
+            for j in range(m):
+                slopes[0, j] *= scale
+                slopes[1, j] *= scale
+            _through(slopes, by_slope[r, c], out[r, c])
+
+
+@entry
+def _reduced(padded, by_slope, at_rows, at_cols, weights, offsets, half, out):
+    """The same of windows at (n,) rows and columns with weights (n, 2, points) of their own."""
+    m = padded.shape[2]
+    slopes = np.empty((2, m), np.float32)
+    for w in range(len(at_rows)):
+        r, c = at_rows[w], at_cols[w]
+        slopes[:] = 0.0
+        for p in range(len(offsets)):
+            along, down = np.float32(weights[w, 0, p]), np.float32(weights[w, 1, p])
+            if along == 0.0 and down == 0.0:
+                continue
+            point = padded[r + half + offsets[p, 0], c + half + offsets[p, 1]]
+            for j in range(m):
+                slopes[0, j] += along * point[j]
+                slopes[1, j] += down * point[j]
+        _through(slopes, by_slope[r, c], out[r, c])
+
+
+def common_part(factor: Float, valid: Bool, slopes: Slopes, by_slope: Float, half: int) -> Float32:
+    """Return the common factor (r, c, 3, k) of the strain; values of points whose status is not ``OK`` are undefined.
+
+    In single precision, as files hold it.
+
+    Parameters
+    ----------
+    factor
+        (r, c, 6, k) of the points.
+    valid
+        (r, c) True where there are values.
+    slopes
+        The windows' fits.
+    by_slope
+        (r, c, 3, 12) derivatives of exx, eyy, exy over the slopes of X Y Z U V W over column, then over row.
+    half
+        Points to each side of a window's middle.
+    """
+    rows, cols, _, k = factor.shape
+    padded = np.zeros((rows + 2 * half, cols + 2 * half, 6 * k), np.float32)
+    inner_part = padded[half : half + rows, half : half + cols]
+    inner_part[...] = factor.reshape(rows, cols, 6 * k)
+    if not valid.all():
+        inner_part[~valid] = 0.0
+    whole = slopes.status == StrainStatus.OK
+    for r, c, _ in slopes.reduced:
+        whole[r, c] = False
+    by_slope = np.ascontiguousarray(by_slope, dtype=np.float32)
+    out = np.zeros((rows, cols, 3, k), np.float32)
+    _whole(padded, by_slope, whole, half, out)
+    offsets: NDArray[np.int64] = np.ascontiguousarray(window_offsets(half)[0], dtype=np.int64)
+    for r, c, weights in slopes.reduced:
+        at = np.ascontiguousarray(r, dtype=np.int64), np.ascontiguousarray(c, dtype=np.int64)
+        _reduced(padded, by_slope, *at, np.ascontiguousarray(weights, dtype=np.float64), offsets, half, out)
+    return out
