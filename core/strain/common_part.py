@@ -27,38 +27,36 @@ def _through(slopes, by_slope, out):
 
 
 @entry
-def _whole(padded, by_slope, good, half, out):
-    """Rows ``out`` (r, c, 3, k) of points ``good`` as if all windows were whole; ``padded`` (r + 2 half, ..., 6 k)."""
-    rows, cols = good.shape
-    m = padded.shape[2]
-    even, line = np.empty((cols + 2 * half, m), np.float32), np.empty((cols + 2 * half, m), np.float32)
+def _whole(factor, valid, by_slope, good, half, out):
+    """Rows ``out`` (r, c, 3, k) of points ``good`` as if all windows were whole; ``factor`` (r, c, 6 k)."""
+    rows, cols, m = factor.shape
+    even, line = np.empty((cols, m), np.float32), np.empty((cols, m), np.float32)
     slopes = np.empty((2, m), np.float32)
     squares = 0
     for k in range(-half, half + 1):
         squares += k * k
     scale = np.float32(1.0 / (squares * (2 * half + 1)))
-    for r in range(rows):
-        for c in range(cols + 2 * half):
-            for j in range(m):
-                even[c, j] = padded[r + half, c, j]
-                line[c, j] = 0.0
-            for k in range(1, half + 1):
-                far = np.float32(k)
-                for j in range(m):
-                    ahead, behind = padded[r + half + k, c, j], padded[r + half - k, c, j]
-                    even[c, j] += ahead + behind
-                    line[c, j] += far * (ahead - behind)
+    for r in range(half, rows - half):
         for c in range(cols):
+            even[c, :] = 0.0
+            line[c, :] = 0.0
+            for k in range(-half, half + 1):
+                if valid[r + k, c]:
+                    far = np.float32(k)
+                    for j in range(m):
+                        even[c, j] += factor[r + k, c, j]
+                        line[c, j] += far * factor[r + k, c, j]
+        for c in range(half, cols - half):
             if not good[r, c]:
                 continue
             for j in range(m):
                 slopes[0, j] = 0.0
-                slopes[1, j] = line[c + half, j]
+                slopes[1, j] = line[c, j]
             for k in range(1, half + 1):
                 far = np.float32(k)
                 for j in range(m):
-                    slopes[0, j] += far * (even[c + half + k, j] - even[c + half - k, j])
-                    slopes[1, j] += line[c + half + k, j] + line[c + half - k, j]
+                    slopes[0, j] += far * (even[c + k, j] - even[c - k, j])
+                    slopes[1, j] += line[c + k, j] + line[c - k, j]
             for j in range(m):
                 slopes[0, j] *= scale
                 slopes[1, j] *= scale
@@ -66,25 +64,25 @@ def _whole(padded, by_slope, good, half, out):
 
 
 @entry
-def _reduced(padded, by_slope, at_rows, at_cols, weights, offsets, half, out):
+def _reduced(factor, by_slope, at_rows, at_cols, weights, offsets, out):
     """The same of windows at (n,) rows and columns with weights (n, 2, points) of their own."""
-    m = padded.shape[2]
+    m = factor.shape[2]
     slopes = np.empty((2, m), np.float32)
     for w in range(len(at_rows)):
         r, c = at_rows[w], at_cols[w]
         slopes[:] = 0.0
         for p in range(len(offsets)):
             along, down = np.float32(weights[w, 0, p]), np.float32(weights[w, 1, p])
-            if along == 0.0 and down == 0.0:
+            if along == 0.0 and down == 0.0:  # no point there
                 continue
-            point = padded[r + half + offsets[p, 0], c + half + offsets[p, 1]]
+            point = factor[r + offsets[p, 0], c + offsets[p, 1]]
             for j in range(m):
                 slopes[0, j] += along * point[j]
                 slopes[1, j] += down * point[j]
         _through(slopes, by_slope[r, c], out[r, c])
 
 
-def common_part(factor: Float, valid: Bool, slopes: Slopes, by_slope: Float, half: int) -> Float32:
+def common_part(factor: Float | Float32, valid: Bool, slopes: Slopes, by_slope: Float, half: int) -> Float32:
     """Return the common factor (r, c, 3, k) of the strain; values of points whose status is not ``OK`` are undefined.
 
     In single precision, as files hold it.
@@ -103,19 +101,15 @@ def common_part(factor: Float, valid: Bool, slopes: Slopes, by_slope: Float, hal
         Points to each side of a window's middle.
     """
     rows, cols, _, k = factor.shape
-    padded = np.zeros((rows + 2 * half, cols + 2 * half, 6 * k), np.float32)
-    inner_part = padded[half : half + rows, half : half + cols]
-    inner_part[...] = factor.reshape(rows, cols, 6 * k)
-    if not valid.all():
-        inner_part[~valid] = 0.0
+    points = np.ascontiguousarray(factor, dtype=np.float32).reshape(rows, cols, 6 * k)
     whole = slopes.status == StrainStatus.OK
     for r, c, _ in slopes.reduced:
         whole[r, c] = False
     by_slope = np.ascontiguousarray(by_slope, dtype=np.float32)
     out = np.zeros((rows, cols, 3, k), np.float32)
-    _whole(padded, by_slope, whole, half, out)
+    _whole(points, valid, by_slope, whole, half, out)
     offsets: NDArray[np.int64] = np.ascontiguousarray(window_offsets(half)[0], dtype=np.int64)
     for r, c, weights in slopes.reduced:
         at = np.ascontiguousarray(r, dtype=np.int64), np.ascontiguousarray(c, dtype=np.int64)
-        _reduced(padded, by_slope, *at, np.ascontiguousarray(weights, dtype=np.float64), offsets, half, out)
+        _reduced(points, by_slope, *at, np.ascontiguousarray(weights, dtype=np.float64), offsets, out)
     return out

@@ -7,7 +7,7 @@ from dataclasses import fields
 import numpy as np
 from scipy import ndimage
 
-from core.arrays import Bool, Float
+from core.arrays import Bool, Float, Float32
 from core.common.factor import FINE, rounded
 from core.errors import InputError
 from core.field.points.result import Field
@@ -73,7 +73,7 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
     covariance[..., range(3), range(3)] += left
     common = None
     if field.common is not None:
-        common = np.full((*field.shape, 3, field.common.shape[-1]), np.nan)
+        common = np.full((*field.shape, 3, field.common.shape[-1]), np.nan, np.float32)
         # slopes hold the points' own rounding: finer digits would be noise
         part = _common_part(field, slopes, surface, options)
         typical = np.sqrt(np.median(covariance[good][:, range(3), range(3)], axis=0)) if good.any() else None
@@ -96,7 +96,7 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
     )
 
 
-def _common_part(field: Field, slopes: Slopes, surface: OnSurface, options: StrainOptions) -> Float:
+def _common_part(field: Field, slopes: Slopes, surface: OnSurface, options: StrainOptions) -> Float32:
     """(n, 3, k) common factor of the strain: that of the points through the windows' weights."""
     assert field.common is not None
     good = slopes.status == StrainStatus.OK
@@ -105,7 +105,7 @@ def _common_part(field: Field, slopes: Slopes, surface: OnSurface, options: Stra
         surface.frame, surface.gradient, options.tensor, surface.per_mm, surface.strain
     ).reshape(-1, 3, 12)
     part = common_part(field.common, field.valid, slopes, by_slope, options.window // 2)
-    return np.asarray(part[good], dtype=np.float64)
+    return part[good]
 
 
 def surface_slopes(
