@@ -15,7 +15,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from core.arrays import Float, Float32
+from core.arrays import Float, Float32, Floats
 from core.cameras.stereo import StereoPair
 from core.common.derivatives import Estimator, measured_derivatives
 from core.errors import CalibrationInputError
@@ -55,7 +55,7 @@ class Causes:
         one: Cause = "calibration"
         return Causes((one,) * count)
 
-    def squares(self, factor: Float) -> dict[Cause, Float]:
+    def squares(self, factor: Floats) -> dict[Cause, Float]:
         """Return by cause the variance (...) of a factor's rows (..., k)."""
         out = {}
         for cause in self.told:
@@ -318,7 +318,7 @@ def rounded(factor: _Either, own: Float | None = None, *, fine: float = FINE) ->
     return _to_step(factor, _rounding(factor[sample_of(len(factor))], own, fine))
 
 
-def _rounding(some: Float | Float32, own: Float | None, fine: float) -> Float:
+def _rounding(some: Floats, own: Float | None, fine: float) -> Float:
     """(m,) a power of two that the components of a factor are rounded to, by a sample (n, m, k) of it."""
     if not some.size:
         return np.ones(some.shape[1])
@@ -331,7 +331,8 @@ def _rounding(some: Float | Float32, own: Float | None, fine: float) -> Float:
 def _to_step(factor: _Either, step: Float) -> _Either:
     """Round a factor (n, m, k) to steps (m,): exact in either precision, but for steps that hold nothing."""
     by = np.asarray(step[:, None], dtype=factor.dtype)
-    out = factor / np.where(by > 0.0, by, 1.0)
+    out = factor.copy()
+    np.divide(out, np.where(by > 0.0, by, 1.0), out=out)
     np.rint(out, out=out)
     out *= by
     return out

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float, Float32
+from core.arrays import Bool, Float32, Floats
 from core.field.region.window import window_offsets
 from core.matching.kernels.naming import entry, inner
 from core.strain.result import StrainStatus
@@ -82,7 +82,7 @@ def _reduced(factor, by_slope, at_rows, at_cols, weights, offsets, out):
         _through(slopes, by_slope[r, c], out[r, c])
 
 
-def common_part(factor: Float | Float32, valid: Bool, slopes: Slopes, by_slope: Float, half: int) -> Float32:
+def common_part(factor: Floats, valid: Bool, slopes: Slopes, by_slope: Floats, half: int) -> Float32:
     """Return the common factor (r, c, 3, k) of the strain; values of points whose status is not ``OK`` are undefined.
 
     In single precision, as files hold it.

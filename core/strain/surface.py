@@ -105,7 +105,7 @@ def _common_part(field: Field, slopes: Slopes, surface: OnSurface, options: Stra
         surface.frame, surface.gradient, options.tensor, surface.per_mm, surface.strain
     ).reshape(-1, 3, 12)
     part = common_part(field.common, field.valid, slopes, by_slope, options.window // 2)
-    return part[good]
+    return np.asarray(part[good])
 
 
 def surface_slopes(
