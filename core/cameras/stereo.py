@@ -72,13 +72,24 @@ class StereoPair:
 
     def epipolar_residual_of_rays(self, ray1: SpacePoints, ray2: SpacePoints) -> Float:
         """Return the same of rays in the cameras' own frames: a lens is inverted once for several poses."""
+        jacobian = self.cam2.lens.image_jacobian(ray2.xyz_mm[..., :2])
+        return self.epipolar_residual_at(ray1, ray2, jacobian)
+
+    def epipolar_residual_at(self, ray1: SpacePoints, ray2: SpacePoints, jacobian: Float) -> Float:
+        """Return the same with camera 2's lens Jacobian (..., 2, 2) at its rays: a pose has no part in it."""
+        a, b = (ray1.xyz_mm @ self._essential[:, k] for k in (0, 1))  # plane through both pinholes and ray 1
+        c = ray1.xyz_mm @ self._essential[:, 2]
+        x, y, z = np.moveaxis(ray2.xyz_mm, -1, 0)
+        algebraic = a * x + b * y + c * z
+        # d(algebraic)/d(px) = (a, b) J^-1, a matrix of 2 x 2
+        (p, q), (r, s) = np.moveaxis(jacobian, (-2, -1), (0, 1))
+        return np.asarray(algebraic * np.abs(p * s - q * r) / np.hypot(a * s - b * r, b * p - a * q))
+
+    @cached_property
+    def _essential(self) -> Float:
+        """(3, 3) that takes a ray of camera 1, a row, to the normal of its epipolar plane in camera 2."""
         R, t = self.cam2_from_cam1.rotation, self.cam2_from_cam1.translation_mm
-        line = np.cross(t, ray1.xyz_mm @ R.T)  # plane through both pinholes and ray 1, in camera 2
-        algebraic = np.sum(line * ray2.xyz_mm, axis=-1)
-        # d(algebraic)/d(px) = line_xy J^-1
-        jac = self.cam2.lens.image_jacobian(ray2.xyz_mm[..., :2])
-        gradient = np.linalg.solve(np.swapaxes(jac, -1, -2), line[..., :2, None])[..., 0]
-        return np.asarray(algebraic / np.linalg.norm(gradient, axis=-1))
+        return np.cross(t, R.T)
 
     def triangulate(self, xy1_px: ArrayLike, xy2_px: ArrayLike) -> SpacePoints:
         """Mid-point of the shortest segment between the two rays, in the system frame."""

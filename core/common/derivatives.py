@@ -95,6 +95,10 @@ class ReferenceView:
             pair, points_mm, ray, A1, A2, along, np.stack([-along[:, 1], along[:, 0]], axis=-1), length
         )
 
+    def keep(self) -> None:
+        """Make what all steps need of the points, once; parts of them have it then too."""
+        _ = self.by_image, self.by_parameters, self._by_normalised
+
     def at(self, some: Index) -> ReferenceView:
         """Return that of some of the points, with what is known of them."""
         names = ("ray", "by_point1", "by_point2", "along", "across", "px_per_mm")

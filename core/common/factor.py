@@ -11,10 +11,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 
-from core.arrays import Float
+from core.arrays import Float, Float32, Floats
 from core.cameras.stereo import StereoPair
 from core.common.derivatives import Estimator, measured_derivatives
 from core.errors import CalibrationInputError
@@ -29,6 +30,7 @@ FINE = 1 / 128
 """Of a component's common standard deviation: what a factor is rounded to, to be short in files."""
 _SAMPLE = 500  # points by which columns are chosen
 _OWN_FINE = 1 / 1024
+_Either = TypeVar("_Either", Float, Float32)
 _DEPTHS = (0.97, 1.0, 1.03)  # of the stand-off: points by which columns are ordered
 
 
@@ -53,7 +55,7 @@ class Causes:
         one: Cause = "calibration"
         return Causes((one,) * count)
 
-    def squares(self, factor: Float) -> dict[Cause, Float]:
+    def squares(self, factor: Floats) -> dict[Cause, Float]:
         """Return by cause the variance (...) of a factor's rows (..., k)."""
         out = {}
         for cause in self.told:
@@ -211,22 +213,74 @@ class Factor:
     Attributes
     ----------
     values
-        (n, 3, k) of X, Y, Z, or (n, 6, k) of X, Y, Z, U, V, W: mm for unit causes.
+        (n, 3, k) of X, Y, Z, or (n, 6, k) of X, Y, Z, U, V, W: mm for unit causes. Rounded so that single precision
+        holds it.
     causes
         Of the columns.
     """
 
-    values: Float
+    values: Float32
     causes: Causes
 
 
+@dataclass(frozen=True, eq=False)
+class FactorColumns:
+    """The columns of a factor, chosen by a sample of its points, and how finely it is rounded.
+
+    Attributes
+    ----------
+    names
+        Of the parameters.
+    directions
+        (len(names), k) of unit causes in them.
+    causes
+        Of the columns.
+    step
+        (3 or 6,) mm: what each component is rounded to.
+    """
+
+    names: Sequence[str]
+    directions: Float
+    causes: Causes
+    step: Float
+
+    @staticmethod
+    def chosen(source: ParameterCovariance, sample: Estimator, own_mm: Float | None = None) -> FactorColumns:
+        """Choose as few columns as hold :data:`KEPT` of each point's common variance.
+
+        Parameters
+        ----------
+        source
+            What is common.
+        sample
+            The estimator at :func:`sample_of` the points: the factor changes slowly from point to point.
+        own_mm
+            (3,) or (6,) typical standard deviations of the points' own; what is far below them is rounded away.
+
+        Raises
+        ------
+        CalibrationInputError
+            ``covariance_not_positive``.
+        """
+        L, causes = source.columns
+        kept = fewest_columns(sample.through(source.names, L), causes)
+        directions = L[:, kept]
+        found = Causes(tuple(causes.columns[k] for k in kept), causes.told)
+        step = _rounding(sample.through(source.names, directions), own_mm, FINE)
+        return FactorColumns(source.names, directions, found, step)
+
+    def at(self, estimator: Estimator) -> Float32:
+        """Return the factor (n, 3 or 6, k) at an estimator's points."""
+        return _to_step(estimator.through(self.names, self.directions), self.step).astype(np.float32)
+
+
+def sample_of(count: int) -> slice:
+    """Return which of some points choose a factor's columns."""
+    return slice(None, None, max(count // _SAMPLE, 1))
+
+
 def factor_of(
-    source: ParameterCovariance,
-    points_mm: Float,
-    displaced_mm: Float | None = None,
-    *,
-    own_mm: Float | None = None,
-    estimator: Estimator | None = None,
+    source: ParameterCovariance, points_mm: Float, displaced_mm: Float | None = None, *, own_mm: Float | None = None
 ) -> Factor:
     """Return the common factor of points, with as few columns as hold :data:`KEPT` of each point's common variance.
 
@@ -240,24 +294,19 @@ def factor_of(
         (n, 3) their current positions.
     own_mm
         (3,) or (6,) typical standard deviations of the points' own; what is far below them is rounded away.
-    estimator
-        At these points, if it is known.
 
     Raises
     ------
     CalibrationInputError
         ``covariance_not_positive``.
     """
-    L, causes = source.columns
-    at = Estimator.at(source.pair, points_mm, displaced_mm) if estimator is None else estimator
-    # which columns: the factor changes slowly from point to point
-    some = slice(None, None, max(len(points_mm) // _SAMPLE, 1))
-    kept = fewest_columns(at.through(source.names, L, some), causes)
-    values = at.through(source.names, L[:, kept])
-    return Factor(rounded(values, own_mm), Causes(tuple(causes.columns[k] for k in kept), causes.told))
+    some = sample_of(len(points_mm))
+    sample = Estimator.at(source.pair, points_mm[some], None if displaced_mm is None else displaced_mm[some])
+    columns = FactorColumns.chosen(source, sample, own_mm)
+    return Factor(columns.at(Estimator.at(source.pair, points_mm, displaced_mm)), columns.causes)
 
 
-def rounded(factor: Float, own: Float | None = None, *, fine: float = FINE) -> Float:
+def rounded(factor: _Either, own: Float | None = None, *, fine: float = FINE) -> _Either:
     """Return a factor (n, m, k) rounded to a small part of each component's standard deviation, as a power of two.
 
     It stays far below what the points' own noise and the columns left out change, and is the same in memory and in
@@ -266,19 +315,30 @@ def rounded(factor: Float, own: Float | None = None, *, fine: float = FINE) -> F
     """
     if not factor.size:
         return factor
-    some = factor[:: max(len(factor) // _SAMPLE, 1)]
-    middle = np.sqrt(np.median((some**2).sum(axis=-1), axis=0))
-    step = fine * middle
+    return _to_step(factor, _rounding(factor[sample_of(len(factor))], own, fine))
+
+
+def _rounding(some: Floats, own: Float | None, fine: float) -> Float:
+    """(m,) a power of two that the components of a factor are rounded to, by a sample (n, m, k) of it."""
+    if not some.size:
+        return np.ones(some.shape[1])
+    step = fine * np.sqrt(np.median((np.asarray(some, dtype=np.float64) ** 2).sum(axis=-1), axis=0))
     if own is not None:
         step = np.maximum(step, _OWN_FINE * np.where(np.isfinite(own), own, 0.0))
-    step = (2.0 ** np.floor(np.log2(np.where(step > 0.0, step, 1e-300))))[:, None]
-    out = factor / step
+    return np.asarray(2.0 ** np.floor(np.log2(np.where(step > 0.0, step, 1e-300))))
+
+
+def _to_step(factor: _Either, step: Float) -> _Either:
+    """Round a factor (n, m, k) to steps (m,): exact in either precision, but for steps that hold nothing."""
+    by = np.asarray(step[:, None], dtype=factor.dtype)
+    out = factor.copy()
+    np.divide(out, np.where(by > 0.0, by, 1.0), out=out)
     np.rint(out, out=out)
-    out *= step
-    return np.asarray(out)
+    out *= by
+    return out
 
 
-def common_factor(source: ParameterCovariance, points_mm: Float, displaced_mm: Float | None = None) -> Float:
+def common_factor(source: ParameterCovariance, points_mm: Float, displaced_mm: Float | None = None) -> Float32:
     """Return the values of :func:`factor_of`."""
     return factor_of(source, points_mm, displaced_mm).values
 

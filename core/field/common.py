@@ -11,8 +11,11 @@ from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.common.budget import budget_of
 from core.common.derivatives import Estimator, ReferenceView, lower_root
-from core.common.factor import ParameterCovariance, factor_of
+from core.common.factor import FactorColumns, ParameterCovariance, sample_of
 from core.field.points.result import Field
+
+_POINTS_AT_ONCE = 4096
+_KEPT_POINTS = 100_000  # of more, what the steps have in common is made anew for each: it is 0.5 kB a point
 
 
 @dataclass(eq=False)
@@ -56,20 +59,39 @@ class CommonParts:
         valid = field.valid
         view = self._view(field.xyz_mm[valid], valid)
         now = None if field.uvw_mm is None else view.points_mm + field.uvw_mm[valid]
-        own = field.covariance[valid]
-        at = Estimator.at(self.pair, view.points_mm, now, view)
-        common, causes, frozen = None, None, None
+        n = len(view.points_mm)
+        if n <= _KEPT_POINTS:
+            view.keep()
+
+        def at(some: slice) -> Estimator:
+            return Estimator.at(self.pair, view.points_mm[some], None if now is None else now[some], view.at(some))
+
+        common, columns, frozen = None, None, None
         if self.source is not None:
-            middle = np.sqrt(np.median(np.diagonal(own, axis1=1, axis2=2), axis=0)) if len(own) else None
-            found = factor_of(self.source, view.points_mm, now, own_mm=middle, estimator=at)
-            causes = found.causes
-            common = _spread(found.values, valid)
-        if now is not None:
-            added = None if field.references is None else field.references.added_share
-            if field.references is None or added is not None:
-                part = _frozen(own[:, 3:, 3:], at, None if added is None else added[valid])
-                frozen = _spread(part, valid)
-        return replace(field, common=common, causes=causes, frozen=frozen)
+            own = np.diagonal(field.covariance, axis1=2, axis2=3)[valid]
+            columns = FactorColumns.chosen(
+                self.source, at(sample_of(n)), np.sqrt(np.median(own, axis=0)) if n else None
+            )
+            common = np.full((valid.size, own.shape[-1], len(columns.causes.columns)), np.nan, np.float32)
+        added = None if field.references is None else field.references.added_share
+        if now is not None and (field.references is None or added is not None):
+            frozen = np.full((valid.size, 3, 3), np.nan)
+        place = np.flatnonzero(valid)
+        noise = field.covariance.reshape(valid.size, *field.covariance.shape[2:])
+        for first in range(0, n, _POINTS_AT_ONCE):  # what stays in the processor's cache
+            some = slice(first, min(first + _POINTS_AT_ONCE, n))
+            estimator, here = at(some), place[some]
+            if common is not None and columns is not None:
+                common[here] = columns.at(estimator)
+            if frozen is not None:
+                share = None if added is None else added.reshape(-1, 3, 3)[here]
+                frozen[here] = _frozen(noise[here, 3:, 3:], estimator, share)
+        return replace(
+            field,
+            common=None if common is None else common.reshape(*field.shape, *common.shape[1:]),
+            causes=None if columns is None else columns.causes,
+            frozen=None if frozen is None else frozen.reshape(*field.shape, 3, 3),
+        )
 
     def _view(self, points: Float, valid: Bool) -> ReferenceView:
         """The reference's view of a field's valid points: a step's are the reference's own, but for those it lost."""
@@ -87,15 +109,6 @@ class CommonParts:
 def with_common_parts(field: Field, source: ParameterCovariance | None, pair: StereoPair) -> Field:
     """Return one field with what is common in its uncertainty: see :meth:`CommonParts.of`."""
     return CommonParts(pair, source).of(field)
-
-
-def _spread(values: Float, valid: Bool) -> Float:
-    """(r, c, ...) of the values (n, ...) of valid points, NaN elsewhere."""
-    if valid.all():
-        return values.reshape(*valid.shape, *values.shape[1:])
-    out = np.full((*valid.shape, *values.shape[1:]), np.nan)
-    out[valid] = values
-    return out
 
 
 def _frozen(own: Float, at: Estimator, added: Float | None = None) -> Float:

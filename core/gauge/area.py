@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Bool, Float
+from core.arrays import Bool, Float, Floats
 from core.errors import RegionError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels, steps_px
@@ -85,7 +85,7 @@ def area_statistics(
     inside: Bool,
     *,
     shared: SharedPixels,
-    common: Float | None = None,
+    common: Floats | None = None,
     sigma_reference: Float | None = None,
 ) -> AreaStatistics:
     """Return the statistics of values over an area.
@@ -120,7 +120,7 @@ def area_statistics(
         mean = Reading(float(v.mean()), float("nan"))
     if n and sigma is not None and np.isfinite(sigma[used]).all():
         frozen = None if sigma_reference is None else variance(sigma_reference)
-        row = None if common is None else np.asarray(common[used].mean(axis=0))
+        row = None if common is None else np.asarray(common[used].mean(axis=0, dtype=np.float64))
         mean = reading_of(mean.value, variance(sigma), frozen, row, field.causes)
     if not n:
         nan = float("nan")

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.arrays import Bool, Float
+from core.arrays import Bool, Float, Floats
 from core.errors import RegionError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels, roots_of, steps_px
@@ -56,7 +56,7 @@ class Samples:
         """(m,) True where the position has values."""
         return np.isfinite(self.weight[:, 0])
 
-    def of(self, values: Float) -> Float:
+    def of(self, values: Floats) -> Float:
         """Interpolate values (r, c, ...) of the grid; (m, ...), NaN where missing."""
         flat = values.reshape(-1, *values.shape[2:])[self.index]
         weight = self.weight.reshape(self.weight.shape + (1,) * (values.ndim - 2))

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Bool, Float
+from core.arrays import Float
 from core.cameras.camera import Camera, RigidTransform
 from core.cameras.stereo import StereoPair
 
@@ -47,24 +47,35 @@ def changes_between(before: StereoPair, after: StereoPair) -> Float:
     return np.concatenate([Rotation.from_matrix(turn).as_rotvec(), across * angle])
 
 
-def offset_slopes(pair: StereoPair, change: Float, xy1_px: Float, xy2_px: Float) -> Float:
-    """Return d(epipolar offset of matched points, px) / d(change), (n, 5), at a change of the pair."""
-    columns = []
-    rays = pair.cam1.rays_cam(xy1_px), pair.cam2.rays_cam(xy2_px)
-    for step in np.eye(5) * _STEP_RAD:
-        ahead, back = (changed(pair, change + s).epipolar_residual_of_rays(*rays) for s in (step, -step))
-        columns.append((ahead - back) / (2.0 * _STEP_RAD))
-    return np.stack(columns, axis=-1)
+Ends = tuple[tuple[StereoPair, StereoPair], ...]
 
 
-def point_slopes(pair: StereoPair, xy1_px: Float, xy2_px: Float) -> Float:
-    """Return d(triangulated points of the system frame, mm) / d(change), (n, 3, 5)."""
-    columns = []
+def ends_of(pair: StereoPair, change: Float) -> Ends:
+    """Return for each number of a change the pair a little further along it and a little back, for differences."""
+    return tuple((changed(pair, change + s), changed(pair, change - s)) for s in np.eye(5) * _STEP_RAD)
+
+
+def offset_slopes(pair: StereoPair, change: Float, xy1_px: Float, xy2_px: Float, ends: Ends | None = None) -> Float:
+    """Return d(epipolar offset of matched points, px) / d(change), (n, 5), at a change of the pair.
+
+    ``ends`` is :func:`ends_of` of pair and change, where it is known.
+    """
+    one, two = pair.cam1.rays_cam(xy1_px), pair.cam2.rays_cam(xy2_px)
+    jacobian = pair.cam2.lens.image_jacobian(two.xyz_mm[..., :2])
+    offsets = (
+        [side.epipolar_residual_at(one, two, jacobian) for side in sides] for sides in ends or ends_of(pair, change)
+    )
+    return np.stack([(ahead - back) / (2.0 * _STEP_RAD) for ahead, back in offsets], axis=-1)
+
+
+def point_slopes(pair: StereoPair, xy1_px: Float, xy2_px: Float, ends: Ends | None = None) -> Float:
+    """Return d(triangulated points of the system frame, mm) / d(change), (n, 3, 5).
+
+    ``ends`` is :func:`ends_of` of the pair at no change, where it is known.
+    """
     rays = pair.cam1.rays_cam(xy1_px), pair.cam2.rays_cam(xy2_px)
-    for step in np.eye(5) * _STEP_RAD:
-        ahead, back = (changed(pair, s).triangulate_rays(*rays).xyz_mm for s in (step, -step))
-        columns.append((ahead - back) / (2.0 * _STEP_RAD))
-    return np.stack(columns, axis=-1)
+    points = ([side.triangulate_rays(*rays).xyz_mm for side in sides] for sides in ends or ends_of(pair, np.zeros(5)))
+    return np.stack([(ahead - back) / (2.0 * _STEP_RAD) for ahead, back in points], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,25 +88,24 @@ class ChangeSlopes:
         The cameras before a change.
     xy1_px, xy2_px
         (n, 2) the points in both cameras.
+    ends
+        :func:`ends_of` of the pair at no change, where it is known.
     """
 
     pair: StereoPair
     xy1_px: Float
     xy2_px: Float
+    ends: Ends | None = None
 
     @cached_property
     def offset(self) -> Float:
         """(n, 5) :func:`offset_slopes` at no change."""
-        return offset_slopes(self.pair, np.zeros(5), self.xy1_px, self.xy2_px)
+        return offset_slopes(self.pair, np.zeros(5), self.xy1_px, self.xy2_px, self.ends)
 
     @cached_property
     def position(self) -> Float:
         """(n, 3, 5) :func:`point_slopes`."""
-        return point_slopes(self.pair, self.xy1_px, self.xy2_px)
-
-    def of(self, which: Bool) -> ChangeSlopes:
-        """Return those of the points ``which`` (n,)."""
-        return self if which.all() else ChangeSlopes(self.pair, self.xy1_px[which], self.xy2_px[which])
+        return point_slopes(self.pair, self.xy1_px, self.xy2_px, self.ends)
 
 
 def plausible_bump(pair: StereoPair) -> Float:

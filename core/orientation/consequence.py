@@ -47,9 +47,57 @@ class Consequence:
         return dict(vars(self))
 
 
-def consequence_of(
-    pair: StereoPair, points: MatchedPoints, change: Float, covariance: Float, known: ChangeSlopes | None = None
-) -> Consequence | None:
+@dataclass(frozen=True, eq=False)
+class Consequences:
+    """What any change makes of points: all of it is linear in the change.
+
+    Attributes
+    ----------
+    moved, shape
+        (n, 3, 5) mm per unit of a change: the points' differences, and these without a rigid motion.
+    strain
+        (2, 2, n, 5) of the difference, per unit of a change.
+    """
+
+    moved: Float
+    shape: Float
+    strain: Float
+
+    @staticmethod
+    def of(pair: StereoPair, points: MatchedPoints, known: ChangeSlopes | None = None) -> Consequences | None:
+        """Return those of points; None if fewer than ten can be triangulated. ``known`` are their slopes."""
+        if len(points.xy1_px) == 0:
+            return None
+        some = np.unique(spread_indices(len(points.xy1_px), _AT_MOST))
+        xy1, xy2 = points.xy1_px[some], points.xy2_px[some]
+        xyz = pair.triangulate(xy1, xy2).xyz_mm
+        slopes = point_slopes(pair, xy1, xy2) if known is None or len(some) < len(points.xy1_px) else known.position
+        good = np.isfinite(xyz).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2))
+        if good.sum() < 10:
+            return None
+        xyz, slopes = xyz[good], slopes[good]
+        return Consequences(slopes, without_rigid_motion(xyz, slopes), _strain(xyz, slopes))
+
+    def by(self, change: Float, covariance: Float) -> Consequence:
+        """Return those of a change (5,) with its covariance (5, 5)."""
+        # of points in a narrow view some changes are known only by the prior: a root that takes rounding below zero
+        values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        um = 1e3
+        return Consequence(
+            shape_um=um * _rms(self.shape @ change),
+            shape_sigma_um=um * _rms_over(self.shape @ root),
+            z_um=um * _rms(self.moved[:, 2:] @ change),
+            z_sigma_um=um * _rms_over(self.moved[:, 2:] @ root),
+            displacement_um=um * _rms(self.moved @ change),
+            displacement_sigma_um=um * _rms_over(self.moved @ root),
+            strain_microstrain=1e6 * float(_largest_principal(self.strain @ change).max()),
+            strain_sigma_microstrain=1e6
+            * float(np.sqrt((_largest_principal(self.strain @ root) ** 2).sum(axis=-1)).max()),
+        )
+
+
+def consequence_of(pair: StereoPair, points: MatchedPoints, change: Float, covariance: Float) -> Consequence | None:
     """Return what a change makes of points.
 
     Parameters
@@ -58,44 +106,20 @@ def consequence_of(
         The cameras and the points as matched.
     change, covariance
         (5,) and (5, 5), :data:`core.orientation.change.CHANGE_NAMES`.
-    known
-        Slopes of these points, where they are known already.
 
     Returns
     -------
     Consequence or None
         None if fewer than ten points can be triangulated.
     """
-    if len(points.xy1_px) == 0:
-        return None
-    some = np.unique(spread_indices(len(points.xy1_px), _AT_MOST))
-    xy1, xy2 = points.xy1_px[some], points.xy2_px[some]
-    xyz = pair.triangulate(xy1, xy2).xyz_mm
-    slopes = point_slopes(pair, xy1, xy2) if known is None or len(some) < len(points.xy1_px) else known.position
-    good = np.isfinite(xyz).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2))
-    if good.sum() < 10:
-        return None
-    xyz, slopes = xyz[good], slopes[good]
-    # of points in a narrow view some changes are known only by the prior: a root that takes rounding below zero
-    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    moved, spread = slopes @ change, slopes @ root
-    shape = without_rigid_motion(xyz, np.concatenate([moved[..., None], spread], axis=-1))
-    strain = _strain(xyz, np.concatenate([moved[..., None], spread], axis=-1))
-    largest = np.abs(np.linalg.eigvalsh(strain[..., 0].transpose(2, 0, 1))).max(axis=1)
-    sigma = np.sqrt((np.abs(np.linalg.eigvalsh(np.moveaxis(strain[..., 1:], (0, 1), (-2, -1)))).max(-1) ** 2).sum(-1))
-    at = int(np.argmax(largest))
-    um = 1e3
-    return Consequence(
-        shape_um=um * _rms(shape[..., 0]),
-        shape_sigma_um=um * _rms_over(shape[..., 1:]),
-        z_um=um * _rms(moved[:, 2:]),
-        z_sigma_um=um * _rms_over(spread[:, 2:]),
-        displacement_um=um * _rms(moved),
-        displacement_sigma_um=um * _rms_over(spread),
-        strain_microstrain=1e6 * float(largest[at]),
-        strain_sigma_microstrain=1e6 * float(sigma.max()),
-    )
+    found = Consequences.of(pair, points)
+    return None if found is None else found.by(change, covariance)
+
+
+def _largest_principal(strain: Float) -> Float:
+    """(...) the principal strain of larger size of symmetric strains (2, 2, ...)."""
+    xx, yy, xy = strain[0, 0], strain[1, 1], strain[0, 1]
+    return np.asarray(np.abs(0.5 * (xx + yy)) + np.hypot(0.5 * (xx - yy), xy))
 
 
 def without_rigid_motion(xyz_mm: Float, difference_mm: Float) -> Float:

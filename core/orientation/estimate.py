@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from core.arrays import Float
 from core.cameras.stereo import StereoPair
@@ -68,6 +69,7 @@ def estimate_change(
     bump_rad: float | None = None,
     start: Float | None = None,
     slopes: ChangeSlopes | None = None,
+    blocks: NDArray[np.int64] | None = None,
 ) -> OrientationEstimate:
     """Estimate the change of the relative orientation.
 
@@ -83,8 +85,9 @@ def estimate_change(
         Size of the bump, where it is known; else from the offsets.
     start
         (5,) a change to start from; none if left out.
-    slopes
-        Of these points, where they are known already; without a start.
+    slopes, blocks
+        Of these points, where they are known already: :class:`core.orientation.change.ChangeSlopes`, without a start;
+        :func:`core.orientation.noise.blocks_of`.
 
     Returns
     -------
@@ -93,7 +96,8 @@ def estimate_change(
     """
     xy1, xy2 = points.xy1_px, points.xy2_px
     unit, size = plausible_bump(pair), _FIRST_RAD if bump_rad is None else bump_rad
-    blocks, terms = blocks_of(xy1, points.step), smooth_terms(xy1)
+    terms = smooth_terms(xy1)
+    blocks = blocks_of(xy1, points.step) if blocks is None else blocks
     change = np.zeros(5) if start is None else np.array(start, dtype=np.float64)
     J = offset_slopes(pair, change, xy1, xy2) if slopes is None or start is not None else slopes.offset
 

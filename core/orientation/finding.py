@@ -10,14 +10,12 @@ import numpy as np
 
 from core.arrays import Float
 from core.calibration import COVARIANCE_NAMES
-from core.calibration.uncertainty import image_derivatives
 from core.cameras.stereo import StereoPair
 from core.field.region.trend import smooth_terms
-from core.orientation.change import ChangeSlopes
-from core.orientation.consequence import Consequence, consequence_of
+from core.orientation.consequence import Consequence
 from core.orientation.estimate import estimate_change
-from core.orientation.matched import MatchedPoints, across_line
-from core.orientation.noise import blocks_of, effective_variance, robust_weights
+from core.orientation.matched import MatchedPoints
+from core.orientation.offsets import StepOffsets
 from core.significance import chi_square_tail, two_sided_sigmas
 
 Against = Literal["calibration", "reference", "last_step"]
@@ -90,60 +88,16 @@ class OffsetFinding:
         return {**vars(self), **lists, "pattern_px": dict(self.pattern_px), "consequence": consequence}
 
 
-def calibration_slopes(pair: StereoPair, points: MatchedPoints, names: Sequence[str] = COVARIANCE_NAMES) -> Float:
-    """Return d(epipolar offset, px) / d(both cameras' parameters by name), (n, len(names)), at matched points.
-
-    The point that camera 1 sees stays on its pixel's ray; its image in camera 2 moves off the position that was
-    measured. What moves along the line counts for nothing.
-    """
-    xyz = pair.triangulate(points.xy1_px, points.xy2_px).xyz_mm
-    across = across_line(pair, points.xy1_px, points.xy2_px)
-    A1, A2 = pair.cam1.point_jacobian(xyz), pair.cam2.point_jacobian(xyz)
-    by_parameters = image_derivatives(pair, xyz, names)
-    in_camera2 = A2 @ np.linalg.pinv(A1) @ by_parameters[:, :2] - by_parameters[:, 2:]
-    return np.asarray(np.einsum("nj,njk->nk", across, in_camera2))
-
-
-@dataclass(frozen=True, eq=False)
-class SmoothOffsets:
-    """Smooth part of offsets: coefficients (6,) over orthonormal terms of the image, and their covariance.
-
-    A coefficient is the root mean square that its term contributes over the points.
-    """
-
-    terms: Float
-    coefficients: Float
-    covariance: Float
-    projector: Float
-
-
-def smooth_offsets(points: MatchedPoints, offset_px: Float) -> SmoothOffsets:
-    """Fit the mean, slope and curvature of offsets (n,) robustly."""
-    plain = smooth_terms(points.xy1_px)
-    n = len(plain)
-    terms = np.linalg.qr(plain)[0] * np.sqrt(n)
-    terms *= np.sign(terms[0, 0])
-    weights = np.ones(n)
-    for _ in range(4):
-        normal = np.linalg.pinv((terms * weights[:, None]).T @ terms)
-        projector = normal @ (terms * weights[:, None]).T
-        coefficients = projector @ offset_px
-        weights, _ = robust_weights(offset_px - terms @ coefficients)
-    variance = effective_variance(terms, weights, offset_px, blocks_of(points.xy1_px, points.step))
-    return SmoothOffsets(terms, coefficients, normal * variance, projector)
-
-
 def judge_offsets(
     pair: StereoPair,
-    points: MatchedPoints,
+    points: MatchedPoints | StepOffsets,
     *,
-    before: tuple[MatchedPoints, Float] | None = None,
+    before: tuple[MatchedPoints, Float] | StepOffsets | None = None,
     against: Against = "calibration",
     covariance: Float | None = None,
     names: Sequence[str] = COVARIANCE_NAMES,
     own_px: float | None = None,
     imported: bool = False,
-    slopes: ChangeSlopes | None = None,
 ) -> OffsetFinding | None:
     """Judge the offsets of one step.
 
@@ -152,10 +106,11 @@ def judge_offsets(
     pair
         The calibrated cameras.
     points
-        The step's points as matched.
+        The step's points as matched; as :class:`core.orientation.offsets.StepOffsets`, with the same parameters'
+        names, where they are judged more than once.
     before
-        Points of the reference or of another step, and their offsets (m,); of the calibration's own error that part
-        cancels then which is the same at both depths.
+        Points of the reference or of another step, and their offsets (m,), or the same in one; of the calibration's own
+        error that part cancels then which is the same at both depths.
     against
         What the offsets are held against.
     covariance, names
@@ -164,33 +119,27 @@ def judge_offsets(
         The calibration's own offset at most, where it is known.
     imported
         True for another program's calibration, whose own error is not known.
-    slopes
-        Of the step's points, where they are judged more than once.
 
     Returns
     -------
     OffsetFinding or None
         None with fewer than :data:`MIN_POINTS` points.
     """
-    if len(points.xy1_px) < MIN_POINTS or (before is not None and len(before[1]) < MIN_POINTS):
+    step = (points if isinstance(points, StepOffsets) else StepOffsets(pair, points, names)).finite
+    held = StepOffsets(pair, before[0], names, before[1]) if isinstance(before, tuple) else before
+    if len(step.offset_px) < MIN_POINTS or (held is not None and len(held.offset_px) < MIN_POINTS):
         return None
-    offset = pair.epipolar_residual_px(points.xy1_px, points.xy2_px)
-    good = np.isfinite(offset)
-    if good.sum() < MIN_POINTS:
-        return None
-    points, offset = MatchedPoints(points.xy1_px[good], points.xy2_px[good], points.step[good]), offset[good]
-    slopes = ChangeSlopes(pair, points.xy1_px, points.xy2_px) if slopes is None else slopes.of(good)
-    earlier = None if before is None else _earlier(points, *before)
+    offset, smooth, earlier = step.offset_px, step.smooth, None if held is None else _earlier(step, held)
     if earlier is not None:
         offset = offset - earlier.offset_px
-    smooth = smooth_offsets(points, offset)
+        smooth = step.smooth_part(offset)
     C = smooth.covariance + _FLOOR_PX[against] ** 2 * np.eye(6)
-    J = np.zeros((6, len(names))) if covariance is None else smooth.projector @ calibration_slopes(pair, points, names)
-    if earlier is not None and before is not None:
+    J = np.zeros((6, len(names))) if covariance is None else smooth.projector @ step.by_parameters
+    if earlier is not None and held is not None:
         C = C + earlier.covariance
         if covariance is not None:
             # a motion in depth brings another part of the calibration's error to the same place of the image
-            J = J - earlier.projector @ calibration_slopes(pair, before[0], names)
+            J = J - earlier.projector @ held.by_parameters
     known = against != "calibration" or covariance is not None
     if covariance is not None:
         C = C + J @ covariance @ J.T
@@ -206,7 +155,8 @@ def judge_offsets(
             moved, known = moved and rms > own_px, True
         if imported or not known:
             moved = None
-    estimate = estimate_change(pair, points, offset, slopes=slopes)
+    estimate = estimate_change(pair, step.points, offset, slopes=step.change_slopes, blocks=step.blocks)
+    cost = step.consequences
     parts = {name: float(np.sqrt(np.sum(c[part] ** 2))) for name, part in _PARTS.items()}
     finding = OffsetFinding(
         against=against,
@@ -223,7 +173,7 @@ def judge_offsets(
         change_deg=tuple(float(v) for v in np.degrees(estimate.change)),
         change_sigma_deg=tuple(float(v) for v in np.degrees(np.sqrt(np.diag(estimate.covariance)))),
         determined=estimate.determined,
-        consequence=consequence_of(pair, points, estimate.change, estimate.covariance, slopes),
+        consequence=None if cost is None else cost.by(estimate.change, estimate.covariance),
         text="",
     )
     return _with_text(finding)
@@ -242,17 +192,15 @@ class _Earlier:
     projector: Float
 
 
-def _earlier(points: MatchedPoints, earlier: MatchedPoints, earlier_px: Float) -> _Earlier:
+def _earlier(step: StepOffsets, held: StepOffsets) -> _Earlier:
     """At the same place, since an error of the calibration belongs to the image, not to the point of the specimen."""
-    fit = smooth_offsets(earlier, earlier_px)
+    fit, count = held.smooth, len(held.offset_px)
     # the earlier terms at the points, through the plain polynomial of all positions together
-    both = smooth_terms(np.concatenate([earlier.xy1_px, points.xy1_px]))
-    there, here = both[: len(earlier_px)], both[len(earlier_px) :]
+    both = smooth_terms(np.concatenate([held.points.xy1_px, step.points.xy1_px]))
+    there, here = both[:count], both[count:]
     turn = np.linalg.lstsq(there, fit.terms, rcond=None)[0]
     terms = here @ turn
-    mine = np.linalg.qr(smooth_terms(points.xy1_px))[0] * np.sqrt(len(points.xy1_px))
-    mine *= np.sign(mine[0, 0])
-    onto = mine.T / len(points.xy1_px) @ terms
+    onto = step.terms.T / len(step.offset_px) @ terms
     return _Earlier(terms @ fit.coefficients, onto @ fit.covariance @ onto.T, onto @ fit.projector)
 
 

@@ -76,10 +76,6 @@ def seen_by_camera2(pair: StereoPair, xy1_px: Float, xyz_mm: Float, offset_px: F
 def across_line(pair: StereoPair, xy1_px: Float, xy2_px: Float) -> Float:
     """Return (n, 2) the gradient of the epipolar offset over the position in camera 2: across the line."""
     h = _STEP_PX
-    return np.stack(
-        [
-            (pair.epipolar_residual_px(xy1_px, xy2_px + d) - pair.epipolar_residual_px(xy1_px, xy2_px - d)) / (2 * h)
-            for d in (np.array([h, 0.0]), np.array([0.0, h]))
-        ],
-        axis=1,
-    )
+    ends = np.array([[h, 0.0], [-h, 0.0], [0.0, h], [0.0, -h]])[:, None]
+    right, left, below, above = pair.epipolar_residual_px(xy1_px, xy2_px + ends)
+    return np.stack([right - left, below - above], axis=1) / (2 * h)

@@ -22,7 +22,7 @@ def blocks_of(xy_px: Float, step: NDArray[np.int32]) -> NDArray[np.int64]:
     """Return (n,) the number of the block that a point lies in: 8 x 8 over each step's points."""
     low, high = xy_px.min(axis=0), xy_px.max(axis=0)
     cell = np.minimum((xy_px - low) / np.maximum(high - low, 1e-9) * _BLOCKS, _BLOCKS - 1).astype(np.int64)
-    _, number = np.unique(np.column_stack([step, cell]), axis=0, return_inverse=True)
+    _, number = np.unique((step.astype(np.int64) * _BLOCKS + cell[:, 0]) * _BLOCKS + cell[:, 1], return_inverse=True)
     return np.asarray(number.ravel())
 
 

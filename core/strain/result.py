@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float
+from core.arrays import Bool, Float, Floats
 from core.strain.options import StrainOptions
 
 
@@ -75,7 +75,7 @@ class StrainField:
     strain: Float
     covariance: Float
     patch: Float | None = None
-    common: Float | None = None
+    common: Floats | None = None
     raised: Bool | None = None
 
     @property

@@ -7,18 +7,19 @@ from dataclasses import fields
 import numpy as np
 from scipy import ndimage
 
-from core.arrays import Bool, Float
+from core.arrays import Bool, Float, Float32
 from core.common.factor import FINE, rounded
 from core.errors import InputError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
 from core.matching.geometry import tangent_frames
 from core.strain.arcs import missed_slope
+from core.strain.common_part import common_part
 from core.strain.one_sided import OnSurface, raise_order
 from core.strain.options import StrainOptions
 from core.strain.result import StrainField, StrainStatus
 from core.strain.tensors import strain_of, strain_of_stretch, strain_slopes
-from core.strain.window import Slopes, slopes_of, window_slopes
+from core.strain.window import Slopes, window_slopes
 
 
 def surface_strain(field: Field, options: StrainOptions | None = None, *, subset_px: int) -> StrainField:
@@ -72,7 +73,7 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
     covariance[..., range(3), range(3)] += left
     common = None
     if field.common is not None:
-        common = np.full((*field.shape, 3, field.common.shape[-1]), np.nan)
+        common = np.full((*field.shape, 3, field.common.shape[-1]), np.nan, np.float32)
         # slopes hold the points' own rounding: finer digits would be noise
         part = _common_part(field, slopes, surface, options)
         typical = np.sqrt(np.median(covariance[good][:, range(3), range(3)], axis=0)) if good.any() else None
@@ -95,18 +96,16 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
     )
 
 
-def _common_part(field: Field, slopes: Slopes, surface: OnSurface, options: StrainOptions) -> Float:
+def _common_part(field: Field, slopes: Slopes, surface: OnSurface, options: StrainOptions) -> Float32:
     """(n, 3, k) common factor of the strain: that of the points through the windows' weights."""
     assert field.common is not None
-    k, good = field.common.shape[-1], slopes.status == StrainStatus.OK
+    good = slopes.status == StrainStatus.OK
     by_slope = np.zeros((*field.shape, 3, 12), np.float32)
     by_slope[good] = strain_slopes(
         surface.frame, surface.gradient, options.tensor, surface.per_mm, surface.strain
     ).reshape(-1, 3, 12)
-    out = np.empty((*field.shape, 3, k))
-    for at, moved in slopes_of(field.common.reshape(*field.shape, 6 * k), field.valid, slopes, options.window // 2):
-        out[at] = by_slope[at] @ moved.reshape(*moved.shape[:-2], 12, k)
-    return np.asarray(out[good])
+    part = common_part(field.common, field.valid, slopes, by_slope, options.window // 2)
+    return np.asarray(part[good])
 
 
 def surface_slopes(

@@ -7,15 +7,13 @@ of the surface.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy import ndimage
 
-from core.arrays import Bool, Float, Float32
+from core.arrays import Bool, Float
 from core.field.points.shared_pixels import SharedPixels
 from core.field.region.cuts import Cuts
 from core.field.region.window import connected_points, distinct_windows, fit_terms, steps_of, ways_cut, window_offsets
@@ -25,7 +23,6 @@ from core.strain.result import StrainStatus
 
 _AT_ONCE = 1024
 _VALUES_AT_ONCE = 1_000_000  # of one quantity: large windows come in smaller batches
-_FLOATS_AT_ONCE = 100_000  # what stays in the processor's cache
 _RANK = 1e-14
 
 
@@ -240,56 +237,6 @@ def window_slopes(
             second_spread[r, k] = windows.correlation.spread(bending)[which]
             connected.append(seen)
     return Slopes(status, slope, spread, second, moments, reduced, windows, connected, second_spread)
-
-
-def slopes_of(values: Float, valid: Bool, slopes: Slopes, half: int) -> Iterator[tuple[Any, Float32]]:
-    """Yield slopes (..., 2, m) over column and row of other values (r, c, m), by the weights of the same windows.
-
-    They come with the rows and columns of their points: those of whole windows a few rows at a time, then those of
-    the reduced ones, which take the former's place. They are in single precision, as files hold such values.
-    """
-    rows, cols, m = values.shape
-    side = 2 * half + 1
-    padded = np.zeros((rows + 2 * half, cols + 2 * half, m), np.float32)
-    padded[half : half + rows, half : half + cols] = values
-    if not valid.all():
-        padded[half : half + rows, half : half + cols][~valid] = 0.0
-    scale = np.float32(1.0 / (side * float((np.arange(-half, half + 1) ** 2).sum())))
-    at_once = max(_FLOATS_AT_ONCE // max(cols * m, 1), 1)
-    for first in range(0, rows, at_once):
-        part = padded[first : min(first + at_once, rows) + 2 * half]
-        over_rows, evenly = _line_and_sum(part, half, 0)
-        out = np.empty((len(over_rows), cols, 2, m), np.float32)
-        np.multiply(_line_and_sum(evenly, half, 1)[0], scale, out=out[:, :, 0])
-        np.multiply(_line_and_sum(over_rows, half, 1)[1], scale, out=out[:, :, 1])
-        here = np.arange(first, first + len(out))
-        yield np.ix_(here, np.arange(cols)), out
-    offsets, _ = window_offsets(half)
-    reach = offsets @ np.array([cols + 2 * half, 1])
-    flat = padded.reshape(-1, m)
-    for r, k, weights in slopes.reduced:
-        data = flat.take(((r + half) * (cols + 2 * half) + k + half)[:, None] + reach, axis=0)
-        yield (r, k), weights.astype(np.float32) @ data
-
-
-def _line_and_sum(values: Float32, half: int, axis: int) -> tuple[Float32, Float32]:
-    """Sums over each window along an axis, by distance from its middle, and evenly; whole windows alone."""
-    n = values.shape[axis] - 2 * half
-
-    def at(k: int) -> Float32:
-        return values[k : k + n] if axis == 0 else values[:, k : k + n]
-
-    evenly = at(half).copy()
-    line = np.zeros_like(evenly)
-    part = np.empty_like(evenly)
-    for k in range(1, half + 1):
-        ahead, behind = at(half + k), at(half - k)
-        evenly += ahead
-        evenly += behind
-        np.subtract(ahead, behind, out=part)
-        part *= k
-        line += part
-    return line, evenly
 
 
 def plane_weights(half: int) -> Float:

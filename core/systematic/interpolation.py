@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -30,6 +31,7 @@ from core.systematic.term import Figure, Term
 
 SMOOTH_PX = 1.5
 """Of the smoother gradients: little of the bias is left in them. Wider ones see it less surely."""
+_LARGE_PIXELS = 8_000_000  # from here on only what is looked at is smoothed: 8 bytes a pixel
 _PROBED_PX = 21  # of a subset, its middle: a wider one costs more and tells little more
 _SAMPLE = 256
 _MIN_SAMPLE = 32
@@ -41,30 +43,50 @@ _QUANTITIES = ("x_um", "y_um", "z_um", "u_um", "v_um", "w_um")
 
 @dataclass(frozen=True, eq=False)
 class SmoothSlopes:
-    """The reference image of camera 1 with its gradients, smoothed: made once for all steps.
+    """The reference image of camera 1 with its gradients, smoothed: made once for all steps, but of a large image.
 
     Attributes
     ----------
     image
         As it was matched.
-    along_x, along_y
-        (rows, cols) its gradients after a Gaussian of :data:`SMOOTH_PX`.
+    whole
+        (rows, cols) its gradients along x and y after a Gaussian of :data:`SMOOTH_PX`; None of a large image: what is
+        looked at is smoothed anew each time.
     """
 
     image: ImageData
-    along_x: Float32
-    along_y: Float32
+    whole: tuple[Float32, Float32] | None
 
     @staticmethod
     def of(image: ImageData) -> SmoothSlopes:
         """Return those of a prepared image."""
+        if image.raw.size > _LARGE_PIXELS:
+            return SmoothSlopes(image, None)
+        along_x, along_y = (np.empty(image.shape, np.float32) for _ in range(2))
         taps = Blur(SMOOTH_PX).taps
-        out = []
-        for slope in image.gradients:
-            smooth = np.empty(slope.shape, np.float32)
+        for slope, smooth in zip(image.gradients, (along_x, along_y), strict=True):
             correlate(slope, taps, taps, smooth)
-            out.append(smooth)
-        return SmoothSlopes(image, out[0], out[1])
+        return SmoothSlopes(image, (along_x, along_y))
+
+    def about(self, centres_px: Float, half: int) -> tuple[Float32, Float32]:
+        """Return both (n, 2 half + 1, 2 half + 1) about points (n, 2); undefined where these leave the image."""
+        side, (rows, cols) = 2 * half + 1, self.image.shape
+        out = np.zeros((2, len(centres_px), side, side), np.float32)
+        taps = Blur(SMOOTH_PX).taps.astype(np.float32)
+        reach = len(taps) // 2
+        for k, (x, y) in enumerate(np.rint(centres_px).astype(int).tolist()):
+            if x < half or y < half or x + half >= cols or y + half >= rows:
+                continue
+            left, top = x - half, y - half
+            for axis in range(2):
+                if self.whole is not None:
+                    out[axis, k] = self.whole[axis][top : top + side, left : left + side]
+                    continue
+                first_x, first_y = max(left - reach, 0), max(top - reach, 0)
+                wide = self.image.gradients[axis][first_y : top + side + reach, first_x : left + side + reach]
+                smooth = cv2.sepFilter2D(wide, cv2.CV_32F, taps, taps, borderType=cv2.BORDER_REFLECT_101)
+                out[axis, k] = smooth[top - first_y :, left - first_x :][:side, :side]
+        return out[0], out[1]
 
 
 def interpolation_term(
@@ -101,8 +123,8 @@ def interpolation_term(
     images = found.images_px.copy()
     offset = field.epipolar_px.ravel()[index]
     images += np.where(np.isfinite(offset), offset, 0.0)[:, None, None] * found.across
-    slopes, smooth = reference.image.gradients, (reference.along_x, reference.along_y)
     probed_px = min(subset_px, _PROBED_PX)
+    slopes, smooth = reference.image.gradients, reference.about(centres, probed_px // 2)
     shifts, sines, left = [], [], []
     for k, other in enumerate(others):
         seen = residual_shifts(

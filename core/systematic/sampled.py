@@ -60,14 +60,14 @@ def _value(coefficients, order, x, y, wx, wy):
 
 
 @inner
-def _shift(pixels, current, gx, gy, ax, ay, x0, y0, half, gain, mean_r, mean_c):
-    """Shift x, y that residuals show through the gradients ``ax, ay``."""
+def _shift(pixels, current, gx, gy, ax, ay, left, top, x0, y0, half, gain, mean_r, mean_c):
+    """Shift x, y that residuals show through the gradients ``ax, ay``, the subset's from ``left, top`` on."""
     a00 = a01 = a10 = a11 = b0 = b1 = 0.0
     for i in range(2 * half + 1):
         for j in range(2 * half + 1):
             y, x = y0 - half + i, x0 - half + j
             rest = gain * (current[i, j] - mean_c) - (pixels[y, x] - mean_r)
-            u, v, g, h = ax[y, x], ay[y, x], gx[y, x], gy[y, x]
+            u, v, g, h = ax[top + i, left + j], ay[top + i, left + j], gx[y, x], gy[y, x]
             a00 += u * g
             a01 += u * h
             a10 += v * g
@@ -106,8 +106,8 @@ def _residual_shifts(pixels, gx, gy, lx, ly, coefficients, order, centres, image
             continue
         gain = (s_rc - s_r * s_c / n) / contrast
         known = gain, s_r / n, s_c / n
-        out[k, 0], out[k, 1] = _shift(pixels, current, gx, gy, gx, gy, x0, y0, half, *known)
-        out[k, 2], out[k, 3] = _shift(pixels, current, gx, gy, lx, ly, x0, y0, half, *known)
+        out[k, 0], out[k, 1] = _shift(pixels, current, gx, gy, gx, gy, x0 - half, y0 - half, x0, y0, half, *known)
+        out[k, 2], out[k, 3] = _shift(pixels, current, gx, gy, lx[k], ly[k], 0, 0, x0, y0, half, *known)
 
 
 def residual_shifts(
@@ -125,8 +125,10 @@ def residual_shifts(
 
     Parameters
     ----------
-    pixels, slopes, smooth
-        (rows, cols) of the reference: grey levels, the matcher's gradients, and smoother ones.
+    pixels, slopes
+        (rows, cols) of the reference: grey levels and the matcher's gradients.
+    smooth
+        (n, subset_px, subset_px) smoother ones, of the subsets that lie in the image.
     coefficients, order
         Spline of the other image, see :class:`core.matching.image.ImageData`.
     centres_px

@@ -112,15 +112,18 @@ def _second(values: Float, axis: int, lag: int) -> Float:
 
 def _noise_ratio(half: int, lag: int, moments: Float, shared: SharedPixels, step: tuple[float, float]) -> Float:
     """(3,) variance of the estimate over that of the strain itself, in whole windows."""
-    from scipy.signal import oaconvolve  # slow to load, and not every start needs it
-
     offsets, _ = window_offsets(half)
     side = 2 * (half + lag) + 1
     at = np.arange(-side, side + 1)
     rho = shared.correlation(at[None, :] * step[0], at[:, None] * step[1])
 
+    # sums over pairs of points by products of spectra, wide enough that nothing comes round
+    whole = (3 * side, 3 * side)
+    between = np.fft.rfft2(rho, whole)
+
     def spread(weights: Float) -> float:
-        return float((weights * oaconvolve(weights, rho, mode="same")).sum())
+        around = np.fft.irfft2(np.fft.rfft2(weights, whole) * between, whole)
+        return float((weights * around[side : 2 * side, side : 2 * side]).sum())
 
     ratios = []
     for weights, moment in zip(plane_weights(half), moments, strict=False):

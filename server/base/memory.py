@@ -13,8 +13,13 @@ def hurry() -> None:
     gc.disable()
 
 
+def go_on() -> None:
+    """End the pause; what was loaded in it is left out of the rounds, and so is its little garbage."""
+    gc.freeze()
+    gc.enable()
+
+
 def settle() -> None:
     """Exclude the present objects, modules above all, from the garbage collector's rounds: they are never freed."""
     gc.collect()
-    gc.freeze()
-    gc.enable()
+    go_on()

@@ -7,9 +7,12 @@ import importlib
 import re
 import sys
 from collections.abc import Sequence
+from types import ModuleType
 from typing import NoReturn
 
 from core.errors import Cancelled, StereorigError
+from server.base.library_threads import one_library_thread
+from server.base.memory import go_on, hurry
 from server.formats.version import software_version
 
 # name -> (module, one-line help); each module has add_arguments(parser) and run(args) -> int,
@@ -42,7 +45,19 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "export": ("server.cli.measurement.export", "results as NetCDF, CSV, VTU, MATLAB, HDF5, figures and films"),
 }
 
+#: commands that load the kernels
+_MEASURING = ("measure", "reproduce")
 _NEGATIVE_LIST = re.compile(r"-[\d.]+(e[-+]?\d+)?,")
+
+
+def _measuring(module: str) -> ModuleType:
+    """Load a command that measures: its libraries compute on one thread each."""
+    one_library_thread()
+    hurry()
+    try:
+        return importlib.import_module(module)
+    finally:
+        go_on()
 
 
 class _OneLineParser(argparse.ArgumentParser):
@@ -72,7 +87,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, (module, text) in COMMANDS.items():
         sub = subparsers.add_parser(name, help=text, description=text)
         if arguments and arguments[0] == name:
-            command = importlib.import_module(module)
+            command = _measuring(module) if name in _MEASURING else importlib.import_module(module)
             command.add_arguments(sub)
             sub.set_defaults(run=command.run)
     args = parser.parse_args(arguments)

@@ -7,12 +7,15 @@ import base64
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from core.errors import InputError
 from core.field.region.outlines import outlines_of
 from core.settings import Outline
-from server.api.models.recipes import Recipe, recipe_in
 from server.formats.files import make_folder, write_bytes
+
+if TYPE_CHECKING:
+    from server.api.models.recipes import Recipe
 
 #: options whose value is text or a number, by the setting's name
 _PLAIN = {
@@ -37,6 +40,8 @@ def load_recipe(path: Path) -> Recipe:
     InputError
         ``recipe_invalid``; ``file_missing`` if there is none.
     """
+    from server.api.models.recipes import recipe_in  # with all that travels: a third of a start, and seldom needed
+
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:

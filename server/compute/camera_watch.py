@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +16,11 @@ from core.field.points.images import MeasureImage
 from core.field.points.result import Field
 from core.field.settings import MeasureOptions
 from core.orientation import judge_offsets
-from core.orientation.change import ChangeSlopes
+from core.orientation.change import Ends, ends_of
 from core.orientation.coarse import features_off_px
 from core.orientation.finding import Against
-from core.orientation.matched import MatchedPoints, matched_points
+from core.orientation.matched import matched_points
+from core.orientation.offsets import StepOffsets
 from core.orientation.step import SAMPLE, step_points
 from server.formats.results.camera_motion import MOVED_REMEDY, CameraMotion
 
@@ -51,7 +53,11 @@ class CameraWatch:
     covariance: tuple[tuple[str, ...], NDArray[np.float64]] | None
     own_px: float | None
     imported: bool
-    _points: dict[int, MatchedPoints | None] = field(default_factory=dict)
+    _steps: dict[int, StepOffsets | None] = field(default_factory=dict)
+
+    @cached_property
+    def _ends(self) -> Ends:
+        return ends_of(self.pair, np.zeros(5))
 
     def refuse_moved(self, n: int, images: Images, cause: Exception | None = None) -> None:
         """Raise an error for a step without a match, if a camera turned too far for its epipolar lines.
@@ -102,19 +108,12 @@ class CameraWatch:
         CameraMotion or None
             None where too few points could be matched.
         """
-        points = self._of(n, lambda: (result, images))
-        if points is None:
+        step = self._of(n, lambda: (result, images))
+        if step is None:
             return None
-        slopes = ChangeSlopes(self.pair, points.xy1_px, points.xy2_px)
         names, covariance = (COVARIANCE_NAMES, None) if self.covariance is None else self.covariance
         against_calibration = judge_offsets(
-            self.pair,
-            points,
-            covariance=covariance,
-            names=names,
-            own_px=self.own_px,
-            imported=self.imported,
-            slopes=slopes,
+            self.pair, step, covariance=covariance, names=names, own_px=self.own_px, imported=self.imported
         )
         if n == self.reference:
             return CameraMotion.of(against_calibration, None, None)
@@ -122,31 +121,26 @@ class CameraWatch:
         earlier = None
         if previous is not None and previous != self.reference:
             earlier = self._of(previous, lambda: before(previous))
-        compared: tuple[tuple[MatchedPoints | None, Against], ...] = ((reference, "reference"), (earlier, "last_step"))
+        compared: tuple[tuple[StepOffsets | None, Against], ...] = ((reference, "reference"), (earlier, "last_step"))
         against_reference, against_last = (
             None
             if other is None
-            else judge_offsets(
-                self.pair,
-                points,
-                before=(other, self.pair.epipolar_residual_px(other.xy1_px, other.xy2_px)),
-                against=name,
-                covariance=covariance,
-                names=names,
-                slopes=slopes,
-            )
+            else judge_offsets(self.pair, step, before=other, against=name, covariance=covariance, names=names)
             for other, name in compared
         )
         return CameraMotion.of(against_calibration, against_reference, against_last)
 
-    def _of(self, n: int, step: Callable[[], tuple[Field, Images]]) -> MatchedPoints | None:
-        if n not in self._points:
+    def _of(self, n: int, step: Callable[[], tuple[Field, Images]]) -> StepOffsets | None:
+        if n not in self._steps:
             result, images = step()
-            if n == self.reference:
-                self._points[n] = matched_points(self.pair, result, at_most=SAMPLE)
-            else:
-                self._points[n] = step_points(self.pair, result, *images, self.options)
-            others = [k for k in self._points if k != self.reference]
+            points = (
+                matched_points(self.pair, result, at_most=SAMPLE)
+                if n == self.reference
+                else step_points(self.pair, result, *images, self.options)
+            )
+            names = COVARIANCE_NAMES if self.covariance is None else self.covariance[0]
+            self._steps[n] = None if points is None else StepOffsets(self.pair, points, names, ends=self._ends)
+            others = [k for k in self._steps if k != self.reference]
             for k in others[: max(len(others) - _KEPT, 0)]:
-                del self._points[k]
-        return self._points[n]
+                del self._steps[k]
+        return self._steps[n]

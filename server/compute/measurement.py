@@ -1,13 +1,13 @@
 """One step of an analysis, in the worker: images by path, the result as a file in the analysis' folder.
 
 The parts that the steps of one analysis share (cameras, reference images and their spline coefficients, the grid of
-points, the last fields) are kept between tasks, and the next step's images are read while a step is fitted; a fresh
-worker makes them again from the files, so a step measured anywhere gives the same result to the last bit.
+points, the last fields) are kept between tasks, the next step's images are read while a step is fitted, and that step
+is fitted while this one's file is written; a fresh worker makes them again from the files, so a step measured anywhere
+gives the same result to the last bit.
 """
 
 from __future__ import annotations
 
-import time
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -19,13 +19,16 @@ import numpy as np
 from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
 from core.compiling import NotCompiledError, refuse_compiling, report_compiling
+from core.field.points.result import Field
 from core.field.region.region import PointGrid
 from core.field.seeding.seeds import Seed
 from core.measure import MeasureOptions, ReferencePair
+from core.progress import CancelToken, Progress
 from core.systematic.interpolation import SmoothSlopes, interpolation_term
 from core.threads import available_threads, set_threads
 from server.compute.background_compilation import BackgroundCompilation, KernelsAside
 from server.compute.grid_kernels import find_drawn_grid, grid_aside
+from server.compute.overlap import Asked, Measure, MeasureAhead, timed
 from server.compute.sequence import Pair, SequenceMeasurement
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import read_mask
@@ -53,6 +56,7 @@ class _Kept:
 _kept: OrderedDict[str, _Kept] = OrderedDict()
 _aside = KernelsAside("all")
 _reader = ThreadPoolExecutor(1, thread_name_prefix="stereorig-read")
+_ahead = MeasureAhead()
 
 
 def measure_step(task: StepTask) -> dict[str, object]:
@@ -68,24 +72,49 @@ def measure_step(task: StepTask) -> dict[str, object]:
         The service asked for it.
     """
     channel = current_task()
-    began = time.perf_counter()
+    measured = _ahead.take(Asked(_key_of(task), task.step, task.previous), channel)
     kept = _kept_of(task)
     sequence = kept.sequence
     sequence.steps |= task.earlier
-    images = None if task.step.n == task.reference.n else kept.current_images(task.step) or sequence.read(task.step)
-    if task.following is not None:
+    if measured is None:
+        measured = timed(_measuring(kept, task, task.step, task.previous), channel.progress, channel)
+    elif task.following is not None:
         kept.ahead = task.following, _reader.submit(sequence.read, task.following)
-    result = sequence.measure(task.step, images, previous=task.previous, progress=channel.progress, cancel=channel)
-    compute_s = round(time.perf_counter() - began, 3)
-    finished = sequence.finish(task.step, result, about=task.about, in_service=True, keep_starts=task.keeps_starts)
+    if task.following is not None and channel.keeps_going:
+        after = Asked(_key_of(task), task.following, task.step.n)
+        _ahead.begin(after, _measuring(kept, task, task.following, task.step.n))
+    try:
+        finished = sequence.finish(
+            task.step, measured.field, about=task.about, in_service=True, keep_starts=task.keeps_starts
+        )
+    except BaseException:
+        _ahead.drop()
+        raise
     if task.previous not in (None, task.reference.n):
         # no later step starts from there
         starts_file(sequence.file_of(task.previous)).unlink(missing_ok=True)
-    return {**finished.summary, "compute_s": compute_s}
+    return {**finished.summary, "compute_s": measured.seconds}
+
+
+def _measuring(kept: _Kept, task: StepTask, step: StepImages, previous: int | None) -> Measure:
+    """Return the measurement of a step; images of the one that follows the task's are read meanwhile."""
+
+    def measure(progress: Progress, cancel: CancelToken) -> Field:
+        sequence = kept.sequence
+        images = None if step.n == task.reference.n else kept.current_images(step) or sequence.read(step)
+        if task.following is not None and step != task.following:
+            kept.ahead = task.following, _reader.submit(sequence.read, task.following)
+        return sequence.measure(step, images, previous=previous, progress=progress, cancel=cancel)
+
+    return measure
+
+
+def _key_of(task: StepTask) -> str:
+    return repr((task.folder, task.calibration, task.reference, task.settings))
 
 
 def _kept_of(task: StepTask) -> _Kept:
-    key = repr((task.folder, task.calibration, task.reference, task.settings))
+    key = _key_of(task)
     if key not in _kept:
         _kept[key] = _Kept(_begin(task))
         while len(_kept) > _KEPT:

@@ -1,15 +1,24 @@
-"""Reading ahead and writing behind: disk and decoder at work while points are fitted, one item each way.
+"""Reading ahead, writing behind and measuring ahead: disk, decoder and fits at work together, one item each way.
 
-Both keep the order of the items, hold one item at most besides the one in work, and hand errors over where a plain loop
+All keep the order of the items, hold one item at most besides the one in work, and hand errors over where a plain loop
 would have met them.
 """
 
 from __future__ import annotations
 
+import contextlib
+import threading
+import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Generic, TypeVar
+
+from core.field.points.result import Field
+from core.progress import CancelToken, Progress
+from server.worker.process import TaskChannel
+from server.worker.tasks import StepImages
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -97,3 +106,88 @@ class WriteBehind(Generic[Result]):
             self._wait()
         finally:
             self._pool.shutdown(wait=True)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A measured step and the time that it took, s."""
+
+    field: Field
+    seconds: float
+
+
+Measure = Callable[[Progress, CancelToken], Field]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a task asks for: a step of a measurement, and the step that it starts from."""
+
+    measurement: str
+    step: StepImages
+    previous: int | None
+
+
+def timed(measure: Measure, progress: Progress, cancel: CancelToken) -> Measured:
+    """Measure a step now."""
+    began = time.perf_counter()
+    field = measure(progress, cancel)
+    return Measured(field, round(time.perf_counter() - began, 3))
+
+
+class _Channel:
+    """Progress and cancellation of a step that was begun before its task: the task's own, once it is there."""
+
+    def __init__(self) -> None:
+        self.task: TaskChannel | None = None
+        self.dropped = threading.Event()
+
+    @property
+    def cancelled(self) -> bool:
+        return self.dropped.is_set() or (self.task is not None and self.task.cancelled)
+
+    def progress(self, phase: str, done: int, total: int) -> None:
+        if self.task is not None:
+            self.task.progress(phase, done, total)
+
+
+class MeasureAhead:
+    """The next step of a sequence, measured while the last one's file is written.
+
+    A step depends on the one before, not on its file. One step at most is begun before it is asked for; what it ends
+    with, an error too, goes to the task that asks for just this step, and is dropped where another one comes.
+    """
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="stereorig-ahead")
+        self._begun: tuple[Asked, _Channel, Future[Measured]] | None = None
+
+    def begin(self, asked: Asked, measure: Measure) -> None:
+        """Begin a step; the one before was taken or dropped."""
+        channel = _Channel()
+        self._begun = asked, channel, self._pool.submit(timed, measure, channel.progress, channel)
+
+    def take(self, asked: Asked, task: TaskChannel) -> Measured | None:
+        """Return the step if it was begun, once it is measured; else None, and nothing else is under way.
+
+        Raises
+        ------
+        Exception
+            What its measurement ended with.
+        """
+        if self._begun is None or self._begun[0] != asked:
+            self.drop()
+            return None
+        _, channel, future = self._begun
+        self._begun, channel.task = None, task
+        return future.result()
+
+    def drop(self) -> None:
+        """Stop what was begun, and wait until it has."""
+        if self._begun is None:
+            return
+        _, channel, future = self._begun
+        self._begun = None
+        channel.dropped.set()
+        with contextlib.suppress(Exception):  # nobody asked for it
+            future.result()

@@ -111,6 +111,7 @@ class SequenceMeasurement:
         self._common = CommonParts(self.calibration.pair, parameter_covariance(self.calibration))
         self._rbe_px = rbe_of(self.calibration)
         self._fields: dict[int, Field] = {}
+        self._previous: int | None = None
         self._last_images: tuple[int, Pair] | None = None
         self._sequence: Updating | None = None
         self._motions: dict[int, CameraMotion | None] = {}
@@ -175,7 +176,7 @@ class SequenceMeasurement:
         seeds = seeds_of(self.settings)
         if seeds is not None:
             more["seeds"] = seeds
-        self.steps[step.n] = step
+        self.steps[step.n], self._previous = step, previous
         if step.n == self.reference.n:
             own = self.pair.image1, self.pair.image2
             result = self._matched(step.n, own, lambda: self.pair.shape(self.grid, self.options, **more))
@@ -323,12 +324,15 @@ class SequenceMeasurement:
         Later steps propagate the noise of its images; the calibration's error is added once, to the total.
         """
         if n not in self._fields:
+            known = n in (self.reference.n, self._previous)
             path = self.file_of(n)
             if not path.exists():
                 raise FileFormatError(
                     f"The result of step {n} is missing.", code="file_missing", remedy="Start the analysis again."
                 )
-            measured = with_starts(read_measured(path), starts_file(path))
+            measured = read_measured(path)
+            if known:  # of others a file of start values may just be there still
+                measured = with_starts(measured, starts_file(path))
             if n != self.reference.n:
                 return measured
             self._fields[n] = measured

@@ -23,6 +23,7 @@ from typing import Any
 
 from core.compiling import COMPILING, report_compiling
 from core.errors import Cancelled
+from server.base.library_threads import one_library_thread
 from server.base.memory import settle
 from server.base.priority import end_with_parent, lower_worker
 
@@ -31,12 +32,21 @@ _current: TaskChannel | None = None
 
 
 class TaskChannel:
-    """A running task's way back to whoever asked for it: progress out, cancellation in."""
+    """A running task's way back to whoever asked for it: progress out, cancellation in.
 
-    def __init__(self, send: Callable[[tuple[Any, ...]], None], task_id: int, cancel: Event | None) -> None:
+    Attributes
+    ----------
+    keeps_going
+        True where the next task comes to this process too, so that it can be begun before it is asked for.
+    """
+
+    def __init__(
+        self, send: Callable[[tuple[Any, ...]], None], task_id: int, cancel: Event | None, *, keeps_going: bool = False
+    ) -> None:
         self._send = send
         self._task_id = task_id
         self._cancel = cancel
+        self.keeps_going = keeps_going
 
     @property
     def cancelled(self) -> bool:
@@ -60,8 +70,7 @@ def current_task() -> TaskChannel:
 
 def pin_threads(threads: int) -> None:
     """Set the thread counts of every numerical library; before they are imported."""
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = "1"
+    one_library_thread(asked=False)
     os.environ["NUMBA_NUM_THREADS"] = str(threads)
 
 
@@ -118,7 +127,7 @@ def serve(
             task_id, function, args, kwargs = connection.recv()
         except (EOFError, OSError):
             return  # the service is gone
-        _current = channel = TaskChannel(send, task_id, cancel)
+        _current = channel = TaskChannel(send, task_id, cancel, keeps_going=True)
         try:
             with report_compiling(lambda channel=channel: channel.progress(COMPILING, 0, 1)):  # type: ignore[misc]
                 result = function(*args, **kwargs)

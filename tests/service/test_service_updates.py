@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +14,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from core.errors import FileFormatError
+from core.errors import FileFormatError, StereorigError, StorageError
+from core.field.points.result import Field
 from server.api.models import AnalysisRequest
-from server.compute import measurement
+from server.compute import measurement, sequence
+from server.compute.sequence import SequenceMeasurement
 from server.formats.images import write_image
+from server.worker.process import TaskChannel
 from server.worker.tasks import StepImages, StepTask
 from tests.support import sequence_bench as bench
 
@@ -106,3 +111,62 @@ def test_the_default_is_auto() -> None:
     assert body.reference_update == "auto"
     with pytest.raises(ValueError, match="reference_update"):
         AnalysisRequest.model_validate({"region": {"rectangle": [0, 0, 9, 9]}, "reference_update": "often"})
+
+
+def test_a_step_that_was_begun_before_it_was_asked_for_is_the_same(
+    inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain, made = (tasks(inputs, tmp_path / name, reference_update="always") for name in ("plain", "ahead"))
+    for task in plain:
+        measurement.measure_step(task)
+    measurement._kept.clear()
+    monkeypatch.setattr(measurement, "current_task", lambda: TaskChannel(lambda _: None, 0, None, keeps_going=True))
+    threads: list[str] = []
+    measure = SequenceMeasurement.measure
+
+    def noted(self: SequenceMeasurement, *args: Any, **more: Any) -> Field:
+        threads.append(threading.current_thread().name)
+        return measure(self, *args, **more)
+
+    monkeypatch.setattr(SequenceMeasurement, "measure", noted)
+    following = [replace(task, following=after.step) for task, after in itertools.pairwise(made)] + made[-1:]
+    for task in following:
+        measurement.measure_step(task)
+    assert [name.startswith("stereorig-ahead") for name in threads] == [False, True, True, True]
+    for n in STEPS:
+        with (
+            xr.open_dataset(tmp_path / "plain" / f"step_{n:04d}.nc") as a,
+            xr.open_dataset(tmp_path / "ahead" / f"step_{n:04d}.nc") as b,
+        ):
+            for name in a.variables:
+                np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+    # another step is asked for than was begun: as after a step that failed
+    measurement.measure_step(following[1])
+    threads.clear()
+    measurement.measure_step(following[3])
+    assert not threads[-1].startswith("stereorig-ahead")
+    measurement._kept.clear()
+
+
+def test_a_step_begun_ahead_hands_its_error_to_whoever_asks_for_it(
+    inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = tasks(inputs, tmp_path / "broken", reference_update="never")
+    monkeypatch.setattr(measurement, "current_task", lambda: TaskChannel(lambda _: None, 0, None, keeps_going=True))
+    missing = replace(made[1].step, files=(tmp_path / "none.tif", made[1].step.files[1]))
+    summary = measurement.measure_step(replace(made[0], following=missing))
+    assert summary["valid"] > 0  # the step itself is measured and written
+    with pytest.raises(StereorigError, match=r"none\.tif"):
+        measurement.measure_step(replace(made[1], step=missing))
+    assert measurement.measure_step(replace(made[1], previous=STEPS[0]))["valid"] > 0
+    # a full disk stops the step that is written, and what was begun after it
+    full = StorageError("The disk is full.", code="storage_full", remedy="Free some.")
+
+    def refuse(*_: object, **__: object) -> None:
+        raise full
+
+    monkeypatch.setattr(sequence, "write_field", refuse)
+    with pytest.raises(StorageError):
+        measurement.measure_step(replace(made[2], following=made[3].step))
+    assert measurement._ahead._begun is None
+    measurement._kept.clear()

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float
+from core.arrays import Bool, Float, Floats
 from core.common.factor import Causes
 from core.field.points.patch import PatchChoice
 from core.field.points.smoothing_record import Smoothing
@@ -151,7 +151,7 @@ class Field:
     references: References | None = None
     smoothing: Smoothing | None = None
     cuts: Cuts | None = None
-    common: Float | None = None
+    common: Floats | None = None
     causes: Causes | None = None
     frozen: Float | None = None
     rejected: Rejected | None = None

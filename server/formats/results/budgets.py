@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Bool, Float
+from core.arrays import Bool, Float, Floats
 from core.common.factor import Causes
 from core.field.points.result import Field
 from core.names import BUDGET, BudgetName, Cause
@@ -108,7 +108,7 @@ def _diagonal(covariance: Float) -> Float:
     return np.asarray(np.diagonal(covariance, axis1=-2, axis2=-1))
 
 
-def _squares(common: Float | None, causes: Causes | None) -> Mapping[Cause, Float]:
+def _squares(common: Floats | None, causes: Causes | None) -> Mapping[Cause, Float]:
     """Variances (r, c, m) by cause; none where the common factor (r, c, m, k) is not known."""
     if common is None:
         return {}

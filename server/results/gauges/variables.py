@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
+from core.arrays import Float, Floats
 from core.errors import InputError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
@@ -33,7 +33,7 @@ class OwnSigma:
 
     own: Float
     reference: Float | None
-    common: Float | None
+    common: Floats | None
 
 
 class Variables:

@@ -10,15 +10,19 @@ import json
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from core.calibration import CalibrationOptions, NominalCamera
+from core.calibration.expect import expect
 from core.cameras.camera import Camera
 from core.cameras.lens import SeidelLens
 from core.cameras.stereo import StereoPair
 from core.names import CAMERAS
+from core.target import GridTarget
 from server.formats.images import encode_tiff
 from sim.scene import Scene
 from tests.bench.accuracy.paper_rig import Rig, load_rig, plane_scene, turn
@@ -130,5 +134,24 @@ def sequence_files(
     calibration = {
         cam: camera.paper_parameters() for cam, camera in zip(CAMERAS, (rig.pair.cam1, rig.pair.cam2), strict=True)
     }
-    (run / "calibration.json").write_text(json.dumps(calibration))
+    (run / "calibration.json").write_text(json.dumps(calibration | _covariances(rig)))
     return SequenceFiles(run, steps, suffix, rig.pair)
+
+
+def _covariances(rig: Rig) -> dict[str, Any]:
+    """What a calibration with stages is expected to know of the cameras, by cause: results have a common factor by it."""
+    target = GridTarget(pitch_mm=3.0, lines=(11, 11), line_width_mm=0.15, node_tolerance_mm=0.002)
+    one, two = (
+        NominalCamera(
+            rig.size_px,
+            phd_px=float(camera.paper_parameters()["phd_px"]),
+            standoff_mm=float(camera.paper_parameters()["z0_mm"]),
+            angle_deg=angle,
+        )
+        for camera, angle in ((rig.pair.cam1, -12.5), (rig.pair.cam2, 12.5))
+    )
+    expected = expect([-10.0, 0.0, 5.0, 10.0], target, (one, two), CalibrationOptions(lens="paper"))
+    return {
+        "covariance": {"names": list(expected.parameters), "matrix": expected.covariance.tolist()},
+        "covariance_by_cause": {cause: part.tolist() for cause, part in expected.by_cause.items()},
+    }

@@ -40,20 +40,33 @@ SUBSET_PX = 33
 SEED_SIZE = (2448, 2048)
 LARGE_SIZE, LARGE_POINTS = (6000, 4000), 250_000
 STAGES = (
-    # what, where it is looked up, under which name
+    # what, where it is looked up (module, or module:class), under which name
     ("read and decode", "server.compute.sequence", "read_image"),
     ("splines", "core.field.points.images", "prepare"),
     ("fit", "core.field.points.fitter", "fit_motion"),
     ("checks", "core.field.growth.check", "apply_validity_checks"),
     ("assemble", "core.field.growth.field", "assemble"),
     ("parts of subsets", "core.field.growth.check", "reject_straddling"),
-    ("cameras' offsets", "server.compute.camera_watch", "judge_offsets"),
+    ("cameras' offsets", "server.compute.camera_watch:CameraWatch", "judge"),
     ("systematic", "server.compute.sequence", "terms_of"),
+    ("common factor", "core.field.common:CommonParts", "of"),
     ("strain", "server.compute.sequence", "strain_of_step"),
+    ("window's bias", "server.compute.sequence", "with_strain"),
     ("summary", "server.compute.sequence", "summarise"),
+    ("strain's summary", "server.compute.sequence", "summarise_strain"),
     ("write", "server.compute.sequence", "write_field"),
 )
-BESIDE = ("read and decode", "splines", "strain", "summary", "write")  # on threads of their own
+#: on threads of their own
+BESIDE = (
+    "read and decode",
+    "splines",
+    "common factor",
+    "strain",
+    "window's bias",
+    "summary",
+    "strain's summary",
+    "write",
+)
 _CHILD_TIMEOUT_S = 1800
 
 
@@ -114,7 +127,8 @@ def run_child(arguments: list[str], *, threads: int | None = None, cache: Path |
         if threads is not None and hasattr(os, "sched_setaffinity"):
             os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:threads])
 
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    # the command keeps its libraries to one thread; a child that calls it has loaded them before
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
     if cache is not None:
         environment["NUMBA_CACHE_DIR"] = str(cache)
     start = time.perf_counter()
@@ -155,10 +169,13 @@ def timed_stages() -> Iterator[list[tuple[str, float, float, float]]]:
 
     kept = []
     try:
-        for stage, module_name, name in STAGES:
-            module = importlib.import_module(module_name)
-            kept.append((module, name, getattr(module, name)))
-            setattr(module, name, timed(stage, getattr(module, name)))
+        for stage, place, name in STAGES:
+            module_name, _, of_class = place.partition(":")
+            holder: Any = importlib.import_module(module_name)
+            if of_class:
+                holder = getattr(holder, of_class)
+            kept.append((holder, name, getattr(holder, name)))
+            setattr(holder, name, timed(stage, getattr(holder, name)))
         yield events
     finally:
         for module, name, function in kept:

@@ -96,7 +96,8 @@ class Figures:
         valid = min(s.valid for s in self.sequences)
         return "\n\n".join(
             [
-                f"{SIZE} px, {thousands(bench.POINTS)} points, {bench.SUBSET_PX} px subsets, stretch patches, gates on, strain of 9 points, one NetCDF file a step, synced; "
+                f"{SIZE} px, {thousands(bench.POINTS)} points, {bench.SUBSET_PX} px subsets, stretch patches, gates on, strain of 9 points, a "
+                f"calibration with its covariance (common factor, budgets, systematic terms), one NetCDF file a step, synced; "
                 f"{self.sequences[0].steps} steps after the reference, some 0.7 px of motion a step. The rate counts the steps after the first field, from its "
                 f"file to the last one's; {100 * valid:.2f} % of the points valid. Stages are wall milliseconds a step. "
                 f"{', '.join(bench.BESIDE)} run on threads of their own while the next or last step is fitted; the rest of a step is its share of "

@@ -11,9 +11,9 @@ from scipy.ndimage import gaussian_filter
 from core.cameras.camera import TEN_PARAMETER_NAMES, Camera
 from core.cameras.stereo import StereoPair
 from core.orientation import changed, changes_between, consequence_of, estimate_change, judge_offsets
-from core.orientation.change import ChangeSlopes
-from core.orientation.finding import calibration_slopes
+from core.orientation.change import ends_of
 from core.orientation.matched import MatchedPoints
+from core.orientation.offsets import StepOffsets, calibration_slopes
 from core.orientation.propagate import pose_parameters, repaired_covariance
 from core.orientation.repair import Repair
 from core.orientation.structure import structure_left_px
@@ -193,16 +193,24 @@ def test_a_motion_in_depth_under_an_uncertain_calibration_is_no_camera_s() -> No
     assert told.camera_moved
 
 
-def test_slopes_that_are_known_change_no_digit_of_a_finding() -> None:
-    points = matches(CAM1, CAM2, np.random.default_rng(8))
-    known = ChangeSlopes(PAIR, points.xy1_px, points.xy2_px)
-    alone, shared = judge_offsets(PAIR, points), judge_offsets(PAIR, points, slopes=known)
-    assert alone is not None
-    assert shared is not None
-    assert alone.document() == shared.document()
-    some = np.arange(len(points.xy1_px)) % 3 > 0
-    assert np.array_equal(known.of(some).offset, known.offset[some])
-    assert np.array_equal(known.of(some).position, known.position[some])
+def test_what_is_known_of_a_step_changes_no_digit_of_a_finding() -> None:
+    rng = np.random.default_rng(8)
+    points, earlier = matches(CAM1, CAM2, rng), matches(CAM1, CAM2, rng)
+    points.xy2_px[5] = np.nan  # a point without an offset
+    ends = ends_of(PAIR, np.zeros(5))
+    known, held = (StepOffsets(PAIR, of, ends=ends) for of in (points, earlier))
+    before = earlier, PAIR.epipolar_residual_px(earlier.xy1_px, earlier.xy2_px)
+    for _ in range(2):  # what the first call made, the second one takes
+        alone, shared = judge_offsets(PAIR, points), judge_offsets(PAIR, known)
+        assert alone is not None
+        assert shared is not None
+        assert alone.points == len(points.xy1_px) - 1
+        assert alone.document() == shared.document()
+        one = judge_offsets(PAIR, points, before=before, against="reference")
+        two = judge_offsets(PAIR, known, before=held, against="reference")
+        assert one is not None
+        assert two is not None
+        assert one.document() == two.document()
 
 
 def test_slopes_of_the_offset_are_its_differences() -> None:

@@ -12,12 +12,14 @@ from scipy.linalg import logm, sqrtm
 from core.errors import InputError
 from core.field.points.shared_pixels import SharedPixels
 from core.field.region.cuts import Cuts
-from core.field.region.window import distinct_windows
+from core.field.region.window import distinct_windows, window_offsets
 from core.status import PointStatus
 from core.strain import StrainField, StrainOptions, StrainStatus, surface_strain
 from core.strain.arcs import missed_slope
+from core.strain.common_part import common_part
 from core.strain.surface import surface_slopes
 from core.strain.tensors import strain_slopes
+from core.strain.window import plane_weights
 from tests.support.strain_fields import cylinder, make_field, plane, sphere, turned
 
 F_SMALL = np.array([[1.001, 0.0004, 0], [-0.0002, 0.9995, 0], [0, 0, 1]])
@@ -370,6 +372,35 @@ def test_no_window_reaches_over_empty_points(slant):
     assert (found.status[lost] == StrainStatus.NO_POINT).all()
     assert np.isnan(found.strain[lost]).all()
     assert found.valid.sum() > 700
+
+
+@pytest.mark.parametrize("order", [1, "auto"])
+def test_the_common_factor_goes_through_each_windows_own_weights(order):
+    """Point by point in numpy, with edges, lost points and a cut."""
+    rng = np.random.default_rng(4)
+    field = make_field(
+        sphere(80.0), lambda p: p @ F_SMALL.T, shape=(14, 15), cuts=Cuts([[[155.0, 70.0], [155.0, 130.0]]])
+    )
+    lost = rng.random(field.shape) < 0.05
+    field = replace(_without(field, lost), common=rng.normal(size=(*field.shape, 6, 4)))
+    options = StrainOptions(window=5, order=order)
+    slopes, surface, _, _ = surface_slopes(field, options, SharedPixels(33))
+    good = slopes.status == StrainStatus.OK
+    D = np.zeros((*field.shape, 3, 12))
+    D[good] = strain_slopes(surface.frame, surface.gradient, "green_lagrange", surface.per_mm, surface.strain).reshape(
+        -1, 3, 12
+    )
+    found = common_part(field.common, field.valid, slopes, D, 2)
+    own = {(r, c): w for rows, cols, many in slopes.reduced for r, c, w in zip(rows, cols, many, strict=True)}
+    offsets = window_offsets(2)[0]
+    for r, c in zip(*np.nonzero(good), strict=True):
+        weights = own.get((r, c), plane_weights(2))
+        used = (weights != 0.0).any(axis=0)
+        at = offsets[used] + (r, c)
+        moved = weights[:, used] @ field.common[at[:, 0], at[:, 1]].reshape(len(at), -1)
+        assert found[r, c] == pytest.approx(D[r, c] @ moved.reshape(12, 4), rel=2e-5, abs=1e-6)
+    assert len(own) > 50
+    assert (~lost & good).sum() > 150
 
 
 def test_windows_cut_off_alike_share_their_weights_and_no_other():

@@ -17,6 +17,7 @@ from core.field.region.region import PointGrid
 from core.field.seeding.seeds import Seed
 from core.measure import MeasureOptions, measure_shape
 from core.strain import StrainOptions, surface_strain
+from core.systematic import interpolation
 from core.systematic.interpolation import SmoothSlopes, interpolation_term
 from core.systematic.patch_order import patch_term
 from core.systematic.strain_window import window_term
@@ -70,6 +71,19 @@ def test_the_bias_of_sharp_discs_is_estimated_from_the_images_themselves(radius_
     assert size > 40.0
     assert np.sqrt(np.mean(np.square(estimated))) == pytest.approx(size, rel=0.33)
     assert np.sqrt(np.mean(np.square(scatter))) > 0.8 * size
+
+
+def test_a_large_image_is_smoothed_alike_where_it_is_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    image = MeasureImage(discs(SIZE, 3, radius_px=2.0)).prepared("quintic")
+    whole = SmoothSlopes.of(image)
+    monkeypatch.setattr(interpolation, "_LARGE_PIXELS", 100)
+    part = SmoothSlopes.of(image)
+    centres = np.array([[10.0, 11.0], [120.4, 80.6], [124.0, 82.0], [SIZE - 12.0, SIZE - 11.0], [12.0, 200.0]])
+    for found, known in zip(part.about(centres, 10), whole.about(centres, 10), strict=True):
+        assert found.shape == (5, 21, 21)
+        np.testing.assert_allclose(found, known, atol=1e-5 * np.abs(known).max())
+        assert (np.abs(known).max(axis=(1, 2)) > 0.0).all()
+    assert part.whole is None
 
 
 def test_a_soft_image_of_the_same_discs_has_little_of_it() -> None:

@@ -1,0 +1,130 @@
+"""Offsets of one step's points across their epipolar lines, and what judgements of them need, each made once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arrays import Float
+from core.calibration import COVARIANCE_NAMES
+from core.calibration.uncertainty import image_derivatives
+from core.cameras.stereo import StereoPair
+from core.field.region.trend import smooth_terms
+from core.orientation.change import ChangeSlopes, Ends
+from core.orientation.consequence import Consequences
+from core.orientation.matched import MatchedPoints, across_line
+from core.orientation.noise import blocks_of, effective_variance, robust_weights
+
+
+def calibration_slopes(pair: StereoPair, points: MatchedPoints, names: Sequence[str] = COVARIANCE_NAMES) -> Float:
+    """Return d(epipolar offset, px) / d(both cameras' parameters by name), (n, len(names)), at matched points.
+
+    The point that camera 1 sees stays on its pixel's ray; its image in camera 2 moves off the position that was
+    measured. What moves along the line counts for nothing.
+    """
+    xyz = pair.triangulate(points.xy1_px, points.xy2_px).xyz_mm
+    across = across_line(pair, points.xy1_px, points.xy2_px)
+    A1, A2 = pair.cam1.point_jacobian(xyz), pair.cam2.point_jacobian(xyz)
+    by_parameters = image_derivatives(pair, xyz, names)
+    by_image1 = np.einsum("nj,njk->nk", across, A2 @ np.linalg.pinv(A1))
+    return np.asarray(
+        np.einsum("nj,njk->nk", by_image1, by_parameters[:, :2]) - np.einsum("nj,njk->nk", across, by_parameters[:, 2:])
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothOffsets:
+    """Smooth part of offsets: coefficients (6,) over orthonormal terms of the image, and their covariance.
+
+    A coefficient is the root mean square that its term contributes over the points.
+    """
+
+    terms: Float
+    coefficients: Float
+    covariance: Float
+    projector: Float
+
+
+@dataclass(frozen=True, eq=False)
+class StepOffsets:
+    """Matched points of one step, that several judgements are made of.
+
+    Attributes
+    ----------
+    pair, points
+        The calibrated cameras and the points.
+    names
+        The cameras' parameters in the order of their covariance.
+    stated_px
+        (n,) the points' offsets where they are not those of their positions.
+    ends
+        As in :class:`core.orientation.change.ChangeSlopes`.
+    """
+
+    pair: StereoPair
+    points: MatchedPoints
+    names: Sequence[str] = COVARIANCE_NAMES
+    stated_px: Float | None = None
+    ends: Ends | None = None
+
+    @cached_property
+    def offset_px(self) -> Float:
+        """(n,) the offsets."""
+        if self.stated_px is not None:
+            return self.stated_px
+        return self.pair.epipolar_residual_px(self.points.xy1_px, self.points.xy2_px)
+
+    @cached_property
+    def finite(self) -> StepOffsets:
+        """Those of the points that have an offset."""
+        good = np.isfinite(self.offset_px)
+        if good.all():
+            return self
+        some = MatchedPoints(self.points.xy1_px[good], self.points.xy2_px[good], self.points.step[good])
+        return StepOffsets(self.pair, some, self.names, self.offset_px[good], self.ends)
+
+    @cached_property
+    def terms(self) -> Float:
+        """(n, 6) orthonormal terms of the image: the mean, slope and curvature."""
+        terms = np.linalg.qr(smooth_terms(self.points.xy1_px))[0] * np.sqrt(len(self.points.xy1_px))
+        return np.asarray(terms * np.sign(terms[0, 0]))
+
+    @cached_property
+    def blocks(self) -> NDArray[np.int64]:
+        """(n,) :func:`core.orientation.noise.blocks_of`."""
+        return blocks_of(self.points.xy1_px, self.points.step)
+
+    @cached_property
+    def smooth(self) -> SmoothOffsets:
+        """The smooth part of the offsets."""
+        return self.smooth_part(self.offset_px)
+
+    def smooth_part(self, offset_px: Float) -> SmoothOffsets:
+        """Fit the mean, slope and curvature of offsets (n,) robustly."""
+        terms, weights = self.terms, np.ones(len(offset_px))
+        for _ in range(4):
+            normal = np.linalg.pinv((terms * weights[:, None]).T @ terms)
+            projector = normal @ (terms * weights[:, None]).T
+            coefficients = projector @ offset_px
+            weights, _ = robust_weights(offset_px - terms @ coefficients)
+        variance = effective_variance(terms, weights, offset_px, self.blocks)
+        return SmoothOffsets(terms, coefficients, np.asarray(normal * variance, dtype=np.float64), projector)
+
+    @cached_property
+    def by_parameters(self) -> Float:
+        """(n, p) :func:`calibration_slopes`."""
+        return calibration_slopes(self.pair, self.points, self.names)
+
+    @cached_property
+    def change_slopes(self) -> ChangeSlopes:
+        """What a change of the cameras would do to the points."""
+        return ChangeSlopes(self.pair, self.points.xy1_px, self.points.xy2_px, self.ends)
+
+    @cached_property
+    def consequences(self) -> Consequences | None:
+        """What any change makes of the points; None with too few."""
+        return Consequences.of(self.pair, self.points, self.change_slopes)
