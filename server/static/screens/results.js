@@ -32,7 +32,7 @@ import { h, replace, table, when, num, count, quantity, field, select, definitio
 /** @typedef {{ result: Result, state: State, map: FieldMap, scale: Scale, interval: Interval, workspace: Workspace, overlay: Overlay, ends: Ends, probe: HTMLElement, message: HTMLElement, readonly step: number | null,
  *   readonly info: Shown | null, picture: (width: number) => string, onpick: (x: number, y: number, event: Event) => unknown, drawn: Set<() => unknown>, landed: Set<() => unknown> }} Viewer shared by the parts of the screen;
  *   `picture`: what is seen, as SVG; `drawn` is called after each change of step, field or scale, `landed` once more steps are finished */
-/** @typedef {{ root: HTMLElement, update: () => Promise<void>, close: () => void, attach?: () => void, seen?: () => Seen }} OtherView shown instead of the map */
+/** @typedef {{ root: HTMLElement, update: () => Promise<void>, close: () => void, attach?: () => void, seen?: () => Seen[], about?: string, ownScales?: () => boolean }} OtherView shown instead of the map */
 
 /**
  * Which axes a step's frame has, in a few words.
@@ -162,9 +162,9 @@ async function show(root, testId, analysisId, query) {
     result, state, map, scale, workspace, ends, probe, message, interval: /** @type {any} */ (null), overlay: /** @type {any} */ (null),
     get step() { return state.step; },
     get info() { return state.info; },
-    picture: (width) => seenPicture([other?.seen?.() ?? { frame: map.view.frame, within: map.view.content }], {
-      title: `${result.test.name || testId}: ${state.info?.text ?? state.field}, ${state.step === null ? "" : result.stepText(state.step)}`, scale, width,
-      notes: [`axes of the ${result.frame === "system" ? "calibration" : "specimen"}; ${other?.seen ? "the surface in space" : `over the image: ${imageChoice.selectedOptions[0].textContent}`}; ${message.textContent}`, `test ${testId}, analysis ${analysisId}, calibration ${result.analysis.calibration_id ?? result.test.calibration_id ?? "not stated"}`],
+    picture: (width) => seenPicture(other?.seen?.() ?? [{ frame: map.view.frame, within: map.view.content }], {
+      title: `${result.test.name || testId}: ${state.info?.text ?? state.field}, ${state.step === null ? "" : result.stepText(state.step)}`, scale: other?.ownScales?.() ? null : scale, width,
+      notes: [`axes of the ${result.frame === "system" ? "calibration" : "specimen"}; ${other?.about ?? `over the image: ${imageChoice.selectedOptions[0].textContent}`}; ${message.textContent}`, `test ${testId}, analysis ${analysisId}, calibration ${result.analysis.calibration_id ?? result.test.calibration_id ?? "not stated"}`],
     }),
     onpick: (x, y) => pick(x, y),
     drawn: new Set(),
