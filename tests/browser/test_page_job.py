@@ -305,7 +305,7 @@ def check_gauges(shown: Page) -> None:
     assert full > 0  # its face is stretched in the middle
     areas = json.loads(shown.locator('[data-role="area"]').get_attribute("data-answer") or "null")
     assert areas[-1]["mean"] == pytest.approx(2 * areas[-2]["mean"], rel=0.02)
-    rows = shown.locator('[data-role="area"] tbody tr')
+    rows = shown.locator('[data-role="area"] > .scroll > table > tbody > tr')
     expect(rows.first.locator("td").nth(2)).to_have_text("0")  # the reference
     expect(rows.last.locator("td").nth(2)).to_contain_text("mm")
     tools.get_by_role("button", name="Probe", exact=True).click()
