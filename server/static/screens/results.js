@@ -1,7 +1,7 @@
 // Results: the tests and analyses, and one analysis' fields over the image and in space.
 import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
-import { Result, allTests } from "./results/analysis.js";
+import { Result, aboutText, allTests } from "./results/analysis.js";
 import { FieldMap, measured } from "../widgets/field_map.js";
 import { Scale } from "../widgets/scale.js";
 import { about } from "./results/about.js";
@@ -222,7 +222,7 @@ async function show(root, testId, analysisId, query) {
     }
     const { frame } = await result.fields(state.step);
     if (!(await map.load(result, state.step, state.info, state.image))) return;
-    message.textContent = `${state.info.about.replace(/([XYZ])_(frame|sys)/, "$1").replace("axis 1", "X").replace("axis 2", "Y")} · axes: ${axesText(frame)}`;
+    message.textContent = `${aboutText(state.info)} · axes: ${axesText(frame)}`;
     await redraw();
   }
 

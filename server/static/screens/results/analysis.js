@@ -48,6 +48,12 @@ export function groupOf(name) {
   return { at, group: GROUPS[at][0] };
 }
 
+/**
+ * What a field is, its axes named as they are drawn.
+ * @param {Shown} info
+ */
+export const aboutText = (info) => info.about.replace(/([XYZ])_(frame|sys)/, "$1").replace("axis 1", "X").replace("axis 2", "Y");
+
 export class Result {
   /**
    * @param {Model<"TestReply">} test

@@ -1,10 +1,10 @@
 // Gauges drawn on the picture: a line, extensometers, an area; read by the API's gauges operation.
 import * as api from "../../lib/api.js";
 import { chart } from "../../widgets/plots.js";
-import { h, svg, numeric, replace, table, num, count, number, select, field, action, notify, problemText } from "../../lib/dom.js";
+import { h, svg, numeric, replace, table, num, tick, count, number, select, field, action, notify, problemText } from "../../lib/dom.js";
 import { nudge, onGrab } from "../../widgets/view.js";
 import { amount, shown, uncertain } from "../../lib/units.js";
-import { pretty, shownUnit } from "./analysis.js";
+import { aboutText, pretty, shownUnit } from "./analysis.js";
 import { keptGauges } from "./kept.js";
 import { abscissas, areaChart, isRelative } from "./histories.js";
 import { distanceMm } from "../../lib/along.js";
@@ -55,7 +55,7 @@ export function gauges(screen) {
     if (view.drawing) {
       screen.message.textContent = inReference() ? "By keyboard: arrow keys move the cross-hair (Shift 10 px, Alt 0.1 px), Enter sets an end, Escape leaves." : "Gauges are drawn on the reference image: choose it under Image.";
       if (byKey) view.frame.focus();
-    } else screen.message.textContent = screen.info?.about ?? "";
+    } else screen.message.textContent = screen.info ? aboutText(screen.info) : "";
     for (const button of buttons) button.setAttribute("aria-pressed", String(button.dataset.tool === name));
     view.frame.style.cursor = name === "probe" ? "" : "cell";
     if (name !== "probe") panels[name].open = true;
@@ -244,7 +244,7 @@ export function gauges(screen) {
   // numbers by keyboard ----------------------------------------------------------------------------------------
   /** @type {(names: string[], set: (v: Four) => unknown) => { inputs: HTMLInputElement[], row: HTMLElement }} */
   const four = (names, set) => {
-    const inputs = names.map((name) => number(null, { "aria-label": name, style: "width:6em" }));
+    const inputs = names.map((name) => number(null, { "aria-label": name, style: "width:5em" }));
     const use = action("Use", async () => {
       const v = inputs.map((one) => Number(one.value));
       if (inputs.some((one) => one.value === "") || !v.every(Number.isFinite)) throw new Error("Give all four numbers, in pixels of camera 1's reference image.");
@@ -387,7 +387,7 @@ export function gauges(screen) {
       return withBudget(uncertain((v * factor) / to, (s * factor * interval.factor) / to, base, most), budgetTable(budget, base, factor / to, lacking ?? ""));
     };
     replace(extTable, table([
-      ["Step", (one) => one.n], ["Label", (one) => one.label], ...(over.value === "n" ? [] : [numeric(against.text, (/** @type {Row} */ one) => num(one.x, 6))]),
+      ["Step", (one) => one.n], ["Label", (one) => one.label], ...(over.value === "n" ? [] : [numeric(against.text, (/** @type {Row} */ one) => tick(one.x))]),
       ...state.extensometers.map((gauge, k) => numeric(gauge.name, (/** @type {Row} */ one) => valueText(one, k))),
     ], rows, { caption: `± ${interval.text}` }),
     h("div.row", state.extensometers.map((gauge) => h("button", { type: "button", onclick: () => { state.extensometers = state.extensometers.filter((one) => one !== gauge); changed("extensometer"); } }, `Remove ${gauge.name}`))));

@@ -2,7 +2,7 @@
 import * as api from "../../lib/api.js";
 import { chart } from "../../widgets/plots.js";
 import { shown, uncertain } from "../../lib/units.js";
-import { h, replace, field, numeric, num, table, notify } from "../../lib/dom.js";
+import { h, replace, field, numeric, table, tick, notify } from "../../lib/dom.js";
 import { shownUnit } from "./analysis.js";
 import { abscissas, isRelative } from "./histories.js";
 
@@ -79,7 +79,7 @@ export function pointHistory(screen) {
     text.textContent = `${label}; the band is ± ${interval.symbol}: ${interval.text}`;
     plot = await chart(box, { x: against.choice.selectedOptions[0]?.text ?? "", y: `${info.text}${to.unit ? ` (${to.unit})` : ""}`, height: 320, label, series: [{ label: info.text, dots: true }, { label: "+", edge: true }, { label: "−", edge: true }],
       bands: [[2, 3]], data: [placed.map((one) => one.x), value, band(1), band(-1)] });
-    replace(list, table([["Step", (one) => one.n], ...(against.choice.value === "n" ? [] : [numeric(against.choice.selectedOptions[0]?.text ?? "", (/** @type {typeof placed[number]} */ one) => num(one.x, 6))]),
+    replace(list, table([["Step", (one) => one.n], ...(against.choice.value === "n" ? [] : [numeric(against.choice.selectedOptions[0]?.text ?? "", (/** @type {typeof placed[number]} */ one) => tick(one.x))]),
       numeric(`${info.text} ± ${interval.symbol}`, (one) => (one.value === null ? one.why : one.n === zero ? "0" : uncertain(one.value * factor, one.u === null ? null : one.u * interval.factor * factor, base, most)))], placed, { caption: label }));
   }
 
