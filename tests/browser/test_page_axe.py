@@ -176,8 +176,7 @@ def test_the_report_and_its_facts(page: Watched, bench: Bench) -> None:
     expect(report.get_by_role("heading", name="plate <b>&", level=1)).to_be_visible(timeout=200_000)
     expect(report.get_by_role("cell", name="Room <7> & 8", exact=True)).to_be_visible()
     expect(report.get_by_role("cell", name="f/5.6", exact=True)).to_be_visible()
-    # axe sees a report of the same form in test_page_job
-    auditor(report, axe_at=())("the report")
+    # axe, and every size, see a report of the same form in test_page_job
     page.sound()
 
 
