@@ -97,7 +97,8 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
         with served(service) as client:
             wait_for_rig(client)
             client.put(f"{API}/sim/scene", json={"scene": "plate", "load": 689.0}).raise_for_status()
-            yield Bench(service, client, **ids, cut_id=with_a_cut(service, **ids))
+            test_id, analysis_id = ids["test_id"], ids["analysis_id"]
+            yield Bench(service, client, test_id, analysis_id, with_a_cut(service, test_id, analysis_id))
     finally:
         service.close()
 
