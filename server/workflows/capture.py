@@ -7,11 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from core.errors import ImageError
-from core.names import CAMERAS
+from core.names import CAMERAS, CameraName
 from server.base.metrics import timed_capture
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import GrayImage, decode, encode_tiff
-from server.results.images.quality import image_quality, pair_quality
+from server.results.images.quality import ImageQuality, image_quality, pair_quality, quality_warning
 from server.rig.cameras import CapturedPair
 from server.store.documents import StepMetadata, StepRecord
 from server.store.folder import now_utc
@@ -59,7 +59,8 @@ def commit_pair(
     if service.tests.is_calibrated(test_id):
         check_same_cameras(service.tests.calibration_file(test_id), rig.identities(), "The step")
     depth = {cam: 16 if captured.scale > 1 else captured.bit_depth[cam] for cam in CAMERAS}
-    quality = pair_quality(*(image_quality(captured.pixels[cam], depth[cam]) for cam in CAMERAS))
+    rated = {cam: image_quality(captured.pixels[cam], depth[cam]) for cam in CAMERAS}
+    quality = pair_quality(*rated.values())
     dz: dict[str, float] = {cam: rig.dz_of(cam, positions_mm[rig.config.camera(cam).stage_axis]) for cam in CAMERAS}
     warnings = off_zero_warnings(rig.config.calibration.moves, dz)
     if warnings and rig.config.calibration.moves != "target":
@@ -81,7 +82,7 @@ def commit_pair(
         "bit_depth": captured.bit_depth,
         "frame_sequence": captured.sequence,
         "dz_mm": dz,
-        "warnings": warnings,
+        "warnings": warnings + _quality_warnings(rated),
         "scene": None if rig.scene is None else rig.scene.model_dump(),
         "quality": quality,
         "image_size_px": sizes,
@@ -103,6 +104,10 @@ def off_zero_warnings(moves: str, dz_mm: Mapping[str, float]) -> list[str]:
     return [f"{who}. POST /stage/moves with dz_mm 0 for both cameras takes it back."]
 
 
+def _quality_warnings(rated: Mapping[CameraName, ImageQuality]) -> list[str]:
+    return [text for cam in CAMERAS if (text := quality_warning(cam, rated[cam])) is not None]
+
+
 @timed_capture("import")
 def import_step(service: Service, test_id: str, data: dict[str, bytes], metadata: StepMetadata) -> StepRecord:
     """Commit two image files as the test's next step; returns ``step.json``.
@@ -121,13 +126,15 @@ def import_step(service: Service, test_id: str, data: dict[str, bytes], metadata
     _check_sizes(service, test_id, sizes)
     _check_content(images)
     depth = {cam: 8 * images[cam].dtype.itemsize for cam in CAMERAS}
+    rated = {cam: image_quality(images[cam], depth[cam]) for cam in CAMERAS}
     document = {
         **metadata.plain(),
         "source": "import",
         "captured_utc": now_utc(),
         "skew_ms": None,
         "bit_depth": depth,
-        "quality": pair_quality(*(image_quality(images[cam], depth[cam]) for cam in CAMERAS)),
+        "quality": pair_quality(*rated.values()),
+        "warnings": _quality_warnings(rated),
         "image_size_px": sizes,
         **({"grey_from": grey_from} if grey_from else {}),
     }

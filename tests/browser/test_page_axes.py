@@ -112,6 +112,6 @@ def test_axes_are_chosen_by_clicks_and_kept_with_the_test(page: Watched, bench: 
     assert kept["chosen"]
     assert kept["frame"]["kind"] == "plane"
     at.get_by_role("button", name="Best plane, X along the image's rows").click()
-    expect(state).to_contain_text("nobody chose others")
+    expect(state).to_contain_text("Usual axes: best plane")
     reads(at, 1e6 * LATERAL, 3.0)
     page.sound()

@@ -68,12 +68,14 @@ def test_a_bump_between_steps_is_told_with_its_consequence_and_remedy(
     assert motion["camera_moved"] is True
     shown = page.open(f"#/results/{test_id}/{made['analysis_id']}?step=1")
     told = shown.locator('[data-role="camera-motion"]')
-    expect(told).to_contain_text(motion["text"], timeout=SLOW)
+    seen = motion["text"].replace(" um ", " µm ").replace("+-", "±").replace("sigma", "σ")
+    seen = seen.replace("microstrain", "µm/m")
+    expect(told).to_contain_text(seen, timeout=SLOW)
     assert "um in shape" in motion["text"]
     expect(told).to_contain_text("stereorig calibration repair")
     about = shown.locator('[data-role="about"]')
     about.locator("summary").first.click()
-    expect(about.locator("li").filter(has_text=motion["text"])).to_have_count(1)
+    expect(about.locator("li").filter(has_text=seen)).to_have_count(1)
     expect(about.get_by_role("row").filter(has_text="moved").first).to_be_visible()
     # the reference itself has nothing against it
     assert at_rest["camera_motion"]["camera_moved"] is not True

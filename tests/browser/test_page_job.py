@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -208,6 +209,7 @@ def test_from_the_rig_to_the_report(page: Watched, client: httpx.Client, made: M
     progress.get_by_role("link", name="Show results").click()
 
     check_field(shown, client, made.test_id)
+    check_gauges(shown)
     export_opens(shown, client, made.test_id)
     audit("5 results and export")
     check_report(shown)
@@ -277,6 +279,38 @@ def check_field(shown: Page, client: httpx.Client, test_id: str) -> None:
     assert np.sqrt(np.mean(wrong[good] ** 2)) < 2.0  # um
 
 
+def check_gauges(shown: Page) -> None:
+    """An extensometer, a line and an area are drawn: strain and mean deflection grow with the load."""
+    tools = shown.get_by_role("group", name="Tool")
+    canvas = shown.locator('canvas[data-role="map"]')
+    shown.get_by_role("button", name="Fit", exact=True).first.click()
+    for tool, start, end, role in (
+        ("Extensometer", (80, 116), (160, 116), "extensometer-chart"),
+        ("Line", (70, 100), (170, 100), "line-chart"),
+        ("Area", (100, 95), (140, 135), "area"),
+    ):
+        tools.get_by_role("button", name=tool, exact=True).click()
+        canvas.scroll_into_view_if_needed()
+        shown.mouse.move(*on_screen(canvas, *start))
+        shown.mouse.down()
+        shown.mouse.move(*on_screen(canvas, *end), steps=3)
+        shown.mouse.up()
+        expect(shown.locator(f'[data-role="{role}"]')).to_have_attribute("data-answer", re.compile("value|mean"))
+    shown.get_by_label("Against", exact=True).select_option("load")
+    answer = json.loads(shown.locator('[data-role="extensometer-chart"]').get_attribute("data-answer") or "null")
+    assert answer["x"] == [load for _, load in STEPS]
+    none, half, full = (one[0] for one in answer["value"])
+    assert none == 0
+    assert half == pytest.approx(0.5 * full, abs=3 * (answer["sigma"][2][0] or 0))  # the plate is linear
+    assert full > 0  # its face is stretched in the middle
+    areas = json.loads(shown.locator('[data-role="area"]').get_attribute("data-answer") or "null")
+    assert areas[-1]["mean"] == pytest.approx(2 * areas[-2]["mean"], rel=0.02)
+    rows = shown.locator('[data-role="area"] > .scroll > table > tbody > tr')
+    expect(rows.first.locator("td").nth(2)).to_have_text("0")  # the reference
+    expect(rows.last.locator("td").nth(2)).to_contain_text("mm")
+    tools.get_by_role("button", name="Probe", exact=True).click()
+
+
 def on_screen(canvas: Locator, x: float, y: float) -> tuple[float, float]:
     """Where a pixel lies in the window, by the transform that the browser drew it with."""
     box = canvas.evaluate("c => { const b = c.getBoundingClientRect(); return [b.left, b.top, b.width, b.height] }")
@@ -320,6 +354,7 @@ def check_report(shown: Page) -> None:
         "A. Smith",
         "689 kPa 387.8",
         "Stereo angle",
+        "E1",
         "Subset size 25 px",
         "Step size 5 px",
         "Strain formulation Green-Lagrange",

@@ -105,6 +105,38 @@ def test_the_surface_is_saved_with_its_axes_and_its_bar(page: Watched, bench: Be
     page.sound()
 
 
+def test_both_views_are_saved_side_by_side_and_their_difference_with_a_bar_of_its_own(
+    page: Watched, bench: Bench
+) -> None:
+    at = shown(page, bench)
+    at.get_by_text("Export and report").click()
+    at.get_by_role("button", name="Side by side").click()
+    expect(at.locator('canvas[data-role="map-other"]')).to_have_attribute("data-shown", "2 w_mm reference")
+    expect(at.locator('[data-role="seen"]')).to_contain_text("both views side by side")
+    picture = pixels(saved(at, at.locator('[data-role="save-png"]')))
+    each = (picture.shape[1] - 3 * EDGE) // 2
+    top = TOP[True]
+    at.mouse.move(2, 2)
+    for k, left in enumerate((EDGE, 2 * EDGE + each)):
+        looked = Image.open(io.BytesIO(at.locator(".view .content").nth(k).screenshot())).convert("RGB")
+        high = round(each * looked.height / looked.width)
+        expected = np.asarray(looked.resize((each, high), Image.Resampling.BILINEAR)).astype(float)
+        found = picture[top : top + high, left : left + each]
+        own = np.abs(found - expected[: found.shape[0], : found.shape[1]]).mean()
+        assert own < 0.4 * np.abs(found[:, ::-1] - expected[: found.shape[0], : found.shape[1]]).mean()
+    svg = at.get_by_role("button", name="Save as SVG").last
+    drawing = saved(at, svg).read_text()
+    assert (drawing.count('data-role="seen"'), drawing.count('data-role="bar"')) == (2, 1)
+    assert "with a cut, step 2" in drawing
+    at.get_by_label("Right view").select_option("difference")
+    expect(at.locator('[data-role="difference-panel"]')).to_be_visible()
+    expect(at.locator('[data-role="difference"]')).to_have_attribute("data-count", re.compile(r"\d"))
+    drawing = saved(at, svg).read_text()
+    assert (drawing.count('data-role="seen"'), drawing.count('data-role="bar"')) == (2, 2)
+    assert "This less with a cut, step 2" in drawing
+    page.sound()
+
+
 def test_a_calibrations_plots_are_saved_as_numbers_and_pictures(page: Watched, bench: Bench) -> None:
     at = page.open("#/calibrate")
     expect(at.get_by_role("region", name="Views")).to_be_visible()

@@ -351,12 +351,18 @@ def test_each_field_of_a_measurement_says_its_error_beside_itself_and_nothing_is
     ):
         measure.get_by_label(label, exact=True).fill(text)
     expect(measure.get_by_role("alert")).to_have_count(0)
-    # what cannot stand beside a field is left behind with its screen
+    # a region that is missing is said where it is drawn; what stands beside no field is left behind with its screen
     Editor(shown).key("Control+z")  # the region goes
     expect(measure.locator('[data-role="texture"]')).to_contain_text("Draw a region")
     start.click()
+    missing = measure.get_by_role("alert")
+    expect(missing).to_contain_text("There is no region.")
+    expect(measure.get_by_role("button", name="Find the specimen")).to_be_focused()
+    Editor(shown).key("Control+y")
+    expect(missing).to_have_count(0)
+    shown.evaluate("import('/static/lib/dom.js').then(({ notify }) => { notify(new Error('It is over.')) })")
     notice = shown.locator("#notices .notice.bad")
-    expect(notice).to_contain_text("There is no region.")
+    expect(notice).to_contain_text("It is over.")
     shown.get_by_role("link", name="Jobs & system", exact=True).click()
     expect(shown.get_by_role("heading", level=1, name="Jobs and system")).to_be_visible()
     expect(notice).to_have_count(0)

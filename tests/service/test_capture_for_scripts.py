@@ -66,6 +66,21 @@ def test_a_step_keeps_the_clients_time_and_channels_and_tells_what_it_is_worth(
 
 
 @pytest.mark.fault(48)
+def test_a_pair_that_cannot_be_measured_says_so_at_its_top_with_what_to_do(client: httpx.Client) -> None:
+    test_id = new_test(client)
+    client.patch(f"{API}/cameras/cam2", json={"exposure_ms": 0.01}).raise_for_status()
+    try:
+        step = client.post(f"{API}/tests/{test_id}/steps", json={}).json()
+    finally:
+        client.patch(f"{API}/cameras/cam2", json={"exposure_ms": 10.0}).raise_for_status()
+    assert step["quality"]["cam2"]["code"] == "dark"
+    [told] = [text for text in step["warnings"] if text.startswith("cam2: it is too dark")]
+    assert told.endswith("Check lens cap, light, exposure.")
+    assert client.get(f"{API}/tests/{test_id}/steps/0").json()["warnings"] == step["warnings"]
+    again = client.post(f"{API}/tests/{test_id}/steps", json={}).json()
+    assert [text for text in again["warnings"] if text.startswith("cam2: it is too dark")] == []
+
+
 @pytest.mark.parametrize(
     "change",
     [

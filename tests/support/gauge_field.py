@@ -64,7 +64,7 @@ def make_field(
         y_px=y,
         status=status,
         xyz_mm=numbers(xyz),
-        normal_sys=numbers(np.broadcast_to([0.0, 0.0, -1.0], xyz.shape)),
+        normal_sys=numbers(np.broadcast_to([0.0, 0.0, 1.0], xyz.shape)),  # away from camera 1
         theta_rad=numbers(flat),
         phi_rad=numbers(flat),
         zp_mm=numbers(flat),

@@ -20,9 +20,10 @@ Style = tuple[str, tuple[int, int]]
 RULES = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "best-practice"]
 DESK, ACROSS, UPRIGHT = (1280, 800), (1024, 768), (768, 1024)
 STYLES: list[Style] = [("light", DESK), ("dark", DESK), ("light", ACROSS), ("dark", UPRIGHT)]
+# axe takes seconds on a full screen: colours are looked at in both schemes, what is folded away at both widths
+AXE_STYLES: list[Style] = [("light", DESK), ("dark", UPRIGHT)]
 WIDE, PHONE = (1440, 900), (390, 844)
 EVERY_SIZE: list[Style] = [(scheme, size) for size in (WIDE, ACROSS, PHONE) for scheme in ("light", "dark")]
-# axe takes seconds on a full screen: colours are looked at in both schemes, what is folded away at both ends
 AXE_AT: list[Style] = [("light", WIDE), ("dark", PHONE)]
 # a folder: each screen is saved there as it is seen at each size
 PICTURES = "STEREORIG_PAGE_PICTURES"

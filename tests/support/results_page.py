@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
+import json
+import os
+import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -44,9 +49,9 @@ class Bench:
         return np.array(answer.json()["values"], dtype=float)
 
 
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    service = Service(parse_config(SMALL), tmp_path_factory.mktemp("results") / "data").start()
+def make_plate(data: Path) -> dict[str, str]:
+    """Calibrate, capture the plate under three pressures and measure it; return the ids of test and analysis."""
+    service = Service(parse_config(SMALL), data).start()
     try:
         with served(service) as client:
             wait_for_rig(client)
@@ -63,9 +68,37 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
             asked = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "spacing_px": 10, "strain": {"window": 5}}
             made = client.post(f"{API}/tests/{test_id}/analyses", json=asked).json()
             assert wait_for_job(client, made["job"])["state"] == "succeeded"
-            yield Bench(
-                service, client, test_id, made["analysis_id"], with_a_cut(service, test_id, made["analysis_id"])
-            )
+    finally:
+        service.close()
+    return {"test_id": test_id, "analysis_id": str(made["analysis_id"])}
+
+
+def plate_data(shared: Path, copy: Path) -> dict[str, str]:
+    """Copy a data folder with the measured plate, made once in a run: whichever worker comes first makes it."""
+    shared.mkdir(parents=True, exist_ok=True)
+    found = shared / "ids.json"
+    with (shared / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not found.exists():
+            shutil.rmtree(shared / "data", ignore_errors=True)
+            found.write_text(json.dumps(make_plate(shared / "data")))
+    shutil.copytree(shared / "data", copy)
+    ids: dict[str, str] = json.loads(found.read_text())
+    return ids
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    base = tmp_path_factory.getbasetemp()
+    data = tmp_path_factory.mktemp("results") / "data"
+    ids = plate_data((base.parent if os.environ.get("PYTEST_XDIST_WORKER") else base) / "plate", data)
+    service = Service(parse_config(SMALL), data).start()
+    try:
+        with served(service) as client:
+            wait_for_rig(client)
+            client.put(f"{API}/sim/scene", json={"scene": "plate", "load": 689.0}).raise_for_status()
+            test_id, analysis_id = ids["test_id"], ids["analysis_id"]
+            yield Bench(service, client, test_id, analysis_id, with_a_cut(service, test_id, analysis_id))
     finally:
         service.close()
 

@@ -118,6 +118,26 @@ def image_quality(pixels: NDArray[Any], bit_depth: int) -> ImageQuality:
     return ImageQuality(code, mean, mean / full, saturated, contrast, texture, focus)
 
 
+def quality_warning(name: str, quality: ImageQuality) -> str | None:
+    """Return what to warn of in an image, with what to do; None where nothing is wrong with it.
+
+    Parameters
+    ----------
+    name
+        Of its camera.
+    quality
+        Its figures.
+    """
+    said = {
+        "saturated": f"{quality.saturated_share:.1%} of its pixels are at full scale. Lower exposure, gain or light",
+        "dark": f"it is too dark, {quality.mean_share:.1%} of full scale in the mean. Check lens cap, light, exposure",
+        "blank": "it shows noise alone. Check lens cap, light, exposure and that the specimen carries a pattern",
+        "low_texture": "it has too little texture. Check focus, light and that the specimen carries a pattern",
+        "blurred": f"it is blurred: a focus figure of {quality.focus or 0.0:.2f}, below {BLURRED_RATIO}. Focus",
+    }.get(quality.code)
+    return None if said is None else f"{name}: {said}."
+
+
 def pair_quality(cam1: ImageQuality, cam2: ImageQuality) -> dict[str, Any]:
     """Quality of a pair: the first thing that is wrong, and both cameras' figures."""
     code = cam1.code if cam1.code != "ok" else cam2.code

@@ -149,7 +149,7 @@ export function count(value) {
 export function tick(value) {
   if (value === 0) return "0";
   const size = Math.abs(value);
-  const text = size >= 1e5 || size < 1e-3 ? value.toExponential(2).replace(/\.?0+e/, "e") : String(Number(value.toPrecision(6)));
+  const text = size >= 1e6 || size < 1e-3 ? value.toExponential(2).replace(/\.?0+e/, "e") : String(Number(value.toPrecision(6)));
   return text.replaceAll("-", "−");
 }
 
@@ -164,10 +164,10 @@ export function quantity(value, unit, digits = 4) {
 }
 
 /** @param {string | null | undefined} utc */
-export function when(utc) {
+export function when(utc, options = /** @type {Intl.DateTimeFormatOptions | undefined} */ (undefined)) {
   if (!utc) return "–";
   const date = new Date(utc);
-  return Number.isNaN(date.valueOf()) ? utc : date.toLocaleString();
+  return Number.isNaN(date.valueOf()) ? utc : date.toLocaleString(undefined, options);
 }
 
 let fields = 0;

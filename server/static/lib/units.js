@@ -53,12 +53,13 @@ function fixed(value, decimals) {
  * @param {number | null | undefined} value
  * @param {number | null | undefined} u in the same unit
  * @param {string} unit
+ * @param {number} [size] of the largest number beside it: a column has one unit
  * @returns {string} a value without an uncertainty with four digits; an unknown value is a dash
  */
-export function uncertain(value, u, unit) {
+export function uncertain(value, u, unit, size = 0) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
-  if (u === null || u === undefined || !(u > 0) || !Number.isFinite(u)) return amount(value, unit);
-  const to = shown(unit, Math.max(Math.abs(value), u));
+  if (u === null || u === undefined || !(u > 0) || !Number.isFinite(u)) return amount(value, unit, 4, size);
+  const to = shown(unit, Math.max(Math.abs(value), u, size));
   const two = Number((u * to.factor).toPrecision(2));
   const decimals = 1 - Math.floor(Math.log10(two) + 1e-12);
   const after = to.unit ? `\u00a0${to.unit}` : "";
@@ -70,9 +71,10 @@ export function uncertain(value, u, unit) {
  * A number in the unit that suits.
  * @param {number | null | undefined} value
  * @param {string} unit
+ * @param {number} [size] of the largest number beside it: a column has one unit
  */
-export function amount(value, unit, digits = 4) {
-  const to = shown(unit, value ?? null);
+export function amount(value, unit, digits = 4, size = 0) {
+  const to = shown(unit, value === null || value === undefined ? null : Math.max(Math.abs(value), size));
   const text = num(value === null || value === undefined ? value : value * to.factor, digits);
   return text === "–" || !to.unit ? text : `${text}\u00a0${to.unit}`;
 }
@@ -88,3 +90,9 @@ export function evenMarks(values) {
   const decimals = Math.max(0, 1 - Math.floor(Math.log10(step) + 1e-9));
   return values.map((v) => fixed(v, Math.min(decimals, 6)));
 }
+
+/**
+ * The service's words as the page writes units: µm, ±, µm/m.
+ * @param {string | null | undefined} text
+ */
+export const inUnits = (text) => (text ?? "").replaceAll("+-", "±").replace(/(?<=\d )um\b/g, "µm").replace(/(?<=\d )microstrain\b/g, "µm/m").replace(/(?<=\d )sigma\b/g, "σ");

@@ -69,7 +69,7 @@ export async function open(root, { path }) {
     replace(list, table([
       ["Compare", (one) => h("input", { type: "checkbox", value: one.id, checked: compared.has(one.id), disabled: one.state !== "complete", "aria-label": `Compare ${one.id}` }), { unseen: true }],
       ["Calibration", (one) => h("a", { href: `#/calibrate/${one.id}`, "aria-current": one.id === chosen ? "true" : null }, one.label || one.id)],
-      ["Made", (one) => when(one.created_utc)],
+      ["Made", (one) => when(one.created_utc, { dateStyle: "short", timeStyle: "short" })],
       ["State", (one) => statusBadge({ state: one.state, decision: one.decision, level: /** @type {string | undefined} */ (one.verdict?.level) })],
     ], entries, { caption: "Calibrations, newest first", empty: "No calibration yet: run one, or import one." }));
   }
@@ -261,6 +261,7 @@ function run(rig, ends, done, first) {
         ? h("p", verdictOf(ended), " It is shown below.")
         : ended.state === "cancelled" ? h("p", badge("cancelled", "warn"), " The axes were stopped; no calibration was computed from the views.") : problemText(api.jobProblem(ended)));
       if (id) await done(id);
+      if (ended.state === "succeeded") document.querySelector('[aria-label="Verdict"]')?.scrollIntoView({ block: "start" });
     } catch (error) {
       if (!api.aborted(error)) throw error;
     } finally {
@@ -278,7 +279,7 @@ function run(rig, ends, done, first) {
     h("p.quiet", `Target of the rig file: ${targetText(target)}, pitch ${quantity(target.pitch_mm, "mm")}, positions known to ±${um(target.node_tolerance_mm)}. ${MOVES[usual.moves ?? "cameras"]}`),
     h("div.fields",
       field("Fitted positions", positions, "mm", "dZ, away from the target"), field("Held-out positions", held, "mm", "for an independent check"),
-      field("Frames averaged", frames), field("Localiser", localiser), field("Label", label)),
+      field("Frames averaged", frames), field("Line detection", localiser), field("Label", label)),
     h("details", { open: first }, h("summary", "Expected uncertainty"),
       h("div.fields", field("Assumed noise of an intersection", noise, "px"), field("Rotation of the grid", roll, "°", "in the images; 45 for a grid on its corner")), expected),
     h("div.row", start), progress, note.root);
@@ -340,12 +341,12 @@ function decisions(document_, changed, gone) {
   const now = document_.review?.decision;
   const put = (/** @type {"accepted" | "discarded" | null} */ decision, note = "") => api.put(`/calibrations/${id}/review`, { decision, note }).then(changed);
   return [
+    state === "complete" && now === "accepted" ? h("a.button.primary", { href: "#/test?new" }, "Make a test") : null,
     state === "complete" && now !== "accepted" ? action("Accept", () => put("accepted"), { kind: "primary", title: "New tests measure with the newest accepted calibration" }) : null,
     now !== "discarded" ? action("Discard", async () => {
       const note = h("input", { type: "text", maxlength: 300 });
       if (await ask("Discard this calibration?", h("div", h("p", "No new test can be made with it. It stays on disk, and the decision can be withdrawn."), field("Reason", note)), [["Cancel", null], ["Discard", "yes"]])) await put("discarded", note.value);
     }, { kind: "danger" }) : null,
-    state === "complete" && now === "accepted" ? h("a.button.primary", { href: "#/test?new" }, "Make a test") : null,
     now ? action("Withdraw the decision", () => put(null)) : null,
     action("Delete …", async () => {
       if (await ask("Delete this calibration?", h("p", "It is moved to the trash; tests made with it keep their own copy."), [["Cancel", null], ["Delete", "yes"]])) {

@@ -1,7 +1,7 @@
 // Results: the tests and analyses, and one analysis' fields over the image and in space.
 import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
-import { Result, allTests } from "./results/analysis.js";
+import { Result, aboutText, allTests } from "./results/analysis.js";
 import { FieldMap, measured } from "../widgets/field_map.js";
 import { Scale } from "../widgets/scale.js";
 import { about } from "./results/about.js";
@@ -32,7 +32,7 @@ import { h, replace, table, when, num, count, quantity, field, select, definitio
 /** @typedef {{ result: Result, state: State, map: FieldMap, scale: Scale, interval: Interval, workspace: Workspace, overlay: Overlay, ends: Ends, probe: HTMLElement, message: HTMLElement, readonly step: number | null,
  *   readonly info: Shown | null, picture: (width: number) => string, onpick: (x: number, y: number, event: Event) => unknown, drawn: Set<() => unknown>, landed: Set<() => unknown> }} Viewer shared by the parts of the screen;
  *   `picture`: what is seen, as SVG; `drawn` is called after each change of step, field or scale, `landed` once more steps are finished */
-/** @typedef {{ root: HTMLElement, update: () => Promise<void>, close: () => void, attach?: () => void, seen?: () => Seen }} OtherView shown instead of the map */
+/** @typedef {{ root: HTMLElement, update: () => Promise<void>, close: () => void, attach?: () => void, seen?: () => Seen[], about?: string, ownScales?: () => boolean }} OtherView shown instead of the map */
 
 /**
  * Which axes a step's frame has, in a few words.
@@ -162,9 +162,9 @@ async function show(root, testId, analysisId, query) {
     result, state, map, scale, workspace, ends, probe, message, interval: /** @type {any} */ (null), overlay: /** @type {any} */ (null),
     get step() { return state.step; },
     get info() { return state.info; },
-    picture: (width) => seenPicture([other?.seen?.() ?? { frame: map.view.frame, within: map.view.content }], {
-      title: `${result.test.name || testId}: ${state.info?.text ?? state.field}, ${state.step === null ? "" : result.stepText(state.step)}`, scale, width,
-      notes: [`axes of the ${result.frame === "system" ? "calibration" : "specimen"}; ${other?.seen ? "the surface in space" : `over the image: ${imageChoice.selectedOptions[0].textContent}`}; ${message.textContent}`, `test ${testId}, analysis ${analysisId}, calibration ${result.analysis.calibration_id ?? result.test.calibration_id ?? "not stated"}`],
+    picture: (width) => seenPicture(other?.seen?.() ?? [{ frame: map.view.frame, within: map.view.content }], {
+      title: `${result.test.name || testId}: ${state.info?.text ?? state.field}, ${state.step === null ? "" : result.stepText(state.step)}`, scale: other?.ownScales?.() ? null : scale, width,
+      notes: [`axes of the ${result.frame === "system" ? "calibration" : "specimen"}; ${other?.about ?? `over the image: ${imageChoice.selectedOptions[0].textContent}`}; ${message.textContent}`, `test ${testId}, analysis ${analysisId}, calibration ${result.analysis.calibration_id ?? result.test.calibration_id ?? "not stated"}`],
     }),
     onpick: (x, y) => pick(x, y),
     drawn: new Set(),
@@ -222,7 +222,7 @@ async function show(root, testId, analysisId, query) {
     }
     const { frame } = await result.fields(state.step);
     if (!(await map.load(result, state.step, state.info, state.image))) return;
-    message.textContent = `${state.info.about.replace(/([XYZ])_(frame|sys)/, "$1").replace("axis 1", "X").replace("axis 2", "Y")} · axes: ${axesText(frame)}`;
+    message.textContent = `${aboutText(state.info)} · axes: ${axesText(frame)}`;
     await redraw();
   }
 

@@ -6,7 +6,7 @@ import { chart } from "../widgets/plots.js";
 import { allRight, numberWithin, rule, tell } from "../lib/fields.js";
 import { focusCourse } from "./rig/focus.js";
 import { liveCheck } from "./rig/live_check.js";
-import { h, replace, field, number, select, action, definitions, badge, num, count, quantity, notify, problemText, STATE_KIND } from "../lib/dom.js";
+import { h, replace, field, number, select, action, definitions, badge, num, tick, count, quantity, notify, problemText, STATE_KIND } from "../lib/dom.js";
 
 /** @import { Ends } from "#dom" */
 /** @import { Model } from "#routes" */
@@ -170,7 +170,7 @@ function camera(cam, first, ends) {
   const taken = h("p.quiet.taken", { role: "status" });
   /** @param {{ exposure_ms?: number | null, gain_db?: number | null }} settings */
   function applied(settings, more = "") {
-    exposure.value = String(settings.exposure_ms ?? "");
+    exposure.value = settings.exposure_ms === null || settings.exposure_ms === undefined ? "" : String(Number(settings.exposure_ms.toPrecision(5)));
     gain.value = String(settings.gain_db ?? "");
     taken.textContent = `The camera applied ${quantity(settings.exposure_ms, "ms")} and ${quantity(settings.gain_db, "dB")}${more}.`;
     focus.forget();
@@ -234,7 +234,7 @@ function camera(cam, first, ends) {
     replace(quality, badge(q.code, STATE_KIND[q.code] ?? "warn"));
     replace(figures, [...definitions([
       ["frame rate", quantity(frameRate(stats.frames.delivered), "Hz", 3)], ["mean grey", num(q.mean_grey, 4)], ["saturated", quantity(100 * q.saturated_share, "%", 3)],
-      ["texture", quantity(q.texture_grey_per_px, "grey/px", 3)], ["focus figure", q.focus === null || q.focus === undefined ? "– (little but noise is seen)" : num(q.focus, 3)],
+      ["texture", quantity(q.texture_grey_per_px, "grey/px", 3)], ["focus figure", q.focus === null || q.focus === undefined ? "– (noise only)" : num(q.focus, 3)],
       ["dropped", count(stats.frames.dropped)], ["incomplete", count(stats.frames.incomplete)],
     ]).children]);
     const bins = stats.histogram.map((_, i) => i);
@@ -261,7 +261,7 @@ function camera(cam, first, ends) {
 
 /** @typedef {readonly number[] | null | undefined} Span low and high */
 const limits = (/** @type {Span} */ pair) => (pair ? { min: pair[0], max: pair[1] } : {});
-const range = (/** @type {Span} */ pair, /** @type {string} */ name) => (pair ? `${num(pair[0], 3)} to ${num(pair[1], 4)} ${name}` : "");
+const range = (/** @type {Span} */ pair, /** @type {string} */ name) => (pair ? `${tick(pair[0])} to ${tick(pair[1])} ${name}` : "");
 
 /**
  * Rule of a number within a range of the device.

@@ -6,6 +6,8 @@ import { cell, saveButtons, svgText } from "./saving.js";
 /** @typedef {{ x: string, y: string, series: Series[], data: readonly ArrayLike<number | null | undefined>[], bars?: boolean | boolean[], bands?: number[][], label?: string, file?: string, said?: string }} Plot
  *   data: abscissa, then each series; `u`: of each value, as it is shown; `said`: what the band is */
 
+/** Name of the abscissa that counts steps. */
+export const STEPS = "step number";
 export const COLOURS = ["#1f83b4", "#e07b00", "#29a37a", "#b5486e", "#7a6bd0", "#8a7a2d"];
 const [WIDTH, HEIGHT] = [900, 480];
 const EDGE = { left: 84, right: 24, top: 40, bottom: 92 };
@@ -75,7 +77,7 @@ export function svgOf({ x, y, series, data, bars = false, bands = [], label, sai
   const text = (/** @type {string} */ what, /** @type {Record<string, string | number>} */ more) => Object.assign(svg("text", { fill: "#333", "font-size": 14, ...more }), { textContent: what });
   /** @type {SVGElement[]} */
   const parts = [text(label ?? `${y} over ${x}`, { x: EDGE.left, y: 24, "font-size": 15, fill: "#111" })];
-  for (const v of roundTicks(x0, x1, 8)) parts.push(svg("path", { d: `M${px(v)} ${EDGE.top}V${HEIGHT - EDGE.bottom}`, stroke: "#e3e3e3" }), text(tick(v), { x: px(v), y: HEIGHT - EDGE.bottom + 19, "text-anchor": "middle" }));
+  for (const v of roundTicks(x0, x1, 8).filter((at) => x !== STEPS || Number.isInteger(at))) parts.push(svg("path", { d: `M${px(v)} ${EDGE.top}V${HEIGHT - EDGE.bottom}`, stroke: "#e3e3e3" }), text(tick(v), { x: px(v), y: HEIGHT - EDGE.bottom + 19, "text-anchor": "middle" }));
   for (const v of roundTicks(y0, y1)) parts.push(svg("path", { d: `M${EDGE.left} ${py(v)}H${WIDTH - EDGE.right}`, stroke: v === 0 ? "#9a9a9a" : "#e3e3e3" }), text(tick(v), { x: EDGE.left - 7, y: py(v) + 5, "text-anchor": "end" }));
   parts.push(text(x, { x: (EDGE.left + WIDTH - EDGE.right) / 2, y: HEIGHT - EDGE.bottom + 42, "text-anchor": "middle" }),
     text(y, { transform: `translate(18 ${(EDGE.top + HEIGHT - EDGE.bottom) / 2}) rotate(-90)`, "text-anchor": "middle" }));

@@ -1,8 +1,11 @@
 // Line plots: uPlot with this page's colours, loaded when the first one is drawn.
 import { num, tick, h } from "../lib/dom.js";
-import { colourOf, plotButtons, valueText } from "./plot_files.js";
+import { STEPS, colourOf, plotButtons, valueText } from "./plot_files.js";
 
 /** @import uPlot from "uplot" */
+
+/** Of an abscissa that has whole numbers alone. */
+const WHOLE = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000];
 
 /** @type {typeof uPlot | null} */
 let library = null;
@@ -71,7 +74,7 @@ export async function chart(box, { x, y, series, height = 200, data, bars = fals
       width: Math.max(box.clientWidth, 200),
       height,
       scales: { x: { time: false }, ...(range ? { y: { range: () => range() } } : {}) },
-      axes: [{ ...axis(x), size: 34 }, { ...axis(y), size: wide }],
+      axes: [{ ...axis(x), size: 34, ...(x === STEPS ? { incrs: WHOLE } : {}) }, { ...axis(y), size: wide }],
       legend: { show: files || series.filter((one) => !one.edge).length > 1, live: true },
       cursor: { y: false },
       series: [

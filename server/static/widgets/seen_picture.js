@@ -3,7 +3,7 @@ import { svg } from "../lib/dom.js";
 import { svgText } from "./saving.js";
 
 /** @import { Scale } from "./scale.js" */
-/** @typedef {{ frame: HTMLElement, within?: HTMLElement | null, title?: string }} Seen a frame; `within`: its picture, whose surroundings are left out */
+/** @typedef {{ frame: HTMLElement, within?: HTMLElement | null, title?: string, scale?: Scale }} Seen a frame; `within`: its picture, whose surroundings are left out; `scale`: a colour bar of its own */
 /** @typedef {{ x: number, y: number, width: number, height: number }} Box */
 
 const INK = ["fill", "stroke", "stroke-width", "stroke-dasharray", "stroke-linecap", "stroke-linejoin", "opacity", "fill-opacity", "font-size", "font-weight", "text-anchor", "dominant-baseline", "r"];
@@ -125,7 +125,7 @@ export function seenPicture(frames, { title, notes = [], scale = null, width = 1
   /** @type {SVGElement[]} */
   const parts = [text(title, { x: EDGE, y: 26, "font-size": 16, fill: "#111" })];
   let bottom = 40;
-  frames.forEach(({ frame, within, title: name }, k) => {
+  frames.forEach(({ frame, within, title: name, scale: own_ }, k) => {
     const own = frame.getBoundingClientRect();
     const inner = (within ?? frame).getBoundingClientRect();
     const [left, top] = [Math.max(own.left, inner.left), Math.max(own.top, inner.top)];
@@ -135,7 +135,9 @@ export function seenPicture(frames, { title, notes = [], scale = null, width = 1
     const at = { x: EDGE + k * (each + EDGE), y: name ? 62 : 40, width: each, height: (each * high) / wide };
     if (name) parts.push(text(name, { x: at.x, y: 54 }));
     parts.push(svg("svg", { ...at, viewBox: `0 0 ${wide} ${high}`, overflow: "hidden", "data-role": "seen" }, svg("rect", { width: wide, height: high, fill: getComputedStyle(frame).backgroundColor }), layers(frame, place)));
-    bottom = Math.max(bottom, at.y + at.height);
+    const [drawn, more] = own_ ? legendOf(own_, at.x, at.y + at.height + EDGE, each) : [[], 0];
+    parts.push(...drawn);
+    bottom = Math.max(bottom, at.y + at.height + (own_ ? EDGE + more : 0));
   });
   bottom += EDGE;
   if (scale) {

@@ -1,7 +1,7 @@
 // Numbers as they are shown, against the rules of the GUM and figures worked out by hand.
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { amount, evenMarks, shown, uncertain, useStrainUnit } from "../../../server/static/lib/units.js";
+import { amount, evenMarks, inUnits, shown, uncertain, useStrainUnit } from "../../../server/static/lib/units.js";
 
 const plain = (text) => text.replaceAll("\u00a0", " ");
 
@@ -41,4 +41,15 @@ test("a scale's marks have the same decimals", () => {
   assert.deepEqual(evenMarks([-0.538, -0.269, 0, 0.269, 0.538]), ["−0.54", "−0.27", "0.00", "0.27", "0.54"]);
   assert.deepEqual(evenMarks([-116, -104, -92.1, -79.9, -67.8]), ["−116", "−104", "−92", "−80", "−68"]);
   assert.deepEqual(evenMarks([1000, 1250, 1500, 1750, 2000]), ["1000", "1250", "1500", "1750", "2000"]);
+});
+
+test("the service's words get the page's units", () => {
+  assert.equal(inUnits("0.044 +- 0.18 um in shape, 13 +- 50 microstrain (27.0 sigma)"), "0.044 ± 0.18 µm in shape, 13 ± 50 µm/m (27.0 σ)");
+  assert.equal(inUnits("a column of um"), "a column of um");
+  assert.equal(inUnits(null), "");
+});
+
+test("a column has one unit: that of its largest number", () => {
+  assert.equal(uncertain(-0.05815, 0.00011, "mm", 0.11643), "−0.05815 ± 0.00011\u00a0mm");
+  assert.equal(amount(0.00138, "mm", 3, 0.1134), "0.00138\u00a0mm");
 });

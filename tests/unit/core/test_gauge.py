@@ -382,7 +382,7 @@ def test_plane_alignment_finds_the_plane_and_turns_everything() -> None:
     step = new.xyz_mm[0, 1] - new.xyz_mm[0, 0]
     assert step == pytest.approx([0.02 * STEP, 0, 0], abs=1e-10)
     assert new.uvw_mm == pytest.approx(np.einsum("ji,rcj->rci", TURN, field.uvw_mm), abs=1e-9)
-    assert new.normal_sys[3, 3] == pytest.approx(TURN.T @ [0, 0, -1.0], abs=1e-9)
+    assert new.normal_sys[3, 3] == pytest.approx(TURN.T @ [0, 0, 1.0], abs=1e-9)
     before = extensometer(field, (50.0, 70.0), (130.0, 120.0), shared=SHARED)
     after = extensometer(new, (50.0, 70.0), (130.0, 120.0), shared=SHARED)
     assert after.strain.value == pytest.approx(before.strain.value, abs=1e-12)

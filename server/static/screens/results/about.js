@@ -3,6 +3,7 @@ import { h, replace, table, badge, definitions, num, tick, count, quantity, when
 
 import { REMEDY, camerasBadge } from "./cameras.js";
 import { NOT_INCLUDED } from "./uncertainty.js";
+import { inUnits } from "../../lib/units.js";
 
 /** @import { Viewer } from "../results.js" */
 /** @import { StepSummary } from "#routes" */
@@ -39,7 +40,7 @@ export function about(screen) {
     ]);
     replace(body,
       analysis.stale ? h("p", badge("out of date", "warn"), " ", (analysis.stale_reasons ?? []).join("; ")) : null,
-      warned.length ? h("div", h("h3", "Warnings"), h("ul", warned.map((one) => h("li", one)))) : null,
+      warned.length ? h("div", h("h3", "Warnings"), h("ul", warned.map((one) => h("li", inUnits(one))))) : null,
       failed.length ? h("div", h("h3", "Steps that failed"), h("ul", failed.map(([n, one]) => h("li", `Step ${n}: ${one.code}: ${one.cause} ${one.remedy}`)))) : null,
       h("h3", "Settings"),
       definitions([["kind", analysis.kind], ...Object.entries(analysis.settings ?? {}).map(([name, value]) => /** @type {const} */ ([name.replace(/_/g, " "), text(value)])),
@@ -58,7 +59,7 @@ export function about(screen) {
         ["Patch", (one) => h("span", { title: one.patch?.reason ?? "" }, one.patch?.patch ?? "–")],
         ["Time", (one) => quantity(one.wall_s, "s", 3), { numeric: true }],
       ], steps, { caption: `Summary of ${(analysis.n_finished ?? 0) > steps.length ? `the first ${steps.length} steps of ${count(analysis.n_finished)}` : "each step"}; σ are medians of the reported standard uncertainties (k = 1)${steps.some((one) => !one.sigma_calibration_median_mm) ? `, ${NOT_INCLUDED}` : ""}`, empty: "No step is finished yet." }),
-      definitions(steps.length ? [["epipolar check of the last step", steps.at(-1)?.epipolar_check?.reason ?? "–"], ["cameras at the last step", steps.at(-1)?.camera_motion?.text ?? "–"], ["patch of the last step", steps.at(-1)?.patch?.reason ?? "–"]] : []));
+      definitions(steps.length ? [["epipolar check of the last step", inUnits(steps.at(-1)?.epipolar_check?.reason ?? "–")], ["cameras at the last step", inUnits(steps.at(-1)?.camera_motion?.text ?? "–")], ["patch of the last step", inUnits(steps.at(-1)?.patch?.reason ?? "–")]] : []));
   }
   draw();
   return { root, draw };

@@ -10,6 +10,7 @@ import { axesOf } from "../../widgets/triad.js";
 
 const MAX_BYTES = 300e6;
 const STRAIN = /^(sigma_)?(exx|eyy|exy|e1|e2|max_shear|von_mises)(_patch)?$/;
+const ANGLE = /^(sigma_)?strain_angle_rad$/;
 /** @type {Record<string, string>} */
 const NAMES = {
   d_mm: "|d|, size of the displacement", x_mm: "X", y_mm: "Y", z_mm: "Z", u_mm: "U", v_mm: "V", w_mm: "W", exx: "exx", eyy: "eyy", exy: "exy", e1: "e1, larger principal", e2: "e2, smaller principal",
@@ -29,6 +30,7 @@ const GROUPS = [
  */
 export function shownUnit(name, units) {
   if (STRAIN.test(name)) return { unit: "µm/m", factor: 1e6 };
+  if (ANGLE.test(name)) return { unit: "°", factor: 180 / Math.PI };
   return { unit: units === "pixel" ? "px" : units === "1" ? "" : units === "count" ? "grey" : units, factor: 1 };
 }
 
@@ -46,6 +48,12 @@ export function groupOf(name) {
   const at = GROUPS.findIndex(([, pattern]) => pattern.test(name));
   return { at, group: GROUPS[at][0] };
 }
+
+/**
+ * What a field is, its axes named as they are drawn.
+ * @param {Shown} info
+ */
+export const aboutText = (info) => info.about.replace(/([XYZ])_(frame|sys)/, "$1").replace("axis 1", "X").replace("axis 2", "Y");
 
 export class Result {
   /** @type {Model<"AnalysisReply"> | null} */

@@ -212,6 +212,15 @@ export async function compare(screen) {
   await fillAnalyses().catch(notify);
   return {
     root, update,
+    /** Both pictures, each with its name; the difference with a colour bar of its own. */
+    seen: () => {
+      const one = { frame: map.view.frame, within: map.view.content, title: left.firstElementChild?.textContent ?? "" };
+      if (panel.hidden && !(other && right.now && right.view.empty.hidden)) return [one];
+      const two = { frame: right.view.frame, within: right.view.content, title: rightName.textContent ?? "" };
+      return panel.hidden ? [one, two] : [{ ...one, scale: screen.scale }, { ...two, scale }];
+    },
+    about: "side by side",
+    ownScales: () => !panel.hidden,
     /** The left view moves in, and back out when this is closed. */
     attach: () => { left.append(map.view.root); map.view.fit(); },
     close: () => {

@@ -52,7 +52,7 @@ export function files(screen) {
   const course = h("div", { "data-role": "export-course", role: "status" });
 
   /** Whether only the page has the picture: the deformed image, lines over the colours, the surface in space. */
-  const here = () => screen.state.mode === "surface" || screen.state.image !== "reference" || screen.overlay.on;
+  const here = () => screen.state.mode !== "image" || screen.state.image !== "reference" || screen.overlay.on;
 
   function tell() {
     const { info, scale } = screen;
@@ -63,7 +63,7 @@ export function files(screen) {
     }
     const unit = scale.unit ? ` ${scale.unit}` : "";
     what.textContent = `${info.text}, ${result.stepText(screen.step)}${scale.flags ? "" : `; ${MAPS[scale.name]} from ${tick(Number(scale.low.toPrecision(4)))} to ${tick(Number(scale.high.toPrecision(4)))}${unit}${Number(scale.levels.value) > 1 ? `, ${asked.levels} levels` : ""}`}; `
-      + `axes of the ${result.frame === "system" ? "calibration" : "specimen"}; ${here() ? `as it is seen, ${screen.state.mode === "surface" ? "in space" : "its lines and its image included"}; a film of it ${over.checked ? "is over the reference image" : "has no image"}` : over.checked ? "over the reference image" : "without an image"}.`;
+      + `axes of the ${result.frame === "system" ? "calibration" : "specimen"}; ${here() ? `as it is seen, ${screen.state.mode === "surface" ? "in space" : screen.state.mode === "compare" ? "both views side by side" : "its lines and its image included"}; a film of it ${over.checked ? "is over the reference image" : "has no image"}` : over.checked ? "over the reference image" : "without an image"}.`;
   }
   over.addEventListener("change", tell);
 

@@ -96,7 +96,7 @@ export function frames(screen, reread) {
   }
   async function tell() {
     const { text, chosen } = await api.get(`/tests/${result.testId}/frame`);
-    state.textContent = `Kept with the test: ${text.replace(/^aligned by/, "laid by")}${chosen ? "" : " (the usual ones, nobody chose others)"}.`;
+    state.textContent = `${chosen ? "Kept with the test" : "Usual axes"}: ${text.replace(/^aligned by plane/, "best plane of the reference shape").replace(/^aligned by/, "laid by")}.`;
   }
   choice.addEventListener("change", () => choose().catch(notify));
   root.addEventListener("toggle", () => root.open && !picking && tell().catch(notify));

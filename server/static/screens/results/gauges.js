@@ -1,10 +1,10 @@
 // Gauges drawn on the picture: a line, extensometers, an area; read by the API's gauges operation.
 import * as api from "../../lib/api.js";
 import { chart } from "../../widgets/plots.js";
-import { h, svg, numeric, replace, table, num, count, number, select, field, action, notify, problemText } from "../../lib/dom.js";
+import { h, svg, numeric, replace, table, num, tick, count, number, select, field, action, notify, problemText } from "../../lib/dom.js";
 import { nudge, onGrab } from "../../widgets/view.js";
 import { amount, shown, uncertain } from "../../lib/units.js";
-import { shownUnit } from "./analysis.js";
+import { aboutText, pretty, shownUnit } from "./analysis.js";
 import { keptGauges } from "./kept.js";
 import { abscissas, areaChart, isRelative } from "./histories.js";
 import { distanceMm } from "../../lib/along.js";
@@ -55,7 +55,7 @@ export function gauges(screen) {
     if (view.drawing) {
       screen.message.textContent = inReference() ? "By keyboard: arrow keys move the cross-hair (Shift 10 px, Alt 0.1 px), Enter sets an end, Escape leaves." : "Gauges are drawn on the reference image: choose it under Image.";
       if (byKey) view.frame.focus();
-    } else screen.message.textContent = screen.info?.about ?? "";
+    } else screen.message.textContent = screen.info ? aboutText(screen.info) : "";
     for (const button of buttons) button.setAttribute("aria-pressed", String(button.dataset.tool === name));
     view.frame.style.cursor = name === "probe" ? "" : "cell";
     if (name !== "probe") panels[name].open = true;
@@ -244,13 +244,13 @@ export function gauges(screen) {
   // numbers by keyboard ----------------------------------------------------------------------------------------
   /** @type {(names: string[], set: (v: Four) => unknown) => { inputs: HTMLInputElement[], row: HTMLElement }} */
   const four = (names, set) => {
-    const inputs = names.map((name) => number(null, { "aria-label": name, placeholder: name.split(" ").slice(1).join(" "), style: "width:6em" }));
+    const inputs = names.map((name) => number(null, { "aria-label": name, style: "width:5em" }));
     const use = action("Use", async () => {
       const v = inputs.map((one) => Number(one.value));
       if (inputs.some((one) => one.value === "") || !v.every(Number.isFinite)) throw new Error("Give all four numbers, in pixels of camera 1's reference image.");
       await set(/** @type {Four} */ (v));
     });
-    return { inputs, row: h("div.row", inputs, h("span.unit", "px"), use) };
+    return { inputs, row: h("div.row", inputs.map((one, k) => h("label.field", h("small.hint", names[k].split(" ").slice(1).join(" ")), one)), h("span.unit", "px"), use) };
   };
   const lineInputs = four(["Line from x", "Line from y", "Line to x", "Line to y"], ([x0, y0, x1, y1]) => { state.line = [[x0, y0], [x1, y1]]; return changed("line"); });
   const areaInputs = four(["Area left", "Area top", "Area right", "Area bottom"], (v) => { state.area = v; return changed("area"); });
@@ -323,7 +323,7 @@ export function gauges(screen) {
       budgetTable(rms(budget), unit, factor, lacking ?? ""));
     lineChart.dataset.answer = JSON.stringify({ x, value, sigma });
     await plot("line", lineChart, { x: inMm ? "distance (mm)" : "distance (px)", y: `${screen.info?.text ?? name}${unit ? ` (${unit})` : ""}`, height: 320, said: interval.text,
-      series: [{ label: name, u: errors }, { label: `+ ${interval.symbol}`, edge: true, colour: 0 }, { label: `− ${interval.symbol}`, edge: true, colour: 0 }], bands: [[2, 3]], data: [x, values, band(1), band(-1)], label: `${name} along the line` });
+      series: [{ label: pretty(name), u: errors }, { label: `+ ${interval.symbol}`, edge: true, colour: 0 }, { label: `− ${interval.symbol}`, edge: true, colour: 0 }], bands: [[2, 3]], data: [x, values, band(1), band(-1)], label: `${pretty(name)} along the line` });
   }
 
   const extChart = h("div", { "data-role": "extensometer-chart" });
@@ -381,12 +381,13 @@ export function gauges(screen) {
     const valueText = (/** @type {Row} */ one, /** @type {number} */ k) => {
       const [v, s] = [of(one, k, "value"), of(one, k, "sigma")];
       if (v === null) return one.each[k]?.missing?.replace(/_/g, " ") || "–";
-      if (s === null) return amount((v * factor) / to, base);
+      if (one.n === start && !s) return "0";
+      if (s === null) return amount((v * factor) / to, base, 4, most);
       const { budget, not_included: lacking } = one.each[k]?.values[name] ?? {};
-      return withBudget(uncertain((v * factor) / to, (s * factor * interval.factor) / to, base), budgetTable(budget, base, factor / to, lacking ?? ""));
+      return withBudget(uncertain((v * factor) / to, (s * factor * interval.factor) / to, base, most), budgetTable(budget, base, factor / to, lacking ?? ""));
     };
     replace(extTable, table([
-      ["Step", (one) => one.n], ["Label", (one) => one.label], ...(over.value === "n" ? [] : [numeric(against.text, (/** @type {Row} */ one) => num(one.x, 6))]),
+      ["Step", (one) => one.n], ["Label", (one) => one.label], ...(over.value === "n" ? [] : [numeric(against.text, (/** @type {Row} */ one) => tick(one.x))]),
       ...state.extensometers.map((gauge, k) => numeric(gauge.name, (/** @type {Row} */ one) => valueText(one, k))),
     ], rows, { caption: `± ${interval.text}` }),
     h("div.row", state.extensometers.map((gauge) => h("button", { type: "button", onclick: () => { state.extensometers = state.extensometers.filter((one) => one !== gauge); changed("extensometer"); } }, `Remove ${gauge.name}`))));
@@ -412,22 +413,25 @@ export function gauges(screen) {
   function drawArea(name, steps) {
     answers.area = { name, steps };
     const { unit, factor } = shownUnit(name, steps.at(-1)?.areas?.[0]?.values[name]?.units ?? "");
+    const zero = isRelative(name) ? result.reference : null; // where it is zero by definition
+    const most = factor * Math.max(0, ...steps.map((one) => Math.abs(one.areas?.[0]?.values[name]?.mean ?? 0)));
     /** @type {(one: GaugeReadings, part: "mean" | "mean_sigma" | "sd" | "rms" | "min" | "max", digits?: number) => string} */
-    const cell = (one, part, digits = 4) => amount((one.areas?.[0]?.values[name]?.[part] ?? NaN) * factor, unit, digits);
+    const cell = (one, part, digits = 4) => (one.n === zero ? "0" : amount((one.areas?.[0]?.values[name]?.[part] ?? NaN) * factor, unit, digits, most));
     const mean = (/** @type {GaugeReadings} */ one) => {
       const v = one.areas?.[0]?.values[name];
       if (!v || v.mean_sigma === null) return cell(one, "mean");
-      return withBudget(uncertain((v.mean ?? NaN) * factor, v.mean_sigma * factor * interval.factor, unit), budgetTable(v.mean_budget, unit, factor, v.not_included ?? ""));
+      return withBudget(uncertain((v.mean ?? NaN) * factor, v.mean_sigma * factor * interval.factor, unit, most), budgetTable(v.mean_budget, unit, factor, v.not_included ?? ""));
     };
+    const to = shown(unit, most);
     plots.area?.close();
     plots.area = null;
-    areaChart(areaPlot, { result, against: areaAgainst, name, unit, factor, interval, steps }).then((made) => { plots.area?.close(); plots.area = made; }, notify);
+    areaChart(areaPlot, { result, against: areaAgainst, name, text: pretty(name), unit: to.unit, factor: factor * to.factor, interval, steps }).then((made) => { plots.area?.close(); plots.area = made; }, notify);
     areaBox.dataset.answer = JSON.stringify(steps.map((one) => one.areas?.[0]?.values[name] ?? null));
     replace(areaBox, table([
       ["Step", (one) => one.n], ["Label", (one) => one.label], [`Mean ± ${interval.symbol}`, mean, { numeric: true }],
       ["sd", (one) => cell(one, "sd", 3), { numeric: true }], ["rms", (one) => cell(one, "rms"), { numeric: true }], ["Min", (one) => cell(one, "min"), { numeric: true }], ["Max", (one) => cell(one, "max"), { numeric: true }],
       ["Points", (one) => (one.problem ? one.problem.cause ?? "–" : `${one.areas?.[0].valid} of ${one.areas?.[0].points}`), { numeric: true }],
-    ], steps, { caption: `${name} over the rectangle; ${interval.text}` }));
+    ], steps, { caption: `${pretty(name)} over the rectangle; ${interval.text}` }));
   }
 
   interval.changed.add(() => Promise.all([drawLine(), drawExtensometers(), answers.area && drawArea(answers.area.name, answers.area.steps)]));
@@ -444,6 +448,7 @@ export function gauges(screen) {
   let first = true;
   screen.drawn.add(async () => {
     draw();
+    if (first) fillInputs();
     if (first && state.extensometers.length) { panels.extensometer.open = true; readExtensometers().catch(notify); }
     if (first) for (const name of /** @type {const} */ (["line", "area"])) panels[name].open = Boolean(state[name]);
     first = false;

@@ -77,9 +77,9 @@ export const isRelative = (name) => RELATIVE.test(name);
 /**
  * An area's mean over the steps.
  * @param {HTMLElement} box
- * @param {{ result: Result, against: ReturnType<typeof abscissas>, name: string, unit: string, factor: number, interval: Interval, steps: GaugeReadings[] }} of
+ * @param {{ result: Result, against: ReturnType<typeof abscissas>, name: string, text: string, unit: string, factor: number, interval: Interval, steps: GaugeReadings[] }} of
  */
-export function areaChart(box, { result, against, name, unit, factor, interval, steps }) {
+export function areaChart(box, { result, against, name, text, unit, factor, interval, steps }) {
   const found = steps.map((one) => {
     const read = one.areas?.[0]?.values[name];
     return { n: one.n, mean: read?.mean ?? null, u: read?.mean_sigma ?? null };
@@ -89,7 +89,7 @@ export function areaChart(box, { result, against, name, unit, factor, interval, 
     .map((one) => ({ x: against.at(one.n) ?? NaN, value: one.mean === null ? null : factor * one.mean, u: one.u === null ? null : factor * interval.factor * one.u }))
     .filter((one) => Number.isFinite(one.x)).sort((p, q) => p.x - q.x);
   const edge = (/** @type {1 | -1} */ sign) => rows.map((one) => (one.value === null || one.u === null ? null : one.value + sign * one.u));
-  return chart(box, { x: against.text, y: `mean ${name}${unit ? ` (${unit})` : ""}`, height: 320, said: interval.text, label: `Mean of ${name} over the area`,
-    series: [{ label: `mean ${name}`, dots: true, u: rows.map((one) => one.u) }, { label: `+ ${interval.symbol}`, edge: true, colour: 0 }, { label: `− ${interval.symbol}`, edge: true, colour: 0 }], bands: [[2, 3]],
+  return chart(box, { x: against.text, y: `mean ${text}${unit ? ` (${unit})` : ""}`, height: 320, said: interval.text, label: `Mean of ${text} over the area`,
+    series: [{ label: `mean ${text}`, dots: true, u: rows.map((one) => one.u) }, { label: `+ ${interval.symbol}`, edge: true, colour: 0 }, { label: `− ${interval.symbol}`, edge: true, colour: 0 }], bands: [[2, 3]],
     data: [rows.map((one) => one.x), rows.map((one) => one.value), edge(1), edge(-1)] });
 }

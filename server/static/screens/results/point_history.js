@@ -2,7 +2,7 @@
 import * as api from "../../lib/api.js";
 import { chart } from "../../widgets/plots.js";
 import { shown, uncertain } from "../../lib/units.js";
-import { h, replace, field, numeric, num, table, notify } from "../../lib/dom.js";
+import { h, replace, field, numeric, table, tick, notify } from "../../lib/dom.js";
 import { shownUnit } from "./analysis.js";
 import { abscissas, isRelative } from "./histories.js";
 
@@ -18,7 +18,7 @@ export function pointHistory(screen) {
   const list = h("div");
   const text = h("p.quiet", { role: "status" }, "Click a point of the picture: the shown field there, step by step, is drawn here.");
   const against = abscissas(result);
-  const root = h("details.panel", { "data-role": "point" }, h("summary", "Point"), field("History against", against.choice), text, box, list);
+  const root = h("details.panel", { "data-role": "point" }, h("summary", "Point"), h("div.row", field("History against", against.choice)), text, box, list);
   /** @type {Awaited<ReturnType<typeof chart>> | null} */
   let plot = null;
   /** @type {Map<string, Promise<Record<string, Reading>>>} by step, point and axes: every variable of it */
@@ -69,6 +69,7 @@ export function pointHistory(screen) {
     const { unit: base, factor } = shownUnit(info.name, info.unit);
     const to = shown(base, factor * Math.max(0, ...rows.map((one) => Math.abs(one.value ?? 0))));
     const placed = rows.map((one) => ({ ...one, x: against.at(one.n) ?? NaN })).filter((one) => Number.isFinite(one.x)).sort((p, q) => p.x - q.x);
+    const most = factor * Math.max(0, ...placed.map((one) => Math.abs(one.value ?? 0)));
     const value = placed.map((one) => (one.value === null ? null : one.value * factor * to.factor));
     const band = (/** @type {1 | -1} */ sign) => placed.map((one, k) => { const v = value[k]; return v === null || one.u === null ? null : v + sign * one.u * interval.factor * factor * to.factor; });
     plot?.close();
@@ -78,8 +79,8 @@ export function pointHistory(screen) {
     text.textContent = `${label}; the band is ± ${interval.symbol}: ${interval.text}`;
     plot = await chart(box, { x: against.choice.selectedOptions[0]?.text ?? "", y: `${info.text}${to.unit ? ` (${to.unit})` : ""}`, height: 320, label, series: [{ label: info.text, dots: true }, { label: "+", edge: true }, { label: "−", edge: true }],
       bands: [[2, 3]], data: [placed.map((one) => one.x), value, band(1), band(-1)] });
-    replace(list, table([["Step", (one) => one.n], numeric(against.choice.selectedOptions[0]?.text ?? "", (one) => num(one.x, 6)),
-      numeric(`${info.text} ± ${interval.symbol}`, (one) => (one.value === null ? one.why : one.n === zero ? "0" : uncertain(one.value * factor, one.u === null ? null : one.u * interval.factor * factor, base)))], placed, { caption: label }));
+    replace(list, table([["Step", (one) => one.n], ...(against.choice.value === "n" ? [] : [numeric(against.choice.selectedOptions[0]?.text ?? "", (/** @type {typeof placed[number]} */ one) => tick(one.x))]),
+      numeric(`${info.text} ± ${interval.symbol}`, (one) => (one.value === null ? one.why : one.n === zero ? "0" : uncertain(one.value * factor, one.u === null ? null : one.u * interval.factor * factor, base, most)))], placed, { caption: label }));
   }
 
   const redraw = () => draw().catch(notify);

@@ -11,13 +11,17 @@ const INTERNALS = "Internals";
 /** @typedef {Reply<"get", "/tests/{test_id}/analyses/{analysis_id}/probe">} Answer */
 /** @type {WeakMap<Viewer, Answer>} */
 const answers = new WeakMap(); // the one shown, for another interval
+/** @type {WeakMap<Answer, string[]>} */
+const correlations = new WeakMap(); // names of its correlations, in their order
 
 /**
  * Show a probe's answer and mark its point in the picture.
  * @param {Viewer} screen
  * @param {Answer} answer
  */
-export function pinned(screen, answer) {
+export async function pinned(screen, answer) {
+  const { shown } = await screen.result.fields(answer.step);
+  correlations.set(answer, shown.filter((one) => one.name === "zncc").map((one) => one.text.replace("correlation ", "ZNCC ").replace(" with ", ", ")));
   if (!answers.has(screen)) screen.interval.changed.add(() => draw(screen, /** @type {Answer} */ (answers.get(screen))));
   answers.set(screen, answer);
   draw(screen, answer);
@@ -36,7 +40,7 @@ function draw(screen, answer) {
     const { unit, factor } = shownUnit(name, units);
     const row = { name: pretty(name), title: name, ...groupOf(name) };
     if (Array.isArray(value)) {
-      if (value.length <= CORRELATIONS) rows.push(.../** @type {(number | null)[]} */ (value).map((one, k) => ({ ...row, name: `${row.name} ${k + 1}`, text: num(one, 5) })));
+      if (value.length <= CORRELATIONS) rows.push(.../** @type {(number | null)[]} */ (value).map((one, k) => ({ ...row, name: (name === "zncc" && correlations.get(answer)?.[k]) || `${row.name} ${k + 1}`, text: num(one, 5) })));
       continue;
     }
     const shown = value === null || value === undefined ? null : value * factor;
@@ -52,7 +56,7 @@ function draw(screen, answer) {
   replace(screen.probe,
     h("div.spread", h("span", `row ${answer.row}, column ${answer.col}, step ${answer.step}`), badge(answer.status.replace(/_/g, " "), STATE_KIND[answer.status] ?? "warn")),
     groups(rows.filter((row) => row.group !== INTERNALS)),
-    h("details", { open: kept }, h("summary", "Internals"), groups(rows.filter((row) => row.group === INTERNALS))));
+    h("details", { open: kept }, h("summary", "Internals"), h("div", { "data-group": INTERNALS }, table(columns, rows.filter((row) => row.group === INTERNALS)))));
   mark(screen);
 }
 

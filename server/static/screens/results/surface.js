@@ -287,7 +287,7 @@ export async function surface(screen) {
   /** What is in the frame, for a picture that is made at once: WebGL's canvas forgets what was drawn. */
   function seen() {
     renderer.render(scene, camera);
-    return { frame: space, title: note.textContent ?? "" };
+    return [{ frame: space, title: note.textContent ?? "" }];
   }
 
   async function save() {
@@ -358,5 +358,5 @@ export async function surface(screen) {
     renderer.dispose();
     renderer.forceContextLoss();
   };
-  return { root, update, close, seen };
+  return { root, update, close, seen, about: "the surface in space" };
 }

@@ -1,5 +1,6 @@
 // What must be known before a result is used: the analysis' `warnings`, failed checks in red, the rest in amber.
 import { h, badge, STATE_KIND } from "../../lib/dom.js";
+import { inUnits } from "../../lib/units.js";
 
 /** @import { Model } from "#routes" */
 /** @typedef {Model<"AnalysisWarning">} Warning */
@@ -29,7 +30,7 @@ export function stateBadge(state, warnings) {
  * @param {{ warnings?: Warning[] }} analysis
  */
 export function warningsCell(analysis) {
-  return h("span.row", (analysis.warnings ?? []).map((one) => h("span", { title: `${one.text} ${one.remedy}` }, badge(word(one), one.level === "failed" ? "bad" : "warn"))));
+  return h("span.row", (analysis.warnings ?? []).map((one) => h("span", { title: inUnits(`${one.text} ${one.remedy}`) }, badge(word(one), one.level === "failed" ? "bad" : "warn"))));
 }
 
 /**
@@ -39,5 +40,5 @@ export function warningsCell(analysis) {
 export function warningsBox(warnings) {
   if (!warnings?.length) return null;
   return h("div", { role: "alert", "data-role": "warnings" }, warnings.map((one) =>
-    h(`div.caution${one.level === "failed" ? ".bad" : ""}`, { "data-warning": one.code }, h("p", badge(word(one), one.level === "failed" ? "bad" : "warn"), ` ${one.text}`), h("p", one.remedy))));
+    h(`div.caution${one.level === "failed" ? ".bad" : ""}`, { "data-warning": one.code }, h("p", badge(word(one), one.level === "failed" ? "bad" : "warn"), ` ${inUnits(one.text)}`), h("p", one.remedy))));
 }

@@ -59,7 +59,11 @@ export async function livePanel(ends) {
   ends.push(() => { closed = true; clearTimeout(timer); views.forEach((one) => one.end()); },
     events.on("job", (job) => !["queued", "running", "cancelling"].includes(job.state) && note.update()),
     events.on("stage", () => { note.update(); }), events.on("scene", begin));
-  return { root: h("div", note.root, box, rig.sim && rig.scene ? loadOf(rig.scene) : null), look: note.update };
+  const load = h("div");
+  const drawLoad = (/** @type {Model<"RigReply">} */ now) => { if (!load.contains(document.activeElement)) replace(load, now.sim && now.scene ? loadOf(now.scene) : null); };
+  drawLoad(rig);
+  ends.push(events.on("scene", async () => { const now = await api.get("/rig").catch(() => null); if (now && !closed) drawLoad(now); }));
+  return { root: h("div", note.root, box, load), look: note.update };
 }
 
 /** @param {Model<"SceneReply">} scene of a simulated rig */

@@ -118,6 +118,7 @@ export async function measurePanel(id, test, ends, done) {
     }
 
     const found = h("span.quiet", { role: "status", "data-role": "found" });
+    const missing = h("small.error", { role: "alert", hidden: true }); // what a measurement lacks here
     const find = action("Find the specimen", async () => {
       found.textContent = "";
       if (!allRight(rules.filter(([control]) => control === subset))) return;
@@ -166,6 +167,7 @@ export async function measurePanel(id, test, ends, done) {
     ends.push(() => clearTimeout(timer));
     function changed() {
       keep();
+      missing.hidden ||= editor.region() !== null;
       drawSample();
       drawGauge();
       checkSeeds();
@@ -289,7 +291,13 @@ export async function measurePanel(id, test, ends, done) {
     const start = action("Measure", async () => {
       if (!allRight(rules)) return;
       const region = editor.region();
-      if (!region) throw api.problemOf({ cause: "There is no region.", remedy: "Draw a rectangle or a polygon over camera 1's image." });
+      if (!region) {
+        missing.textContent = "There is no region. Draw a rectangle or a polygon over camera 1's image.";
+        missing.hidden = false;
+        find.scrollIntoView({ block: "center" });
+        find.focus({ preventScroll: true });
+        return;
+      }
       /** @type {Request} */
       const body_ = {
         kind: /** @type {Request["kind"]} */ (kind.value), region, subset_px: Number(subset.value), spacing_px: Number(spacing.value), patch: /** @type {Request["patch"]} */ (patch.value), interpolation: /** @type {Request["interpolation"]} */ (interpolation.value), prefilter_px: Number(prefilter.value), max_sigma_px: Number(maxSigma.value),
@@ -312,7 +320,7 @@ export async function measurePanel(id, test, ends, done) {
       h("div.grid.two.views", { style: { marginTop: "0.5rem" } }, views.map((view, k) => h("div", h("h3", `cam${k + 1}`), view.root))),
       h("div.grid.two", { style: { marginTop: "var(--gap)" } },
         h("div",
-          h("fieldset", h("legend", "Region and seeds"), h("div.row", find, found), editor.list,
+          h("fieldset", h("legend", "Region and seeds"), h("div.row", find, found), missing, editor.list,
             h("p.hint", "Seeds are searched for automatically if none are given. On a periodic texture, click three points that are not on one line, each in both views.")),
           h("fieldset", h("legend", "Subsets and texture"),
             h("div.fields", field("Subset", subset, "px", "odd"), field("Spacing", spacing, "px", "distance of neighbouring points")),

@@ -79,7 +79,7 @@ export async function stepsPanel(id, test, ends, reread) {
             await refresh();
           }
         }))),
-      (step.warnings ?? []).map((warning) => h("div.caution.bad", { role: "alert", "data-role": "step-warning" }, h("p", warning.replace(/ POST .*$/, "")), step.quality?.code === "cameras_off_zero" ? backToZero(() => live.look()) : null)),
+      (step.warnings ?? []).map((warning) => h(`div.caution${KIND[quality.code ?? ""] === "bad" ? ".bad" : ""}`, { role: "alert", "data-role": "step-warning" }, h("p", warning.replace(/ POST .*$/, "")), step.quality?.code === "cameras_off_zero" ? backToZero(() => live.look()) : null)),
       fieldOf(step),
       h("p.quiet", [when(step.captured_utc), step.load_n !== null && step.load_n !== undefined ? `load ${quantity(step.load_n, "N", 6)}` : null, channels || null, step.skew_ms !== null && step.skew_ms !== undefined ? `skew ${quantity(step.skew_ms, "ms", 3)}${quality.max_skew_ms ? ` of ${quantity(quality.max_skew_ms, "ms", 3)} allowed` : ""}` : null, (step.frames ?? 1) > 1 ? `${step.frames} frames averaged` : null].filter(Boolean).join(" · ")),
       table([["Figure", (row) => row[0], { unseen: true }], ["cam1", (row) => (quality.cam1 ? row[1](quality.cam1) : "–"), { numeric: true }], ["cam2", (row) => (quality.cam2 ? row[1](quality.cam2) : "–"), { numeric: true }]], rows, { caption: "Quality of the pair" }));
