@@ -179,13 +179,13 @@ def _pulled(
         bad |= counts & (np.abs(shift) > np.maximum(_OFF_SIGMAS * sd, _OFF_PX))
         # beside a shape's edge a pull is expected: where all residuals are correlated it is doubtful, and is said
         doubtful = edges & (sure > 1.0) & ~counts & (len(pulls) == 1)
-        if unknown == 0:  # the offset is no part of a position
-            bad |= doubtful & ~(np.hypot(sd, shift) < fitter.options.max_sigma_px)
         shift = np.where(counts | doubtful, shift, 0.0)
+        if len(pulls) == 3 or unknown == 0:  # a shape's offset is no part of a position
+            bad |= (shift != 0.0) & ~(np.hypot(sd, shift) < fitter.options.max_sigma_px)
         points.covariance[index, unknown, unknown] += (shift / unit[:, unknown]) ** 2
     points.epipolar_sigma_px[index] = np.sqrt(points.covariance[index, -1, -1])
     for pull in pulls[-2:]:
-        bad |= pull.other_centre
+        bad |= pull.centre > 1.0
     return bad
 
 
