@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arrays import Bool, Float
-from core.field.checks.block_median import block_medians, reach_of
-from core.field.checks.lost_correlation import SIGMAS_OF_QUARTER, SIGMAS_OF_TENTH
+from core.field.checks.block_median import SIGMAS_OF_QUARTER, SIGMAS_OF_TENTH, least_about, reach_of
 from core.field.parts.beside_edges import beside_edges
 from core.field.parts.subset_parts import Pull, pull_of_parts
 from core.field.parts.subset_residuals import subset_residuals
@@ -99,18 +98,10 @@ def _suspects(fitter: Fitter, points: PointFits, shape: tuple[int, int], texture
     gaps = cv2.morphologyEx((~ok).astype(np.uint8).reshape(shape), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     out = cv2.dilate(gaps, about).ravel() > 0
     reach = _WIDER * reach_of(subset, spacing_px)
-    every = np.zeros(shape, bool)
-    every[::2, ::2] = True  # enough for a quantile of some subsets' points
-    known = ok & every.ravel()
     for k in range(points.zncc.shape[1]):
         energy = np.log(np.where(ok, np.maximum((1.0 - points.zncc[:, k]) * texture, 1e-9), 1.0))
-        # what pulls at many points in a row raises their middle: those that lose least are the measure
-        quarter, tenth = (
-            block_medians(energy, known, shape, reach, otherwise=float(np.quantile(energy[ok], q)), quantile=q)
-            for q in (0.25, 0.1)
-        )
-        scatter = np.maximum((quarter - tenth) / (SIGMAS_OF_TENTH - SIGMAS_OF_QUARTER), 0.0)
-        out |= energy - quarter > (_LOUDER + SIGMAS_OF_QUARTER) * scatter
+        level, scatter = least_about(energy, ok, shape, reach, every=2)
+        out |= energy - level > _LOUDER * scatter
     return np.asarray(out)
 
 
