@@ -29,6 +29,7 @@ _CENTRES = (1.0 / 6.0, 1.0 / 10.0)  # half of a subset's centre that must be wha
 _CENTRE_LOSS = 0.2  # of the texture's variance
 _CENTRE_SIGMAS = 5.0  # of the mean square of so many pixels, over that of the half that matches best
 _STEPS = 3  # towards that half
+_FAINT = 0.5  # of what the smallest other centre adds to a subset's residuals: gain and match take up some of it
 
 
 class Pull(NamedTuple):
@@ -98,7 +99,7 @@ def pull_of_parts(found: SubsetResiduals, visible: Bool, degree: int) -> Pull:
         shift,
         np.sqrt(variances[:, centre] * residual[:, None]),
         part,
-        _centre_loss(found, columns, visible, *_best_half(sums, counts, of_whole, ridge)),
+        _centre(found, columns, visible, sums, counts, of_whole, ridge),
     )
 
 
@@ -154,6 +155,26 @@ def _parts() -> NDArray[np.bool_]:
     return np.asarray(np.unique(np.array(small), axis=0))
 
 
+def _centre(
+    found: SubsetResiduals, columns: Float, visible: Bool, sums: Float, counts: Float, match: Float, ridge: Float
+) -> Float:
+    """(m,) loss of the centre in the match of the best half; zero where all residuals are less than it would make."""
+    out = np.zeros(len(match))
+    k, width = match.shape[1], visible.shape[1]
+    smallest = min((2 * _reach(part, width) + 1) ** 2 for part in _CENTRES) / width**2
+    whole = sums.sum(axis=1)
+    some = np.flatnonzero(whole[:, k, k] > _FAINT * _CENTRE_LOSS * smallest * whole[:, k - 1, k - 1])
+    if len(some):
+        half = _best_half(sums[some], counts[some], match[some], ridge[some])
+        part_of = SubsetResiduals(*(values[some] for values in found))
+        out[some] = _centre_loss(part_of, columns[some], visible[some], *half)
+    return out
+
+
+def _reach(part: float, width: int) -> int:
+    return max(round(part * width), 2)
+
+
 def _best_half(sums: Float, counts: Float, match: Float, ridge: Float) -> tuple[Float, Float]:
     """Match (m, k) of the half of the cells with the least residuals, and (m,) what these say of all residuals' square.
 
@@ -195,7 +216,7 @@ def _centre_loss(found: SubsetResiduals, columns: Float, visible: Bool, match: F
     texture = energy(found.reference, visible)
     out = np.zeros(len(texture))
     for part in _CENTRES:
-        reach = max(round(part * width), 2)
+        reach = _reach(part, width)
         middle = (slice(None), *(slice(width // 2 - reach, width // 2 + reach + 1),) * 2)
         seen = visible[middle]
         by_chance = 1.0 + _CENTRE_SIGMAS * np.sqrt(2.0 / np.maximum(seen.sum(axis=(1, 2)), 1))
