@@ -11,7 +11,7 @@ from core.field.points.result import Field
 from core.field.region.region import PointGrid
 from core.measure import MeasureOptions, ReferencePair, measure_shape
 from server.formats.results.summary import summarise
-from tests.support.relief_rig import HOLE, PLATEAU, Body, Feature, Texture, trace, two_cameras
+from tests.support.relief_rig import HOLE, PLATEAU, WIRE, Body, Feature, Texture, trace, two_cameras
 from tests.support.relief_truth import Part
 
 SUBSET_PX = 21
@@ -69,6 +69,16 @@ def test_the_rim_of_a_hole_is_not_extended_into_it() -> None:
     assert (there > 15.0).any()
     assert not (field.valid & (there > 27.0 / 6.0 + 3.0)).any()
     assert field.valid[there == 0.0].mean() > 0.6
+
+
+def test_what_lies_behind_a_wire_is_not_delivered_before_it() -> None:
+    wire = Feature(WIRE, (0.0, 0.0), (1.0, 40.0), 7.0, 0.3, 0.4)
+    part = Part(two_cameras((200, 180)), (Body((wire,), texture=Texture(wavelength_mm=0.5)),))
+    grid = PointGrid.rectangle(20.0, 20.0, 180.0, 160.0, spacing_px=2.0)
+    found = part.beside_truth(measure_shape(part.pair, *part.images(), grid, OPTIONS), grid, SUBSET_PX)
+    assert (found.face < -1).sum() > 100
+    assert found.wrong == 0
+    assert found.share > 0.99
 
 
 def test_a_given_seed_adds_to_the_automatic_ones(steps: Part, images: tuple[np.ndarray, np.ndarray]) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from core.arrays import Bool, Float
 
+SIGMAS_OF_QUARTER, SIGMAS_OF_TENTH = 0.6745, 1.2816  # below the middle of a normal distribution
 _REACH_SUBSETS, _MIN_REACH, _MAX_REACH = 1.5, 3, 24
 _FEW = 12
 
@@ -29,6 +32,33 @@ def reach_of(subset_px: int, spacing_px: float) -> int:
     return int(np.clip(np.ceil(_REACH_SUBSETS * subset_px / spacing_px), _MIN_REACH, _MAX_REACH))
 
 
+def least_about(values: Float, ok: Bool, shape: tuple[int, int], reach: int, *, every: int = 1) -> tuple[Float, Float]:
+    """Return (n,) level and scatter of the values about each point, from those that are least.
+
+    What loses more than it must at many points in a row, as an edge or an open crack, raises their middle, and is no
+    measure of their scatter: the quarter and the tenth of them that lose least are.
+
+    Parameters
+    ----------
+    values, ok
+        (n,) of points row by row.
+    shape
+        Rows and columns.
+    reach
+        Points, as in :func:`block_medians`.
+    every
+        Of so many rows and columns one counts: enough for the quantiles of some subsets' points.
+    """
+    counted = np.zeros(shape, bool)
+    counted[::every, ::every] = True
+    shares = (0.25, 0.1)
+    quarter, tenth = _block_quantiles(
+        values, ok & counted.ravel(), shape, reach, otherwise=np.quantile(values[ok], shares).tolist(), quantiles=shares
+    )
+    scatter = np.maximum((quarter - tenth) / (SIGMAS_OF_TENTH - SIGMAS_OF_QUARTER), 0.0)
+    return quarter + SIGMAS_OF_QUARTER * scatter, scatter
+
+
 def block_medians(
     values: Float, known: Bool, shape: tuple[int, int], reach: int, *, otherwise: float, quantile: float = 0.5
 ) -> Float:
@@ -47,6 +77,19 @@ def block_medians(
     quantile
         Another one than the median.
     """
+    return _block_quantiles(values, known, shape, reach, otherwise=[otherwise], quantiles=(quantile,))[0]
+
+
+def _block_quantiles(
+    values: Float,
+    known: Bool,
+    shape: tuple[int, int],
+    reach: int,
+    *,
+    otherwise: Sequence[float],
+    quantiles: tuple[float, ...],
+) -> list[Float]:
+    """Several quantiles of the same blocks, each with its value where there are too few."""
     rows, cols = shape
     beside = reach // 2
     width = reach + 2 * beside + 1
@@ -65,18 +108,22 @@ def block_medians(
     after, left, above = total[last], total[last[0], first[1]], total[first[0], last[1]]
     r, c = blocks
     count = after[:r, :c] - left[:r, :c] - above[:r, :c] + total[first]
-    at = quantile * (np.maximum(count, 1) - 1)
-    low = np.floor(at).astype(int)
-    share = at - low
-    below, above = (
-        np.take_along_axis(ordered, i[..., None], axis=-1)[..., 0] for i in (low, np.where(share > 0.0, low + 1, low))
-    )
     enough = count >= _FEW
-    below, above = np.where(enough, below, 0.0), np.where(enough, above, 0.0)
-    # rounded as numpy's interpolation between the two
-    step = above - below
-    found = np.where(share < 0.5, below + step * share, above - step * (1.0 - share))
-    if quantile == 0.5:
-        found = (below + above) / 2.0
-    level = np.where(enough, found, otherwise)
-    return np.repeat(np.repeat(level, reach, axis=0), reach, axis=1)[:rows, :cols].ravel()
+    found = []
+    for quantile, unknown in zip(quantiles, otherwise, strict=True):
+        at = quantile * (np.maximum(count, 1) - 1)
+        low = np.floor(at).astype(int)
+        share = at - low
+        below, above = (
+            np.take_along_axis(ordered, i[..., None], axis=-1)[..., 0]
+            for i in (low, np.where(share > 0.0, low + 1, low))
+        )
+        below, above = np.where(enough, below, 0.0), np.where(enough, above, 0.0)
+        # rounded as numpy's interpolation between the two
+        step = above - below
+        between = np.where(share < 0.5, below + step * share, above - step * (1.0 - share))
+        if quantile == 0.5:
+            between = (below + above) / 2.0
+        level = np.where(enough, between, unknown)
+        found.append(np.repeat(np.repeat(level, reach, axis=0), reach, axis=1)[:rows, :cols].ravel())
+    return found

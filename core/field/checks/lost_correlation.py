@@ -14,7 +14,7 @@ import numpy as np
 
 from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
-from core.field.checks.block_median import block_medians, reach_of, spacing_of
+from core.field.checks.block_median import block_medians, least_about, reach_of, spacing_of
 from core.field.points.fitter import PointFits
 from core.field.points.starts import view_cosines
 from core.robust import MAD_TO_SIGMA
@@ -24,7 +24,6 @@ _LOST_TO_VIEW = 0.015
 """1 - zncc over the squared excess of the blur's variance, relative to one camera's own: three times what real speckle
 loses on faces of 45 degrees."""
 _MOST_EXCESS = 3.0  # a surface that is seen at half the width
-SIGMAS_OF_QUARTER, SIGMAS_OF_TENTH = 0.6745, 1.2816  # below the middle of a normal distribution
 _LEAST_IN_TIME = 0.675  # of the bound where something may have changed the view
 _FINE = 2.0
 _SHAPE_FACTOR, _SHAPE_LOSS = 12.0, 0.04
@@ -145,18 +144,9 @@ def _of_the_best(
     View and lens are the same in both images, so that all points of a texture lose alike but for noise. An open crack
     takes more from half of the points about it, whose median is then no measure.
     """
-    energy = np.log(loss * texture)
-
-    def lower(values: Float, quantile: float) -> Float:
-        return block_medians(
-            values, ok, shape, reach, otherwise=float(np.quantile(values[ok], quantile)), quantile=quantile
-        )
-
-    quarter = lower(energy, 0.25)
-    scatter = np.maximum((quarter - lower(energy, 0.1)) / (SIGMAS_OF_TENTH - SIGMAS_OF_QUARTER), 0.0)
-    level = np.exp(quarter + SIGMAS_OF_QUARTER * scatter) / texture
+    level, scatter = least_about(np.log(loss * texture), ok, shape, reach)
     least = max(_LEAST_IN_TIME * limits.min_factor, 1.0)
-    return level, np.clip(np.exp(limits.sigmas * scatter), least, limits.max_factor)
+    return np.exp(level) / texture, np.clip(np.exp(limits.sigmas * scatter), least, limits.max_factor)
 
 
 def _excess_blur(points: PointFits, pair: StereoPair, rays: Float, index: np.ndarray) -> Float:

@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arrays import Bool, Float
-from core.field.checks.block_median import block_medians, reach_of
-from core.field.checks.lost_correlation import SIGMAS_OF_QUARTER, SIGMAS_OF_TENTH
+from core.field.checks.block_median import SIGMAS_OF_QUARTER, SIGMAS_OF_TENTH, least_about, reach_of
 from core.field.parts.beside_edges import beside_edges
-from core.field.parts.subset_parts import Pull, pull_of_parts
-from core.field.parts.subset_residuals import subset_residuals
+from core.field.parts.subset_parts import pull_of_parts
+from core.field.parts.subset_residuals import SubsetResiduals, subset_residuals
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.starts import depth_per_px
 from core.progress import CancelToken, raise_if_cancelled
@@ -39,6 +38,8 @@ _OFF_SIGMAS, _OFF_PX = 3.0, 0.03  # what a part changes by, over the point's sta
 _USUAL = 256  # points that tell how much parts change a usual match
 _OF_WHITE, _SCATTER_OF_WHITE = 2.0, 0.26  # median of the largest change's significance, its logarithm's scatter
 _AT_ONCE = 256
+# unknown, comparison counted from the last, direction in it
+_SHAPE, _MOTION = ((0, -1, 0), (1, -1, 1)), ((1, -2, 0), (2, -2, 1), (3, -1, 0))
 
 
 def reject_straddling(
@@ -99,18 +100,10 @@ def _suspects(fitter: Fitter, points: PointFits, shape: tuple[int, int], texture
     gaps = cv2.morphologyEx((~ok).astype(np.uint8).reshape(shape), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     out = cv2.dilate(gaps, about).ravel() > 0
     reach = _WIDER * reach_of(subset, spacing_px)
-    every = np.zeros(shape, bool)
-    every[::2, ::2] = True  # enough for a quantile of some subsets' points
-    known = ok & every.ravel()
     for k in range(points.zncc.shape[1]):
         energy = np.log(np.where(ok, np.maximum((1.0 - points.zncc[:, k]) * texture, 1e-9), 1.0))
-        # what pulls at many points in a row raises their middle: those that lose least are the measure
-        quarter, tenth = (
-            block_medians(energy, known, shape, reach, otherwise=float(np.quantile(energy[ok], q)), quantile=q)
-            for q in (0.25, 0.1)
-        )
-        scatter = np.maximum((quarter - tenth) / (SIGMAS_OF_TENTH - SIGMAS_OF_QUARTER), 0.0)
-        out |= energy - quarter > (_LOUDER + SIGMAS_OF_QUARTER) * scatter
+        level, scatter = least_about(energy, ok, shape, reach, every=2)
+        out |= energy - level > _LOUDER * scatter
     return np.asarray(out)
 
 
@@ -136,14 +129,14 @@ class _Usual:
 
 
 def _usual_factors(fitter: Fitter, points: PointFits, xy_px: Float, least: float) -> Float:
-    """(o, 2) variance of what parts change at usual points over that by white noise, by comparison and direction.
+    """(1 or 2, 2) variance of what parts change at usual points over that by white noise, by comparison and direction.
 
     A prefilter, blur at t or paint that changes with the load correlate the residuals of all points, and not all alike:
     a wider scatter of the significance, too, raises what is unusual.
     """
     ok = np.flatnonzero(points.ok)
     found, visible = subset_residuals(fitter, points, ok[spread_indices(len(ok), _USUAL)], xy_px)
-    pulls = [pull_of_parts(one, visible, 2 if fitter.terms == 6 else 1) for one in found]
+    pulls = [pull_of_parts(one, visible, 2 if fitter.terms == 6 else 1) for one in found[-2:]]
     # edges pull at many points: those that are changed least are the measure
     quarter, tenth = np.log(np.quantile([pull.significance for pull in pulls], (0.25, 0.1), axis=1))
     scatter = np.maximum((quarter - tenth) / (SIGMAS_OF_TENTH - SIGMAS_OF_QUARTER), _SCATTER_OF_WHITE)
@@ -159,11 +152,12 @@ def _pulled(
     least = np.where(edges, _EDGE_SIGMAS, _PART_SIGMAS)
     found, visible = subset_residuals(fitter, points, index, xy_px)
     degree = 2 if fitter.terms == 6 else 1
-    pulls = [pull_of_parts(one, visible, degree) for one in found]
+    # a motion's reference pair was compared in its shape: it counts where something has changed since
+    pulls = [pull_of_parts(one, visible, degree) for one in found[-2:]]
     unit = _unit_px(fitter, points, index, rays)
     covariance = points.covariance[index]
     bad = np.zeros(len(index), bool)
-    for unknown, which, direction, before in _compared(pulls):
+    for unknown, which, direction in _SHAPE if len(pulls) == 1 else _MOTION:
         pull = pulls[which]
         sure = pull.significance[:, direction] / least
         if not (sure > 1.0).any():  # nothing changes, whatever is usual
@@ -173,36 +167,24 @@ def _pulled(
         noise_factor = usual.factors[which, direction]
         most = max(_MOST_CORRELATED, noise_factor)
         correlated = np.clip((sd / pull.sigma_px[:, direction]) ** 2, noise_factor, most)
-        shift = _change(pull, direction, before)
+        shift = np.take_along_axis(pull.shift_px[:, direction], pull.part[:, direction, None], axis=1)[:, 0]
+        if len(pulls) == 2 and unknown == 3:  # what camera 2 shows at both times is the shape's
+            some = np.flatnonzero(sure > 1.0)
+            before = pull_of_parts(SubsetResiduals(*(values[some] for values in found[0])), visible[some], degree)
+            shift[some] -= before.shift_px[np.arange(len(some)), direction, pull.part[some, direction]]
         far = np.abs(shift) > _FAR_SIGMAS * sd
         counts = (sure > np.sqrt(correlated)) | ((sure > np.sqrt(noise_factor)) & far)
         bad |= counts & (np.abs(shift) > np.maximum(_OFF_SIGMAS * sd, _OFF_PX))
         # beside a shape's edge a pull is expected: where all residuals are correlated it is doubtful, and is said
         doubtful = edges & (sure > 1.0) & ~counts & (len(pulls) == 1)
-        if unknown == 0:  # the offset is no part of a position
-            bad |= doubtful & ~(np.hypot(sd, shift) < fitter.options.max_sigma_px)
         shift = np.where(counts | doubtful, shift, 0.0)
+        if len(pulls) == 2 or unknown == 0:  # a shape's offset is no part of a position
+            bad |= (shift != 0.0) & ~(np.hypot(sd, shift) < fitter.options.max_sigma_px)
         points.covariance[index, unknown, unknown] += (shift / unit[:, unknown]) ** 2
     points.epipolar_sigma_px[index] = np.sqrt(points.covariance[index, -1, -1])
-    for pull in pulls[-2:]:
-        bad |= pull.other_centre
+    for pull in pulls:
+        bad |= pull.centre > 1.0
     return bad
-
-
-def _compared(pulls: list[Pull]) -> list[tuple[int, int, int, Pull | None]]:
-    """Unknown, comparison, direction there, and the comparison whose change does not count."""
-    if len(pulls) == 1:
-        return [(0, 0, 0, None), (1, 0, 1, None)]
-    return [(1, 1, 0, None), (2, 1, 1, None), (3, 2, 0, pulls[0])]
-
-
-def _change(pull: Pull, direction: int, before: Pull | None) -> Float:
-    """(m,) px by which the most significant part changes the match."""
-    part = pull.part[:, direction, None]
-    shift = np.take_along_axis(pull.shift_px[:, direction], part, axis=1)[:, 0]
-    if before is not None:  # what camera 2 shows at both times is the shape's
-        shift = shift - np.take_along_axis(before.shift_px[:, direction], part, axis=1)[:, 0]
-    return np.asarray(shift)
 
 
 def _unit_px(fitter: Fitter, points: PointFits, index: NDArray[np.intp], rays: Float) -> Float:

@@ -3,6 +3,10 @@
 A part that lies on another face, moves otherwise, or shows something else pulls the whole subset's match towards its
 own. Without the part the match then moves by more than the noise explains (Hausman's test of two estimates of which
 one holds the other's data; with single rows left out it is known as DFBETA).
+
+A thing in front of the subset's centre, as a wire, may pull it nowhere. The result is then that of the surface behind:
+the centre does not show what was matched. It is held against the match of that half of the subset which matches best
+(least trimmed squares): what the thing does to gain and match, and so to all residuals, is no measure of the usual.
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammainc, gammaincinv
 
 from core.arrays import Bool, Float
 from core.field.parts.subset_residuals import SubsetResiduals
@@ -22,7 +27,9 @@ _LEAST_SHARE = 0.02  # of the whole's variance: the linear step is no better
 _TINY_VARIANCE = 1.0 / 12.0  # of rounding
 _CENTRES = (1.0 / 6.0, 1.0 / 10.0)  # half of a subset's centre that must be what it seems, over the subset
 _CENTRE_LOSS = 0.2  # of the texture's variance
-_CENTRE_SIGMAS = 5.0  # of the mean square of so many pixels, over the whole subset's
+_CENTRE_SIGMAS = 5.0  # of the mean square of so many pixels, over that of the half that matches best
+_STEPS = 3  # towards that half
+_FAINT = 0.5  # of what the smallest other centre adds to a subset's residuals: gain and match take up some of it
 
 
 class Pull(NamedTuple):
@@ -38,15 +45,16 @@ class Pull(NamedTuple):
         (m, 2) standard deviation of the whole's match by white noise as large as its residuals.
     part
         (m, 2) the most significant one.
-    other_centre
-        (m,) True where the subset's centre shows something else than its surroundings' match.
+    centre
+        (m,) mean square of the residuals of the subset's centre in the match of its best half, over the most that one
+        surface with white noise shows.
     """
 
     significance: Float
     shift_px: Float
     sigma_px: Float
     part: NDArray[np.intp]
-    other_centre: Bool
+    centre: Float
 
 
 def pull_of_parts(found: SubsetResiduals, visible: Bool, degree: int) -> Pull:
@@ -61,7 +69,8 @@ def pull_of_parts(found: SubsetResiduals, visible: Bool, degree: int) -> Pull:
     degree
         Of the patch.
     """
-    sums, counts = _sums_of_cells(found, visible, degree)
+    columns = _columns(found, degree)
+    sums, counts = _sums_of_cells(columns, visible)
     k = sums.shape[-1] - 1  # the last column is the residual
     centre = [0, 6 if degree == 2 else 3]
     whole, n = sums.sum(axis=1), counts.sum(axis=1)
@@ -90,19 +99,25 @@ def pull_of_parts(found: SubsetResiduals, visible: Bool, degree: int) -> Pull:
         shift,
         np.sqrt(variances[:, centre] * residual[:, None]),
         part,
-        _other_centre(found, visible),
+        _centre(found, columns, visible, sums, counts, of_whole, ridge),
     )
 
 
-def _sums_of_cells(found: SubsetResiduals, visible: Bool, degree: int) -> tuple[Float, Float]:
-    """Products (m, cells, q, q) of the columns summed over the cells, and the cells' pixels (m, cells)."""
-    m, width, _ = found.residual.shape
+def _columns(found: SubsetResiduals, degree: int) -> Float:
+    """(m, s, s, q) derivatives of the residuals, then gain and offset, then the residuals."""
+    width = found.residual.shape[1]
     v, u = (np.mgrid[:width, :width] - width // 2) / (width // 2)
     plane = [np.ones_like(u), u, v]
     full = [*plane, u * u, u * v, v * v] if degree == 2 else plane
     columns = [found.along * b for b in full] + [found.across * b for b in plane]
     columns += [np.ones_like(found.residual), found.reference, found.residual]
-    table = np.stack(columns, axis=-1) * visible[..., None]
+    return np.stack(columns, axis=-1)
+
+
+def _sums_of_cells(columns: Float, visible: Bool) -> tuple[Float, Float]:
+    """Products (m, cells, q, q) of the columns summed over the cells, and the cells' pixels (m, cells)."""
+    m, width, _ = visible.shape
+    table = columns * visible[..., None]
     edges = np.round(np.linspace(0, width, _CELLS + 1)).astype(int)
     q = table.shape[-1]
     sums, counts = np.empty((m, _CELLS, _CELLS, q, q)), np.empty((m, _CELLS, _CELLS))
@@ -140,17 +155,71 @@ def _parts() -> NDArray[np.bool_]:
     return np.asarray(np.unique(np.array(small), axis=0))
 
 
-def _other_centre(found: SubsetResiduals, visible: Bool) -> Bool:
+def _centre(
+    found: SubsetResiduals, columns: Float, visible: Bool, sums: Float, counts: Float, match: Float, ridge: Float
+) -> Float:
+    """(m,) loss of the centre in the match of the best half; zero where all residuals are less than it would make."""
+    out = np.zeros(len(match))
+    k, width = match.shape[1], visible.shape[1]
+    smallest = min((2 * _reach(part, width) + 1) ** 2 for part in _CENTRES) / width**2
+    whole = sums.sum(axis=1)
+    some = np.flatnonzero(whole[:, k, k] > _FAINT * _CENTRE_LOSS * smallest * whole[:, k - 1, k - 1])
+    if len(some):
+        half = _best_half(sums[some], counts[some], match[some], ridge[some])
+        part_of = SubsetResiduals(*(values[some] for values in found))
+        out[some] = _centre_loss(part_of, columns[some], visible[some], *half)
+    return out
+
+
+def _reach(part: float, width: int) -> int:
+    return max(round(part * width), 2)
+
+
+def _best_half(sums: Float, counts: Float, match: Float, ridge: Float) -> tuple[Float, Float]:
+    """Match (m, k) of the half of the cells with the least residuals, and (m,) what these say of all residuals' square.
+
+    Parameters
+    ----------
+    sums, counts
+        Of the cells.
+    match
+        (m, k) where to start.
+    ridge
+        (m, k, k) added to normal equations.
+    """
+    k = match.shape[1]
+    half = sums.shape[1] // 2
+    for _ in range(_STEPS):
+        square = (
+            sums[:, :, k, k]
+            - 2.0 * np.einsum("mck,mk->mc", sums[:, :, k, :k], match)
+            + np.einsum("mcij,mi,mj->mc", sums[:, :, :k, :k], match, match)
+        )
+        order = np.argsort(np.where(counts > 0, square / np.maximum(counts, 1.0), np.inf), axis=1)[:, :half]
+        best = np.take_along_axis(sums, order[..., None, None], axis=1).sum(axis=1)
+        match = np.linalg.solve(best[:, :k, :k] + ridge, best[:, :k, k:])[..., 0]
+    n = np.take_along_axis(counts, order, axis=1).sum(axis=1)
+    left = np.maximum(best[:, k, k] - np.einsum("mi,mi->m", match, best[:, :k, k]), 0.0)
+    # the best half of white noise has less than its share
+    a = 0.5 * np.maximum(counts.sum(axis=1) / counts.shape[1], 1.0)
+    share = 2.0 * gammainc(a + 1.0, gammaincinv(a, 0.5))
+    return match, np.maximum(left / np.maximum(n - k, 1.0), _TINY_VARIANCE) / share
+
+
+def _centre_loss(found: SubsetResiduals, columns: Float, visible: Bool, match: Float, usual: Float) -> Float:
+    """(m,) mean square of the centre's residuals in a match, over the most that is to be expected of ``usual``."""
+
     def energy(values: Float, seen: Bool) -> Float:
         return np.asarray((values**2 * seen).sum(axis=(1, 2)) / np.maximum(seen.sum(axis=(1, 2)), 1))
 
-    width = found.residual.shape[1]
-    texture, usual = energy(found.reference, visible), energy(found.residual, visible)
-    out = np.zeros(len(texture), bool)
+    width, k = visible.shape[1], match.shape[1]
+    texture = energy(found.reference, visible)
+    out = np.zeros(len(texture))
     for part in _CENTRES:
-        reach = max(round(part * width), 2)
+        reach = _reach(part, width)
         middle = (slice(None), *(slice(width // 2 - reach, width // 2 + reach + 1),) * 2)
         seen = visible[middle]
         by_chance = 1.0 + _CENTRE_SIGMAS * np.sqrt(2.0 / np.maximum(seen.sum(axis=(1, 2)), 1))
-        out |= energy(found.residual[middle], seen) > np.maximum(_CENTRE_LOSS * texture, by_chance * usual)
+        left = columns[middle][..., k] - np.einsum("mijk,mk->mij", columns[middle][..., :k], match)
+        out = np.maximum(out, energy(left, seen) / np.maximum(_CENTRE_LOSS * texture, by_chance * usual))
     return out
