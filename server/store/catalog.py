@@ -26,7 +26,7 @@ Entry = tuple[str, str, str, Mapping[str, object]]
 _log = logging.getLogger("stereorig.store")
 _PATIENCE_S = 30.0
 #: of an analysis' job; they were megabytes, to be read with every list of jobs
-_KEPT_STEPS = 20
+_KEPT_STEPS = 5
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS jobs (
@@ -322,7 +322,7 @@ class Catalog:
 
 def _job_text(job: JobRecord) -> str:
     """Return a job as it is kept; the figures of an analysis' steps lie beside their results."""
-    return json.dumps((job.bounded(_KEPT_STEPS) if job.kind == "analysis" else job).plain())
+    return json.dumps((job.bounded(_KEPT_STEPS, only="steps") if job.kind == "analysis" else job).plain())
 
 
 def _rows(entries: list[Entry]) -> list[tuple[str, str, str, str]]:

@@ -49,10 +49,12 @@ class JobRecord(Document):
     result: dict[str, object] | None = Field(None, description="Result, when it succeeded.")
     problem: JobProblem | None = Field(None, description="Problem that left no result.")
 
-    def bounded(self, most: int) -> JobRecord:
+    def bounded(self, most: int, only: str | None = None) -> JobRecord:
         """Return the record with so many entries of each list in its result at most; ``n_<list>`` counts them all."""
         cut: dict[str, object] = {}
         for name, value in (self.result or {}).items():
+            if only not in (None, name):
+                continue
             if isinstance(value, list) and len(value) > most:
                 cut |= {name: value[:most], f"n_{name}": len(value)}
             elif isinstance(value, dict) and len(value) > most:

@@ -19,7 +19,6 @@ from pydantic import BaseModel, ValidationError
 from core.errors import InputError, StorageError
 from server.api.models import (
     AnalysisAccepted,
-    AnalysisReply,
     AnalysisRequest,
     AnalysisStepList,
     CalibrationAccepted,

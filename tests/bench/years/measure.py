@@ -186,7 +186,7 @@ def main() -> None:
         tests, steps = map(int, size.split("/"))
         with tempfile.TemporaryDirectory() as folder:
             costs.append(measure(Path(folder), tests, steps))
-        print(json.dumps(asdict(costs[-1]), indent=1), flush=True)
+            print(json.dumps(asdict(costs[-1]), indent=1), flush=True)
     if args.json is not None:
         args.json.write_text(json.dumps([asdict(one) for one in costs], indent=1))
     if args.page:

@@ -24,7 +24,7 @@ from server.store.documents import JobRecord
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 #: of each list in the result of a job that is listed with others
-LISTED = 5
+LISTED = 1
 
 
 def known_job(service: ServiceDep, job_id: JobId) -> JobRecord:
