@@ -29,6 +29,7 @@ from server.rig.build import check_config
 from server.rig.devices import DeviceFinder
 from server.store.calibrations import CalibrationStore
 from server.store.catalog import Catalog
+from server.store.certificates import CertificateStore
 from server.store.folder import DataFolder
 from server.store.index import rebuild
 from server.store.noise import NoiseStore
@@ -73,6 +74,7 @@ class Service:
         self.tests = TestStore(self.folder)
         self.noise = NoiseStore(self.folder)
         self.recipes = RecipeStore(self.folder)
+        self.certificates = CertificateStore(self.folder)
         self.trash = Trash(self.folder.root)
         self.differences: list[str] = []
         self.metrics = Metrics()
@@ -125,6 +127,7 @@ class Service:
             parts.callback(self.catalog.close)
             self.noise.end_unfinished()
             self.recipes.reserve_ids()
+            self.certificates.reserve_ids()
             self.differences = rebuild(self.catalog, self.folder, self.calibrations, self.tests, self.noise)
             for line in self.differences:
                 _log.info("catalogue: %s", line)

@@ -1,4 +1,4 @@
-"""The evidence of a verification procedure in numbers: a rig with its noise, its calibration's error and hidden faults."""
+"""The evidence of a verification procedure in numbers: a rig with noise, a calibration's error and hidden faults."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STEP_S = 30.0
 
 @dataclass(frozen=True)
 class Fault:
-    """Hidden faults: relative errors of the target's pitch, the stage and the artefact, a drift, a camera that moved."""
+    """Hidden faults: errors of the target's pitch, the stage and the artefact, a drift, a camera that moved."""
 
     pitch: float = 0.0
     stage: float = 0.0
