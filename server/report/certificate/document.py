@@ -150,5 +150,5 @@ def _page(
         tables=[(title, found) for title, found in tables if found],
         evidence=gathered.evidence,
         static=gathered.static,
-        text_of=text_of,
+        text_of=lambda value, unit: text_of(value, unit).replace(" um", " \u00b5m"),
     )
