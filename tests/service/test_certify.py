@@ -93,6 +93,7 @@ def test_a_target_of_known_size_is_a_length(bench: tuple[Path, httpx.Client, Tak
     assert [one["name"] for one in found] == ["grid", "again"]
     assert done["result"]["outcome"] == "pass", shown["reasons"]
     assert len(shown["made_of"]["pictures_sha256"]) == 4
+    assert client.delete(f"{API}/tests/{taken[0]}/steps/{n}").json()["code"] == "in_use"
     stated = {**target, "pitch_mm": 1.002 * target["pitch_mm"]}
     wrong = certified(client, taken, lengths=[{**place, "target": stated}], limits={"lengths": 1})
     assert wrong["result"]["outcome"] == "fail"

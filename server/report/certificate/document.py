@@ -123,7 +123,10 @@ def _judged(one: Judged) -> dict[str, object]:
 def _made_of(source: Source, gathered: Gathered) -> dict[str, object]:
     """Return ids and checksums of everything that the certificate rests on."""
     head = source.heads[max(source.heads)]
-    steps = {str(n): {cam: one.inputs_sha256.get(cam) for cam in CAMERAS} for n, one in source.heads.items()}
+    steps: dict[str, dict[str, str | None]] = {
+        str(n): {cam: one.inputs_sha256.get(cam) for cam in CAMERAS} for n, one in source.heads.items()
+    }
+    steps |= {str(n): {**images} for n, images in gathered.pictured.items()}
     return {
         "test_id": source.test_record.id or None,
         "analysis_id": source.analysis.id or None,

@@ -51,11 +51,14 @@ class Gathered:
         The static steps, as named or by their labels.
     images_sha256
         Checksums of pictures that were read beside the results, by name.
+    pictured
+        Steps that were read beside the results, with their pictures' checksums by camera.
     """
 
     evidence: Evidence
     static: list[int] = field(default_factory=list)
     images_sha256: dict[str, str] = field(default_factory=dict)
+    pictured: dict[int, dict[str, str]] = field(default_factory=dict)
 
 
 def gather(
@@ -124,7 +127,7 @@ def gather(
             gauge_length = found.length0_mm.value
     for one in plan.lengths:
         if one.target is not None:
-            lengths.append(_of_target(source, one, folder, gathered.images_sha256))
+            lengths.append(_of_target(source, one, folder, gathered))
     gathered.evidence = Evidence(
         tuple(at_rest),
         tuple(moved),
@@ -209,7 +212,7 @@ def _between(step: Readings, one: asked.KnownLength) -> KnownLength:
     return length_between(one.name, reading, known_mm=one.length_mm, sigma_mm=one.u_mm, artefact=one.artefact)
 
 
-def _of_target(source: Source, one: asked.KnownLength, folder: Path | None, sha256: dict[str, str]) -> KnownLength:
+def _of_target(source: Source, one: asked.KnownLength, folder: Path | None, gathered: Gathered) -> KnownLength:
     """Measure a target of known size in a pair of pictures; its own uncertainty counts as new at each place."""
     assert one.target is not None
     if source.calibration is None:
@@ -218,7 +221,7 @@ def _of_target(source: Source, one: asked.KnownLength, folder: Path | None, sha2
             code="calibration_missing",
             remedy="Give it with --calibration.",
         )
-    images = _pictures(source, one, folder, sha256)
+    images = _pictures(source, one, folder, gathered)
     target = target_of(one.target.plain(), "lengths.target")
     found = distance_of_target(source.calibration, images, target, distance_sigma_mm=one.u_mm)
     bare = check_target_images(source.calibration.pair, images, target, distance_sigma_mm=one.u_mm)
@@ -231,7 +234,7 @@ def _of_target(source: Source, one: asked.KnownLength, folder: Path | None, sha2
 
 
 def _pictures(
-    source: Source, one: asked.KnownLength, folder: Path | None, sha256: dict[str, str]
+    source: Source, one: asked.KnownLength, folder: Path | None, gathered: Gathered
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     paths: dict[str, Path] = {}
     recorded: dict[str, str] = {}
@@ -267,7 +270,9 @@ def _pictures(
                 remedy=_REMEDY,
                 camera=cam,
             )
-        sha256[f"{one.name}, {cam}"] = digest
+        gathered.images_sha256[f"{one.name}, {cam}"] = digest
+        if one.n is not None:
+            gathered.pictured.setdefault(one.n, {})[cam] = digest
     return read_image(paths["cam1"]), read_image(paths["cam2"])
 
 

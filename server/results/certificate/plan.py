@@ -164,12 +164,6 @@ class CertificatePlan(Request):
             raise disagreement(f"step {twice[0]} is named twice: a step is static, a translation or a rotation")
         return self
 
-    def steps(self) -> set[int]:
-        """Return the steps that are named."""
-        named = {one.n for one in self.translations} | {one.n for one in self.rotations} | set(self.static_steps or ())
-        named |= {one.n for one in self.lengths if one.n is not None}
-        return named | {one.n for one in (self.extensometer.readings if self.extensometer else ())}
-
 
 def plan_in(document: object, *, name: str) -> CertificatePlan:
     """Read a plan.
