@@ -65,10 +65,12 @@ def make_certificate(
 
     Parameters
     ----------
-    source, plan, folder, on_step
+    source, plan
         As of :func:`server.report.certificate.evidence.gather`, with its errors.
     certificate_id
         Id in a data folder; empty of files.
+    folder, on_step
+        As there.
     """
     gathered = gather(source, plan, folder=folder, on_step=on_step)
     verdict = certify(gathered.evidence, plan.limits)
