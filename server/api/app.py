@@ -22,6 +22,7 @@ from server.api.routes.analyses import analyses, exports, gauges, picking, previ
 from server.api.routes.calibrations import calibrations, guide, noise, repair, review
 from server.api.routes.calibrations import checks as calibration_checks
 from server.api.routes.calibrations import exports as calibration_exports
+from server.api.routes.certificates import certificates
 from server.api.routes.rig import cameras, devices, live_check, stage
 from server.api.routes.service import jobs, session, system
 from server.api.routes.tests import channels, frame, metadata, recipes, tests, watch, workspace
@@ -144,6 +145,7 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         gauges,
         exports,
         report,
+        certificates,
         jobs,
         previews,
     ):

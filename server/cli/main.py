@@ -34,6 +34,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "report": ("server.cli.measurement.report", "write a report of results: one HTML file that a lab can file"),
     "verify": ("server.cli.operation.verify", "check a data folder: damage, leftovers, checksums"),
     "reproduce": ("server.cli.evidence.reproduce", "measure a stored analysis again and compare"),
+    "certify": ("server.cli.evidence.certify", "judge the measuring system by known motions and lengths"),
     "bundle": ("server.cli.evidence.bundle", "pack a test into one file, or open such a file"),
     "repair": ("server.cli.operation.repair", "put a data folder in order after a crash"),
     "trash": ("server.cli.operation.trash", "what was deleted: list, restore, remove for good"),
@@ -79,7 +80,7 @@ def _joined(arguments: Sequence[str]) -> list[str]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit status (0 done, 1 failed, 2 wrong usage, 3 steps failed, 130 stopped)."""
+    """Run the command line; return the exit status (0 done, 1 failed, 2 wrong usage, 3 to 5 in part, 130 stopped)."""
     arguments = _joined(sys.argv[1:] if argv is None else argv)
     parser = _OneLineParser(prog="stereorig", description="Stereo measurement of shape and displacement.")
     parser.add_argument("--version", action="version", version=f"stereorig {software_version()}")

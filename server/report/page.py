@@ -61,13 +61,15 @@ def _css_text(text: str) -> Markup:
     return Markup('"' + "".join(f"\\{ord(c):x} " if c in '"\\<>&' else c for c in printable) + '"')
 
 
-def render(head: str, **content: object) -> tuple[bytes, str]:
+def render(head: str, *, template: str = "report.html.j2", **content: object) -> tuple[bytes, str]:
     """Fill the page.
 
     Parameters
     ----------
     head
         Text at the head of every printed page.
+    template
+        The page's.
     content
         Variables of the templates.
 
@@ -88,5 +90,5 @@ def render(head: str, **content: object) -> tuple[bytes, str]:
     style = templates.get_template("style.css.j2").render(head=head)
     digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
     policy = f"default-src 'none'; style-src 'sha256-{digest}'; img-src data:; base-uri 'none'; form-action 'none'"
-    page = templates.get_template("report.html.j2").render(style=Markup(style), policy=policy, **content)
+    page = templates.get_template(template).render(style=Markup(style), policy=policy, **content)
     return page.encode(), policy

@@ -88,11 +88,22 @@ class TestRecord(Record):
     metadata: dict[str, object] = Field(default={}, validation_alias=AliasChoices(*METADATA_NAMES))
 
 
+class OffsetRecord(Record):
+    """One finding about the cameras, see :class:`core.orientation.OffsetFinding`."""
+
+    camera_moved: bool | None = None
+    offset_rms_px: float
+    expected_px: float
+    sigmas: float
+
+
 class CameraMotionRecord(Record):
     """What a step's epipolar offsets said about the cameras, see :class:`server.formats.results.camera_motion`."""
 
     camera_moved: bool | None = None
     text: str
+    calibration: OffsetRecord | None = None
+    reference: OffsetRecord | None = None
 
 
 class StepSummaryRecord(Record):

@@ -37,8 +37,8 @@ class JobRecord(Document):
 
     id: str = Field(description="Id of the job.", examples=["j000007-a31f0c"])
     kind: str = Field(
-        description="`calibration`, `noise`, `analysis`, `repetition`, `export`, `burst`, `move`, `home`, "
-        "`leave_configuration` or `reconnect`."
+        description="`calibration`, `noise`, `analysis`, `repetition`, `certificate`, `export`, `burst`, `move`, "
+        "`home`, `leave_configuration` or `reconnect`."
     )
     state: JobState = Field(description="State of the job.")
     subject: dict[str, object] = Field(description="Ids of what it works on.")
@@ -313,3 +313,28 @@ class TrashEntry(Record, Document):
     deleted_by: str | None = Field(None, description="Whose key it was; `local` where none is asked for.")
     why: str | None = Field(None, description="`asked for`; `retention` where an earlier version moved it by itself.")
     size_bytes: int | None = Field(None, description="Room that emptying frees.")
+
+
+class CertificateSources(Document):
+    """What a certificate rests on."""
+
+    test_id: str | None = None
+    analysis_id: str | None = None
+    calibration_sha256: str | None = None
+    steps: dict[str, dict[str, str | None]] = Field(default_factory=dict)
+
+
+class CertificateRecord(Document):
+    """``certificate.json``; its tables are further entries."""
+
+    id: str
+    title: str = ""
+    outcome: Literal["pass", "conditional", "fail"]
+    created_utc: str
+    valid_until_utc: str | None = None
+    software_version: str = ""
+    simulated: bool = False
+    reasons: list[dict[str, str]] = Field(default_factory=list)
+    suspects: list[dict[str, str]] = Field(default_factory=list)
+    made_of: CertificateSources
+    policy: str = ""

@@ -40,12 +40,13 @@ _KNOWN = {
     "calibration": r"(plan|target|view|review|judgement|failure|rejected)\.json|"
     r"(calibration\.json|residuals\.nc)(\.sha256)?|calibration\.checks\.json|views",
     "noise": r"(plan|frames|failure)\.json|noise\.json(\.sha256)?|frames",
+    "certificate": r"certificate\.(json|html)(\.sha256)?|withdrawn\.json",
     "test": r"(test|calibration|watch|workspace)\.json|calibrations|steps|analyses|exports",
     "step": r"step\.json|cam[12]\.tif",
     "analysis": r"(analysis|jobs|noise|summary)\.json|mask\.png|step_\d+\.(nc|nc\.sha256|json)|starts_\d+\.npz",
 }
 _WRITING_S = 1.0  # longer than a file is under way
-_FOLDERS = frozenset({"calibrations", "tests", "noise", "recipes", "trash", ".exports"})
+_FOLDERS = frozenset({"calibrations", "tests", "noise", "recipes", "certificates", "trash", ".exports"})
 
 
 @dataclass(frozen=True)
@@ -181,6 +182,16 @@ class _Walk:
         if (path / "noise.json").is_file():
             self.document(path / "noise.json")
             self.compare_beside(path / "noise.json")
+
+    def certificate(self, path: Path) -> None:
+        self.strangers(path, "certificate")
+        self.documents(path, "withdrawn.json")
+        self.document(path / "certificate.json")
+        for name in ("certificate.json", "certificate.html"):
+            if (path / name).is_file():
+                self.compare_beside(path / name)
+            else:
+                self.report("damaged", path / name, "it is missing")
 
     def test(self, path: Path) -> None:
         self.there.add(("test", "", path.name))
@@ -347,6 +358,8 @@ def _check_all(root: Path) -> Verification:
             walk.calibration(path)
         for path in walk.entries(root / "noise", "n", "plan.json"):
             walk.noise(path)
+        for path in walk.entries(root / "certificates", "v", "certificate.json"):
+            walk.certificate(path)
         for path in walk.entries(root / "tests", "t", "test.json"):
             walk.test(path)
         walk.catalog()

@@ -89,6 +89,14 @@ def _name(service: Service, kind: Kind, ids: Ids) -> str:
 
 
 def _check_unused(service: Service, kind: Kind, ids: Ids) -> None:
+    certificate = service.certificates.resting_on(kind, ids)
+    if certificate is not None:
+        raise _in_use(
+            kind,
+            f"by certificate {certificate}, which rests on it",
+            "Withdraw the certificate first (POST /certificates/{id}:withdraw).",
+            certificate_id=certificate,
+        )
     named = {k: v for k, v in ids.items() if k != "n"}
 
     def uses(subject: Mapping[str, object]) -> bool:

@@ -29,6 +29,7 @@ from server.rig.build import check_config
 from server.rig.devices import DeviceFinder
 from server.store.calibrations import CalibrationStore
 from server.store.catalog import Catalog
+from server.store.certificates import CertificateStore
 from server.store.folder import DataFolder
 from server.store.indexing.build import Index
 from server.store.indexing.clean_stop import take_mark
@@ -77,6 +78,7 @@ class Service:
         self.tests = TestStore(self.folder)
         self.noise = NoiseStore(self.folder)
         self.recipes = RecipeStore(self.folder)
+        self.certificates = CertificateStore(self.folder)
         self.trash = Trash(self.folder.root)
         self.index = Index(self.catalog, self.folder, self.calibrations, self.tests, self.noise)
         self.metrics = Metrics()
@@ -248,6 +250,7 @@ class Service:
         parts.callback(self.catalog.close)
         self.noise.end_unfinished()
         self.recipes.reserve_ids()
+        self.certificates.reserve_ids()
         self.index.begin(known)
         parts.callback(self._end_index)
         self.index.start()

@@ -386,6 +386,14 @@ def _analysis(session: Session, test: str) -> str:
     call("get_analysis", test, made["analysis_id"])
     call("list_analysis_steps", test, made["analysis_id"])
     wait_for_job(client, call("reproduce_analysis", test, made["analysis_id"]).json()["job"])
+    plan = {"title": "Bench 2", "static_steps": [1], "limits": {"displacement_mpe_um": 5.0}, "valid_days": 180}
+    asked = {"test_id": test, "analysis_id": made["analysis_id"], "plan": plan}
+    certificate = wait_for_job(client, call("create_certificate", summary="Noise floor", body=asked).json()["job"])
+    certificate_id = certificate["result"]["certificate_id"]
+    call("list_certificates")
+    call("get_certificate", certificate_id)
+    call("get_certificate_report", certificate_id)
+    call("withdraw_certificate", certificate_id, body={"reason": "The lens of camera 2 was exchanged."})
     return str(made["analysis_id"])
 
 

@@ -28,6 +28,7 @@ _TAGS = {
     "calibrations": "Calibrations: made on the rig, or imported.",
     "tests": "Tests and their load steps.",
     "analyses": "Shape and displacement, computed over a test's steps.",
+    "certificates": "Verification certificates of the measuring system.",
     "results": "Fields, points, gauges and files of an analysis.",
     "trash": "Deleting, restoring, deletion by age.",
     "jobs": "Anything that takes longer than a request.",

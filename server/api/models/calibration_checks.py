@@ -10,7 +10,7 @@ from core.calibration.checks.distance import MARK_SIGMA_PX
 from core.names import CameraName
 from core.settings import Pixel, Real
 from server.base.models import Reply, Request, StepNumber, one_of
-from server.config.rig_file import TargetSection
+from server.results.certificate.plan import StatedTarget
 
 Mark = tuple[Pixel, Pixel]
 Positive = Annotated[Real, Field(gt=0.0, le=1e9, allow_inf_nan=False)]
@@ -22,15 +22,6 @@ class Marks(Request):
 
     cam1: tuple[Mark, Mark] = Field(description="Both marks in camera 1.", examples=[[[82.0, 120.0], [170.0, 121.5]]])
     cam2: tuple[Mark, Mark] = Field(description="The same two, in the same order, in camera 2.")
-
-
-class StatedTarget(TargetSection):
-    """A target of known size, as in a rig file; which fields its kind needs is told where it is used."""
-
-    @model_validator(mode="after")
-    def _fields_of_its_kind(self) -> Self:
-        # no schema says which fields go together: such a target is refused as a value, not as a malformed request
-        return self
 
 
 class TargetOfStep(Request):

@@ -1,1 +1,1 @@
-"""Commands that show others what a result is worth: repetition, bundle, comparison with a model."""
+"""Commands that show others what a result is worth: certificate, repetition, bundle, comparison with a model."""

@@ -1,6 +1,7 @@
 // Running and ended jobs, and the state of the system.
 import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
+import { certificates } from "./certificates.js";
 import { stateBadge, warningsBox } from "./results/warnings.js";
 import { h, replace, action, badge, count, definitions, num, quantity, table, when, problemText, STATE_KIND } from "../lib/dom.js";
 
@@ -148,10 +149,11 @@ export async function open(root) {
     }
   }
 
+  const kept = certificates();
   const ended = events.on("job", take);
   await refresh();
   system();
   const timer = setInterval(system, 3000);
-  replace(root, h("h1", "Jobs and system"), h("div.grid.side", h("div", h("section.panel", list), detail), health));
-  return () => { ended(); clearInterval(timer); };
+  replace(root, h("h1", "Jobs and system"), h("div.grid.side", h("div", h("section.panel", list), detail), h("div", health, kept.element)));
+  return () => { ended(); kept.close(); clearInterval(timer); };
 }

@@ -1,0 +1,75 @@
+"""Certificates, as they travel."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, StringConstraints
+
+from server.base.models import Label, Listing, Reply, Request
+from server.results.certificate.plan import CertificatePlan
+
+Outcome = Literal["pass", "conditional", "fail"]
+
+
+class CertificateRequest(Request):
+    """A certificate to make from an analysis' results."""
+
+    test_id: Annotated[str, StringConstraints(max_length=40)] = Field(
+        description="Test whose steps were taken for it.", examples=["t000001-a31f0c"]
+    )
+    analysis_id: Annotated[str, StringConstraints(max_length=40)] = Field(
+        description="Analysis that measured them.", examples=["a000001-77d0b3"]
+    )
+    plan: CertificatePlan = Field(description="What is known of the steps, and what is asked of the system.")
+
+
+class WithdrawRequest(Request):
+    """Withdrawal of a certificate."""
+
+    reason: Annotated[Label, StringConstraints(min_length=1)] = Field(
+        description="Why it does not hold any more.", examples=["The lens of camera 2 was exchanged."]
+    )
+
+
+class CertificateFinding(Reply):
+    """A reason of a verdict, or a suspect."""
+
+    code: str = Field(description="Stable name.", examples=["calibration_scale"])
+    text: str = Field(description="The finding with its figures.")
+    remedy: str = Field(description="What to do.")
+
+
+class CertificateReason(CertificateFinding):
+    """Why a verdict is no pass."""
+
+    outcome: Outcome = Field(description="What it makes the verdict at least.")
+
+
+class CertificateEntry(Reply):
+    """Entry of a certificate in a list."""
+
+    id: str = Field(description="Id.", examples=["v000001-5d0a3f"])
+    title: str = Field(description="What is certified.")
+    outcome: Outcome = Field(description="The verdict when it was made.")
+    state: Literal["valid", "failed", "expired", "void", "withdrawn"] = Field(
+        description="Whether it holds now: `void` once another calibration was made after it."
+    )
+    why: str = Field(description="Why it does not hold; empty where it does.")
+    created_utc: str = Field(description="Time at which it was made.")
+    valid_until_utc: str | None = Field(description="Time until which it holds; null of one that failed.")
+    test_id: str | None = Field(description="Its test.")
+    analysis_id: str | None = Field(description="Its analysis.")
+
+
+class CertificateReply(CertificateEntry):
+    """A certificate; its tables as further entries, as in certificate.json."""
+
+    reasons: list[CertificateReason] = Field(description="Why it is no pass; empty of a pass.")
+    suspects: list[CertificateFinding] = Field(description="What is suspect, the most probable cause first.")
+
+
+class CertificateList(Listing):
+    """Certificates, oldest first."""
+
+    certificates: list[CertificateEntry] = Field(description="Short entry of each.")

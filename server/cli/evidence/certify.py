@@ -1,0 +1,66 @@
+"""``stereorig certify``: a verification certificate from measured steps and what is known of them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from server.cli.terminal import ProgressLine
+from server.formats.files import make_folder, write_bytes
+from server.formats.results.summary import to_json
+from server.results.certificate.plan import load_plan
+
+OUTCOME_STATUS = {"pass": 0, "conditional": 4, "fail": 5}
+"""Exit status by verdict; 1 to 3 are errors, as of every command."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.description = (
+        "Judge a measuring system by static pairs, known translations, known lengths, a rotation and a reference "
+        "extensometer, as far as a plan names them: noise floor, errors beside their uncertainty, class of the virtual "
+        "extensometer, verdict with reasons and what is suspect. Writes certificate.json and certificate.html. Ends "
+        "with 0 for a pass, 4 for a conditional one, 5 for a fail."
+    )
+    add = parser.add_argument
+    add(
+        "folder",
+        metavar="DATA_OR_RESULTS",
+        type=Path,
+        help="a data folder, a test's, an analysis', or what stereorig measure --out wrote",
+    )
+    add("plan", metavar="PLAN", type=Path, help="JSON: what is known of each step, and the limits")
+    add("--test", metavar="ID", help="which test of a data folder (its only one)")
+    add("--analysis", metavar="ID", help="which analysis of a test (the newest with results)")
+    add("--calibration", metavar="FILE", type=Path, help="the calibration, where it is not beside the results")
+    add("--out", metavar="DIR", type=Path, default=Path("certificate"), help="folder of the certificate (certificate)")
+    add("--json", action="store_true", help="print the certificate as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, judge, write, print; return the verdict's status."""
+    # the reports' library takes a second to load
+    from server.report.certificate.document import make_certificate
+    from server.report.source import find_source
+
+    plan = load_plan(args.plan)
+    source = find_source(args.folder, test=args.test, analysis=args.analysis, calibration=args.calibration)
+    progress = ProgressLine()
+    try:
+        made = make_certificate(
+            source,
+            plan,
+            folder=args.plan.absolute().parent,
+            on_step=lambda done, total: progress.show("reading", done / total),
+        )
+    finally:
+        progress.close()
+    make_folder(args.out.absolute())
+    write_bytes(args.out / "certificate.html", made.page)
+    write_bytes(args.out / "certificate.json", to_json(made.document))
+    if args.json:
+        print(json.dumps(made.document, indent=1))
+    else:
+        print("\n".join([*made.lines, f"written: {args.out / 'certificate.html'}, {args.out / 'certificate.json'}"]))
+    return OUTCOME_STATUS[made.outcome]

@@ -1,0 +1,1 @@
+"""What a verification certificate is made from, as it is asked for."""

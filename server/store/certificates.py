@@ -1,0 +1,114 @@
+"""Certificates on disk: a folder each with the page, and ``certificate.json`` as the last file, which makes it one.
+
+What a certificate rests on is protected from deletion until it is withdrawn; it is itself never changed or removed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from core.errors import FileFormatError, StateError
+from server.base.errors import NotFoundError
+from server.formats.files import require_recorded
+from server.store.documents import CertificateRecord
+from server.store.durable import known_json, make_folder, read_record, write_bytes, write_json
+from server.store.folder import DataFolder, is_id, now_utc
+
+_DOCUMENT, _PAGE, _WITHDRAWN = "certificate.json", "certificate.html", "withdrawn.json"
+
+
+class CertificateStore:
+    """The certificates of one data folder."""
+
+    def __init__(self, folder: DataFolder) -> None:
+        self._folder = folder
+        self._root = folder.root / "certificates"
+
+    def reserve_ids(self) -> None:
+        """Reserve the ids that exist, of folders that a kill left unfinished too."""
+        for path in self._root.glob("v*"):
+            if is_id(path.name, "v"):
+                self._folder.ids.reserve(path.name)
+
+    def ids(self) -> list[str]:
+        """Ids of all certificates, in the order of their making."""
+        return sorted(p.parent.name for p in self._root.glob(f"v*/{_DOCUMENT}") if is_id(p.parent.name, "v"))
+
+    def new_id(self) -> str:
+        """Return the id of a certificate that is to be made."""
+        return self._folder.ids.new("v")
+
+    def put(self, certificate_id: str, document: Mapping[str, object], page: bytes) -> None:
+        """Keep a certificate; durable when this returns."""
+        if not self._root.is_dir():
+            make_folder(self._root)
+        path = self._root / certificate_id
+        make_folder(path)
+        write_bytes(path / _PAGE, page, checksum=True)
+        write_json(path / _DOCUMENT, document, checksum=True)
+
+    def read(self, certificate_id: str) -> CertificateRecord:
+        """Return a certificate.
+
+        Raises
+        ------
+        NotFoundError
+            If there is none with this id.
+        FileFormatError
+            ``checksum_mismatch`` if it is not as it was written.
+        """
+        path = self._root / certificate_id / _DOCUMENT
+        if not is_id(certificate_id, "v") or not path.is_file():
+            raise NotFoundError(f"There is no certificate {certificate_id[:40]!r}.", kind="certificate")
+        require_recorded(path, f"certificate {certificate_id}", f"certificates/{certificate_id}")
+        return read_record(CertificateRecord, path)
+
+    def page(self, certificate_id: str) -> bytes:
+        """Return the page as it was made; raises as :meth:`read`."""
+        self.read(certificate_id)
+        path = self._root / certificate_id / _PAGE
+        if not path.is_file():
+            raise FileFormatError(
+                f"The page of certificate {certificate_id} is missing.",
+                code="file_missing",
+                remedy="Restore it from a backup; certificate.json has all of its figures.",
+            )
+        require_recorded(path, f"certificate {certificate_id}", f"certificates/{certificate_id}")
+        return path.read_bytes()
+
+    def withdrawn(self, certificate_id: str) -> Mapping[str, object] | None:
+        """Return when, by whom and why a certificate was withdrawn; None: it was not."""
+        return known_json(self._root / certificate_id / _WITHDRAWN) or None
+
+    def withdraw(self, certificate_id: str, reason: str, by: str) -> None:
+        """Withdraw a certificate; it stays, and protects nothing any more.
+
+        Raises
+        ------
+        StateError
+            ``certificate_withdrawn`` if it was withdrawn before.
+        """
+        self.read(certificate_id)
+        if self.withdrawn(certificate_id) is not None:
+            raise StateError(
+                f"Certificate {certificate_id} was withdrawn before.",
+                code="certificate_withdrawn",
+                remedy="Nothing is left to do.",
+            )
+        write_json(self._root / certificate_id / _WITHDRAWN, {"utc": now_utc(), "by": by, "reason": reason})
+
+    def resting_on(self, kind: str, ids: Mapping[str, object]) -> str | None:
+        """Return a certificate in force that rests on a test, step or analysis; None without one."""
+        if kind not in ("test", "step", "analysis"):
+            return None  # a test keeps its own copy of the calibration
+        for certificate_id in self.ids():
+            try:
+                made_of = read_record(CertificateRecord, self._root / certificate_id / _DOCUMENT).made_of
+            except FileFormatError:
+                continue  # `verify` tells of one that is damaged; it must not keep everything from being deleted
+            if made_of.test_id != ids.get("test_id") or self.withdrawn(certificate_id) is not None:
+                continue
+            rests = kind == "test" or (kind == "analysis" and made_of.analysis_id == ids.get("analysis_id"))
+            if rests or (kind == "step" and str(ids.get("n")) in made_of.steps):
+                return certificate_id
+        return None

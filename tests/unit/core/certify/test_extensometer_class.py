@@ -1,0 +1,56 @@
+"""The class of an extensometer: limits of ISO 9513 worked out by hand."""
+
+from __future__ import annotations
+
+import pytest
+
+from core.certify.evidence import ExtensometerPoint, ExtensometerRun
+from core.certify.extensometer_class import extensometer_class
+from core.certify.noise_floor import independent_values
+
+
+def run(error: float = 0.0, offset_mm: float = 0.0, u_mm: float = 1e-5, **more: object) -> ExtensometerRun:
+    points = tuple(ExtensometerPoint(n, 0.1 * n, u_mm, 0.1 * n * (1.0 + error) + offset_mm, 1e-4) for n in range(1, 11))
+    return ExtensometerRun(points, static_mm=(0.0, 2e-4), **more)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("error", "offset_mm", "reached"),
+    [
+        (0.0, 0.0, "0.2"),
+        (0.0, 5.9e-4, "0.2"),  # 0.6 um are permitted where 0.2 % are less
+        (0.0, 6.1e-4, "0.5"),
+        (1.9e-3, 0.0, "0.2"),
+        (2.1e-3, 0.0, "0.5"),
+        (4.9e-3, 0.0, "0.5"),
+        (9.9e-3, 0.0, "1"),
+        (-1.99e-2, 0.0, "2"),
+        (2.1e-2, 0.0, None),
+        (0.0, 7e-3, None),
+    ],
+)
+def test_the_class_is_the_finest_whose_limits_all_readings_keep(
+    error: float, offset_mm: float, reached: str | None
+) -> None:
+    assert extensometer_class(run(error, offset_mm)).reached == reached
+
+
+def test_resolution_and_gauge_length_count_too() -> None:
+    coarse = ExtensometerRun(run().points, static_mm=(-1.1e-3, 1.1e-3))  # 1.1 um; of 0.1 mm class 2 permits 2 um
+    assert extensometer_class(coarse).reached == "2"
+    assert extensometer_class(run(gauge_length_mm=25.2, known_gauge_length_mm=25.0)).reached == "1"
+    assert extensometer_class(run(gauge_length_mm=26.0, known_gauge_length_mm=25.0)).reached is None
+
+
+def test_a_reference_that_is_too_coarse_is_told() -> None:
+    found = extensometer_class(run(u_mm=3e-4, gauge_length_mm=25.0, known_gauge_length_mm=25.0))
+    assert found.reached == "0.2"
+    assert found.reference_fit == "1"  # 2 u = 0.6 um; a third of 3 um is permitted
+    assert any("third" in note for note in found.notes)
+    assert not extensometer_class(run(gauge_length_mm=25.0, known_gauge_length_mm=25.0)).notes
+
+
+def test_overlapping_windows_count_for_less() -> None:
+    assert independent_values(100, 20.0, 20.0) == 100.0
+    # half of a window shared with each of two neighbours: 1 + 2 / 4 along each axis
+    assert independent_values(100, 10.0, 20.0) == pytest.approx(100.0 / 1.5**2)
