@@ -14,7 +14,7 @@ from core.field.points.shared_pixels import SharedPixels
 from core.gauge.rigid import skew
 from core.model.filtered import ModelField, model_at_points
 from core.model.placement import Placement, no_overlap
-from core.model.regions import Tiles, Verdict, holm, own_covariance_of_means, tiles_of
+from core.model.regions import Tiles, Verdict, holm, own_covariance_of_means, tiles_of, whitening
 from core.model.result import Compared, CompareOptions, Comparison, ModelStatus
 from core.model.strains import compare_strain
 from core.model.surface import ModelSurface
@@ -86,10 +86,11 @@ def compare_with_model(
     dX, dU are the points' own noise, correlated by shared pixels, and their common factor; p comes from the same
     measurement, so that the common columns of both are added before they are squared. Regions' means have one joint
     covariance from all of this, the load's uncertainty and the systematic size among it. The chi-square of all of them
-    falls into one part in proportion to the model's displacement, and the rest: a stiffness that is wrong by little would
-    be lost among the regions. Each is judged at 1 - sqrt(confidence), so that a right model is accepted as often as asked.
-    The verdict of a region is the chi-square of its own three means. Rigid motion is fitted to the means by
-    generalised least squares, and takes six degrees of freedom.
+    falls into one part in proportion to the model's displacement, and the rest: a stiffness that is wrong by little
+    would be lost among the regions. Both are independent and judged together, so that a right model is accepted as
+    often as asked; where strain is compared too, each quantity has half of what may be refuted wrongly. The verdict of
+    a region is the chi-square of its own three means. Rigid motion is fitted to the means by generalised least squares,
+    and takes six degrees of freedom.
     """
     options = CompareOptions() if options is None else options
     if field.uvw_mm is None:
@@ -120,7 +121,8 @@ def compare_with_model(
         mean, covariance = mean - N @ fitted, left
         difference = replace(difference, value=difference.value - modes @ fitted)
         rigid = fitted + np.concatenate([turned, np.zeros(3)])
-    displacement = _judged(measured.uvw_mm, model, difference, load, tiles, mean, covariance, options)
+    level = (1.0 - options.confidence) / (1 if strain is None else 2)
+    displacement = _judged(measured.uvw_mm, model, difference, load, tiles, mean, covariance, options, level)
     factor, factor_sigma = _factor(field, tiles, measured, model, difference, shared, options, modes)
     height = found.distance_mm[over]
     noise = np.einsum("na,nab,nb->n", field.normal_sys[over], field.covariance[over][:, :3, :3], field.normal_sys[over])
@@ -137,8 +139,14 @@ def compare_with_model(
         strain=None
         if strain is None
         else compare_strain(
-            measured, found.field, difference.own, np.concatenate([difference.columns, load[..., None]], -1), tiles,
-            strain, subset_px=subset_px, confidence=options.confidence,
+            measured,
+            found.field,
+            difference.own,
+            np.concatenate([difference.columns, load[..., None]], -1),
+            tiles,
+            strain,
+            subset_px=subset_px,
+            level=level,
         ),
         factor=factor,
         factor_sigma=factor_sigma,
@@ -189,7 +197,9 @@ def _without_rotation(field: Field, model: Float, over: Bool) -> tuple[Field, Fl
     uvw = (field.xyz_mm + field.uvw_mm - middle) @ R + middle - field.xyz_mm
     J = np.block([[np.eye(3), np.zeros((3, 3))], [R.T - np.eye(3), R.T]])
     common = None if field.common is None else J @ field.common
-    return replace(field, uvw_mm=uvw, covariance=J @ field.covariance @ J.T, common=common, frozen=None), turn.as_rotvec()
+    return replace(
+        field, uvw_mm=uvw, covariance=J @ field.covariance @ J.T, common=common, frozen=None
+    ), turn.as_rotvec()
 
 
 def _difference(field: Field, model: Float, found: ModelField, placement: Placement) -> _Difference:
@@ -222,9 +232,10 @@ def _joint(
 
 def _fitted(mean: Float, covariance: Float, modes: Float) -> tuple[Float, Float]:
     """Amplitudes of modes (3 t, q) by generalised least squares, and the covariance of what is left."""
-    weight = np.linalg.pinv(covariance, rcond=1e-14, hermitian=True)
-    H = np.linalg.pinv(modes.T @ weight @ modes, rcond=1e-14, hermitian=True)
-    return H @ modes.T @ weight @ mean, covariance - modes @ H @ modes.T
+    T = whitening(covariance)
+    white = T @ modes
+    H = np.linalg.inv(white.T @ white)
+    return H @ white.T @ (T @ mean), covariance - modes @ H @ modes.T
 
 
 def _judged(
@@ -236,6 +247,7 @@ def _judged(
     mean: Float,
     covariance: Float,
     options: CompareOptions,
+    level: float,
 ) -> Compared:
     each = tuple(
         Verdict.of(mean[3 * k : 3 * k + 3], covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3])
@@ -243,7 +255,6 @@ def _judged(
     )
     overall = Verdict.of(mean, covariance)
     scale, pattern = _parts(overall, mean, covariance, tiles.means(np.where(tiles.number[..., None] >= 0, model, 0.0)))
-    level = 1.0 - options.confidence
     # both are independent if the model is right: together they are beyond the level as often as it says
     least = min(scale.probability, pattern.probability) if scale.degrees else pattern.probability
     together = 1.0 - (1.0 - least) ** 2 if scale.degrees else least
@@ -268,17 +279,14 @@ def _judged(
 
 def _parts(overall: Verdict, mean: Float, covariance: Float, model: Float) -> tuple[Verdict, Verdict]:
     """Split a chi-square: what is in proportion to the model's means (t, 3), and the rest."""
-    N = model.ravel()
-    weight = np.linalg.pinv(covariance, rcond=1e-14, hermitian=True)
-    size = float(N @ weight @ N)
+    T = whitening(covariance)
+    white = T @ model.ravel()
+    size = float(white @ white)
     if not size > 0.0:
         return Verdict(0.0, 0, np.nan), overall
-    along = float(N @ weight @ mean) ** 2 / size
+    along = float(white @ (T @ mean)) ** 2 / size
     rest, degrees = max(overall.chi_square - along, 0.0), overall.degrees - 1
-    return (
-        Verdict(along, 1, chi_square_tail(along, 1)),
-        Verdict(rest, degrees, chi_square_tail(rest, degrees)),
-    )
+    return (Verdict(along, 1, chi_square_tail(along, 1)), Verdict(rest, degrees, chi_square_tail(rest, degrees)))
 
 
 def _factor(
@@ -300,7 +308,8 @@ def _factor(
         return np.nan, np.nan
     if modes is not None:
         N = np.concatenate([N, tiles.means(modes).reshape(-1, 6)], axis=1)
-    weight = np.linalg.pinv(covariance, rcond=1e-14, hermitian=True)
-    H = np.linalg.pinv(N.T @ weight @ N, rcond=1e-14, hermitian=True)
-    seen = tiles.means(np.where(over[..., None], measured.uvw_mm, 0.0)).ravel()
-    return float((H @ N.T @ weight @ seen)[0]), float(np.sqrt(max(H[0, 0], 0.0)))
+    T = whitening(covariance)
+    white = T @ N
+    H = np.linalg.pinv(white.T @ white, hermitian=True)  # a model that moves rigidly alone has no factor of its own
+    seen = T @ tiles.means(np.where(over[..., None], measured.uvw_mm, 0.0)).ravel()
+    return float((H @ white.T @ seen)[0]), float(np.sqrt(max(H[0, 0], 0.0)))

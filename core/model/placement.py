@@ -1,7 +1,7 @@
 """Where a model lies in the system frame: a rigid placement with its uncertainty.
 
-``x_sys = R x_model + t``. Errors are a small rotation about ``centre_mm`` (rad) and a shift (mm), both along the system's
-axes: a point of the model that was placed at x is placed too far by ``omega x (x - centre) + shift``.
+``x_sys = R x_model + t``. Errors are a small rotation about ``centre_mm`` (rad) and a shift (mm), both along the
+system's axes: a point of the model that was placed at x is placed too far by ``omega x (x - centre) + shift``.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def place_given(
     return Placement(R, np.asarray(origin_mm, dtype=np.float64), centre, own, _no_common(field), "given")
 
 
-def place_in_frame(frame: Alignment, model_mm: ArrayLike | None, field: Field) -> Placement:
+def place_in_frame(frame: Alignment, model_mm: ArrayLike | None) -> Placement:
     """Place a model by a frame that was laid through measured positions (3-2-1).
 
     Parameters
@@ -97,8 +97,6 @@ def place_in_frame(frame: Alignment, model_mm: ArrayLike | None, field: Field) -
         Through six measured positions.
     model_mm
         (6, 3) the same six positions on the model; None: the frame's axes are the model's own.
-    field
-        That it was laid through.
 
     Raises
     ------
@@ -167,9 +165,7 @@ def place_by_markers(
     spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
     if not spread[1] > 1e-6 * spread[0]:
         raise RegionError(
-            "The markers lie on one line of the model.",
-            code="gauge_unusable",
-            remedy="Give markers that span an area.",
+            "The markers lie on one line of the model.", code="gauge_unusable", remedy="Give markers that span an area."
         )
     m = len(xy)
     first, second = (i.ravel() for i in np.meshgrid(np.arange(m), np.arange(m), indexing="ij"))
@@ -267,8 +263,8 @@ def no_overlap(field: Field, surface: ModelSurface, over: int) -> MeasurementErr
     x = field.xyz_mm[field.valid]
     size = float(np.linalg.norm(np.ptp(x, axis=0))) if len(x) else 0.0
     return MeasurementError(
-        f"{over} of the {len(x)} measured points lie over the model: it is {surface.size_mm:.4g} mm across, the measured "
-        f"field {size:.4g} mm.",
+        f"{over} of the {len(x)} measured points lie over the model: it is {surface.size_mm:.4g} mm across, the "
+        f"measured field {size:.4g} mm.",
         code="model_no_overlap",
         remedy="Check the model's unit of length and how it is aligned: by 3-2-1 or markers where the frames differ.",
     )

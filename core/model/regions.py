@@ -14,7 +14,7 @@ from core.field.points.shared_pixels import SharedPixels, roots_of, steps_px
 from core.significance import chi_square_tail
 
 _MIN_SHARE = 0.4  # of a tile's points; smaller rests at the rim join a neighbour
-_SMALL = 1e-12
+_SMALL = 1e-10  # of the largest eigenvalue: what rounding leaves of a direction without variance
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,14 +63,19 @@ class Verdict:
 
     @staticmethod
     def of(difference: Float, covariance: Float) -> Verdict:
-        """Return the verdict on a difference (n,) by its covariance (n, n); directions without variance do not count."""
-        scale = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-        scale = np.where(scale > 0.0, scale, 1.0)
-        value, vector = np.linalg.eigh(covariance / scale[:, None] / scale)
-        kept = value > _SMALL * max(float(value[-1]), _SMALL)
-        along = vector[:, kept].T @ (difference / scale)
-        chi = float((along**2 / value[kept]).sum())
-        return Verdict(chi, int(kept.sum()), chi_square_tail(chi, int(kept.sum())))
+        """Return the verdict on a difference (n,) by its covariance (n, n); directions without any do not count."""
+        T = whitening(covariance)
+        chi, degrees = float(((T @ difference) ** 2).sum()), len(T)
+        return Verdict(chi, degrees, chi_square_tail(chi, degrees))
+
+
+def whitening(covariance: Float) -> Float:
+    """Return T (q, n) with T C T' = 1, q the rank of the covariance C (n, n): T' T is its inverse where it has any."""
+    scale = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    value, vector = np.linalg.eigh(covariance / scale[:, None] / scale)
+    kept = value > _SMALL * max(float(value[-1]), _SMALL)
+    return np.asarray((vector[:, kept] / np.sqrt(value[kept])).T / scale)
 
 
 def tiles_of(field: Field, compared: Bool, *, width_px: float) -> Tiles:
@@ -98,9 +103,7 @@ def tiles_of(field: Field, compared: Bool, *, width_px: float) -> Tiles:
     return Tiles(number, len(names))
 
 
-def own_covariance_of_means(
-    field: Field, tiles: Tiles, covariance: Float, shared: SharedPixels
-) -> Float:
+def own_covariance_of_means(field: Field, tiles: Tiles, covariance: Float, shared: SharedPixels) -> Float:
     """Return (3 t, 3 t) covariance of the tiles' means from the points' own noise and the pixels that they share.
 
     Parameters

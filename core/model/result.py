@@ -101,8 +101,8 @@ class Compared:
     accepted
         True if the model is not refuted by the field as a whole.
     scale, pattern
-        The two independent parts of ``overall`` that are judged: in proportion to the model's displacement (one degree of
-        freedom: a stiffness or load that is wrong), and all else. None where the verdict is not made of them.
+        The two independent parts of ``overall`` that are judged: in proportion to the model's displacement (one degree
+        of freedom: a stiffness or load that is wrong), and all else. None where the verdict is not made of them.
     """
 
     measured: Float
@@ -121,9 +121,7 @@ class Compared:
     @property
     def z(self) -> Float:
         """(r, c, 3) difference over its standard uncertainty."""
-        return np.divide(
-            self.difference, self.sigma, out=np.full_like(self.difference, np.nan), where=self.sigma > 0.0
-        )
+        return np.divide(self.difference, self.sigma, out=np.full_like(self.difference, np.nan), where=self.sigma > 0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ def compare_strain(
     options: StrainOptions,
     *,
     subset_px: int,
-    confidence: float,
+    level: float,
 ) -> Compared | None:
     """Compare the strains of two displacements over the same points; None where no window has enough of them.
 
@@ -44,8 +44,8 @@ def compare_strain(
         Of the measured strain.
     subset_px
         Width of the subset.
-    confidence
-        Of the verdict.
+    level
+        Share of right models that may be refuted.
 
     Notes
     -----
@@ -56,10 +56,8 @@ def compare_strain(
     covariance = np.zeros((*measured.shape, 6, 6))
     covariance[..., 3:, 3:] = own
     common = np.concatenate([np.zeros_like(columns), columns], axis=-2)
-    of_difference = {"covariance": covariance, "common": common, "causes": None, "frozen": None}
-    one = replace(measured, status=model.status, **of_difference)
-    other = replace(model, **of_difference)
-    a, b = (surface_strain(f, options, subset_px=subset_px) for f in (one, other))
+    one = replace(measured, status=model.status, covariance=covariance, common=common, causes=None, frozen=None)
+    a, b = (surface_strain(f, options, subset_px=subset_px) for f in (one, replace(one, uvw_mm=model.uvw_mm)))
     both = (a.status == StrainStatus.OK) & (b.status == StrainStatus.OK) & (tiles.number >= 0)
     if a.raised is not None and b.raised is not None:
         both &= a.raised == b.raised  # the windows of the others are not the same
@@ -77,10 +75,9 @@ def compare_strain(
         part = 0.0 if variances.common is None else (variances.common**2).sum(axis=1)
         mean[t] = difference[number == t].mean(axis=0)
         sigma[t] = np.sqrt(variances.own + part)
-    level = 1.0 - confidence
     z2 = (mean / sigma) ** 2
     p = np.array([[chi_square_tail(float(v), 1) if np.isfinite(v) else np.nan for v in row] for row in z2])
-    refuted = holm(p.ravel(), level).reshape(p.shape).any(axis=1)
+    refuted = np.asarray(holm(p.ravel(), level).reshape(p.shape).any(axis=1))
     # of each region by itself: the least probable of its three components, times three
     each = tuple(_least(z2[t], p[t]) for t in range(tiles.count))
     known = np.isfinite(p)

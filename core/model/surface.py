@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,7 +77,9 @@ class ModelSurface:
         used = np.unique(self.triangles)
         bad = ~np.isfinite(np.concatenate([self.nodes_mm[used], self.displacement_mm[used]], axis=1)).all(axis=1)
         if bad.any():
-            raise _invalid(f"{int(bad.sum())} of its {len(used)} nodes have a position or displacement that is no number")
+            raise _invalid(
+                f"{int(bad.sum())} of its {len(used)} nodes have a position or displacement that is no number"
+            )
         if not self.area_mm2.max() > 0.0:
             raise _invalid("its surface has no area")
 
@@ -94,7 +97,7 @@ class ModelSurface:
     def normals(self) -> Float:
         """(m, 3) unit normals of the triangles; zero for one without area."""
         size = np.linalg.norm(self._cross, axis=1, keepdims=True)
-        return np.divide(self._cross, size, out=np.zeros_like(self._cross), where=size > 0.0)
+        return np.asarray(np.divide(self._cross, size, out=np.zeros_like(self._cross), where=size > 0.0))
 
     @property
     def size_mm(self) -> float:
@@ -105,9 +108,7 @@ class ModelSurface:
     def moved(self, rotation: Float, shift_mm: Float) -> ModelSurface:
         """Return the surface with positions R x + t and displacements R u."""
         return replace(
-            self,
-            nodes_mm=self.nodes_mm @ rotation.T + shift_mm,
-            displacement_mm=self.displacement_mm @ rotation.T,
+            self, nodes_mm=self.nodes_mm @ rotation.T + shift_mm, displacement_mm=self.displacement_mm @ rotation.T
         )
 
     def facing(self, direction: Float) -> ModelSurface:
@@ -131,14 +132,13 @@ class ModelSurface:
     def feet(self, points_mm: Float) -> Feet:
         """Return the points of the surface next to ``points_mm`` (n, 3)."""
         # the triangle whose middle is nearest bounds the distance; one of another may still be nearer
-        found = self._middles.query(points_mm)[1].astype(np.int64)
+        found = _nearest(self._middles, points_mm, 1)[1][:, 0]
         distance = _closest(points_mm, self.corners_mm[found])[1]
         for tree, members, radius in self._classes:
             count = min(_FIRST, len(members))
             left = np.arange(len(points_mm))
             while left.size:
-                away, k = tree.query(points_mm[left], k=count)
-                away, k = away.reshape(left.size, -1), k.reshape(left.size, -1)
+                away, k = _nearest(tree, points_mm[left], count)
                 near = away - self._reach[members[k]] <= distance[left][:, None] * (1.0 + 1e-12)
                 near &= members[k] != found[left][:, None]
                 i, j = np.nonzero(near)
@@ -182,7 +182,7 @@ class ModelSurface:
         return np.asarray((count[back.ravel()] == 1).reshape(-1, 3))
 
     @cached_property
-    def _middles(self) -> cKDTree:
+    def _middles(self) -> Any:
         return cKDTree(self.corners_mm.mean(axis=1))
 
     @cached_property
@@ -191,13 +191,13 @@ class ModelSurface:
         return np.asarray(np.linalg.norm(self.corners_mm - self.corners_mm.mean(axis=1)[:, None], axis=2).max(axis=1))
 
     @cached_property
-    def _classes(self) -> list[tuple[cKDTree, Index, float]]:
+    def _classes(self) -> list[tuple[Any, Index, float]]:
         """Triangles of like size: a tree of their middles, their indices, the largest distance of a corner."""
         middle, reach = self.corners_mm.mean(axis=1), self._reach
         level = np.floor(np.log2(np.maximum(reach, 1e-9 * reach.max()))).astype(int)
-        out = []
+        out: list[tuple[Any, Index, float]] = []
         for one in np.unique(level):
-            members = np.flatnonzero(level == one)
+            members = np.flatnonzero(level == one).astype(np.int64)
             out.append((cKDTree(middle[members]), members, float(reach[members].max())))
         return out
 
@@ -222,12 +222,13 @@ def surface_of_cloud(nodes_mm: Float, displacement_mm: Float, towards: Float) ->
     if len(flat) < 3 or not np.isfinite(flat).all():
         raise _invalid(f"it has {len(flat)} points, or one that is no number")
     spacing = np.linalg.norm(np.ptp(flat, axis=0)) / np.sqrt(len(flat))
-    away, nearest = cKDTree(flat).query(flat, k=2)
+    tree = cKDTree(flat)
+    away, nearest = _nearest(tree, flat, 2)
     apart = np.linalg.norm(nodes_mm - nodes_mm[nearest[:, 1]], axis=1)
     behind = (away[:, 1] < _STACKED * spacing) & (apart > _STACKED * spacing)
     if behind.mean() > 0.05:
         raise InputError(
-            f"{int(behind.sum())} of the model's {len(flat)} points lie behind another one, so that they are no surface.",
+            f"{int(behind.sum())} of the model's {len(flat)} points lie behind another one: they are no surface.",
             code="model_not_a_surface",
             remedy="Export the nodes of the measured surface alone, or a file with elements (VTU, XDMF).",
         )
@@ -237,9 +238,15 @@ def surface_of_cloud(nodes_mm: Float, displacement_mm: Float, towards: Float) ->
         raise _invalid("its points lie on one line") from error
     triangles = found.simplices.astype(np.int64)
     longest = np.linalg.norm(flat[triangles] - flat[np.roll(triangles, 1, axis=1)], axis=2).max(axis=1)
-    near = cKDTree(flat).query(flat, k=min(7, len(flat)))[0][:, 1:]
+    near = _nearest(tree, flat, min(7, len(flat)))[0][:, 1:]
     local = np.median(near, axis=1)[triangles].max(axis=1)
     return ModelSurface(nodes_mm, displacement_mm, triangles[longest <= _LONG_EDGE * np.sqrt(2.0) * local])
+
+
+def _nearest(tree: Any, points: Float, count: int) -> tuple[Float, Index]:
+    """Distances and indices (n, count) of the nearest members of a tree."""
+    away, index = tree.query(points, k=count)
+    return away.reshape(len(points), count), index.reshape(len(points), count).astype(np.int64)
 
 
 def _closest(p: Float, corners: Float) -> tuple[Float, Float]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
+import meshio
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
@@ -13,6 +15,9 @@ from core.common.factor import Causes
 from core.field.points.result import Field
 from core.model.surface import ModelSurface
 from core.status import PointStatus
+from core.strain import surface_strain
+from core.strain.options import StrainOptions
+from server.formats.results.writing import Provenance, write_field
 from sim.plate import CircularPlate
 from tests.support.strain_fields import make_field
 
@@ -121,9 +126,7 @@ def bench(
             out += displacement(x + np.array([a, b, 0.0]))
         return x + out / ox.size
 
-    field = make_field(
-        lambda a, b: np.stack([a, b, np.zeros_like(a)], axis=-1), seen, shape=shape, spacing_px=STEP_PX
-    )
+    field = make_field(lambda a, b: np.stack([a, b, np.zeros_like(a)], axis=-1), seen, shape=shape, spacing_px=STEP_PX)
     field = replace(field, normal_sys=np.broadcast_to([0.0, 0.0, -1.0], field.xyz_mm.shape))
     su, sv, sw = (1e-3 * s for s in sigma_um)
     covariance = np.zeros((*shape, 6, 6))
@@ -150,3 +153,35 @@ def bench(
         field = replace(field, **{name: values})
     field.covariance[lost] = 1e-6 * np.eye(6)
     return Bench(field, (su, sv, sw))
+
+
+def write_result(folder: Path, field: Field, *, n: int = 1, strain_window: int | None = 7) -> Path:
+    """Write a field as the result of step n."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"step_{n:04d}.nc"
+    strain = (
+        None
+        if strain_window is None
+        else surface_strain(field, StrainOptions(window=strain_window), subset_px=SUBSET_PX)
+    )
+    provenance = Provenance(
+        settings={"subset_px": SUBSET_PX, "spacing_px": STEP_PX},
+        inputs={"calibration": "c0" * 32},
+        software_version="test",
+        frame="system",
+        step=n,
+        extra={"reference_step": 0},
+    )
+    write_field(path, field, provenance, strain)
+    return path
+
+
+def write_model(path: Path, surface: ModelSurface, *, per_mm: float = 1.0) -> Path:
+    """Write a model's surface, lengths times ``per_mm``, by another program's writer."""
+    mesh = meshio.Mesh(
+        per_mm * surface.nodes_mm,
+        [("triangle", surface.triangles)],
+        point_data={"displacement": per_mm * surface.displacement_mm},
+    )
+    meshio.write(path, mesh)
+    return path

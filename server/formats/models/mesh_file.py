@@ -60,6 +60,5 @@ def require_count(count: int, what: str) -> None:
     """
     if not 0 <= count <= MAX_NUMBERS:
         raise unreadable(
-            f"{what} has {count} numbers, {MAX_NUMBERS} at most are read",
-            remedy="Export the measured surface alone.",
+            f"{what} has {count} numbers, {MAX_NUMBERS} at most are read", remedy="Export the measured surface alone."
         )

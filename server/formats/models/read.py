@@ -123,7 +123,7 @@ def _beside(path: Path, name: str) -> Path:
     """Return the file of heavy data, which lies beside the light one and nowhere else."""
     plain = name.strip()
     found = path.parent / Path(plain).name
-    if Path(plain).name in ("", ".", "..") or Path(plain).parent not in (Path(), Path(".")):
+    if Path(plain).name in ("", ".", "..") or Path(plain).parent != Path():
         raise unreadable(f"it names its heavy data {plain[:100]!r}: only files beside it are read")
     if not found.is_file():
         raise unreadable(
@@ -146,7 +146,9 @@ def _displacement(mesh: MeshFile, wanted: str | None) -> tuple[str, Float]:
         if values.ndim == 2 and values.shape[1] == 3:
             return by_name[names[0].lower()], np.asarray(values, dtype=np.float64)
     shown = ", ".join(f"{n} ({1 if v.ndim == 1 else v.shape[1]})" for n, v in list(mesh.data.items())[:20]) or "none"
-    asked = "no displacement of three components" if wanted is None else f"no displacement {wanted!r} of three components"
+    asked = (
+        "no displacement of three components" if wanted is None else f"no displacement {wanted!r} of three components"
+    )
     raise InputError(
         f"The model has {asked} at its nodes; it has (with components): {shown}.",
         code="model_no_displacement",

@@ -127,4 +127,8 @@ def _without_appended(content: bytes) -> tuple[bytes, bytes, bool]:
     head = content[begin : opened + 1]
     is_text = b"base64" in head
     appended = content[mark + 1 : end]
-    return content[:begin] + content[end + len(b"</AppendedData>") :], appended.strip() if is_text else appended, is_text
+    return (
+        content[:begin] + content[end + len(b"</AppendedData>") :],
+        appended.strip() if is_text else appended,
+        is_text,
+    )

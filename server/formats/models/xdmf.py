@@ -69,7 +69,7 @@ def read_xdmf(content: bytes, heavy: Heavy, *, time: float | None = None) -> Mes
         raise unreadable("it has no grid")
     at = [_time(one) for one in grids]
     held = [k for k, one in enumerate(grids) if one.find("Attribute") is not None] or list(range(len(grids)))
-    k = held[-1] if time is None else min(held, key=lambda i: abs((math.inf if at[i] is None else at[i]) - time))
+    k = held[-1] if time is None else min(held, key=lambda i: _away(at[i], time))
     grid = grids[k]
     # later states of a series refer to the mesh of the first
     topology, geometry = (_first(grid, root, name) for name in ("Topology", "Geometry"))
@@ -102,13 +102,19 @@ def read_xdmf(content: bytes, heavy: Heavy, *, time: float | None = None) -> Mes
             continue
         values = numbers(one)
         count = _COMPONENTS.get(one.get("AttributeType", "Scalar").lower(), 0)
-        if values.size % max(n, 1) or (count and values.size != count * n and values.size // max(n, 1) not in (1, 2, 3)):
+        if values.size % max(n, 1) or (
+            count and values.size != count * n and values.size // max(n, 1) not in (1, 2, 3)
+        ):
             raise unreadable(f"the attribute {name} has {values.size} numbers for {n} nodes")
         data[name] = values.reshape(n, -1) if values.size != n else values.ravel()
         if _unit(one):
             units[name] = _unit(one)
     cells = [] if topology is None else _cells(topology, numbers(topology), n)
     return MeshFile(points.astype(np.float64), cells, data, units, at[k])
+
+
+def _away(at: float | None, time: float) -> float:
+    return math.inf if at is None else abs(at - time)
 
 
 def _time(grid: Any) -> float | None:
