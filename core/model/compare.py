@@ -87,9 +87,10 @@ def compare_with_model(
     measurement, so that the common columns of both are added before they are squared. Regions' means have one joint
     covariance from all of this, the load's uncertainty and the systematic size among it. The chi-square of all of them
     falls into one part in proportion to the model's displacement, and the rest: a stiffness that is wrong by little
-    would be lost among the regions. Both are independent and judged together, so that a right model is accepted as
-    often as asked; where strain is compared too, each quantity has half of what may be refuted wrongly. The verdict of
-    a region is the chi-square of its own three means. Rigid motion is fitted to the means by generalised least squares,
+    would be lost among the regions. The third part is the region that fits worst, by the chi-square of its own three
+    means times the number of regions. The three are judged together, so that a right model is accepted as often as
+    asked at the least, and a region is refuted only where the model is; where strain is compared too, each quantity has
+    half of what may be refuted wrongly. Rigid motion is fitted to the means by generalised least squares,
     and takes six degrees of freedom.
     """
     options = CompareOptions() if options is None else options
@@ -255,9 +256,10 @@ def _judged(
     )
     overall = Verdict.of(mean, covariance)
     scale, pattern = _parts(overall, mean, covariance, tiles.means(np.where(tiles.number[..., None] >= 0, model, 0.0)))
-    # both are independent if the model is right: together they are beyond the level as often as it says
-    least = min(scale.probability, pattern.probability) if scale.degrees else pattern.probability
-    together = 1.0 - (1.0 - least) ** 2 if scale.degrees else least
+    local = _worst(each)
+    parts = [one.probability for one in (scale, pattern, local) if one.degrees]
+    # of independent ones, so many together are beyond the level as often as it says; of these at most as often
+    together = 1.0 - (1.0 - min(parts)) ** len(parts) if parts else np.nan
     over = tiles.number >= 0
     variance = np.diagonal(difference.own, axis1=-2, axis2=-1) + (difference.columns**2).sum(axis=-1)
     variance = variance + np.where(over[..., None], load, 0.0) ** 2 + np.square(options.systematic_mm)
@@ -269,12 +271,22 @@ def _judged(
         tile_difference=mean.reshape(-1, 3),
         tile_sigma=np.sqrt(np.maximum(np.diagonal(covariance), 0.0)).reshape(-1, 3),
         verdicts=each,
-        refuted=holm(np.array([v.probability for v in each]), level),
+        refuted=holm(np.array([v.probability for v in each]), 1.0 - (1.0 - level) ** (1.0 / max(len(parts), 1))),
         overall=replace(overall, probability=together),
         accepted=not together <= level,
         scale=scale,
         pattern=pattern,
+        local=local,
     )
+
+
+def _worst(each: tuple[Verdict, ...]) -> Verdict:
+    """Return the verdict of the region that fits worst, its probability times their number."""
+    known = [v for v in each if v.degrees]
+    if not known:
+        return Verdict(np.nan, 0, np.nan)
+    worst = min(known, key=lambda v: v.probability)
+    return replace(worst, probability=min(1.0, worst.probability * len(known)))
 
 
 def _parts(overall: Verdict, mean: Float, covariance: Float, model: Float) -> tuple[Verdict, Verdict]:

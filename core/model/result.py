@@ -100,9 +100,10 @@ class Compared:
         For the whole field, all means together.
     accepted
         True if the model is not refuted by the field as a whole.
-    scale, pattern
-        The two independent parts of ``overall`` that are judged: in proportion to the model's displacement (one degree
-        of freedom: a stiffness or load that is wrong), and all else. None where the verdict is not made of them.
+    scale, pattern, local
+        The parts that are judged: of ``overall`` that in proportion to the model's displacement (one degree of freedom:
+        a stiffness or load that is wrong) and all else, and the region that fits worst. None where the verdict is not
+        made of them.
     """
 
     measured: Float
@@ -117,6 +118,7 @@ class Compared:
     accepted: bool
     scale: Verdict | None = None
     pattern: Verdict | None = None
+    local: Verdict | None = None
 
     @property
     def z(self) -> Float:

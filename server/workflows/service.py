@@ -31,6 +31,7 @@ from server.store.calibrations import CalibrationStore
 from server.store.catalog import Catalog
 from server.store.folder import DataFolder
 from server.store.index import rebuild
+from server.store.models import ModelStore
 from server.store.noise import NoiseStore
 from server.store.recipes import RecipeStore
 from server.store.tests import TestStore
@@ -73,6 +74,7 @@ class Service:
         self.tests = TestStore(self.folder)
         self.noise = NoiseStore(self.folder)
         self.recipes = RecipeStore(self.folder)
+        self.models = ModelStore(self.tests)
         self.trash = Trash(self.folder.root)
         self.differences: list[str] = []
         self.metrics = Metrics()

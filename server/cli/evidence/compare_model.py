@@ -6,7 +6,7 @@ import argparse
 import math
 from pathlib import Path
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from core.errors import InputError
 from server.exports.vtu import write_vtu
@@ -16,11 +16,10 @@ from server.formats.results.folder import first_results
 from server.formats.results.summary import to_json
 from server.results.models.compare import compare_files
 from server.results.models.document import ComparisonReply, FieldVerdict
-from server.results.models.request import CompareRequest, ModelPlacement
+from server.results.models.request import CompareRequest, placement_in
 from server.results.steps import Source, read_step
 from server.wording import problems_in
 
-_ALIGN: TypeAdapter[ModelPlacement] = TypeAdapter(ModelPlacement)
 _SHOWN = 12  # refuted regions
 _MICRO = 1e6
 
@@ -117,14 +116,7 @@ def _align(args: argparse.Namespace) -> dict[str, object]:
     if kind == "3-2-1":
         v = _numbers("--align 3-2-1", positions, 12)
         return {"kind": "3-2-1", "positions_px": [v[k : k + 2] for k in range(0, 12, 2)]}
-    try:
-        return dict(_ALIGN.validate_json(args.align).model_dump())
-    except ValidationError as error:
-        raise InputError(
-            f"--align {args.align[:60]!r} names no alignment: {error.errors()[0]['msg']}.",
-            code="wrong_usage",
-            remedy='Give given, 3-2-1:X,Y,..., markers, best-fit or JSON as {"kind": "given", "origin_mm": [1, 0, 0]}.',
-        ) from error
+    return placement_in(args.align).model_dump()
 
 
 def _numbers(option: str, text: str, count: int) -> list[float]:
@@ -190,7 +182,12 @@ def _quantity(name: str, one: FieldVerdict, scale: float, unit: str) -> list[str
         f"{name}: {'accepted' if one.accepted else 'refuted'}, probability {p if p is None else format(p, '.3g')}; "
         f"difference rms {rms} {unit}, over its uncertainty {z}"
     ]
-    for part, said in ((one.scale, "in proportion to the model"), (one.pattern, "of another form")):
+    parts = (
+        (one.scale, "in proportion to the model"),
+        (one.pattern, "of another form"),
+        (one.local, "in the region that fits worst"),
+    )
+    for part, said in parts:
         if part is not None and part.probability is not None and part.chi_square is not None:
             out.append(
                 f"  {said}: chi-square {part.chi_square:.1f} of {part.degrees}, probability {part.probability:.3g}"

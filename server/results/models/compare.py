@@ -234,6 +234,7 @@ def _field_verdict(one: Compared, names: tuple[str, ...]) -> FieldVerdict:
         overall=overall,
         scale=_verdict(one.scale),
         pattern=_verdict(one.pattern),
+        local=_verdict(one.local),
         rms=rms(one.difference),
         rms_z=rms(one.z),
     )

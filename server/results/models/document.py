@@ -49,6 +49,7 @@ class FieldVerdict(_Part):
         None, description="Part in proportion to the model's displacement: a stiffness or load that is wrong."
     )
     pattern: VerdictReply | None = Field(None, description="All else.")
+    local: VerdictReply | None = Field(None, description="The region that fits worst, for the number of regions.")
     rms: dict[str, float | None] = Field(description="Root mean square of the difference over the points.")
     rms_z: dict[str, float | None] = Field(description="Of the difference over its standard uncertainty; 1 of noise.")
 

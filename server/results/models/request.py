@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field, StringConstraints
+from pydantic import ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
 
+from core.errors import InputError
 from core.settings import Real
 from server.base.models import Number, Request, StepNumber, Switch
 from server.formats.models.read import UNITS, Unit
@@ -76,6 +78,9 @@ ModelPlacement = Annotated[
 ]
 
 
+_PLACEMENT: TypeAdapter[ModelPlacement] = TypeAdapter(ModelPlacement)
+
+
 class ModelReading(Request):
     """How a model's file is read and where the model lies."""
 
@@ -97,8 +102,8 @@ class ModelReading(Request):
     )
 
 
-class CompareRequest(ModelReading):
-    """A comparison of one step with a model."""
+class Judging(Request):
+    """Which step is compared with a model, and how it is judged."""
 
     step: StepNumber | None = Field(None, description="Step to compare; the last one measured if left out.")
     tile_px: Annotated[Real, Field(gt=0.0, le=1e5)] | None = Field(
@@ -116,3 +121,46 @@ class CompareRequest(ModelReading):
     interpolation: Switch = Field(
         True, description="Count the estimated bias of interpolation, where the result has it, as an uncertainty."
     )
+
+
+class CompareRequest(ModelReading, Judging):
+    """A comparison of one step with a model."""
+
+
+class ComparisonRequest(Judging):
+    """A comparison with a model that is kept with the test."""
+
+    model_config = ConfigDict(protected_namespaces=())
+
+    model_id: Annotated[str, StringConstraints(max_length=40)] = Field(
+        description="Id of the model.", examples=["m000001-4b1e09"]
+    )
+    align: ModelPlacement | None = Field(None, description="Where the model lies; as kept with it if left out.")
+
+    def with_model(self, reading: Mapping[str, object]) -> CompareRequest:
+        """Return the whole request, with how the model is read as it is kept."""
+        own = self.model_dump(exclude={"model_id", "align"})
+        align = {} if self.align is None else {"align": self.align.model_dump()}
+        return CompareRequest.model_validate({**reading, **own, **align})
+
+
+def placement_in(text: str | None) -> ModelPlacement:
+    """Return the placement that JSON states; the system frame without any.
+
+    Raises
+    ------
+    InputError
+        ``alignment_invalid``.
+    """
+    if text is None:
+        return GivenPlacement(kind="given")
+    try:
+        return _PLACEMENT.validate_json(text)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(
+            f"{text[:60]!r} names no alignment of a model: {f'{where}: ' if where else ''}{first['msg']}.",
+            code="alignment_invalid",
+            remedy='Give JSON such as {"kind": "given", "origin_mm": [1, 0, 0]}; or 3-2-1, markers, best-fit.',
+        ) from error
