@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from core.arrays import Bool, Float
-from core.errors import InputError, MeasurementError
+from core.errors import InputError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
 from core.gauge.rigid import skew
@@ -21,7 +21,8 @@ from core.model.surface import ModelSurface
 from core.significance import chi_square_tail
 from core.strain.options import StrainOptions
 
-_FAR = 0.02  # of the field's size
+_FAR = 0.02  # of the field's size: not on the model
+_NEAR = 0.5  # of the field's size: over the model at another height, not elsewhere
 _MIN_POINTS = 10
 _MIN_SHARE = 0.05
 _TILES = 8  # across the field
@@ -71,9 +72,7 @@ def compare_with_model(
     Raises
     ------
     InputError
-        ``comparison_needs_motion`` for a shape.
-    MeasurementError
-        ``model_no_overlap`` where hardly any point lies over the model, ``model_geometry_differs`` where the points
+        ``comparison_needs_motion`` for a shape; ``model_no_overlap`` where hardly any point lies over the model, ``model_geometry_differs`` where the points
         over it are far from its surface.
 
     Notes
@@ -161,14 +160,15 @@ def _on_model(field: Field, placed: ModelSurface, subset_px: int, options: Compa
     x = field.xyz_mm[field.valid]
     if len(x) < _MIN_POINTS:
         raise no_overlap(field, placed, 0)
-    far = options.far_mm or _FAR * float(np.linalg.norm(np.ptp(x, axis=0)))
-    feet = placed.feet(x)
+    size = float(np.linalg.norm(np.ptp(x, axis=0)))
+    far = options.far_mm or _FAR * size
+    feet = placed.feet(x, within_mm=max(far, _NEAR * size))
     above = feet.beyond_mm <= far
     if above.sum() < max(_MIN_POINTS, _MIN_SHARE * len(x)):
         raise no_overlap(field, placed, int(above.sum()))
     away = feet.distance_mm[above]
     if np.mean(away > far) > 0.5:
-        raise MeasurementError(
+        raise InputError(
             f"The model has another shape: {int((away > far).sum())} of {len(away)} measured points over it are more "
             f"than {far:.3g} mm from its surface, {np.median(away):.3g} mm in the median.",
             code="model_geometry_differs",

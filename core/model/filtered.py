@@ -70,7 +70,7 @@ def model_at_points(field: Field, surface: ModelSurface, *, subset_px: float, fa
     valid = field.valid
     rows, cols = np.nonzero(valid)
     x = field.xyz_mm[rows, cols]
-    feet = surface.feet(x)
+    feet = surface.feet(x, within_mm=far_mm)
     normal = surface.normals[feet.triangle]
     away = x - np.einsum("nk,nka->na", feet.weight, surface.corners_mm[feet.triangle])
     towards = field.normal_sys[rows, cols]
@@ -84,7 +84,7 @@ def model_at_points(field: Field, surface: ModelSurface, *, subset_px: float, fa
     for first in range(0, len(x), _AT_ONCE):
         some = np.flatnonzero(covered[first : first + _AT_ONCE]) + first
         at = np.stack([field.x_px[rows[some], cols[some]], field.y_px[rows[some], cols[some]]], axis=-1)
-        value[some] = _through_subset(x[some], across[some], at, field, surface, subset_px, order)
+        value[some] = _through_subset(x[some], across[some], at, field, surface, subset_px, order, far_mm)
     covered &= np.isfinite(value).all(axis=1)
     value[~covered] = np.nan
     filled = {
@@ -142,16 +142,23 @@ def _step(xy: Float, axis: int) -> float:
 
 
 def _through_subset(
-    x: Float, across: Float, at_px: Float, field: Field, surface: ModelSurface, subset_px: float, order: int
+    x: Float,
+    across: Float,
+    at_px: Float,
+    field: Field,
+    surface: ModelSurface,
+    subset_px: float,
+    order: int,
+    far_mm: float,
 ) -> Float:
     """(n, 3) values at the centre of polynomials fitted to the surface's displacement over subsets; NaN without."""
     node, weight = leggauss(_NODES)
     a, b = (0.5 * subset_px * v.ravel() for v in np.meshgrid(node, node))
     w = np.outer(weight, weight).ravel() / 4.0
     points = x[:, None, :] + np.einsum("nak,kq->nqa", across, np.stack([a, b]))
-    feet = surface.feet(points.reshape(-1, 3))
-    spacing = np.linalg.norm(across, axis=1).max(axis=1) * subset_px / _NODES
-    on = feet.beyond_mm.reshape(len(x), -1) <= 1e-6 * spacing[:, None]
+    width = np.linalg.norm(across, axis=1).max(axis=1) * subset_px
+    feet = surface.feet(points.reshape(-1, 3), within_mm=far_mm + float(width.max(initial=0.0)))
+    on = feet.beyond_mm.reshape(len(x), -1) <= 1e-6 * width[:, None]
     if field.cuts:
         to = at_px[:, None, :] + np.stack([a, b], axis=-1)
         on &= ~crosses(at_px[:, None, :], to, field.cuts)

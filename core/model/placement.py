@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from core.arrays import Float
-from core.errors import MeasurementError, RegionError
+from core.errors import InputError, MeasurementError, RegionError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels, roots_of
 from core.gauge.align import Alignment, three_two_one
@@ -207,7 +207,7 @@ def place_by_fit(field: Field, surface: ModelSurface, start: Placement, *, share
 
     Raises
     ------
-    MeasurementError
+    InputError
         ``model_no_overlap`` where fewer than ten points lie over the model.
     """
     R, t = start.rotation, start.shift_mm
@@ -258,11 +258,11 @@ def place_by_fit(field: Field, surface: ModelSurface, start: Placement, *, share
     return Placement(R, t, centre, own, common, "best-fit", int(used.sum()), rms, names)
 
 
-def no_overlap(field: Field, surface: ModelSurface, over: int) -> MeasurementError:
+def no_overlap(field: Field, surface: ModelSurface, over: int) -> InputError:
     """Return the error for a model that does not lie where the field was measured."""
     x = field.xyz_mm[field.valid]
     size = float(np.linalg.norm(np.ptp(x, axis=0))) if len(x) else 0.0
-    return MeasurementError(
+    return InputError(
         f"{over} of the {len(x)} measured points lie over the model: it is {surface.size_mm:.4g} mm across, the "
         f"measured field {size:.4g} mm.",
         code="model_no_overlap",

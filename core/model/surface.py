@@ -129,14 +129,20 @@ class ModelSurface:
         """Return (n, 3) displacements, linear over each triangle."""
         return np.asarray(np.einsum("nk,nka->na", feet.weight, self.displacement_mm[self.triangles[feet.triangle]]))
 
-    def feet(self, points_mm: Float) -> Feet:
-        """Return the points of the surface next to ``points_mm`` (n, 3)."""
+    def feet(self, points_mm: Float, *, within_mm: float = np.inf) -> Feet:
+        """Return the points of the surface next to ``points_mm`` (n, 3).
+
+        A point farther away than ``within_mm`` has one near by, not always the nearest, and lies beyond the border.
+        """
         # the triangle whose middle is nearest bounds the distance; one of another may still be nearer
-        found = _nearest(self._middles, points_mm, 1)[1][:, 0]
+        to_middle, nearest = _nearest(self._middles, points_mm, 1)
+        found = nearest[:, 0]
         distance = _closest(points_mm, self.corners_mm[found])[1]
+        away_from_all = to_middle[:, 0] - self._reach.max() > within_mm
+        close = np.flatnonzero(~away_from_all)
         for tree, members, radius in self._classes:
             count = min(_FIRST, len(members))
-            left = np.arange(len(points_mm))
+            left = close
             while left.size:
                 away, k = _nearest(tree, points_mm[left], count)
                 near = away - self._reach[members[k]] <= distance[left][:, None] * (1.0 + 1e-12)
@@ -161,7 +167,7 @@ class ModelSurface:
         normal = self.normals[found]
         along = away - np.einsum("na,na->n", away, normal)[:, None] * normal
         beyond = np.where(self._on_border(found, weight), np.linalg.norm(along, axis=1), 0.0)
-        return Feet(found, weight, to, beyond)
+        return Feet(found, weight, to, np.where(away_from_all, to, beyond))
 
     def _on_border(self, triangle: Index, weight: Float) -> Bool:
         """(n,) True where a foot lies on an edge of one triangle alone."""

@@ -86,9 +86,10 @@ def compare_files(
     StateError
         ``no_results`` without files.
     InputError
-        ``step_missing``, ``comparison_needs_motion``, ``settings_missing``; what reading a model raises.
+        ``step_missing``, ``comparison_needs_motion``, ``settings_missing``, ``model_no_overlap``,
+        ``model_geometry_differs``; what reading a model raises.
     MeasurementError
-        ``model_no_overlap``, ``model_geometry_differs``, ``too_few_points``.
+        ``too_few_points`` for a marker or a position of 3-2-1.
     """
     path = _chosen(files, request.step)
     head, field = read_head(path), read_field(path)
