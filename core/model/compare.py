@@ -72,8 +72,8 @@ def compare_with_model(
     Raises
     ------
     InputError
-        ``comparison_needs_motion`` for a shape; ``model_no_overlap`` where hardly any point lies over the model, ``model_geometry_differs`` where the points
-        over it are far from its surface.
+        ``comparison_needs_motion`` for a shape; ``model_no_overlap`` where hardly any point lies over the model,
+        ``model_geometry_differs`` where the points over it are far from its surface.
 
     Notes
     -----

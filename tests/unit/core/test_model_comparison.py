@@ -66,8 +66,8 @@ def test_the_nearest_point_of_a_surface_is_that_of_a_search_over_all_triangles()
 
 def test_kirsch_s_displacement_has_three_times_the_stress_beside_the_hole() -> None:
     u = kirsch(radius_mm=2.0, stress_mpa=60.0)
-    at, h = np.array([0.0, 2.0, 0.0]), 1e-5
-    exx = (u(at + [h, 0, 0]) - u(at - [h, 0, 0]))[0] / (2 * h)
+    h = 1e-5
+    exx = (u(np.array([h, 2.0, 0])) - u(np.array([-h, 2.0, 0])))[0] / (2 * h)
     assert exx == pytest.approx(3.0 * 60.0 / 71.0e3, rel=1e-4)
     far = (u(np.array([200.0 + h, 0, 0])) - u(np.array([200.0 - h, 0, 0])))[0] / (2 * h)
     assert far == pytest.approx(60.0 / 71.0e3, rel=1e-3)
@@ -124,7 +124,7 @@ def test_a_right_model_is_accepted_and_two_per_cent_of_stiffness_refuted(plate: 
 
 
 def test_common_causes_are_not_averaged_away(plate: Bench, right: ModelSurface) -> None:
-    # six standard deviations of one cause under a hundredth of the noise: where it is known, 36 is the chi-square's bound
+    # six standard deviations of one cause under a hundredth of the noise: where it is known, 36 bounds the chi-square
     assert plate.field.common is not None
     assert plate.field.uvw_mm is not None
     moved = replace(
