@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 
 from server.cli.main import main
+from server.report.build import make_report
+from server.report.source import find_source
 from server.store.verify import verify
 from server.workflows.service import Service
-from tests.support.model_bench import MM_PER_PX, SUBSET_PX, bench, kirsch, mesh, write_model, write_result
+from tests.support.model_bench import MM_PER_PX, bench, kirsch, mesh, write_model, write_result
 from tests.support.service_rig import new_test, served, tiny_config
 
 API = "/api/v1"
@@ -199,7 +201,11 @@ def test_models_are_listed_verified_and_deleted(service: Service, client: httpx.
     assert client.delete(f"{models}/{model['id']}").status_code == 404
 
 
-def test_the_subset_of_the_bench_is_the_file_s(folder: Path) -> None:
-    from server.formats.results.reading import read_head
-
-    assert read_head(folder / "step_0001.nc").settings["subset_px"] == SUBSET_PX
+def test_the_report_shows_the_newest_models(service: Service, client: httpx.Client, url: str, folder: Path) -> None:
+    stiff = kept(client, url, folder / "wrong.xdmf", folder / "wrong.h5", unit="mm")
+    test_id, analysis_id = stiff["test_id"], url.split("/")[-1]
+    page = make_report(find_source(service.tests.analysis_path(test_id, analysis_id))).page.decode()
+    part = page[page.index('<section id="models">') :].split("</section>")[0]
+    assert "wrong.xdmf" in part
+    assert "The model is refuted" in part
+    assert "data:image/png;base64," in part
