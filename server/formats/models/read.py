@@ -100,6 +100,13 @@ def read_model(
     return ModelFile(mesh, _TO_MM[own] * mesh.points, _TO_MM[moved] * values, own, moved, name)
 
 
+def ending_of(head: bytes) -> str:
+    """Return the ending that a file without one would have, by its first bytes."""
+    if b"<VTKFile" in head:
+        return ".vtu"
+    return ".xdmf" if b"<Xdmf" in head else ".csv"
+
+
 def _mesh(path: Path, time: float | None) -> MeshFile:
     ending = path.suffix.lower()
     if ending not in SUFFIXES:

@@ -18,13 +18,14 @@ from server.api.routes.analyses.exports import finished
 from server.base.models import FormNumber, Ids, one_line
 from server.exports.comparison import check_model_task
 from server.formats.files import sha256_of
-from server.formats.models.read import SUFFIXES, Unit
+from server.formats.models.read import SUFFIXES, Unit, ending_of
 from server.results.models.request import ModelReading, placement_in
 from server.store.models import ModelRecord, check_file_name
 
 router = APIRouter(prefix="/tests/{test_id}/models", tags=["tests"])
 ModelId = Annotated[str, Path(max_length=40, description="Id of a model.")]
 _NAME = 200
+_HEAD = 1000
 
 
 @router.post(
@@ -34,7 +35,9 @@ async def create_model(
     request: Request,
     service: ServiceDep,
     test_id: TestId,
-    file: Annotated[UploadFile, File(description="VTU, XDMF or CSV; its name's ending says which.")],
+    file: Annotated[
+        UploadFile, File(description="VTU, XDMF or CSV; its name's ending says which, its begin where it has none.")
+    ],
     heavy: Annotated[
         UploadFile | None, File(description="HDF5 file of an XDMF, under the name that stands in that.")
     ] = None,
@@ -63,7 +66,8 @@ async def create_model(
     service.tests.path(test_id)
     reading = ModelReading(unit=unit, displacement=displacement, time=time, align=placement_in(align))
     name = one_line((file.filename or "")[-_NAME:])
-    ending = FilePath(name).suffix.lower()
+    ending = FilePath(name).suffix.lower() or ending_of(await file.read(_HEAD))
+    await file.seek(0)
     if ending not in SUFFIXES:
         raise InputError(
             f"The model's file {name[:80]!r} ends in none of {', '.join(SUFFIXES)}.",
