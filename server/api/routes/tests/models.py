@@ -35,9 +35,7 @@ async def create_model(
     request: Request,
     service: ServiceDep,
     test_id: TestId,
-    file: Annotated[
-        UploadFile, File(description="VTU, XDMF or CSV; its name's ending says which, its begin where it has none.")
-    ],
+    file: Annotated[UploadFile, File(description="VTU, XDMF or CSV, told by its name's ending or its first bytes.")],
     heavy: Annotated[
         UploadFile | None, File(description="HDF5 file of an XDMF, under the name that stands in that.")
     ] = None,
