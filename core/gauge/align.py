@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,6 +46,10 @@ class Alignment:
     points: int
     budgets: tuple[Budget, ...] = (UNKNOWN,) * 6
     """Of the six errors."""
+    own_covariance: Float = dataclass_field(default_factory=lambda: np.zeros((6, 6)))
+    """(6, 6) the points' own part of it."""
+    common: Float | None = None
+    """(6, k) common factor of the six errors; None where the field has none."""
 
 
 def align_plane(
@@ -119,7 +124,7 @@ def align_plane(
     # positions have the reference pair's noise alone
     budgets = budgets_through(np.eye(6), own, own, row, field.causes)
     rms = float(np.sqrt(np.mean(((x - origin) @ normal) ** 2)))
-    return Alignment(R, origin, full, rms, len(x), budgets)
+    return Alignment(R, origin, full, rms, len(x), budgets, own, row)
 
 
 def image_rows(field: Field) -> Float:
@@ -212,7 +217,7 @@ def align_3_2_1(field: Field, positions_px: ArrayLike, *, shared: SharedPixels) 
             remedy="Choose positions where the shape was measured.",
         )
     x = positions.of(field.xyz_mm)
-    R, origin = _three_two_one(x)
+    R, origin = three_two_one(x)
     first, second = (i.ravel() for i in np.meshgrid(np.arange(6), np.arange(6), indexing="ij"))
     blocks = positions.covariance(shared, first, second)[:, :3, :3].reshape(6, 6, 3, 3)
     joint = own = np.swapaxes(blocks, 1, 2).reshape(18, 18)
@@ -227,15 +232,31 @@ def align_3_2_1(field: Field, positions_px: ArrayLike, *, shared: SharedPixels) 
         for sign in (1.0, -1.0):
             moved = x.copy().ravel()
             moved[k] += sign * step
-            R2, o2 = _three_two_one(moved.reshape(6, 3))
+            R2, o2 = three_two_one(moved.reshape(6, 3))
             turn = R @ R2.T  # of the new axes, along the new axes
             ends.append(np.concatenate([[turn[2, 1], turn[0, 2], turn[1, 0]], R @ (o2 - origin)]))
         slope[:, k] = (ends[0] - ends[1]) / (2.0 * step)
     budgets = budgets_through(slope, own, own, shift, field.causes)
-    return Alignment(R, origin, slope @ joint @ slope.T, 0.0, 6, budgets)
+    return Alignment(
+        R,
+        origin,
+        slope @ joint @ slope.T,
+        0.0,
+        6,
+        budgets,
+        slope @ own @ slope.T,
+        None if shift is None else slope @ shift,
+    )
 
 
-def _three_two_one(x: Float) -> tuple[Float, Float]:
+def three_two_one(x: Float) -> tuple[Float, Float]:
+    """Return axes (rows) and origin of the frame through six positions (6, 3), see :func:`align_3_2_1`.
+
+    Raises
+    ------
+    RegionError
+        ``gauge_unusable`` for three on one line, or two that are one.
+    """
     normal = np.cross(x[1] - x[0], x[2] - x[0])
     size = float(np.linalg.norm(normal))
     reach = max(float(np.linalg.norm(x[1] - x[0])), float(np.linalg.norm(x[2] - x[0])))

@@ -6,6 +6,7 @@ sum over the points: each point's weight is the sum over all windows of the area
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,7 @@ from core.strain.options import StrainOptions
 from core.strain.result import StrainStatus
 from core.strain.surface import surface_slopes
 from core.strain.tensors import strain_slopes
-from core.strain.window import plane_weights
+from core.strain.window import Slopes, plane_weights
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,14 @@ def mean_strain_sigma(field: Field, options: StrainOptions, inside: Bool, *, sub
 
 
 def mean_strain_variance(field: Field, options: StrainOptions, inside: Bool, *, subset_px: float) -> MeanStrainVariance:
-    """Return the uncertainty of the means of exx, eyy, exy over an area, by where it comes from.
+    """Return the uncertainty of the means of exx, eyy, exy over an area; see :func:`mean_strain_variances`."""
+    return mean_strain_variances(field, options, [inside], subset_px=subset_px)[0]
+
+
+def mean_strain_variances(
+    field: Field, options: StrainOptions, areas: Sequence[Bool], *, subset_px: float
+) -> list[MeanStrainVariance]:
+    """Return the uncertainty of the means of exx, eyy, exy over areas, by where it comes from.
 
     Parameters
     ----------
@@ -80,8 +88,8 @@ def mean_strain_variance(field: Field, options: StrainOptions, inside: Bool, *, 
         The displacement that the strain was computed from.
     options
         Options of its computation.
-    inside
-        (r, c) the area.
+    areas
+        (r, c) each.
     subset_px
         Width of the subset that the field was measured with.
 
@@ -93,18 +101,46 @@ def mean_strain_variance(field: Field, options: StrainOptions, inside: Bool, *, 
     covariances. What planes leave out in one-sided windows (order ``auto``) may have one sign, and is added whole. The
     common factor goes through the same weights: ``sum_k v_k . F_k``, squared.
     """
-    from scipy.signal import oaconvolve  # slow to load, and not every start needs it
-
     shared = SharedPixels.of(field, subset_px)
     slopes, surface, left, _ = surface_slopes(field, options, shared)
-    frame, per_mm, gradient, strain = surface.frame, surface.per_mm, surface.gradient, surface.strain
     good = slopes.status == StrainStatus.OK
-    used = good & inside
-    n = int(used.sum())
-    if n == 0:
-        return MeanStrainVariance(np.full(3, np.nan))
+    by_slope = strain_slopes(surface.frame, surface.gradient, options.tensor, surface.per_mm, surface.strain)
+    frozen = field.frozen_covariance
+    there = field.valid[..., None, None]
+    roots = roots_of(np.where(there, field.covariance, 0.0))
+    roots_frozen = None if frozen is None else roots_of(np.where(there, frozen, 0.0))
+    out = []
+    for inside in areas:
+        used = good & inside
+        if not used.any():
+            out.append(MeanStrainVariance(np.full(3, np.nan)))
+            continue
+        v = _through_windows(field, options, slopes, used, by_slope[used[good]])
+
+        def noise(roots: Float, v: Float = v) -> Float:
+            each = v @ roots
+            return np.asarray(np.maximum(np.einsum("rcij,rcij->i", each, shared.summed(field, each)), 0.0))
+
+        common = None
+        if field.common is not None:
+            common = np.einsum("rcij,rcjk->ik", v, np.where(there, field.common, 0.0))
+        out.append(
+            MeanStrainVariance(
+                noise(roots) + np.sqrt(left[used]).mean(axis=0) ** 2,
+                None if roots_frozen is None else noise(roots_frozen),
+                common,
+                field.causes,
+            )
+        )
+    return out
+
+
+def _through_windows(field: Field, options: StrainOptions, slopes: Slopes, used: Bool, by_slope: Float) -> Float:
+    """(r, c, 3, 6): each point's weight in the mean strain over the points ``used``, zero where it has none."""
+    from scipy.signal import oaconvolve  # slow to load, and not every start needs it
+
     D = np.zeros((*field.shape, 3, 2, 6))
-    D[used] = strain_slopes(frame, gradient, options.tensor, per_mm, strain)[used[good]] / n
+    D[used] = by_slope / len(by_slope)
     half = options.window // 2
     v = np.zeros((field.shape[0] + 2 * half, field.shape[1] + 2 * half, 3, 6))
     offsets, _ = window_offsets(half)
@@ -118,19 +154,4 @@ def mean_strain_variance(field: Field, options: StrainOptions, inside: Bool, *, 
         kernel[offsets[:, 0] + half, offsets[:, 1] + half] = along
         v += oaconvolve(D[..., a, :], kernel[:, :, None, None], mode="full", axes=(0, 1))
     v = v[half : half + field.shape[0], half : half + field.shape[1]]
-
-    def noise(covariance: Float) -> Float:
-        roots = roots_of(np.where(field.valid[..., None, None], covariance, 0.0))
-        each = np.where(field.valid[..., None, None], v, 0.0) @ roots
-        return np.asarray(np.maximum(np.einsum("rcij,rcij->i", each, shared.summed(field, each)), 0.0))
-
-    frozen = field.frozen_covariance
-    common = None
-    if field.common is not None:
-        common = np.einsum("rcij,rcjk->ik", v, np.where(field.valid[..., None, None], field.common, 0.0))
-    return MeanStrainVariance(
-        noise(field.covariance) + np.sqrt(left[used]).mean(axis=0) ** 2,
-        None if frozen is None else noise(frozen),
-        common,
-        field.causes,
-    )
+    return np.where(field.valid[..., None, None], v, 0.0)

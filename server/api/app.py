@@ -18,14 +18,25 @@ from server.api.protocol.auth import AccessRules, Door, Sessions
 from server.api.protocol.delivery import Delivery
 from server.api.protocol.guard import LOOPBACK_NAMES, Guard
 from server.api.protocol.old_addresses import OldAddresses
-from server.api.routes.analyses import analyses, exports, gauges, picking, previews, region, repetition, report, results
+from server.api.routes.analyses import (
+    analyses,
+    comparison,
+    exports,
+    gauges,
+    picking,
+    previews,
+    region,
+    repetition,
+    report,
+    results,
+)
 from server.api.routes.calibrations import calibrations, guide, noise, repair, review
 from server.api.routes.calibrations import checks as calibration_checks
 from server.api.routes.calibrations import exports as calibration_exports
 from server.api.routes.certificates import certificates
 from server.api.routes.rig import cameras, devices, live_check, stage
 from server.api.routes.service import jobs, session, system
-from server.api.routes.tests import channels, frame, metadata, recipes, tests, watch, workspace
+from server.api.routes.tests import channels, frame, metadata, models, recipes, tests, watch, workspace
 from server.api.routes.tests.trash import router as trash_router
 from server.http.access import KeyFile
 from server.workflows.calibration.guided import Guides
@@ -137,12 +148,14 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         recipes,
         watch,
         channels,
+        models,
         analyses,
         picking,
         region,
         repetition,
         results,
         gauges,
+        comparison,
         exports,
         report,
         certificates,

@@ -35,6 +35,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "verify": ("server.cli.operation.verify", "check a data folder: damage, leftovers, checksums"),
     "reproduce": ("server.cli.evidence.reproduce", "measure a stored analysis again and compare"),
     "certify": ("server.cli.evidence.certify", "judge the measuring system by known motions and lengths"),
+    "compare-model": ("server.cli.evidence.compare_model", "compare a measured step with a finite element result"),
     "bundle": ("server.cli.evidence.bundle", "pack a test into one file, or open such a file"),
     "repair": ("server.cli.operation.repair", "put a data folder in order after a crash"),
     "trash": ("server.cli.operation.trash", "what was deleted: list, restore, remove for good"),

@@ -18,6 +18,7 @@ from server.formats.results.uncertainty import NOT_INCLUDED, Statement
 from server.formats.version import software_version
 from server.report import pictures
 from server.report.calibration import CalibrationPart, calibration_gaps
+from server.report.evidence.models import compared_models
 from server.report.floor import STRAINS, UM
 from server.report.geometry import geometry
 from server.report.hardware import hardware, image_sizes
@@ -124,6 +125,7 @@ def make_report(source: Source, coverage: CoverageFields | None = None) -> Repor
         fields=_fields(measured),
         courses=courses(measured),
         gauges=gauges(source, measured),
+        models=compared_models(source),
         uncertainty=sentence(measured),
         budget=field_budgets(measured),
         budget_names=list(BUDGET),

@@ -41,7 +41,7 @@ _KNOWN = {
     r"(calibration\.json|residuals\.nc)(\.sha256)?|calibration\.checks\.json|views",
     "noise": r"(plan|frames|failure)\.json|noise\.json(\.sha256)?|frames",
     "certificate": r"certificate\.(json|html)(\.sha256)?|withdrawn\.json",
-    "test": r"(test|calibration|watch|workspace)\.json|calibrations|steps|analyses|exports",
+    "test": r"(test|calibration|watch|workspace)\.json|calibrations|steps|analyses|exports|models",
     "step": r"step\.json|cam[12]\.tif",
     "analysis": r"(analysis|jobs|noise|summary)\.json|mask\.png|step_\d+\.(nc|nc\.sha256|json)|starts_\d+\.npz",
 }
@@ -204,6 +204,18 @@ class _Walk:
             self.step(path.name, step)
         for analysis in self.entries(path / "analyses", "a", "analysis.json"):
             self.analysis(path.name, analysis)
+        for model in self.entries(path / "models", "m", "model.json"):
+            self.model(model)
+
+    def model(self, path: Path) -> None:
+        document = self.document(path / "model.json")
+        files = (document or {}).get("files")
+        held = files if isinstance(files, dict) else {}
+        for name, sha256 in held.items():
+            self.compare(path / Path(name).name, sha256)
+        for file in sorted(path.iterdir()) if document is not None else ():
+            if file.name not in {*held, "model.json"} and not file.name.endswith(".part"):
+                self.report("foreign", file, "this name is not one that the service makes")
 
     def calibrations_of(self, path: Path, document: dict[str, Any]) -> None:
         """Check a test's copies of calibrations: the first, and those that it was given since."""

@@ -33,6 +33,7 @@ from server.store.certificates import CertificateStore
 from server.store.folder import DataFolder
 from server.store.indexing.build import Index
 from server.store.indexing.clean_stop import take_mark
+from server.store.models import ModelStore
 from server.store.noise import NoiseStore
 from server.store.recipes import RecipeStore
 from server.store.tests import TestStore
@@ -79,6 +80,7 @@ class Service:
         self.noise = NoiseStore(self.folder)
         self.recipes = RecipeStore(self.folder)
         self.certificates = CertificateStore(self.folder)
+        self.models = ModelStore(self.tests)
         self.trash = Trash(self.folder.root)
         self.index = Index(self.catalog, self.folder, self.calibrations, self.tests, self.noise)
         self.metrics = Metrics()

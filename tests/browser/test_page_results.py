@@ -6,6 +6,7 @@ import io
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from server.formats.results.reading import read_field, read_head
 from server.formats.results.writing import Provenance, write_field
 from server.report.source import find_source
 from server.store.index import analysis_entry
+from sim.plate import CircularPlate
 from tests.support import results_page
 from tests.support.page_bench import UNREACHED, Watched, tabbed, watched
 from tests.support.results_page import (
@@ -944,3 +946,35 @@ def test_gauges_field_limits_and_colours_are_there_again_and_go_into_the_report(
     [gauge] = metadata.gauges.extensometers
     assert (gauge.name, gauge.a_px, gauge.b_px) == ("E1", (80.0, 100.0), (160.0, 110.0))
     page.sound()
+
+
+def test_a_step_is_compared_with_a_model_on_the_page(page: Watched, bench: Bench, tmp_path: Path) -> None:
+    # the plate of Eq. (18) as a model ten times too stiff: refuted where it bulges
+    plate = CircularPlate(youngs_modulus_mpa=710.0e3)
+    w0, radius = plate.centre_deflection_mm(689.0), plate.radius_mm
+    x, y = (v.ravel() for v in np.meshgrid(*[np.linspace(-12.0, 12.0, 60)] * 2))
+    q = np.minimum((x**2 + y**2) / radius**2, 1.0)
+    w = -w0 * (1.0 - q) ** 2
+    zero = np.zeros_like(x)
+    rows = np.column_stack([x, y, zero, zero, zero, w])
+    for name, head in (("model.csv", "x_mm,y_mm,z_mm,u_mm,v_mm,w_mm"), ("bare.csv", "x,y,z,u,v,w")):
+        np.savetxt(tmp_path / name, rows, delimiter=",", header=head, comments="")
+    at = shown(page, bench)
+    at.get_by_text("Comparison with a model", exact=True).click()
+    panel = at.locator('[data-role="models"]')
+    panel.get_by_label("File", exact=True).set_input_files(tmp_path / "bare.csv")
+    panel.get_by_role("button", name="Keep with the test").click()
+    expect(at.get_by_text("states no unit of length").first).to_be_visible()
+    panel.get_by_label("File", exact=True).set_input_files(tmp_path / "model.csv")
+    panel.get_by_role("button", name="Keep with the test").click()
+    expect(panel.locator('[data-role="model"]')).to_contain_text("model.csv (mm)")
+    panel.get_by_role("button", name="Compare this step").click()
+    expect(panel.locator('[data-role="model-verdict"]')).to_contain_text("refuted", timeout=120_000)
+    found = bench.client.get(f"{API}/tests/{bench.test_id}/models").json()["models"][-1]
+    body = {"model_id": found["id"], "step": 2}
+    said = bench.client.post(f"{bench.path()}/comparison", json=body, timeout=120.0).json()
+    assert not said["accepted"]
+    assert panel.locator("rect[data-region]").count() == len(said["regions"])
+    assert panel.locator("table").filter(has_text="Where the model is refuted").locator("tbody tr").count() == len(
+        said["refuted"]
+    )

@@ -440,6 +440,16 @@ def _results(session: Session, test: str, analysis: str) -> None:
         body={"align": {"kind": "plane"}, "remove_rigid": {}},
         summary="In the frame of the best-fit plane, rigid motion taken out",
     )
+    nodes = [f"{x},{y},0,0,0,-0.05" for y in range(-8, 9, 2) for x in range(-8, 9, 2)]
+    table = "\n".join(["x_mm,y_mm,z_mm,u_mm,v_mm,w_mm", *nodes, ""]).encode()
+    placed = {"align": '{"kind": "best-fit"}'}
+    what = "A table of nodes with their displacements, laid onto the measured shape"
+    model = call("create_model", test, summary=what, form=placed, files={"file": table}, text_files=True).json()["id"]
+    call("list_models", test)
+    asked = {"model_id": model, "step": 1, "load_uncertainty": 0.005}
+    call("compare_with_model", test, analysis, summary="The load known to half a per cent", body=asked)
+    call("compare_with_model", test, analysis, body=asked, query={"format": "vtu"})
+    call("delete_model", test, model)
     for form in ("csv", "nc"):
         call("export", test, analysis, query={"format": form, "step": 1})
     begun = call("begin_export", test, analysis, query={"format": "csv", "step": 1}).json()["job"]

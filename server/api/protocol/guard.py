@@ -87,7 +87,7 @@ class Guard:
             )
             await response(scope, receive, send)
             return
-        limit = UPLOAD_LIMIT if scope["path"].endswith("/steps:import") else BODY_LIMIT
+        limit = UPLOAD_LIMIT if scope["path"].endswith(("/steps:import", "/models")) else BODY_LIMIT
         length = headers.get(b"content-length", "0")
         if not length.isdigit() or int(length) > limit:
             response = problem_response(413, "body_too_large", f"The body is larger than {limit} bytes.", "Send less.")

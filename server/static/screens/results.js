@@ -15,6 +15,7 @@ import { pointHistory } from "./results/point_history.js";
 import { mark, pinned } from "./results/probe.js";
 import { interval } from "./results/uncertainty.js";
 import { live, usualField } from "./results/live.js";
+import { models } from "./results/models.js";
 import { stateBadge, warningsBox, warningsCell } from "./results/warnings.js";
 import { amount, shown as shown_, strainUnit, useStrainUnit } from "../lib/units.js";
 import { seenPicture } from "../widgets/seen_picture.js";
@@ -379,9 +380,10 @@ async function show(root, testId, analysisId, query) {
   const axes = frames(screen, async () => { scale.forget(); state.pinned = undefined; replace(probe, h("p.quiet", "Click a point to see all its values.")); await refresh(); });
   axesField.append(h("label", { for: "resultframe" }, "Axes"), axes.choice);
   const filesPanel = files(screen);
+  const modelsPanel = models(screen);
   const point = pointHistory(screen);
-  below.append(point.root, gaugePanels, axes.root, filesPanel, aboutPanel.root);
-  const dependent = [modes, controls, pictured, figures, point.root, gaugePanels, axes.root, filesPanel]; // on a finished step
+  below.append(point.root, gaugePanels, axes.root, modelsPanel, filesPanel, aboutPanel.root);
+  const dependent = [modes, controls, pictured, figures, point.root, gaugePanels, axes.root, modelsPanel, filesPanel]; // on a finished step
   await refresh();
   ends.push(events.on("result", async (event) => {
     if (event.analysis_id !== analysisId) return;

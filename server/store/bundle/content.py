@@ -23,7 +23,8 @@ _NAMES = re.compile(
     r"test\.json|workspace\.json|calibration\.json|calibrations/[0-9a-f]{64}\.json|"
     r"steps/\d{4}/(step\.json|cam[12]\.tif)|steps/\d{4}\.deleted|"
     rf"analyses/a{_ID}/((analysis|jobs|noise|summary)\.json|mask\.png|step_\d{{4}}\.(nc|nc\.sha256|json)|"
-    r"starts_\d{4}\.npz)"
+    r"starts_\d{4}\.npz)|"
+    rf"models/m{_ID}/(model\.json|[A-Za-z0-9_][A-Za-z0-9._-]{{0,99}})"
 )
 _TEST = re.compile(rf"tests/(t{_ID})/(.+)", re.DOTALL)
 
@@ -57,7 +58,7 @@ def files_of(test: Path) -> list[Path]:
         if path.is_symlink() or not path.is_file() or _NAMES.fullmatch(name) is None:
             continue
         parts = name.split("/")
-        mark = {"steps": "step.json", "analyses": "analysis.json"}.get(parts[0])
+        mark = {"steps": "step.json", "analyses": "analysis.json", "models": "model.json"}.get(parts[0])
         if mark is None or len(parts) < 3 or (test / parts[0] / parts[1] / mark).is_file():
             found.append(path)
     return found

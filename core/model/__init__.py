@@ -1,0 +1,1 @@
+"""Comparison of a measured field with a model of the same surface."""

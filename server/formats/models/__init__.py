@@ -1,0 +1,1 @@
+"""Results of finite element programs: readers of VTU, XDMF and CSV."""

@@ -1,0 +1,212 @@
+"""XDMF: light data in XML, heavy data in it or in HDF5 files beside it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from defusedxml import ElementTree as Xml
+from defusedxml.common import DefusedXmlException
+
+from core.arrays import Float
+from server.formats.models.cells import NODES
+from server.formats.models.mesh_file import Index, MeshFile, require_count, unreadable
+from server.formats.results.netcdf import opened
+
+#: XDMF's name and number of each kind of cell, and VTK's
+_KINDS = {
+    "triangle": (4, 5),
+    "quadrilateral": (5, 9),
+    "tetrahedron": (6, 10),
+    "pyramid": (7, 14),
+    "wedge": (8, 13),
+    "hexahedron": (9, 12),
+    "triangle_6": (36, 22),
+    "tri_6": (36, 22),
+    "quadrilateral_9": (35, 28),
+    "quad_9": (35, 28),
+    "quadrilateral_8": (37, 23),
+    "quad_8": (37, 23),
+    "tetrahedron_10": (38, 24),
+    "tet_10": (38, 24),
+    "hexahedron_20": (48, 25),
+    "hex_20": (48, 25),
+}
+_BY_NUMBER = dict(_KINDS.values())
+_COUNTED = (1, 2, 3)  # kinds in a mixed list that state their number of nodes
+_COMPONENTS = {"scalar": 1, "vector": 3, "tensor": 9, "tensor6": 6}
+Heavy = Callable[[str], Path]
+
+
+def read_xdmf(content: bytes, heavy: Heavy, *, time: float | None = None) -> MeshFile:
+    """Read a file.
+
+    Parameters
+    ----------
+    content
+        The light data.
+    heavy
+        Gives the path of a file of heavy data by its name, or raises an error.
+    time
+        The state nearest to this time of a series; None: the last.
+
+    Raises
+    ------
+    FileFormatError
+        ``model_unreadable``; what ``heavy`` raises.
+    """
+    try:
+        root = Xml.fromstring(content)
+    except (Xml.ParseError, DefusedXmlException, ValueError) as error:
+        raise unreadable(f"it is no XML ({error})") from error
+    if not root.tag.lower().endswith("xdmf"):
+        raise unreadable(f"it begins with {root.tag!r}, not with Xdmf")
+    grids = [one for one in root.iter("Grid") if one.get("GridType", "Uniform") == "Uniform"]
+    if not grids:
+        raise unreadable("it has no grid")
+    at = [_time(one) for one in grids]
+    held = [k for k, one in enumerate(grids) if one.find("Attribute") is not None] or list(range(len(grids)))
+    k = held[-1] if time is None else min(held, key=lambda i: _away(at[i], time))
+    grid = grids[k]
+    # later states of a series refer to the mesh of the first
+    topology, geometry = (_first(grid, root, name) for name in ("Topology", "Geometry"))
+    if geometry is None:
+        raise unreadable("it has no geometry")
+    items = {item.get("Name"): item for item in root.iter("DataItem") if item.get("Name")}
+
+    def numbers(element: Any) -> Float:
+        item = element.find("DataItem") if element.tag != "DataItem" else element
+        if item is None:
+            raise unreadable(f"a {element.tag} has no data")
+        reference = item.get("Reference")
+        if reference is not None:
+            name = reference if reference != "XML" else (item.text or "").strip()
+            item = next((one for key, one in items.items() if key and f'"{key}"' in name), item)
+        return _numbers(item, heavy)
+
+    xyz = numbers(geometry)
+    parts = 2 if geometry.get("GeometryType", geometry.get("Type", "XYZ")).upper() == "XY" else 3
+    points = xyz.reshape(-1, parts)
+    if parts == 2:
+        points = np.column_stack([points, np.zeros(len(points))])
+    n, data, units = len(points), {}, {}
+    stated = _unit(geometry)
+    if stated:
+        units[""] = stated
+    for one in grid.findall("Attribute"):
+        name = one.get("Name") or ""
+        if one.get("Center", "Node") != "Node" or not name:
+            continue
+        values = numbers(one)
+        count = _COMPONENTS.get(one.get("AttributeType", "Scalar").lower(), 0)
+        if values.size % max(n, 1) or (
+            count and values.size != count * n and values.size // max(n, 1) not in (1, 2, 3)
+        ):
+            raise unreadable(f"the attribute {name} has {values.size} numbers for {n} nodes")
+        data[name] = values.reshape(n, -1) if values.size != n else values.ravel()
+        if _unit(one):
+            units[name] = _unit(one)
+    cells = [] if topology is None else _cells(topology, numbers(topology), n)
+    return MeshFile(points.astype(np.float64), cells, data, units, at[k])
+
+
+def _away(at: float | None, time: float) -> float:
+    return math.inf if at is None else abs(at - time)
+
+
+def _time(grid: Any) -> float | None:
+    found = grid.find("Time")
+    try:
+        return None if found is None else float(found.get("Value", ""))
+    except ValueError:
+        return None
+
+
+def _first(grid: Any, root: Any, name: str) -> Any:
+    own = grid.find(name)
+    return own if own is not None else next(root.iter(name), None)
+
+
+def _unit(element: Any) -> str:
+    for one in element.findall("Information"):
+        if one.get("Name", "").lower() in ("unit", "units"):
+            return (one.get("Value") or one.text or "").strip()
+    return ""
+
+
+def _numbers(item: Any, heavy: Heavy) -> Float:
+    try:
+        shape = [int(v) for v in item.get("Dimensions", "").split()]
+    except ValueError:
+        raise unreadable(f"a data item has the dimensions {item.get('Dimensions')!r}") from None
+    count = math.prod(shape)
+    require_count(count, "a data item")
+    text, form = (item.text or "").strip(), item.get("Format", "XML").upper()
+    if form == "XML":
+        try:
+            values = np.array(text.split(None, count)[:count], dtype=np.float64)
+        except ValueError as error:
+            raise unreadable(f"a data item holds text that is no number ({error})") from error
+    elif form in ("HDF", "HDF5"):
+        name, _, inside = text.partition(":")
+        values = _from_hdf(heavy(name), inside, count)
+    else:
+        raise unreadable(f"a data item has the format {form}", remedy="Write the heavy data as HDF5 or XML.")
+    if shape and values.size != count:
+        raise unreadable(f"a data item has {values.size} of {count} numbers: the file was cut short")
+    return values.astype(np.float64)
+
+
+def _from_hdf(path: Path, inside: str, count: int) -> Float:
+    parts = [part for part in inside.split("/") if part]
+    with opened(path) as data:
+        group: Any = data
+        for part in parts[:-1]:
+            group = getattr(group, "groups", {}).get(part)
+        held = None if group is None or not parts else group.variables.get(parts[-1])
+        if held is None:
+            raise unreadable(f"{path.name} has no data set {inside}")
+        require_count(int(held.size), f"{path.name}:{inside}")
+        if held.size < count:
+            raise unreadable(f"{path.name}:{inside} has {held.size} of {count} numbers")
+        try:
+            return np.asarray(held[...], dtype=np.float64).ravel()
+        except (OSError, RuntimeError, ValueError) as error:
+            raise unreadable(f"{path.name}:{inside} is damaged ({error})") from error
+
+
+def _cells(topology: Any, flat: Float, n: int) -> list[tuple[int, Index]]:
+    name = topology.get("TopologyType", topology.get("Type", "")).lower()
+    nodes = flat.astype(np.int64)
+    if name == "mixed":
+        found = _mixed(nodes)
+    elif name in _KINDS:
+        kind = _KINDS[name][1]
+        if nodes.size % NODES[kind]:
+            raise unreadable(f"its topology {name} has {nodes.size} nodes, no multiple of {NODES[kind]}")
+        found = [(kind, nodes.reshape(-1, NODES[kind]))]
+    else:
+        return []
+    for _, cells in found:
+        if cells.size and not (cells.min() >= 0 and cells.max() < n):
+            raise unreadable(f"a cell has the node {cells.max()}, but there are {n}")
+    return found
+
+
+def _mixed(nodes: Index) -> list[tuple[int, Index]]:
+    lists: dict[int, list[Index]] = {}
+    at = 0
+    while at < len(nodes):
+        number = int(nodes[at])
+        if number in _COUNTED and at + 1 < len(nodes):
+            at += 2 + max(0, int(nodes[at + 1]))
+            continue
+        kind = _BY_NUMBER.get(number)
+        if kind is None or at + 1 + NODES[kind] > len(nodes):
+            raise unreadable(f"its mixed topology has a cell of the kind {number}, or ends inside one")
+        lists.setdefault(kind, []).append(nodes[at + 1 : at + 1 + NODES[kind]])
+        at += 1 + NODES[kind]
+    return [(kind, np.stack(cells)) for kind, cells in lists.items()]

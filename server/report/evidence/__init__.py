@@ -1,0 +1,1 @@
+"""Parts of the report that show what a result is worth beside others."""

@@ -1,0 +1,1 @@
+"""Results compared with models: the request, the comparison, the document."""
