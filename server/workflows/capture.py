@@ -15,7 +15,7 @@ from server.results.images.quality import ImageQuality, image_quality, pair_qual
 from server.rig.cameras import CapturedPair
 from server.store.documents import StepMetadata, StepRecord
 from server.store.folder import now_utc
-from server.store.index import step_entry
+from server.store.indexing.entries import step_entry
 from server.workflows.camera_identity import check_same_cameras
 from server.workflows.service import Service
 

@@ -11,7 +11,7 @@ from server.formats.channel_table import ChannelTable
 from server.formats.channel_units import unit_of
 from server.results.channels import step_time
 from server.store.documents import StepRecord
-from server.store.index import step_entry
+from server.store.indexing.entries import step_entry
 from server.workflows.service import Service
 
 #: readings may lie this many times their median distance apart and still be joined by a straight line

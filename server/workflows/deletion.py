@@ -9,8 +9,8 @@ from core.errors import StateError, StereorigError
 from server.base.models import Ids
 from server.jobs.job import ACTIVE
 from server.store.documents import TrashEntry
-from server.store.index import calibration_entry, entries_of_test
-from server.store.lost_jobs import LostJobs
+from server.store.indexing.entries import calibration_entry, entries_of_test
+from server.store.indexing.lost_jobs import LostJobs
 from server.store.trash import Kind
 from server.workflows.service import Service
 

@@ -10,7 +10,7 @@ from server.base.models import Ids
 from server.formats.calibrations.recognise import load_calibration
 from server.jobs.idempotency import RequestMark
 from server.store.documents import TestRecord
-from server.store.index import test_entry
+from server.store.indexing.entries import test_entry
 from server.workflows.calibration.review import LATEST, check_not_discarded, newest_accepted
 from server.workflows.camera_identity import check_same_cameras
 from server.workflows.service import Service

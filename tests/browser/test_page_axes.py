@@ -11,7 +11,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from core.strain import StrainOptions, surface_strain
 from server.formats.results.writing import Provenance, write_field
-from server.store.index import analysis_entry
+from server.store.indexing.entries import analysis_entry
 from tests.support import results_page
 from tests.support.gauge_field import SUBSET, make_field
 from tests.support.page_bench import Watched, watched

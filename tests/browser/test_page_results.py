@@ -22,7 +22,7 @@ from server.formats.results.netcdf import library
 from server.formats.results.reading import read_field, read_head
 from server.formats.results.writing import Provenance, write_field
 from server.report.source import find_source
-from server.store.index import analysis_entry
+from server.store.indexing.entries import analysis_entry
 from sim.plate import CircularPlate
 from tests.support import results_page
 from tests.support.page_bench import UNREACHED, Watched, tabbed, watched

@@ -17,7 +17,7 @@ import stereorig
 from server.api.models import AnalysisRequest
 from server.formats.images import encode_tiff
 from server.store.documents import JobRecord
-from server.store.index import analysis_entry
+from server.store.indexing.entries import analysis_entry
 from server.workflows.service import Service
 from tests.bench.years.folder import TrueTest
 from tests.support.service_rig import new_test, served, tiny_config

@@ -17,9 +17,9 @@ from server.base.problem import RESTART, problem_of
 from server.store.calibrations import CalibrationStore
 from server.store.catalog import Catalog, Entry
 from server.store.folder import DataFolder, is_id, remove_temporaries
-from server.store.index import calibration_entry, check_trash, entries_of_test, test_entry
 from server.store.indexing.clean_stop import Times, leave_mark, take_mark, times_of
-from server.store.lost_jobs import LostJobs
+from server.store.indexing.entries import calibration_entry, check_trash, entries_of_test, test_entry
+from server.store.indexing.lost_jobs import LostJobs
 from server.store.noise import NoiseStore
 from server.store.tests import TestStore
 

@@ -21,7 +21,7 @@ from server.jobs.job import Job, Waiting
 from server.results.warnings.analysis import analysis_warnings
 from server.store.documents import AnalysisRecord, Finished, StepOutcome
 from server.store.folder import now_utc
-from server.store.index import analysis_entry
+from server.store.indexing.entries import analysis_entry
 from server.store.tests import StepFiles
 from server.worker.dask_cluster import ClusterError
 from server.worker.executor import WorkerDiedError

@@ -20,7 +20,7 @@ from server.jobs.idempotency import RequestMark
 from server.jobs.job import Job, Phase
 from server.results.images.projected_pattern import check_settings
 from server.store.documents import AnalysisRecord
-from server.store.index import analysis_entry
+from server.store.indexing.entries import analysis_entry
 from server.workflows.analysis import checks
 from server.workflows.analysis.run import AnalysisRun, close
 from server.workflows.analysis.tasks import calibration_changed

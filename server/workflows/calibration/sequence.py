@@ -18,7 +18,7 @@ from server.base.models import Ids
 from server.config.rig_file import RigConfig
 from server.jobs.idempotency import RequestMark
 from server.jobs.job import Job
-from server.store.index import calibration_entry
+from server.store.indexing.entries import calibration_entry
 from server.worker.tasks import FitTask, LookTask, find_in_pair, fit_calibration
 from server.workflows.acquisition import begin_acquisition
 from server.workflows.capture import OFF_ZERO_MM

@@ -36,7 +36,7 @@ from server.formats.images import read_image
 from server.results.reader import read_residuals
 from server.store.calibrations import REJECTED
 from server.store.documents import MadeState
-from server.store.index import calibration_entry
+from server.store.indexing.entries import calibration_entry
 from server.workflows.calibration.sequence import CalibrationPlan, begin
 from server.workflows.service import Service
 

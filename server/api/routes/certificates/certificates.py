@@ -8,7 +8,12 @@ from fastapi import APIRouter, Path, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import HTMLResponse, Response
 
-from server.api.models.certificates import CertificateList, CertificateReply, CertificateRequest, WithdrawRequest
+from server.api.models.evidence.certificates import (
+    CertificateList,
+    CertificateReply,
+    CertificateRequest,
+    WithdrawRequest,
+)
 from server.api.models.jobs import Accepted
 from server.api.protocol.attached import Wait, job_reply
 from server.api.protocol.dependencies import KeyHeader, ServiceDep, mark, person_name

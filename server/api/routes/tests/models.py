@@ -10,7 +10,7 @@ from fastapi import APIRouter, File, Form, Path, Request, UploadFile
 from starlette.concurrency import run_in_threadpool
 
 from core.errors import InputError
-from server.api.models.model_files import ModelList
+from server.api.models.evidence.model_files import ModelList
 from server.api.protocol.dependencies import KeyHeader, ServiceDep, TestId, mark
 from server.api.protocol.paging import PageDep
 from server.api.protocol.problems import errors

@@ -36,7 +36,7 @@ from server.base.models import FormNumber, Ids
 from server.formats.images import read_image
 from server.jobs.idempotency import RequestMark
 from server.store.documents import StepMetadata
-from server.store.index import step_entry, test_entry
+from server.store.indexing.entries import step_entry, test_entry
 from server.wording import problems_in
 from server.workflows.analysis.warnings import with_warnings
 from server.workflows.burst import start_burst

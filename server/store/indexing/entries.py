@@ -11,7 +11,7 @@ from server.store.calibrations import CalibrationStore
 from server.store.catalog import Entry
 from server.store.documents import AnalysisRecord, StepRecord, TestRecord
 from server.store.folder import DataFolder, is_id
-from server.store.lost_jobs import LostJobs
+from server.store.indexing.lost_jobs import LostJobs
 from server.store.tests import TestStore
 from server.store.trash import Trash
 
