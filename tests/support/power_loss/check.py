@@ -145,7 +145,7 @@ class Disk:
             for path, blob in sorted(state.tree.items()):
                 if blob is None:
                     (top / path).mkdir()
-                elif not path.startswith(f"{DATA}/catalog."):
+                else:
                     os.link(self._blob(blob), top / path)
             self._put_catalog(top / DATA / "catalog.sqlite", state)
             yield top / DATA
