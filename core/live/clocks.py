@@ -212,7 +212,7 @@ def _line(x: Float, y: Float) -> tuple[float, float]:
 
 def _noise_of(values: Float) -> float:
     """Standard deviation of a series' noise, from its second differences."""
-    return MAD_TO_SIGMA * float(np.median(np.abs(np.diff(values, 2)))) / np.sqrt(6.0)
+    return float(MAD_TO_SIGMA * np.median(np.abs(np.diff(values, 2))) / np.sqrt(6.0))
 
 
 def _correlated(left: Float) -> float:

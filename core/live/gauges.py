@@ -243,7 +243,7 @@ def _numbers(gauge: LiveGauge, sums: Float, normal: Float) -> tuple[Float, Float
     if gauge.kind == "extensometer":
         return _extensometer(sums)
     frame = surface_frames(sums[None, 1:, :3].swapaxes(1, 2), normal[None])
-    per_mm = np.linalg.inv(frame.swapaxes(1, 2) @ sums[None, 1:, :3].swapaxes(1, 2))
+    per_mm = np.asarray(np.linalg.inv(frame.swapaxes(1, 2) @ sums[None, 1:, :3].swapaxes(1, 2)), dtype=np.float64)
     gradient = sums[None, 1:, 3:].swapaxes(1, 2) @ per_mm
     strain = strain_of(frame, gradient, gauge.tensor)
     slopes = np.zeros((6, 3, 6))
