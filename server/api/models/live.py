@@ -49,6 +49,7 @@ class LiveValues(Reply):
     )
     points: int | None = Field(None, description="Points with values.")
     status: dict[str, int] | None = Field(None, description="Points by status.")
+    arrived_s: float | None = Field(None, description="Arrival of the later frame, on the host's monotonic clock.")
     latency_ms: float | None = Field(None, description="From the arrival of the frames to these values.")
     gauges: dict[str, LiveGaugeReply] = Field(description="By name.")
 

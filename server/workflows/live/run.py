@@ -245,6 +245,7 @@ class LiveRun:
                 "how": found["how"],
                 "points": found["points"],
                 "status": found["status"],
+                "arrived_s": max(pair[cam].host_ns for cam in CAMERAS) / 1e9,
                 "latency_ms": round(latency_ms, 3),
                 "gauges": gauges,
             }
