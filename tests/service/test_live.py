@@ -307,7 +307,7 @@ def test_a_channels_clock_is_found_from_a_ramp_and_its_values_at_the_exposure(
         ({}, 422, "invalid_request"),
         ({"points": [{"name": "p", "xy_px": [5, 5]}]}, 422, None),
         ({**GAUGES, "reference": 77}, 409, "no_steps"),
-        ({"points": [{"name": "p", "xy_px": [128, 120]}] * 2}, 422, "invalid_request"),
+        ({"points": [{"name": "p", "xy_px": [128, 120]}] * 2}, 422, "values_disagree"),
     ],
 )
 def test_what_cannot_be_measured_is_refused_at_once(

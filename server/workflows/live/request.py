@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Self
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from core.settings import (
     DEFAULT_INTERPOLATION,
@@ -21,7 +21,7 @@ from core.settings import (
     Whole,
     disagreement,
 )
-from server.base.models import Number, Request, StepNumber, Switch
+from server.base.models import Number, Request, StepNumber, Switch, given
 from server.results.gauges.request import Name
 
 _MAX_GAUGES = 50
@@ -68,8 +68,23 @@ class LiveArea(_LiveGauge, Outline):
         return Outline(rectangle=self.rectangle, polygon=self.polygon, circle=self.circle)
 
 
+class LiveRegion(Region):
+    """Region of a live measurement, as of an analysis, without a mask."""
+
+
 class LiveSettings(Request):
     """A live measurement: gauges, or a field of points, and how they are measured."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "anyOf": [
+                {"required": ["points"], "properties": {"points": {"minItems": 1}}},
+                {"required": ["extensometers"], "properties": {"extensometers": {"minItems": 1}}},
+                {"required": ["areas"], "properties": {"areas": {"minItems": 1}}},
+                {"allOf": [given("region"), {"required": ["field"], "properties": {"field": {"const": True}}}]},
+            ]
+        }
+    )
 
     reference: StepNumber = Field(0, description="Step that everything is compared with; its images are stored.")
     points: list[LivePoint] = Field(default_factory=list, description="Points.", max_length=_MAX_GAUGES)
@@ -77,7 +92,7 @@ class LiveSettings(Request):
         default_factory=list, description="Virtual extensometers.", max_length=_MAX_GAUGES
     )
     areas: list[LiveArea] = Field(default_factory=list, description="Areas.", max_length=_MAX_GAUGES)
-    region: Region | None = Field(None, description="Where points may lie; about the gauges if left out.")
+    region: LiveRegion | None = Field(None, description="Where points may lie; about the gauges if left out.")
     field: Switch = Field(False, description="Measure and hand out all points of the region, as a coarse field.")
     subset_px: SubsetPx = _SUBSET_PX
     spacing_px: SpacingPx = SPACING_PX.default
@@ -105,7 +120,7 @@ class LiveSettings(Request):
         if twice is not None:
             raise disagreement(f"two gauges have the name {twice}")
         if not names and not (self.field and self.region is not None):
-            raise disagreement("give a gauge, or a region with field = true")
+            raise ValueError("give a gauge, or a region with field = true")
         return self
 
     def measuring(self) -> tuple[str, ...]:

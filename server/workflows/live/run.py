@@ -82,7 +82,7 @@ class LiveRun:
         self.begun: dict[str, Any] = {}
         self.field: Any = None
         self.since_utc = utc_text(datetime.now(UTC))
-        self._worker = make_worker(threads)
+        self._worker = make_worker(threads, lowered=False)
         self._newest: dict[str, Any] = {"number": 0, "valid": False, "reason": "starting", "gauges": {}}
         self._spoke = time.monotonic()
         self._ending = threading.Event()

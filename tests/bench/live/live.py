@@ -46,6 +46,8 @@ API = "/api/v1"
 RIG = tiny_rig(
     image_size_px="image_size_px = [512, 480]",
     name='name = "live bench"\ntrigger = "free"\nframe_rate_hz = 50.0',
+    # the cameras run free, each by a thread of its own, on a machine that computes besides
+    max_skew_ms="max_skew_ms = 15.0",
     exposure_ms="exposure_ms = 5.0",
     kernel_threads="kernel_threads = 2",
 )
