@@ -331,13 +331,13 @@ def check_live(task: LiveCheckTask) -> LiveFinding:
 
 def begin_live(task: LiveTask) -> dict[str, Any]:
     """Measure the reference of a live measurement; frames can follow. Returns where its points lie."""
-    begun: dict[str, Any] = _measuring("server.compute.live").begin(task)
+    begun: dict[str, Any] = _measuring("server.compute.live.frames").begin(task)
     return begun
 
 
 def measure_live(pixels: tuple[Any, Any]) -> dict[str, Any]:
     """Measure a frame of the live measurement that was begun; returns readings and counts of points by status."""
-    found: dict[str, Any] = _heavy("server.compute.live").measure(pixels)
+    found: dict[str, Any] = _heavy("server.compute.live.frames").measure(pixels)
     return found
 
 
