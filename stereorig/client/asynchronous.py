@@ -235,7 +235,7 @@ class AsyncTest:
         return await self._client._run(operations.import_channels(self.id, file.name, file.read_bytes(), options))
 
     async def live(self, **settings: Any) -> dict[str, Any]:
-        """Begin a live measurement: ``extensometers=[{"name": "e1", "a_px": ..., "b_px": ...}]``, ``areas``, ``points``.
+        """Begin a live measurement: ``points=[{"name": "p1", "xy_px": [210, 180]}]``, ``extensometers``, ``areas``.
 
         Takes what the API's ``POST /tests/{id}/live`` does, and returns its state.
         """

@@ -13,8 +13,8 @@ from sim.load_frame import LoadFrame
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.description = (
-        "Run a simulated load frame on a TCP port of this machine until interrupted: it takes RATE, HOLD, POS? and FORCE? "
-        "as lines, and pulls the strip before the cameras of a service with a simulated rig."
+        "Run a simulated load frame on a TCP port of this machine until interrupted: it takes RATE, HOLD, POS? and "
+        "FORCE? as lines, and pulls the strip before the cameras of a service with a simulated rig."
     )
     parser.add_argument("--port", type=int, default=5026, help="TCP port on 127.0.0.1, 0 for any (default: 5026)")
     add_service(parser)
