@@ -191,10 +191,10 @@ def main() -> int:
     runs = []
     with serving(playback) as (_, client, test_id):
         main_run = measure(client, test_id, MAIN_POINTS, 60.0 * args.minutes, captures=True)
+        print("with a stored step a second:", _line(main_run), flush=True)
         for points in FIELDS:
             runs.append(measure(client, test_id, points, args.seconds, captures=False))
             print(_line(runs[-1]), flush=True)
-    print("with a stored step a second:", _line(main_run), flush=True)
     print(json.dumps({k: v for k, v in asdict(main_run).items() if k not in ("latency_ms", "memory_mib")}))
     if args.page:
         write_page(main_run, runs)
