@@ -87,7 +87,7 @@ class LiveRun:
         self._spoke = time.monotonic()
         self._ending = threading.Event()
         self._changed = threading.Condition()
-        self._slot: tuple[Pair, float] | None = None
+        self._slot: Pair | None = None
         self._fault: str | None = None
         self._number = 0
         self._clock = _HostClock()
@@ -154,7 +154,6 @@ class LiveRun:
                 self._lost(error.code)
                 self._ending.wait(_PAUSE_S)
                 continue
-            now = time.monotonic()
             self.account.came(passed + 1)
             self.account.skipped(passed)
             if not pair.accepted:
@@ -164,7 +163,7 @@ class LiveRun:
             with self._changed:
                 if self._slot is not None:
                     self.account.skipped(1)
-                self._slot, self._fault = (pair, now), None
+                self._slot, self._fault = pair, None
                 self._changed.notify_all()
 
     def _await_empty(self) -> None:
@@ -179,9 +178,9 @@ class LiveRun:
             self._threads[0].start()
             self._threads[2].start()
             while True:
-                pair, came = self._next()
+                pair = self._next()
                 try:
-                    self._measure_one(pair, came)
+                    self._measure_one(pair)
                 except WorkerDiedError as error:
                     self.account.refused(error.code)
                     self._lost(error.code)
@@ -204,7 +203,7 @@ class LiveRun:
         self.begun = self._result(begin_live, self._task, _BEGIN_S)
         self.state = "running"
 
-    def _next(self) -> tuple[Pair, float]:
+    def _next(self) -> Pair:
         with self._changed:
             while self._slot is None:
                 self._check()
@@ -213,7 +212,7 @@ class LiveRun:
             self._changed.notify_all()
             return taken
 
-    def _measure_one(self, pair: Pair, came: float) -> None:
+    def _measure_one(self, pair: Pair) -> None:
         pixels = tuple(pair[cam].pixels for cam in CAMERAS)
         try:
             found = self._result(measure_live, pixels, _FRAME_S)
@@ -250,7 +249,6 @@ class LiveRun:
                 "gauges": gauges,
             }
         )
-        del came
 
     def _result(self, function: Any, argument: Any, patience_s: float) -> dict[str, Any]:
         future = self._worker.submit(function, argument)
