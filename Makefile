@@ -15,7 +15,7 @@ ARGS ?=
 # only compile the same kernels again
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n > 3 ? 4 : n + 1)))
 
-.PHONY: help wheel demo quick test test-deep serve check check-page kernels bench format accuracy coverage fuzz load years soak openapi reference docs torture powerloss pagespeed pagepictures clean
+.PHONY: help wheel demo quick test test-deep serve check check-page kernels bench format accuracy coverage fuzz load years soak openapi reference docs torture powerloss livebench pagespeed pagepictures clean
 
 help:
 	@echo "make demo    start the service on the simulated paper rig and run the plate experiment over HTTP"
@@ -116,6 +116,10 @@ $(PEER_STAMP): pyproject.toml | $(STAMP)
 
 bench: $(STAMP) $(PEER_STAMP)
 	$(BIN)/python -m tests.bench.speed.bench $(ARGS)
+
+# a live measurement's latency, ten minutes; ARGS="--minutes 1" for less
+livebench: $(STAMP)
+	$(BIN)/python -m tests.bench.live.live --page $(ARGS)
 
 accuracy: $(STAMP)
 	$(BIN)/python -m tests.bench.accuracy.accuracy $(ARGS)

@@ -166,13 +166,13 @@ def _at(good: Bool, around: Float, slopes: Slopes, field: Field, options: Strain
     before = missed_slope(slope[:, :3], second[:, :3], moments)
     now = missed_slope(slope[:, :3] + slope[:, 3:], second[:, 3:], moments)
     slope = slope - np.concatenate([before, now - before], axis=1)
-    frame = _frames(slope[:, :3], field.normal_sys[good])
+    frame = surface_frames(slope[:, :3], field.normal_sys[good])
     per_mm = np.linalg.inv(np.swapaxes(frame, -1, -2) @ slope[:, :3])
     gradient = slope[:, 3:] @ per_mm
     return OnSurface(frame, per_mm, gradient, around[good], strain_of(frame, gradient, options.tensor))
 
 
-def _frames(tangents: Float, towards: Float) -> Float:
+def surface_frames(tangents: Float, towards: Float) -> Float:
     """Frame (n, 3, 2) of the plane of tangents (n, 3, 2), its normal on the side of ``towards`` (n, 3)."""
     normal = np.cross(tangents[..., 0], tangents[..., 1])
     normal = np.where((normal * towards).sum(-1, keepdims=True) < 0.0, -normal, normal)

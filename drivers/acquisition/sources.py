@@ -7,7 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Literal, Protocol
+from typing import Literal, Protocol, TypeVar
 
 from core.errors import CameraError
 from core.names import CAMERAS, CameraName
@@ -16,6 +16,7 @@ from drivers.acquisition.pairing import NumberPairing, Pair, PairingAccount, Tim
 from drivers.acquisition.unit import CameraUnit
 from drivers.cameras.protocol import Frame, FrameStatus
 
+T = TypeVar("T")
 Check = Callable[[], None]
 Units = Mapping[CameraName, CameraUnit]
 
@@ -33,6 +34,12 @@ class PairSource(Protocol):
 
     def next_pair(self, check: Check | None = None) -> Pair:
         """Return a pair exposed after this call; ``check`` may raise while it waits."""
+
+    def newest(self, after: int, check: Check | None = None) -> tuple[int, Pair]:
+        """Return the newest pair with its number among all that came, which is above ``after``; wait for one.
+
+        Pairs between them are passed over. ``check`` may raise while it waits.
+        """
 
     def refresh(self) -> None:
         """Make the units' latest frames new."""
@@ -96,6 +103,10 @@ class TriggeredPairs:
             code="pair_incomplete",
             remedy="Capture again; POST /rig/reconnect if it comes back.",
         )
+
+    def newest(self, after: int, check: Check | None = None) -> tuple[int, Pair]:
+        """See `PairSource`: none comes before it is asked for."""
+        return after + 1, self.next_pair(check)
 
     def refresh(self) -> None:
         """Fire once; a missing pair is no fault here."""
@@ -186,6 +197,7 @@ class StreamedPairs:
             period_ms=1000.0 * max(periods), max_skew_ms=max_skew_ms, common_clock=common_clock(units)
         )
         self._pairs: deque[Pair] = deque(maxlen=_KEPT_PAIRS)
+        self._came = 0
         self._changed = threading.Condition()
         self._ending = False
         self._threads: list[threading.Thread] = []
@@ -211,6 +223,7 @@ class StreamedPairs:
                     pair = self._pairing.feed(cam, frame)
                     if pair is not None:
                         self._pairs.append(pair)
+                        self._came += 1
                         self._changed.notify_all()
         except CameraError:
             pass  # the unit raises the reason to its callers
@@ -229,6 +242,24 @@ class StreamedPairs:
         if self._regular:
             # a frame's time on the host's clock contains the shortest delay of its way, two periods at most
             since += round(2e9 * max(unit.period_s for unit in self._units.values()))
+
+        def begun_since() -> Pair | None:
+            return next((pair for pair in self._pairs if min(_begin(pair.cam1), _begin(pair.cam2)) >= since), None)
+
+        return self._await(begun_since, check)
+
+    def newest(self, after: int, check: Check | None = None) -> tuple[int, Pair]:
+        """See `PairSource`.
+
+        Raises
+        ------
+        CameraError
+            ``no_frames`` when no pair came in time.
+        """
+        return self._await(lambda: (self._came, self._pairs[-1]) if self._came > after else None, check)
+
+    def _await(self, find: Callable[[], T | None], check: Check | None) -> T:
+        """Return what is found among the pairs, as soon as it is there; ``find`` is called with the lock held."""
         limit = self._limit_s()
         deadline = time.monotonic() + limit
         while True:
@@ -237,9 +268,9 @@ class StreamedPairs:
             for unit in self._units.values():
                 _ = unit.reader
             with self._changed:
-                for pair in self._pairs:
-                    if min(_begin(pair.cam1), _begin(pair.cam2)) >= since:
-                        return pair
+                found = find()
+                if found is not None:
+                    return found
                 self._changed.wait(_SLICE_S)
             if time.monotonic() > deadline:
                 raise CameraError(

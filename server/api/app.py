@@ -8,6 +8,7 @@ from typing import Any
 
 from anyio import CapacityLimiter
 from fastapi import FastAPI
+from fastapi.concurrency import run_in_threadpool
 from starlette.types import Lifespan
 
 from server.api.docs import front, openapi, problem_pages
@@ -36,10 +37,12 @@ from server.api.routes.calibrations import exports as calibration_exports
 from server.api.routes.certificates import certificates
 from server.api.routes.rig import cameras, devices, live_check, stage
 from server.api.routes.service import jobs, session, system
-from server.api.routes.tests import channels, frame, metadata, models, recipes, tests, watch, workspace
+from server.api.routes.tests import channels, frame, live, metadata, models, recipes, tests, watch, workspace
 from server.api.routes.tests.trash import router as trash_router
 from server.http.access import KeyFile
+from server.http.line_protocol import LineServer
 from server.workflows.calibration.guided import Guides
+from server.workflows.live.runs import LiveRuns
 from server.workflows.live_check import LiveChecks
 from server.workflows.service import Service
 from server.workflows.watch import Watches
@@ -78,7 +81,10 @@ def create_app(
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        await lines.start()
         yield
+        await lines.close()
+        await run_in_threadpool(live_runs.close)
         audit.close()
         if close_service:
             service.close()
@@ -92,7 +98,11 @@ def create_app(
         requests_per_s=section.requests_per_s,
     )
 
+    live_runs = LiveRuns(service)
+    lines = LineServer(section=service.config.live, runs=live_runs)
     app = bare_app(lifespan)
+    app.state.live_runs = live_runs
+    app.state.lines = lines
     app.state.service = service
     app.state.sessions = sessions
     app.state.watches = Watches(service)
@@ -149,6 +159,7 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         watch,
         channels,
         models,
+        live,
         analyses,
         picking,
         region,

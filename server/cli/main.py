@@ -25,6 +25,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "doctor": ("server.cli.operation.doctor", "check the whole bench: cameras, stage, disk, machine"),
     "rigfile": ("server.cli.operation.rigfile", "check rig files; print every key with its meaning"),
     "simstage": ("server.cli.operation.simstage", "run a simulated motion controller on a socket or pty"),
+    "simframe": ("server.cli.operation.simframe", "run a simulated load frame that pulls the strip of a simulated rig"),
+    "live": ("server.cli.operation.live", "measure a test while it runs: begin, show, stop"),
     "calibrate": ("server.cli.measurement.calibrate", "calibrate a pair of cameras from grid images"),
     "expect": ("server.cli.operation.expect", "predict what a planned measurement will leave uncertain"),
     "channels": ("server.cli.operation.channels", "a load frame's record, aligned with the steps of a test by time"),

@@ -363,6 +363,30 @@ class ServiceSection(_Closed):
         return section
 
 
+class LiveSection(_Closed):
+    """[live]: values of a live measurement for test machines, as lines over TCP."""
+
+    tcp_port: int | None = Field(
+        None, ge=0, le=65535, description="Port of the line protocol; 0: any that is free; left out: it is off."
+    )
+    tcp_host: str = Field(
+        "127.0.0.1",
+        description="Address that it listens at. Without tcp_token whoever reaches it reads the values.",
+        min_length=1,
+        max_length=253,
+    )
+    tcp_token: Annotated[str, Field(pattern=r"^[\x21-\x7e]{8,200}$")] | None = Field(
+        None, description="Word that a client sends first, `SYST:PASS <word>`; needed on another address than loopback."
+    )
+
+    @model_validator(mode="after")
+    def _closed_to_others(self) -> Self:
+        loopback = self.tcp_host in ("127.0.0.1", "localhost", "::1")
+        if self.tcp_port is not None and not loopback and self.tcp_token is None:
+            raise ValueError("tcp_token is needed where tcp_host is not loopback")
+        return self
+
+
 class ComputeSection(_Closed):
     """[compute]: where analyses are computed."""
 
@@ -389,6 +413,7 @@ class RigConfig(_Closed):
     calibration: CalibrationSection
     service: ServiceSection = ServiceSection()
     compute: ComputeSection = ComputeSection()
+    live: LiveSection = LiveSection()
     sim: dict[str, Any] | None = Field(None, description="The simulated world's truth; its own part reads it.")
 
     @model_validator(mode="after")

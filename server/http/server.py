@@ -22,6 +22,7 @@ from server.workflows.service import Service
 _log = logging.getLogger("stereorig.serving")
 _GRACE_S = 3
 _SWEEP_TICKS = 10  # of 0.1 s
+_MAX_MESSAGE = 4096  # bytes: clients of a WebSocket listen, and have nothing to say
 
 
 class OrderlyServer(uvicorn.Server):
@@ -64,7 +65,8 @@ class OrderlyServer(uvicorn.Server):
             uvicorn.Config(
                 app,
                 http=self._keeper.protocol(),
-                ws="none",
+                ws="wsproto",
+                ws_max_size=_MAX_MESSAGE,
                 log_config=None,  # its lines go where all go
                 access_log=False,
                 server_header=False,

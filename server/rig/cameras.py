@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from core.errors import CameraError, StateError
 from core.names import CAMERAS, CameraName
 from drivers.acquisition.pairing import Pair, PairingAccount
-from drivers.acquisition.sources import PairSource
+from drivers.acquisition.sources import PairSource, TriggeredPairs
 from drivers.acquisition.unit import CameraUnit
 from drivers.cameras.protocol import CameraSettings, Frame, Pixels
 from server.config.rig_file import SKEW_PX
@@ -26,6 +26,7 @@ from server.rig.image_speed import ImageMotion, image_motion
 #: where there is nothing older to show, a live view waits this long behind another one or a capture
 _FIRST_FRAME_S = 5.0
 _STALE_DURING_CAPTURE_S = 0.5
+_BEHIND_CAPTURE_S = 0.002
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +63,14 @@ class CapturedPair:
     settings: dict[str, dict[str, float | None]] = field(default_factory=dict)
     frame_counts: dict[str, dict[str, int]] = field(default_factory=dict)
     pair_counts: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class PairMark:
+    """Place of a pair among all that its source made."""
+
+    source: PairSource
+    number: int
 
 
 class _Average:
@@ -174,6 +183,44 @@ class CameraPair:
         if check is not None:
             check()
         return self._source.next_pair(check).require()
+
+    def newest(self, after: PairMark | None, check: Callable[[], None]) -> tuple[PairMark, int, Pair]:
+        """Return the newest pair after the one that the caller has, for measuring; wait for one. Captures come first.
+
+        Parameters
+        ----------
+        after
+            Mark of the last pair that it was given; None for the first.
+        check
+            May raise while it waits.
+
+        Returns
+        -------
+        tuple
+            Its mark, the number of pairs between both that were passed over, and the pair, whatever its skew.
+
+        Raises
+        ------
+        CameraError
+            What the cameras bring up; ``no_frames`` when no pair came in time.
+        """
+        if self.fires:
+            while self._capturing.is_set():
+                check()
+                time.sleep(_BEHIND_CAPTURE_S)
+            with self._lock:
+                source = self._source
+                _, pair = source.newest(0, check)
+            return PairMark(source, 0), 0, pair
+        source = self._source  # streams are shared: a capture and this one take the same pairs
+        last = after.number if after is not None and after.source is source else None
+        number, pair = source.newest(last or 0, check)
+        return PairMark(source, number), 0 if last is None else number - last - 1, pair
+
+    @property
+    def fires(self) -> bool:
+        """True if pairs come when they are asked for alone, by software triggers."""
+        return isinstance(self._source, TriggeredPairs)
 
     def live(self, cam: CameraName, max_age_s: float, after: int | None = None) -> Frame:
         """Return a frame for looking at, at most ``max_age_s`` old where recording allows it.

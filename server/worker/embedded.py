@@ -54,9 +54,14 @@ class ComputeWorker(TaskExecutor):
         ``"module:function"`` that the process calls with ``threads`` before its first task.
     patience_s
         How long a cancelled task may take to stop before its process is ended.
+    lowered
+        Let the process come after other programs.
     """
 
-    def __init__(self, *, threads: int | None = None, warm_up: str | None = None, patience_s: float = 0.5) -> None:
+    def __init__(
+        self, *, threads: int | None = None, warm_up: str | None = None, patience_s: float = 0.5, lowered: bool = True
+    ) -> None:
+        self._lowered = lowered
         self._threads = threads or len(os.sched_getaffinity(0))
         self._warm_up = warm_up
         self._patience_s = patience_s
@@ -172,7 +177,14 @@ class ComputeWorker(TaskExecutor):
         self._cancel = self._context.Event()
         process = self._context.Process(
             target=serve,
-            args=(theirs, self._cancel, self._threads, self._warm_up, logging.getLogger().getEffectiveLevel()),
+            args=(
+                theirs,
+                self._cancel,
+                self._threads,
+                self._warm_up,
+                logging.getLogger().getEffectiveLevel(),
+                self._lowered,
+            ),
             name="stereorig-worker",
             daemon=True,
         )
@@ -280,9 +292,9 @@ class ComputeWorker(TaskExecutor):
         )
 
 
-def make_worker(threads: int | None) -> ComputeWorker:
-    """Make the worker of a service, not yet started."""
-    return ComputeWorker(threads=threads, warm_up="server.worker.tasks:warm_up")
+def make_worker(threads: int | None, *, lowered: bool = True) -> ComputeWorker:
+    """Make the worker of a service, not yet started; one whose answers are waited for is not ``lowered``."""
+    return ComputeWorker(threads=threads, warm_up="server.worker.tasks:warm_up", lowered=lowered)
 
 
 def start_worker(threads: int | None) -> ComputeWorker:

@@ -93,9 +93,14 @@ class LogHandler(logging.Handler):
 
 
 def serve(
-    connection: Connection, cancel: Event, threads: int, warm_up: str | None, log_level: int = logging.WARNING
+    connection: Connection,
+    cancel: Event,
+    threads: int,
+    warm_up: str | None,
+    log_level: int = logging.WARNING,
+    lowered: bool = True,
 ) -> None:
-    """Run tasks from ``connection`` one after another until it closes."""
+    """Run tasks from ``connection`` one after another until it closes; ``lowered`` behind other programs."""
     global _current
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the service's to handle
     faulthandler.enable()  # a fault in compiled code leaves its traceback on the terminal
@@ -120,7 +125,8 @@ def serve(
         except Exception:  # noqa: BLE001 - the first task will report the error to its caller
             _log.exception("warming up failed")
     settle()
-    lower_worker()  # not before: the service waits for it to be ready
+    if lowered:
+        lower_worker()  # not before: the service waits for it to be ready
     send(("ready",))
     while True:
         try:

@@ -249,6 +249,35 @@ class LiveFinding:
     points: int = 0
 
 
+@dataclass(frozen=True, kw_only=True)
+class LiveTask:
+    """A live measurement.
+
+    Parameters
+    ----------
+    calibration, noise
+        Files; no noise models: None.
+    settings
+        As of an analysis.
+    reference
+        Images of the reference step.
+    gauges
+        Each as ``name``, ``kind``, and ``ends_px`` or ``outline``.
+    whole_field
+        Measure and return all points of the region, not only those that gauges need.
+    audit_every
+        Frames between two that have all the checks of a step.
+    """
+
+    calibration: Path
+    settings: StoredSettings
+    reference: StepImages
+    gauges: list[dict[str, Any]]
+    whole_field: bool
+    audit_every: int
+    noise: Path | None = None
+
+
 @dataclass(frozen=True)
 class GuideTask:
     """A guided acquisition.
@@ -298,6 +327,18 @@ def check_live(task: LiveCheckTask) -> LiveFinding:
     """Say how far a live pair's points lie off their epipolar lines."""
     seen: LiveFinding = _measuring("server.compute.live_check").check_live(task)
     return seen
+
+
+def begin_live(task: LiveTask) -> dict[str, Any]:
+    """Measure the reference of a live measurement; frames can follow. Returns where its points lie."""
+    begun: dict[str, Any] = _measuring("server.compute.live.frames").begin(task)
+    return begun
+
+
+def measure_live(pixels: tuple[Any, Any]) -> dict[str, Any]:
+    """Measure a frame of the live measurement that was begun; returns readings and counts of points by status."""
+    found: dict[str, Any] = _heavy("server.compute.live.frames").measure(pixels)
+    return found
 
 
 def look_at_pair(task: GuideTask, pixels: dict[str, Any], serial: int) -> dict[str, Any]:

@@ -40,7 +40,17 @@ class StateCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Yield every figure."""
-        for part in (self._general, self._jobs, self._disk, self._worker, self._readers, self._cameras, self._stage):
+        parts = (
+            self._general,
+            self._jobs,
+            self._disk,
+            self._worker,
+            self._readers,
+            self._live,
+            self._cameras,
+            self._stage,
+        )
+        for part in parts:
             try:
                 yield from part()
             except StereorigError as error:
@@ -84,6 +94,17 @@ class StateCollector(Collector):
         for kind, number in self._service.streams.counts().items():
             readers.add_metric([kind], number)
         yield readers
+
+    def _live(self) -> Iterator[Metric]:
+        run = self._service.live_account
+        if run is None:
+            return
+        account, active = run()
+        yield _gauge("live_running", "1 while a test is measured live.", active)
+        fates = CounterMetricFamily("stereorig_live_frames", "Pairs of the live measurement by fate.", labels=["what"])
+        for name, number in account.items():
+            fates.add_metric([name], number)
+        yield fates
 
     def _cameras(self) -> Iterator[Metric]:
         pair = self._service.rig.pair

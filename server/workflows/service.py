@@ -110,6 +110,10 @@ class Service:
         self.closing = False
         #: held from the reading of a thing to its change, where a client names the state it means
         self.changes = threading.Lock()
+        #: called where streams end: what feeds some of them
+        self.at_streams_end: list[Callable[[], None]] = []
+        #: of the live measurement: its frames by fate, and whether it goes on
+        self.live_account: Callable[[], tuple[dict[str, int], bool]] | None = None
         self.continuing = threading.Lock()
         self._effects = OneEffect(self.catalog)
         self._ended_well = False
@@ -290,6 +294,8 @@ class Service:
         """End live views and event streams, which would otherwise outlast every shutdown."""
         self.closing = True
         self.hub.close()
+        for end in self.at_streams_end:
+            end()
 
     def close(self) -> None:
         """Stop the stage first, then jobs, worker, rig and files; safe to call twice."""

@@ -238,6 +238,23 @@ class AsyncTest:
         file = Path(path)
         return await self._client._run(operations.import_channels(self.id, file.name, file.read_bytes(), options))
 
+    async def live(self, **settings: Any) -> dict[str, Any]:
+        """Begin a live measurement: ``points=[{"name": "p1", "xy_px": [210, 180]}]``, ``extensometers``, ``areas``.
+
+        Takes what the API's ``POST /tests/{id}/live`` does, and returns its state.
+        """
+        return await self._client._run(operations.begin_live(self.id, settings))
+
+    async def live_values(self) -> dict[str, Any]:
+        """Return the newest values of the live measurement: gauges by name, each with ``valid`` and ``values``."""
+        state: dict[str, Any] = await self._client._run(operations.live_state(self.id))
+        values: dict[str, Any] = state["values"]
+        return values
+
+    async def stop_live(self) -> dict[str, Any]:
+        """End the live measurement; return its last state, with the account of its frames."""
+        return await self._client._run(operations.stop_live(self.id))
+
     async def measure(self, request: AnalysisRequest | None = None, **settings: Any) -> AsyncAnalysis:
         """Do as :meth:`Test.measure`."""
         body = request_of(AnalysisRequest, request, settings)

@@ -265,6 +265,29 @@ def import_channels(test_id: str, name: str, content: bytes, options: Mapping[st
     return _read(answer, ChannelsImported)
 
 
+def begin_live(test_id: str, body: Mapping[str, Any]) -> Operation[dict[str, Any]]:
+    """Begin a live measurement; return its state."""
+    answer = yield Ask("POST", f"/tests/{test_id}/live", json=dict(body), key=uuid4().hex)
+    return _plain(answer)
+
+
+def live_state(test_id: str) -> Operation[dict[str, Any]]:
+    """Return the state of a live measurement, with its newest values."""
+    answer = yield Ask("GET", f"/tests/{test_id}/live")
+    return _plain(answer)
+
+
+def stop_live(test_id: str) -> Operation[dict[str, Any]]:
+    """End a live measurement; return its last state."""
+    answer = yield Ask("POST", f"/tests/{test_id}/live:stop")
+    return _plain(answer)
+
+
+def _plain(answer: httpx.Response) -> dict[str, Any]:
+    found: dict[str, Any] = answer.json()
+    return found
+
+
 def measure(test_id: str, request: AnalysisRequest, on_progress: OnProgress | None) -> Operation[str]:
     """Measure a test's steps; return the analysis' id once it has ended, of one that follows at once."""
     begun = yield from _posted(f"/tests/{test_id}/analyses", request, AnalysisAccepted)

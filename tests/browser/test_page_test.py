@@ -428,3 +428,29 @@ def test_a_test_without_calibration_is_given_one_at_its_head(
     shown.get_by_role("button", name="Save", exact=True).click()
     expect(shown.get_by_role("heading", name="renamed")).to_be_visible()
     page.sound()
+
+
+def test_a_test_is_measured_live_and_its_curves_are_drawn(page: Watched, client: httpx.Client, plate: str) -> None:
+    client.put(f"{API}/sim/scene", json={"scene": "plate", "load": 0.0}).raise_for_status()
+    shown = page.open(f"#/test/{plate}")
+    panel = shown.get_by_role("region", name="Live values")
+    panel.get_by_role("button", name="Measure live").click()
+    expect(panel.locator('[data-role="live-values"] tr', has_text="e1")).to_contain_text("±", timeout=SLOW)
+    expect(
+        panel.locator('[data-role="live-curves"]').get_by_role("img", name="Live curves of the gauges")
+    ).to_be_visible(timeout=SLOW)
+    # a channel whose readings are posted is there to be chosen
+    number = client.get(f"{API}/tests/{plate}/live").json()["values"]["number"]
+    client.post(
+        f"{API}/tests/{plate}/live/channels", json={"readings": [{"time_s": 0.0, "channels": {"force_n": 1.0}}]}
+    ).raise_for_status()
+    against = panel.get_by_label("Against")
+    expect(against.locator("option", has_text="force_n")).to_have_count(1, timeout=SLOW)
+    # the switch, and the screen opened again while it goes on
+    shown = page.open("#/test")
+    shown = page.open(f"#/test/{plate}")
+    panel = shown.get_by_role("region", name="Live values")
+    expect(panel.get_by_role("button", name="Measure live")).to_be_hidden()
+    panel.get_by_role("button", name="Stop").click()
+    expect(panel.locator('[data-role="live-state"]')).to_contain_text("ended", timeout=SLOW)
+    assert client.get(f"{API}/tests/{plate}/live").json()["values"]["number"] >= number

@@ -190,6 +190,24 @@ def neighbour_disagreement(
     return difference.reshape(scale.shape) * scale, spread.reshape(scale.shape) * scale, count.reshape(n)
 
 
+def check_neighbours(
+    points: PointFits,
+    pair: StereoPair,
+    shape: tuple[int, int],
+    rays: Float,
+    options: ValidityOptions,
+    visibility: Visibility | None,
+) -> int:
+    """Reject points that disagree with their neighbours' patches; return their number.
+
+    Parameters
+    ----------
+    points, pair, shape, rays, options, visibility
+        As in :func:`apply_validity_checks`, of which this is one check.
+    """
+    return _check_neighbours(points, pair, shape, rays, options, visibility, few=int(points.ok.sum()) < _FEW)
+
+
 def _check_neighbours(
     points: PointFits,
     pair: StereoPair,

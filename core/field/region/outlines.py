@@ -55,6 +55,13 @@ def lay_outlines(outlines: list[Outline], spacing_px: int) -> PointGrid:
     return grid.only(inside)
 
 
+def points_inside(outline: Outline, x_px: Float, y_px: Float) -> Bool:
+    """Return (r, c) True for the points of a grid that lie in an outline or on its border."""
+    everywhere = np.ones(x_px.shape, bool)
+    box = (float(x_px.min()), float(y_px.min()), float(x_px.max()), float(y_px.max()))
+    return _inside(outline, PointGrid(x_px, y_px, everywhere, 1.0, box))
+
+
 def _box(outline: Outline) -> tuple[float, float, float, float]:
     if outline.rectangle is not None:
         x0, y0, x1, y1 = outline.rectangle

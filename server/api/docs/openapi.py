@@ -26,6 +26,7 @@ _TAGS = {
     "stage": "Positions of the axes, moves, homing, stop.",
     "noise": "The cameras' noise, measured.",
     "calibrations": "Calibrations: made on the rig, or imported.",
+    "live": "Measurement while a test runs: newest values, streams, channels beside it.",
     "tests": "Tests and their load steps.",
     "analyses": "Shape and displacement, computed over a test's steps.",
     "certificates": "Verification certificates of the measuring system.",

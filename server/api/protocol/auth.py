@@ -12,9 +12,11 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 
+from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from core.errors import StereorigError
+from server.api.protocol.guard import refuse_socket
 from server.api.protocol.problems import problem_response
 from server.http.access import KeyFile, Person, Role
 
@@ -127,14 +129,18 @@ class Door:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Check, then pass on."""
-        if scope["type"] != "http":
+        if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
         refusal = self._refuse(scope)
+        if refusal is not None and scope["type"] == "websocket":
+            await refuse_socket(refusal, scope, send)
+            return
         await (self._app if refusal is None else refusal)(scope, receive, send)
 
-    def _refuse(self, scope: Scope) -> ASGIApp | None:
-        path, method = scope["path"], scope["method"]
+    def _refuse(self, scope: Scope) -> Response | None:
+        # a WebSocket begins as a reading, and only hands out
+        path, method = scope["path"], scope.get("method", "GET")
         client = (scope.get("client") or ("unknown", 0))[0]
         if scope.get("state", {}).get("crowded") and path not in _HALTS:
             return _crowded()
@@ -176,12 +182,12 @@ class Door:
         return None
 
 
-def _unknown(code: str, cause: str) -> ASGIApp:
+def _unknown(code: str, cause: str) -> Response:
     remedy = "Send 'Authorization: Bearer KEY' with a key made by 'stereorig keys add'."
     return problem_response(401, code, cause, remedy, headers={"WWW-Authenticate": "Bearer"})
 
 
-def _too_many(wait_s: float) -> ASGIApp:
+def _too_many(wait_s: float) -> Response:
     wait = {"Retry-After": str(max(1, math.ceil(wait_s)))}
     return problem_response(
         429,
@@ -192,7 +198,7 @@ def _too_many(wait_s: float) -> ASGIApp:
     )
 
 
-def _crowded() -> ASGIApp:
+def _crowded() -> Response:
     return problem_response(
         503,
         "too_many_connections",

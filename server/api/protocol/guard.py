@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from server.api.protocol.problems import problem_response
@@ -13,6 +14,7 @@ from server.base.errors import TooLargeError
 LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 BODY_LIMIT = 32 * 2**20
 UPLOAD_LIMIT = 1024 * 2**20
+_POLICY_VIOLATION = 1008
 
 
 #: a scheme only where it is an origin; a name or an address, and a port: nothing that two readers may read in two ways
@@ -37,6 +39,21 @@ def _reads_from_another_site(method: str, headers: Mapping[bytes, str]) -> bool:
     return not (followed and method in {"GET", "HEAD"})
 
 
+async def refuse_socket(response: Response, scope: Scope, send: Send) -> None:
+    """Answer a WebSocket's opening with a response instead, before it is accepted."""
+    if "websocket.http.response" not in scope.get("extensions", {}):
+        await send({"type": "websocket.close", "code": _POLICY_VIOLATION})
+        return
+
+    async def renamed(message: Message) -> None:
+        await send({**message, "type": f"websocket.{message['type']}"})
+
+    async def nothing() -> Message:
+        return {"type": "http.disconnect"}
+
+    await response({**scope, "type": "http", "method": "GET"}, nothing, renamed)
+
+
 class Guard:
     """Refuse requests that come by a foreign name or from a foreign page, and bodies without end.
 
@@ -50,31 +67,20 @@ class Guard:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Check, then pass on."""
+        if scope["type"] == "websocket":
+            refusal = self._refuse({k.lower(): v.decode("latin-1") for k, v in scope["headers"]}, "GET")
+            if refusal is not None:
+                await refuse_socket(refusal, scope, send)
+            else:
+                await self._app(scope, receive, send)
+            return
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
         headers = {k.lower(): v.decode("latin-1") for k, v in scope["headers"]}
-        for header, code in ((b"host", "foreign_host"), (b"origin", "foreign_origin")):
-            value = headers.get(header)
-            if value is None and header == b"origin":
-                continue
-            if value is None or host_name(value) not in self._allowed:
-                response = problem_response(
-                    403,
-                    code,
-                    f"Requests with this {header.decode().title()} are not served.",
-                    "Use the address that the service printed when it started.",
-                )
-                await response(scope, receive, send)
-                return
-        if _reads_from_another_site(scope["method"], headers):
-            response = problem_response(
-                403,
-                "foreign_site",
-                "A page of another site asked for this.",
-                "Open it in a tab of its own, or add that site's host to `allowed_hosts` and fetch with CORS.",
-            )
-            await response(scope, receive, send)
+        refusal = self._refuse(headers, scope["method"])
+        if refusal is not None:
+            await refusal(scope, receive, send)
             return
         if b"transfer-encoding" in headers and b"content-length" in headers:
             # two lengths: a proxy in front may believe the other one, and see another request than we do
@@ -94,6 +100,28 @@ class Guard:
             await response(scope, receive, send)
             return
         await _counted(self._app, limit, scope, receive, send)
+
+    def _refuse(self, headers: Mapping[bytes, str], method: str) -> Response | None:
+        """Return the answer to who comes by a foreign name or from a foreign page; None for all others."""
+        for header, code in ((b"host", "foreign_host"), (b"origin", "foreign_origin")):
+            value = headers.get(header)
+            if value is None and header == b"origin":
+                continue
+            if value is None or host_name(value) not in self._allowed:
+                return problem_response(
+                    403,
+                    code,
+                    f"Requests with this {header.decode().title()} are not served.",
+                    "Use the address that the service printed when it started.",
+                )
+        if _reads_from_another_site(method, headers):
+            return problem_response(
+                403,
+                "foreign_site",
+                "A page of another site asked for this.",
+                "Open it in a tab of its own, or add that site's host to `allowed_hosts` and fetch with CORS.",
+            )
+        return None
 
 
 async def _counted(app: ASGIApp, limit: int, scope: Scope, receive: Receive, send: Send) -> None:

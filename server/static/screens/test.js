@@ -3,6 +3,7 @@ import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
 import { readTest } from "../lib/steps.js";
 import { stepsPanel } from "./test/steps.js";
+import { liveValuesPanel } from "./test/live_values.js";
 import { metadataPanel } from "./test/metadata.js";
 import { measurePanel } from "./test/measure.js";
 import { warningsCell } from "./results/warnings.js";
@@ -123,6 +124,7 @@ async function one(root, id) {
   }
   const title = h("h1", test.name);
   const steps = await stepsPanel(id, test, ends, async () => { test = await readTest(id); return test; });
+  const liveValues = await liveValuesPanel(id, ends);
   const measure = await measurePanel(id, test, ends, async () => { test = await readTest(id); drawAnalyses(); });
   steps.onchange((/** @type {typeof test} */ fresh) => { test = fresh; measure.steps(fresh); });
   drawHead();
@@ -137,6 +139,6 @@ async function one(root, id) {
     }),
     () => clearTimeout(later),
   );
-  replace(root, h("div.spread", title, measure.head, h("a", { href: "#/test" }, "All tests")), h("div.grid", head, steps.root, measure.root, analyses));
+  replace(root, h("div.spread", title, measure.head, h("a", { href: "#/test" }, "All tests")), h("div.grid", head, steps.root, measure.root, liveValues, analyses));
   return () => ends.forEach((end) => end());
 }

@@ -1,0 +1,314 @@
+"""The measurement of frames as they come, each from the motion of those before it.
+
+A frame is followed: every point starts from its last two frames' values and takes one fit, most of them one iteration,
+and the checks of single points and of neighbours. What takes longer and changes slowly is measured as a step of a
+sequence is (:class:`core.field.sequence.reference_steps.Updating`), with all its checks: the first frame, every
+``audit_every``-th, a frame whose points were lost, and while some are lost every ``retry_every``-th. What that finds
+of the residuals, the points' standard deviations over those of a fit by itself, holds for the frames that follow it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from core.arrays import Bool, Float
+from core.calibration.volume import CalibratedVolume
+from core.cameras.stereo import StereoPair
+from core.common.factor import ParameterCovariance
+from core.errors import InputError, MeasurementError
+from core.field.checks.extrapolated import mark_extrapolated
+from core.field.checks.validity import check_neighbours
+from core.field.common import CommonParts
+from core.field.growth.grow import fit_in_batches
+from core.field.growth.state import SAMPLE_FAR_PX, prepare
+from core.field.points.assemble import assemble
+from core.field.points.images import MeasureImage
+from core.field.points.result import Field
+from core.field.region.find_visible import with_visibility
+from core.field.region.region import PointGrid
+from core.field.settings import MeasureOptions
+from core.live.gauges import GaugeReadings, GaugeSet, LiveGauge
+from core.matching.image import ImageData
+from core.measure import PreviousStep, ReferencePair, Updating
+from core.noise import NoiseModel
+from core.settings import DEFAULT_REFERENCE_UPDATE, ReferenceUpdate
+from core.status import PointStatus
+from core.threads import run_ranges
+
+Image = np.ndarray | ImageData | MeasureImage
+
+_MAY_BE_LOST = 0.02  # of the points: a frame that loses more is measured anew, as a step
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveOptions:
+    """How a live measurement goes on.
+
+    Attributes
+    ----------
+    audit_every
+        Frames from one that has all the checks of a step to the next.
+    retry_every
+        The same while points of the reference are lost, which come back in such a frame.
+    whole_field
+        Measure all points of the region; False: those that the gauges need.
+    """
+
+    audit_every: int = 500
+    retry_every: int = 25
+    whole_field: bool = False
+
+    def __post_init__(self) -> None:
+        for name, value in (("audit_every", self.audit_every), ("retry_every", self.retry_every)):
+            if value < 1:
+                raise InputError(f"{name} is {value}, it must be 1 or more.", code="option_out_of_range")
+
+
+@dataclass(frozen=True, eq=False)
+class LiveFrame:
+    """What one frame showed.
+
+    Attributes
+    ----------
+    number
+        Of the measured frame, from 1.
+    how
+        ``followed`` from the frames before, or ``step``: measured as a step of a sequence is, with all its checks.
+    field
+        The points; those outside the calibrated volume are marked, and points that the gauges use have the
+        calibration's common factor.
+    readings
+        Of each gauge, by name.
+    """
+
+    number: int
+    how: Literal["followed", "step"]
+    field: Field
+    readings: Mapping[str, GaugeReadings]
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    """What the next frame starts from."""
+
+    number: int
+    images: tuple[MeasureImage, MeasureImage]
+    field: Field
+    before: Field | None  # the frame before it, for the velocity
+    ratio: Float  # (r, c, 6) standard deviations with all checks over a fit's own
+    rate: Float  # convergence rates of the fit
+    since_audit: int
+
+
+@dataclass(eq=False)
+class LiveMeasurement:
+    """Measures the frames of a test as they come.
+
+    Parameters
+    ----------
+    reference
+        The reference pair's images and the calibrated cameras.
+    grid, options
+        Points and settings, as of an analysis.
+    gauges
+        What is read in each frame.
+    live
+        How it goes on.
+    reference_update
+        As of a sequence; a frame that is matched against a later reference is measured as a step, each time.
+    noise
+        Models of both cameras' single frames; those of the reference are in its images.
+    source
+        Covariance of the cameras' parameters, where it is known.
+    volume
+        The calibrated volume, where it is known.
+
+    Raises
+    ------
+    MeasurementError, RegionError, ImageError
+        As :func:`core.measure.measure_shape`; ``gauge_outside``.
+    """
+
+    reference: ReferencePair
+    grid: PointGrid
+    options: MeasureOptions
+    gauges: Sequence[LiveGauge]
+    live: LiveOptions = field(default_factory=LiveOptions)
+    reference_update: ReferenceUpdate = DEFAULT_REFERENCE_UPDATE
+    noise: tuple[NoiseModel | None, NoiseModel | None] = (None, None)
+    source: ParameterCovariance | None = None
+    volume: CalibratedVolume | None = None
+
+    def __post_init__(self) -> None:
+        self.grid = with_visibility(self.grid, self.options.subset_px)
+        whole = self.reference.shape(self.grid, self.options)
+        self._set = GaugeSet(self.gauges, self.options.subset_px, whole)
+        needed = self._set.needed(self.grid.spacing_px)
+        if self.live.whole_field or not self.gauges:
+            needed = np.ones(whole.shape, bool)
+        self.shape = _masked(whole, needed)
+        self._set.shape = self.shape
+        self._common = CommonParts(self.pair, self.source)
+        self._kept: _Kept | None = None
+        self._earlier: dict[int, tuple[tuple[MeasureImage, MeasureImage], Field]] = {}
+        self._count = 0
+        self._updating = Updating(
+            self.pair,
+            (self.reference.image1, self.reference.image2),
+            self.shape,
+            self.grid,
+            self.options,
+            mode=self.reference_update,
+            images_of=lambda n: self._earlier_frame(n)[0],
+            field_of=lambda n: self._earlier_frame(n)[1],
+        )
+
+    @property
+    def pair(self) -> StereoPair:
+        """The calibrated cameras."""
+        return self.reference.pair
+
+    def measure(self, image1: Image, image2: Image) -> LiveFrame:
+        """Measure a frame; one that raises leaves the measurement as it was.
+
+        Parameters
+        ----------
+        image1, image2
+            (rows, cols) camera 1's and camera 2's image.
+
+        Raises
+        ------
+        ImageError
+            The images cannot be used: ``image_blank``, ``same_image``, ``stale_image``, ``image_size_mismatch``.
+        SeedError, MeasurementError
+            Nothing of the surface was found.
+        """
+        images = self._prepared(image1, image2)
+        kept = self._kept
+        frame = None if kept is None or self._is_due(kept) else self._follow(images, kept)
+        how: Literal["followed", "step"] = "followed"
+        if frame is None:
+            how, frame = "step", self._as_step(images)
+        self._keep(frame)
+        shown = mark_extrapolated(frame.field, self.volume)
+        used = self._set.used(shown)
+        if self.source is not None and used.any():
+            shown = self._with_common(shown, used)
+        return LiveFrame(frame.number, how, shown, self._set.read(shown))
+
+    def _prepared(self, image1: Image, image2: Image) -> tuple[MeasureImage, MeasureImage]:
+        images = tuple(
+            MeasureImage(image, f"camera {k + 1}'s frame", noise=self.noise[k])
+            for k, image in enumerate((image1, image2))
+        )
+
+        def prepare_some(first: int, last: int) -> None:
+            for k in range(first, last):
+                images[k].prepared(self.options.interpolation, self.options.noise[k], self.options.blur)
+
+        run_ranges(prepare_some, 2, 1)
+        return images[0], images[1]
+
+    def _is_due(self, kept: _Kept) -> bool:
+        """Return True for a frame that is to have all checks, or cannot be followed."""
+        if self.reference_update == "always" or kept.field.references is not None or kept.field.starts is None:
+            return True
+        lost = bool((self.shape.valid & ~kept.field.valid).any())
+        every = min(self.live.retry_every, self.live.audit_every) if lost else self.live.audit_every
+        return kept.since_audit + 1 >= every
+
+    def _follow(self, images: tuple[MeasureImage, MeasureImage], kept: _Kept) -> _Kept | None:
+        """Measure a frame from those before it; None where points that were there are lost."""
+        field, rate = self._fitted(images, kept.field, kept.before, kept.rate)
+        had = kept.field.valid
+        lost = int((had & ~field.valid & (field.status != PointStatus.OUTSIDE_IMAGE)).sum())
+        if lost > _MAY_BE_LOST * had.sum() or not field.valid.any():
+            return None
+        covariance = field.covariance * kept.ratio[..., :, None] * kept.ratio[..., None, :]
+        return _Kept(
+            number=self._count + 1,
+            images=images,
+            field=replace(field, covariance=covariance),
+            before=kept.field,
+            ratio=kept.ratio,
+            rate=kept.rate if len(kept.rate) else rate,
+            since_audit=kept.since_audit + 1,
+        )
+
+    def _as_step(self, images: tuple[MeasureImage, MeasureImage]) -> _Kept:
+        """Measure a frame as a step of a sequence is."""
+        kept, number = self._kept, self._count + 1
+        previous = None if kept is None else PreviousStep(kept.number, kept.field)
+        field = self._updating.measure(images, previous)
+        if not field.valid.any():
+            raise MeasurementError(
+                "No point of the frame could be measured.",
+                code="nothing_measured",
+                remedy="Check that both cameras see the surface, and that nothing hides it.",
+            )
+        ratio = np.ones((*field.shape, 6))
+        if field.references is None and field.starts is not None:
+            own = self._fitted(images, field, None, np.zeros(0))[0]
+            there = field.valid & own.valid
+            with_checks, alone = (np.diagonal(f.covariance[there], axis1=1, axis2=2) for f in (field, own))
+            ratio[there] = np.sqrt(with_checks / alone)
+        return _Kept(number, images, field, None, ratio, np.zeros(0), 0)
+
+    def _fitted(
+        self, images: tuple[MeasureImage, MeasureImage], previous: Field, before: Field | None, rate: Float
+    ) -> tuple[Field, Float]:
+        """Return the field of one fit of every valid point from its values before, and the fit's convergence rates."""
+        assert previous.starts is not None
+        assert previous.starts.G is not None
+        reference = self.reference.image1, self.reference.image2
+        inputs = prepare(self.pair, reference, images, self.grid, self.options).on_shape(self.shape, previous)
+        n, terms = len(inputs.xy_px), previous.starts.w.shape[-1]
+        w, G = previous.starts.w.reshape(n, terms), previous.starts.G.reshape(n, 3, terms)
+        if before is not None and before.starts is not None and before.starts.G is not None:
+            was = before.starts.G.reshape(n, 3, -1)
+            if was.shape == G.shape:
+                G = np.where(np.isfinite(was), 2.0 * G - was, G)
+        fitter = (inputs.matcher.curved() if terms == 6 else inputs.matcher).converging(rate)
+        points = fitter.empty(n)
+        points.status[:] = previous.status.ravel()
+        index = np.flatnonzero(inputs.usable & previous.valid.ravel())
+        fit_in_batches(fitter, points, index, inputs.xy_px, w[index], G[index], far_px=SAMPLE_FAR_PX)
+        check_neighbours(points, inputs.pair, inputs.grid.shape, inputs.rays, self.options.validity, inputs.visibility)
+        field = assemble(
+            points,
+            pair=self.pair,
+            grid=inputs.grid,
+            fits_image=inputs.fits_image,
+            shape=self.shape,
+            patch=previous.patch,
+        )
+        return field, points.rate[np.isfinite(points.rate)]
+
+    def _keep(self, frame: _Kept) -> None:
+        references = frame.field.references
+        there = {frame.number: (frame.images, frame.field)}
+        if references is not None:
+            wanted = {references.step, *np.unique(references.steps).tolist()}
+            there |= {n: earlier for n, earlier in self._earlier.items() if n in wanted}
+        self._earlier, self._kept, self._count = there, frame, frame.number
+
+    def _earlier_frame(self, n: int) -> tuple[tuple[MeasureImage, MeasureImage], Field]:
+        if n not in self._earlier:
+            raise MeasurementError(
+                f"Frame {n} is not kept any more.", code="frame_gone", remedy="Begin the live measurement again."
+            )
+        return self._earlier[n]
+
+    def _with_common(self, shown: Field, used: Bool) -> Field:
+        """Return the field with the common factor of the points that gauges use."""
+        found = self._common.of(_masked(shown, used))
+        return replace(shown, common=found.common, causes=found.causes)
+
+
+def _masked(field: Field, left: Bool) -> Field:
+    """Return the field with the points ``left`` (r, c) alone; the others count as outside the region."""
+    return replace(field, status=np.where(left, field.status, np.int8(PointStatus.MASKED)))

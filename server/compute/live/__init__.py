@@ -1,0 +1,1 @@
+"""The live measurement's side of the worker."""

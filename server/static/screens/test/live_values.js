@@ -1,0 +1,185 @@
+// A test measured while it runs: a switch, the newest values of its gauges, and their curves against time or a channel.
+import * as api from "../../lib/api.js";
+import { chart } from "../../widgets/plots.js";
+import { amount, uncertain } from "../../lib/units.js";
+import { h, action, badge, field, notify, problemText, replace, select, table } from "../../lib/dom.js";
+
+/** @import { Ends } from "#dom" */
+/** @import { Body, Model, Reply } from "#routes" */
+/** @typedef {Reply<"get", "/tests/{test_id}/live">} Live */
+/** @typedef {Model<"LiveValues">} Values */
+
+const DRAW_MS = 100; // ten pictures a second are enough for eyes
+const KEPT = 3000;
+const CHANNELS_MS = 1000;
+const SHOWN = { extensometer: "strain", area: "eyy", point: "w_mm" };
+const UNITS = { extensometer: "1", area: "1", point: "mm" };
+const KINDS = /** @type {const} */ (["extensometer", "area", "point"]);
+const WORDS = { extensometer: "extensometers: strain", area: "areas: εyy", point: "points: W" };
+
+/**
+ * The gauges that are drawn for a test, as a live measurement takes them.
+ * @param {Reply<"get", "/tests/{test_id}/workspace">} drawn
+ * @returns {Body<"post", "/tests/{test_id}/live">}
+ */
+export function liveGauges(drawn) {
+  // of a union of forms: what is left out is an empty list
+  const gauges = /** @type {any} */ (drawn.gauges);
+  /** @type {any} */
+  const found = { points: [], extensometers: [], areas: [] };
+  for (const one of gauges?.points ?? []) if (one.xy_px) found.points.push({ name: one.name, xy_px: one.xy_px });
+  for (const one of gauges?.extensometers ?? []) if (one.a_px && one.b_px) found.extensometers.push({ name: one.name, a_px: one.a_px, b_px: one.b_px });
+  for (const one of gauges?.areas ?? []) {
+    if (one.rectangle_px) found.areas.push({ name: one.name, rectangle: one.rectangle_px });
+    else if (one.polygon_px) found.areas.push({ name: one.name, polygon: one.polygon_px });
+  }
+  return found;
+}
+
+/**
+ * A vertical extensometer over the middle third of camera 1's image, where none is drawn.
+ * @param {number[]} size
+ * @returns {Body<"post", "/tests/{test_id}/live">}
+ */
+const middle = ([width, height]) => ({ extensometers: [{ name: "e1", a_px: [Math.round(width / 2), Math.round(height / 3)], b_px: [Math.round(width / 2), Math.round((2 * height) / 3)] }] });
+
+/**
+ * @param {string} testId
+ * @param {Ends} ends
+ */
+export async function liveValuesPanel(testId, ends) {
+  const state = h("span", { role: "status", "data-role": "live-state" });
+  const said = h("div");
+  const values = h("div", { "data-role": "live-values" });
+  const curves = h("div", { "data-role": "live-curves" });
+  const kind = select(KINDS.map((name) => [name, WORDS[name]]), "extensometer");
+  const against = select([["time", "time (s)"]], "time");
+  const start = action("Measure live", begin, { kind: "primary" });
+  const stop = action("Stop", end);
+  /** @type {{ number: number, time_s: number, values: Record<string, Record<string, number>> }[]} */
+  let moments = [];
+  /** @type {Map<number, Record<string, number>>} channels at the exposure, by frame */
+  const channels = new Map();
+  /** @type {EventSource | null} */
+  let source = null;
+  /** @type {Values | null} */
+  let newest = null;
+  /** @type {Awaited<ReturnType<typeof chart>> | null} */
+  let plot = null;
+  let plotted = "";
+  let drawing = false;
+  let later = 0;
+  let asking = 0;
+
+  async function begin() {
+    const body = /** @type {any} */ (liveGauges(await api.get(`/tests/${testId}/workspace`)));
+    const none = !(body.points?.length || body.extensometers?.length || body.areas?.length);
+    const size = (await api.get("/rig")).cameras.cam1.nominal.image_size_px;
+    take(await api.post(`/tests/${testId}/live`, { ...(none ? middle(size) : body), silence_ms: 1000 }));
+    if (none) notify("No gauge is drawn for this test (Results, Gauges): an extensometer over the middle of the image is read.");
+  }
+  async function end() {
+    take(await api.post(`/tests/${testId}/live:stop`));
+  }
+
+  /** @param {Live} live */
+  function take(live) {
+    const on = live.state === "starting" || live.state === "running";
+    start.hidden = on;
+    stop.hidden = !on;
+    replace(said, live.problem ? problemText(live.problem) : null);
+    newest = live.values;
+    if (on && !source) follow();
+    if (!on) close();
+    draw(live.state);
+  }
+  function close() {
+    source?.close();
+    source = null;
+    clearInterval(asking);
+  }
+  function follow() {
+    moments = [];
+    channels.clear();
+    source = new EventSource(api.address(`/tests/${testId}/live/events`));
+    source.addEventListener("values", (event) => {
+      /** @type {Values} */
+      const now = JSON.parse(event.data);
+      newest = now;
+      if (now.valid && typeof now.time_s === "number" && now.number > (moments.at(-1)?.number ?? 0)) {
+        moments.push({ number: now.number, time_s: now.time_s, values: Object.fromEntries(Object.entries(now.gauges).map(([name, gauge]) =>
+          [name, Object.fromEntries(Object.entries(gauge.values).map(([quantity, number]) => [quantity, number.value]))])) });
+        if (moments.length > KEPT) channels.delete(/** @type {{ number: number }} */ (moments.shift()).number);
+      }
+      if (!later) later = window.setTimeout(() => { later = 0; draw(now.valid ? "running" : now.reason); }, DRAW_MS);
+    });
+    source.addEventListener("error", () => look().catch(() => {})); // it ended, or the service did
+    asking = window.setInterval(() => askChannels().catch(() => {}), CHANNELS_MS);
+  }
+  async function askChannels() {
+    const known = Object.keys((await api.get(`/tests/${testId}/live`)).channels);
+    if (known.length + 1 !== against.options.length) {
+      const chosen = against.value;
+      replace(against, ["time", ...known].map((name) => h("option", { value: name, selected: name === chosen }, name === "time" ? "time (s)" : name)));
+    }
+    if (against.value === "time") return;
+    // the last ones again: readings come after the frames that they belong to
+    const { frames } = await api.get(`/tests/${testId}/live/history`, { after: Math.max(0, (moments.at(-1)?.number ?? 0) - 500), limit: 1000 });
+    for (const frame of frames) channels.set(frame.number, frame.channels);
+  }
+  async function look() {
+    try {
+      take(await api.get(`/tests/${testId}/live`));
+    } catch (error) {
+      if (!(error instanceof api.Problem) || error.status !== 404) throw error;
+      start.hidden = false;
+      stop.hidden = true;
+      close();
+    }
+  }
+
+  /** @param {string} word */
+  function draw(word) {
+    const good = word === "running";
+    replace(state, badge(good ? "live" : word, good ? "good" : word === "ended" ? "" : "warning"), newest?.number ? ` frame ${newest.number}` : "");
+    const rows = Object.entries(newest?.gauges ?? {}).map(([name, gauge]) => ({ name, gauge, number: gauge.values[SHOWN[gauge.kind]] }));
+    replace(values, rows.length ? table([
+      ["Gauge", (row) => row.name], ["Quantity", (row) => WORDS[row.gauge.kind].split(": ")[1]],
+      ["Value", (row) => (row.number ? (row.number.u === null ? amount(row.number.value, row.number.units) : uncertain(row.number.value, row.number.u, row.number.units)) : `not valid: ${row.gauge.reason}`)],
+    ], rows, { caption: "Newest values, ± standard uncertainty" }) : null);
+    if (!drawing) drawCurves().catch(notify);
+  }
+  async function drawCurves() {
+    drawing = true;
+    try {
+      const wanted = /** @type {keyof typeof SHOWN} */ (kind.value);
+      const names = Object.entries(newest?.gauges ?? {}).filter(([, gauge]) => gauge.kind === wanted).map(([name]) => name);
+      if (!names.length || !moments.length) return;
+      const zero = moments[0].time_s;
+      const at = against.value;
+      const points = moments.flatMap((moment) => {
+        const x = at === "time" ? moment.time_s - zero : channels.get(moment.number)?.[at];
+        return x === undefined ? [] : [{ x, moment }];
+      }).toSorted((a, b) => a.x - b.x);
+      const data = /** @type {any} */ ([points.map((one) => one.x), ...names.map((name) => points.map(({ moment }) => moment.values[name]?.[SHOWN[wanted]] ?? null))]);
+      const key = JSON.stringify([wanted, names, at]);
+      if (key === plotted && plot) {
+        plot.set(data);
+        return;
+      }
+      plot?.close();
+      const unit = UNITS[wanted] === "mm" ? " (mm)" : "";
+      plot = await chart(curves, { x: at === "time" ? "time (s)" : at, y: `${WORDS[wanted].split(": ")[1]}${unit}`, height: 260, data, series: names.map((name) => ({ label: name })), label: "Live curves of the gauges" });
+      plotted = key;
+    } finally {
+      drawing = false;
+    }
+  }
+  kind.addEventListener("change", () => drawCurves().catch(notify));
+  against.addEventListener("change", () => askChannels().then(drawCurves).catch(notify));
+  await look();
+  ends.push(() => { close(); clearTimeout(later); plot?.close(); });
+  return h("section.panel", { "aria-label": "Live values" }, h("div.spread", h("h2", "Live values"), state),
+    h("p.quiet", "Each frame is measured as it comes, and not stored; captures and analyses go on beside it."),
+    h("div.row", start, stop, field("Show", kind), field("Against", against)), said, values, curves);
+}

@@ -1,0 +1,317 @@
+"""One live measurement: a thread takes the newest pair, a thread has it measured, a third watches for silence.
+
+Between the first two lies one slot: a pair that is not measured when the next one comes is skipped. The computation is
+a process of its own, so that analyses and captures go on beside it.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Mapping
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+from core.errors import StereorigError
+from core.live.gauges import UNITS
+from core.names import CAMERAS
+from drivers.acquisition.pairing import Pair
+from server.base.models import utc_text
+from server.base.problem import JobProblem, problem_of
+from server.jobs.events import EventHub
+from server.rig import Rig
+from server.rig.cameras import PairMark
+from server.worker.embedded import make_worker
+from server.worker.executor import WorkerDiedError
+from server.worker.tasks import LiveTask, begin_live, measure_live
+from server.workflows.live.account import Account
+from server.workflows.live.series import LiveSeries, Moment
+
+_log = logging.getLogger("stereorig.live")
+
+_KEPT_EVENTS = 100
+_PAUSE_S = 0.02  # after an error without a frame
+_WATCH_S = 0.01
+_BEGIN_S = 600.0
+_FRAME_S = 30.0
+
+
+class _Ended(Exception):
+    """The live measurement was stopped."""
+
+
+class LiveRun:
+    """One live measurement of a test.
+
+    Parameters
+    ----------
+    test_id
+        The test.
+    task
+        What is measured.
+    settings
+        As they were asked for, for the state.
+    rig
+        Gives the pairs.
+    threads
+        Kernel threads of its process.
+    silence_s
+        Values older than this are no longer valid.
+    """
+
+    def __init__(
+        self,
+        test_id: str,
+        task: LiveTask,
+        settings: Mapping[str, object],
+        rig: Rig,
+        *,
+        threads: int | None,
+        silence_s: float,
+    ) -> None:
+        self.test_id, self.settings, self.silence_s = test_id, settings, silence_s
+        self._task, self._rig = task, rig
+        self.kinds = {str(gauge["name"]): str(gauge["kind"]) for gauge in task.gauges}
+        self.hub = EventHub(keep=_KEPT_EVENTS)
+        self.account = Account()
+        self.series = LiveSeries()
+        self.state = "starting"
+        self.problem: JobProblem | None = None
+        self.begun: dict[str, Any] = {}
+        self.field: Any = None
+        self.since_utc = utc_text(datetime.now(UTC))
+        self._worker = make_worker(threads, lowered=False)
+        self._newest: dict[str, Any] = {"number": 0, "valid": False, "reason": "starting", "gauges": {}}
+        self._spoke = time.monotonic()
+        self._ending = threading.Event()
+        self._changed = threading.Condition()
+        self._slot: Pair | None = None
+        self._fault: str | None = None
+        self._number = 0
+        self._clock = _HostClock()
+        self._threads = [
+            threading.Thread(target=target, name=f"live {name}", daemon=True)
+            for name, target in (("frames", self._take), ("measure", self._measure), ("watch", self._watch))
+        ]
+
+    def start(self) -> None:
+        """Begin; the reference is measured first, in the background."""
+        self._worker.start()
+        self._threads[1].start()
+
+    def stop(self) -> None:
+        """End it; safe to call twice."""
+        self.end()
+        for thread in self._threads:
+            if thread.ident is not None and thread is not threading.current_thread():
+                thread.join(timeout=5.0)
+        self._worker.shutdown()
+        if self.state != "failed":
+            self.state = "ended"
+        self._publish_invalid(self.state)
+
+    def end(self) -> None:
+        """Let it end by itself, and its streams now."""
+        self._ending.set()
+        with self._changed:
+            self._changed.notify_all()
+        self.hub.close()
+
+    @property
+    def active(self) -> bool:
+        """True while it measures or begins to."""
+        return self.state in ("starting", "running")
+
+    def newest(self) -> dict[str, Any]:
+        """Return the newest values; not valid where they are older than they may be."""
+        with self._changed:
+            newest, spoke = self._newest, self._spoke
+        if newest["valid"] and time.monotonic() - spoke > self.silence_s:
+            return _invalid(newest, "silence")
+        return newest
+
+    # threads --------------------------------------------------------------------------------------------------------
+
+    def _check(self) -> None:
+        if self._ending.is_set():
+            raise _Ended
+
+    def _take(self) -> None:
+        """Take pairs; the newest one waits in the slot."""
+        mark: PairMark | None = None
+        while not self._ending.is_set():
+            try:
+                pairs = self._rig.pair
+                if pairs.fires:  # nothing is exposed that would be thrown away
+                    self._await_empty()
+                mark, passed, pair = pairs.newest(mark, self._check)
+            except _Ended:
+                return
+            except StereorigError as error:
+                self.account.without_frame(error.code)
+                self._lost(error.code)
+                self._ending.wait(_PAUSE_S)
+                continue
+            self.account.came(passed + 1)
+            self.account.skipped(passed)
+            if not pair.accepted:
+                self.account.refused("skew_too_large")
+                self._lost("skew_too_large")
+                continue
+            with self._changed:
+                if self._slot is not None:
+                    self.account.skipped(1)
+                self._slot, self._fault = pair, None
+                self._changed.notify_all()
+
+    def _await_empty(self) -> None:
+        with self._changed:
+            while self._slot is not None:
+                self._check()
+                self._changed.wait(_WATCH_S)
+
+    def _measure(self) -> None:
+        try:
+            self._begin()
+            self._threads[0].start()
+            self._threads[2].start()
+            while True:
+                pair = self._next()
+                try:
+                    self._measure_one(pair)
+                except WorkerDiedError as error:
+                    self.account.refused(error.code)
+                    self._lost(error.code)
+                    self._begin()
+        except _Ended:
+            pass
+        except StereorigError as error:
+            self.problem, self.state = problem_of(error), "failed"
+            _log.warning("the live measurement of test %s ended: %s", self.test_id, error.cause)
+            self._ending.set()
+            self._publish_invalid(error.code)
+        except Exception as error:  # noqa: BLE001 - the state says it
+            self.problem, self.state = problem_of(error), "failed"
+            _log.exception("the live measurement of test %s failed", self.test_id)
+            self._ending.set()
+            self._publish_invalid("internal_error")
+
+    def _begin(self) -> None:
+        self.state = "starting"
+        self.begun = self._result(begin_live, self._task, _BEGIN_S)
+        self.state = "running"
+
+    def _next(self) -> Pair:
+        with self._changed:
+            while self._slot is None:
+                self._check()
+                self._changed.wait(_WATCH_S * 10)
+            taken, self._slot = self._slot, None
+            self._changed.notify_all()
+            return taken
+
+    def _measure_one(self, pair: Pair) -> None:
+        pixels = tuple(pair[cam].pixels for cam in CAMERAS)
+        try:
+            found = self._result(measure_live, pixels, _FRAME_S)
+        except (WorkerDiedError, _Ended):
+            raise
+        except StereorigError as error:
+            self.account.refused(error.code)
+            self._lost(error.code)
+            return
+        self._number += 1
+        frame = pair.cam1
+        exposed_ns = frame.host_ns if frame.exposed_ns is None else frame.exposed_ns
+        # arrival in memory: of the later frame
+        latency_ms = 1e3 * (time.monotonic() - max(pair[cam].host_ns for cam in CAMERAS) / 1e9)
+        self.account.measured(found["how"], latency_ms, time.monotonic())
+        gauges = {name: _gauge(self.kinds[name], one) for name, one in found["gauges"].items()}
+        values = {name: {q: number["value"] for q, number in gauge["values"].items()} for name, gauge in gauges.items()}
+        self.series.add(Moment(self._number, exposed_ns / 1e9, values))
+        self.field = found.get("field")
+        self._publish(
+            {
+                "number": self._number,
+                "valid": True,
+                "reason": "",
+                "time_s": exposed_ns / 1e9,
+                "device_time_s": frame.device_ns / 1e9,
+                "exposed_utc": self._clock.utc(exposed_ns),
+                "skew_ms": pair.skew_ms,
+                "how": found["how"],
+                "points": found["points"],
+                "status": found["status"],
+                "arrived_s": max(pair[cam].host_ns for cam in CAMERAS) / 1e9,
+                "latency_ms": round(latency_ms, 3),
+                "gauges": gauges,
+            }
+        )
+
+    def _result(self, function: Any, argument: Any, patience_s: float) -> dict[str, Any]:
+        future = self._worker.submit(function, argument)
+        deadline = time.monotonic() + patience_s
+        while True:
+            try:
+                found: dict[str, Any] = future.result(timeout=0.1)
+            except TimeoutError:
+                if self._ending.is_set() or time.monotonic() > deadline:
+                    future.request_stop()
+                    raise _Ended from None
+                continue
+            return found
+
+    def _watch(self) -> None:
+        """Say so where no value comes."""
+        while not self._ending.wait(_WATCH_S):
+            if self._newest["valid"] and time.monotonic() - self._spoke > self.silence_s:
+                self._publish_invalid(self._fault or "silence")
+
+    # values ---------------------------------------------------------------------------------------------------------
+
+    def _lost(self, code: str) -> None:
+        """Note why a value is missing, and say so at once where the last one was valid."""
+        self._fault = code
+        if self._newest["valid"] or self._newest["reason"] != code:
+            self._publish_invalid(code)
+
+    def _publish_invalid(self, reason: str) -> None:
+        self._publish(_invalid(self._newest, reason))
+
+    def _publish(self, values: dict[str, Any]) -> None:
+        with self._changed:
+            self._newest, self._spoke = values, time.monotonic()
+        self.hub.publish("values", values)
+
+
+class _HostClock:
+    """The calendar's time of moments on the host's monotonic clock."""
+
+    def __init__(self) -> None:
+        self._zero = datetime.now(UTC) - timedelta(seconds=time.monotonic())
+
+    def utc(self, at_ns: int) -> str:
+        return utc_text(self._zero + timedelta(microseconds=at_ns / 1e3))
+
+
+def _gauge(kind: str, found: Mapping[str, Any]) -> dict[str, Any]:
+    missing = str(found["missing"])
+    values = {
+        quantity: {"value": value, "u": _known(u), "u_calibration": _known(common), "units": UNITS[kind][quantity]}  # type: ignore[index]
+        for quantity, (value, u, common) in found["values"].items()
+    }
+    return {"kind": kind, "valid": not missing, "reason": missing, "values": values}
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _invalid(values: Mapping[str, Any], reason: str) -> dict[str, Any]:
+    """Values that do not hold: every gauge without numbers, with the reason."""
+    gauges = {
+        name: {**gauge, "valid": False, "reason": reason, "values": {}} for name, gauge in values["gauges"].items()
+    }
+    return {**values, "valid": False, "reason": reason, "gauges": gauges}

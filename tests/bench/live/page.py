@@ -1,0 +1,94 @@
+"""Writes ``docs/explanation/live_speed.md`` and its plot from what a run showed."""
+
+from __future__ import annotations
+
+import os
+import platform
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from tests.bench.documents.prose import wrapped
+
+if TYPE_CHECKING:
+    from tests.bench.live.live import Run
+
+DOCS = Path(__file__).resolve().parents[3] / "docs"
+PAGE = DOCS / "explanation" / "live_speed.md"
+FIGURE = DOCS / "figures" / "live_latency.png"
+#: ms, of the distribution
+ASKED = {50.0: 8.0, 99.0: 20.0, 99.9: 40.0}
+RATE_HZ = 50.0
+_IDLE_LOAD = 3.0
+
+
+def write_page(main: Run, runs: list[Run]) -> None:
+    """Write page and plot."""
+    _draw(main)
+    rows = "\n".join(
+        f"| p{q:g} | {asked:g} | {main.percentile(q):.1f} | {'held' if main.percentile(q) <= asked else '**missed**'} |"
+        for q, asked in ASKED.items()
+    )
+    rates = "\n".join(
+        f"| {run.points:,} | {run.rate_hz:.1f} | {run.percentile(50.0):.1f} | {run.percentile(99.0):.1f} | "
+        f"{run.account['skipped']} | {run.account['refused']} |"
+        for run in runs
+    )
+    first, last = np.array(main.memory_mib[: len(main.memory_mib) // 4 + 1]), np.array(main.memory_mib[-5:])
+    grown = last.mean(axis=0) - first.mean(axis=0)
+    busy = main.load > _IDLE_LOAD
+    load = f"The machine's load average was {main.load:.1f} on {os.cpu_count()} cores" + (
+        ": other programs ran on it, and these figures are no measure of an idle machine." if busy else "."
+    )
+    account = main.account
+    PAGE.write_text(
+        "\n\n".join(
+            [
+                "# Speed of a live measurement",
+                wrapped(
+                    f"Written by `make livebench` on {datetime.now(UTC):%Y-%m-%d}, {platform.machine()}, "
+                    f"{os.cpu_count()} cores. {load}"
+                ),
+                wrapped(
+                    f"Two simulated cameras of 512 x 480 px at {RATE_HZ:g} Hz show pictures that were rendered "
+                    "beforehand; the service, the cameras, the computation and the reader share the machine. Latency "
+                    "runs from the arrival of the later frame in memory to the value in the reader's process, over a "
+                    "WebSocket."
+                ),
+                f"## {main.points:,} points and 12 gauges beside a stored step a second",
+                wrapped(
+                    f"{main.seconds / 60.0:.1f} minutes, subsets of 21 px, quintic; {main.rate_hz:.1f} values a second; "
+                    f"{main.captures} steps were stored meanwhile."
+                ),
+                f"| latency | asked, ms | measured, ms | |\n| --- | --- | --- | --- |\n{rows}",
+                "![Latency](../figures/live_latency.png)",
+                wrapped(
+                    f"Of {account['frames']:,} pairs {account['measured']:,} were measured ({account['step']} with all "
+                    f"checks), {account['skipped']:,} skipped for a newer one, {account['refused']} refused. Resident "
+                    f"memory grew by {grown[0]:+.1f} MiB (service) and {grown[1]:+.1f} MiB (computation) from the first "
+                    "quarter to the end."
+                ),
+                "## Rate by points",
+                "| points | values/s | p50, ms | p99, ms | skipped | refused |\n| --- | --- | --- | --- | --- | --- |\n"
+                + rates,
+            ]
+        )
+        + "\n",
+        encoding="utf-8",
+    )
+
+
+def _draw(run: Run) -> None:
+    latency = np.sort(run.latency_ms)
+    figure, axes = plt.subplots(figsize=(7.0, 3.6), constrained_layout=True)
+    axes.semilogy(latency, 1.0 - np.arange(len(latency)) / max(len(latency), 1), label="measured")
+    for q, asked in ASKED.items():
+        axes.plot(asked, 1.0 - q / 100.0, "kv", ms=6, label="asked" if q == 50.0 else None)
+    axes.set_xlabel("latency, ms")
+    axes.set_ylabel("share of values that took longer")
+    axes.legend()
+    figure.savefig(FIGURE, dpi=110)
+    plt.close(figure)
