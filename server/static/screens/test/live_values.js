@@ -15,6 +15,8 @@ const CHANNELS_MS = 1000;
 const SHOWN = { extensometer: "strain", area: "eyy", point: "w_mm" };
 const UNITS = { extensometer: "1", area: "1", point: "mm" };
 const KINDS = /** @type {const} */ (["extensometer", "area", "point"]);
+/** A number without a unit is shown without one. @param {string} unit */
+const plain = (unit) => (unit === "1" ? "" : unit);
 const WORDS = { extensometer: "extensometers: strain", area: "areas: εyy", point: "points: W" };
 
 /**
@@ -145,7 +147,7 @@ export async function liveValuesPanel(testId, ends) {
     const rows = Object.entries(newest?.gauges ?? {}).map(([name, gauge]) => ({ name, gauge, number: gauge.values[SHOWN[gauge.kind]] }));
     replace(values, rows.length ? table([
       ["Gauge", (row) => row.name], ["Quantity", (row) => WORDS[row.gauge.kind].split(": ")[1]],
-      ["Value", (row) => (row.number ? (row.number.u === null ? amount(row.number.value, row.number.units) : uncertain(row.number.value, row.number.u, row.number.units)) : `not valid: ${row.gauge.reason}`)],
+      ["Value", (row) => (row.number ? (row.number.u === null ? amount(row.number.value, plain(row.number.units)) : uncertain(row.number.value, row.number.u, plain(row.number.units))) : `not valid: ${row.gauge.reason}`)],
     ], rows, { caption: "Newest values, ± standard uncertainty" }) : null);
     if (!drawing) drawCurves().catch(notify);
   }
