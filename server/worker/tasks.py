@@ -14,6 +14,9 @@ from typing import Any
 from core.names import CAMERAS
 from core.settings import StoredSettings
 
+#: what crosses the process' border: numbers, texts, lists and objects of them
+Plain = dict[str, Any]
+
 
 @dataclass(frozen=True, kw_only=True)
 class StepImages:
@@ -152,8 +155,8 @@ class FitTask:
     """
 
     folder: str
-    plan: dict[str, Any]
-    views: list[dict[str, Any]]
+    plan: Plain
+    views: list[Plain]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,7 +184,7 @@ class RepairTask:
     folder: Path
     original: Path
     steps: list[StepImages]
-    region: dict[str, Any] | None
+    region: Plain | None
     mask: Path | None
     subset_px: int
     spacing_px: int | None
@@ -202,9 +205,9 @@ class LookTask:
         By camera.
     """
 
-    rig: dict[str, Any]
+    rig: Plain
     localiser: str
-    pixels: dict[str, Any]
+    pixels: Plain
     full_scale: dict[str, float]
 
 
@@ -272,7 +275,7 @@ class LiveTask:
     calibration: Path
     settings: StoredSettings
     reference: StepImages
-    gauges: list[dict[str, Any]]
+    gauges: list[Plain]
     whole_field: bool
     audit_every: int
     noise: Path | None = None
@@ -291,7 +294,7 @@ class GuideTask:
     """
 
     folder: str
-    plan: dict[str, Any]
+    plan: Plain
 
 
 def warm_up(threads: int) -> None:
@@ -299,21 +302,21 @@ def warm_up(threads: int) -> None:
     _heavy("server.compute.measurement").warm_up(threads)
 
 
-def measure_step(task: StepTask) -> dict[str, Any]:
+def measure_step(task: StepTask) -> Plain:
     """Measure one step; its result file is readable when this returns. Returns the step's summary."""
-    summary: dict[str, Any] = _measuring("server.compute.measurement").measure_step(task)
+    summary: Plain = _measuring("server.compute.measurement").measure_step(task)
     return summary
 
 
-def fit_calibration(task: FitTask) -> dict[str, Any]:
+def fit_calibration(task: FitTask) -> Plain:
     """Find the grid in every view and fit both cameras; ``calibration.json`` is there when this returns."""
-    summary: dict[str, Any] = _heavy("server.compute.calibration_fit").fit_calibration(task)
+    summary: Plain = _heavy("server.compute.calibration_fit").fit_calibration(task)
     return summary
 
 
-def repair_calibration(task: RepairTask) -> dict[str, Any]:
+def repair_calibration(task: RepairTask) -> Plain:
     """Estimate the cameras' orientation anew; the new ``calibration.json`` is there when this returns."""
-    summary: dict[str, Any] = _measuring("server.compute.orientation_repair").repair_calibration(task)
+    summary: Plain = _measuring("server.compute.orientation_repair").repair_calibration(task)
     return summary
 
 
@@ -329,33 +332,33 @@ def check_live(task: LiveCheckTask) -> LiveFinding:
     return seen
 
 
-def begin_live(task: LiveTask) -> dict[str, Any]:
+def begin_live(task: LiveTask) -> Plain:
     """Measure the reference of a live measurement; frames can follow. Returns where its points lie."""
-    begun: dict[str, Any] = _measuring("server.compute.live.frames").begin(task)
+    begun: Plain = _measuring("server.compute.live.frames").begin(task)
     return begun
 
 
-def measure_live(pixels: tuple[Any, Any]) -> dict[str, Any]:
+def measure_live(pixels: tuple[Any, Any]) -> Plain:
     """Measure a frame of the live measurement that was begun; returns readings and counts of points by status."""
-    found: dict[str, Any] = _heavy("server.compute.live.frames").measure(pixels)
+    found: Plain = _heavy("server.compute.live.frames").measure(pixels)
     return found
 
 
-def look_at_pair(task: GuideTask, pixels: dict[str, Any], serial: int) -> dict[str, Any]:
+def look_at_pair(task: GuideTask, pixels: Plain, serial: int) -> Plain:
     """Find the target coarsely in a live pair, and say whether it is at rest and new."""
-    seen: dict[str, Any] = _heavy("server.compute.guide_session").look_at_pair(task, pixels, serial)
+    seen: Plain = _heavy("server.compute.guide_session").look_at_pair(task, pixels, serial)
     return seen
 
 
-def guide_views(task: GuideTask, views: list[dict[str, Any]]) -> dict[str, Any]:
+def guide_views(task: GuideTask, views: list[Plain]) -> Plain:
     """Take up the views that are new, and say what all cover and which view comes next."""
-    guidance: dict[str, Any] = _heavy("server.compute.guide_session").guide_views(task, views)
+    guidance: Plain = _heavy("server.compute.guide_session").guide_views(task, views)
     return guidance
 
 
-def fit_noise(task: NoiseTask) -> dict[str, Any]:
+def fit_noise(task: NoiseTask) -> Plain:
     """Fit both cameras' noise models; ``noise.json`` is there when this returns."""
-    summary: dict[str, Any] = _heavy("server.compute.noise_fit").fit_noise(task)
+    summary: Plain = _heavy("server.compute.noise_fit").fit_noise(task)
     return summary
 
 

@@ -21,13 +21,13 @@ from server.formats.calibrations.recognise import load_calibration
 from server.formats.calibrations.volume import parameter_covariance, volume_of
 from server.formats.images import read_image
 from server.formats.noise_json import load_noise
-from server.worker.tasks import LiveTask
+from server.worker.tasks import LiveTask, Plain
 
 _running: LiveMeasurement | None = None
 _whole = False
 
 
-def begin(task: LiveTask) -> dict[str, Any]:
+def begin(task: LiveTask) -> Plain:
     """Measure the reference, in place of the live measurement before.
 
     Raises
@@ -68,7 +68,7 @@ def begin(task: LiveTask) -> dict[str, Any]:
     }
 
 
-def measure(pixels: tuple[Any, Any]) -> dict[str, Any]:
+def measure(pixels: tuple[Any, Any]) -> Plain:
     """Measure a frame.
 
     Raises
@@ -83,14 +83,14 @@ def measure(pixels: tuple[Any, Any]) -> dict[str, Any]:
     return _plain(_running.measure(*pixels))
 
 
-def _gauge(given: dict[str, Any], x_px: Float, y_px: Float) -> LiveGauge:
+def _gauge(given: Plain, x_px: Float, y_px: Float) -> LiveGauge:
     if given["kind"] != "area":
         return LiveGauge(given["name"], given["kind"], ends_px=np.array(given["ends_px"], dtype=np.float64))
     inside = points_inside(Outline.model_validate(given["outline"]), x_px, y_px)
     return LiveGauge(given["name"], "area", inside=inside)
 
 
-def _plain(frame: LiveFrame) -> dict[str, Any]:
+def _plain(frame: LiveFrame) -> Plain:
     gauges = {
         name: {
             "missing": gauge.missing,
@@ -98,7 +98,7 @@ def _plain(frame: LiveFrame) -> dict[str, Any]:
         }
         for name, gauge in frame.readings.items()
     }
-    found: dict[str, Any] = {
+    found: Plain = {
         "how": frame.how,
         "points": int(frame.field.valid.sum()),
         "status": status_counts(frame.field),
@@ -110,5 +110,5 @@ def _plain(frame: LiveFrame) -> dict[str, Any]:
     return found
 
 
-def _grid_of(x_px: Float, y_px: Float) -> dict[str, Any]:
+def _grid_of(x_px: Float, y_px: Float) -> Plain:
     return {"x_px": x_px[0].tolist(), "y_px": y_px[:, 0].tolist()}

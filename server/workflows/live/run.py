@@ -25,7 +25,7 @@ from server.rig import Rig
 from server.rig.cameras import PairMark
 from server.worker.embedded import make_worker
 from server.worker.executor import WorkerDiedError
-from server.worker.tasks import LiveTask, begin_live, measure_live
+from server.worker.tasks import LiveTask, Plain, begin_live, measure_live
 from server.workflows.live.account import Account
 from server.workflows.live.series import LiveSeries, Moment
 
@@ -79,11 +79,11 @@ class LiveRun:
         self.series = LiveSeries()
         self.state = "starting"
         self.problem: JobProblem | None = None
-        self.begun: dict[str, Any] = {}
+        self.begun: Plain = {}
         self.field: Any = None
         self.since_utc = utc_text(datetime.now(UTC))
         self._worker = make_worker(threads, lowered=False)
-        self._newest: dict[str, Any] = {"number": 0, "valid": False, "reason": "starting", "gauges": {}}
+        self._newest: Plain = {"number": 0, "valid": False, "reason": "starting", "gauges": {}}
         self._spoke = time.monotonic()
         self._ending = threading.Event()
         self._changed = threading.Condition()
@@ -124,7 +124,7 @@ class LiveRun:
         """True while it measures or begins to."""
         return self.state in ("starting", "running")
 
-    def newest(self) -> dict[str, Any]:
+    def newest(self) -> Plain:
         """Return the newest values; not valid where they are older than they may be."""
         with self._changed:
             newest, spoke = self._newest, self._spoke
@@ -250,12 +250,12 @@ class LiveRun:
             }
         )
 
-    def _result(self, function: Any, argument: Any, patience_s: float) -> dict[str, Any]:
+    def _result(self, function: Any, argument: Any, patience_s: float) -> Plain:
         future = self._worker.submit(function, argument)
         deadline = time.monotonic() + patience_s
         while True:
             try:
-                found: dict[str, Any] = future.result(timeout=0.1)
+                found: Plain = future.result(timeout=0.1)
             except TimeoutError:
                 if self._ending.is_set() or time.monotonic() > deadline:
                     future.request_stop()
@@ -280,7 +280,7 @@ class LiveRun:
     def _publish_invalid(self, reason: str) -> None:
         self._publish(_invalid(self._newest, reason))
 
-    def _publish(self, values: dict[str, Any]) -> None:
+    def _publish(self, values: Plain) -> None:
         with self._changed:
             self._newest, self._spoke = values, time.monotonic()
         self.hub.publish("values", values)
@@ -296,7 +296,7 @@ class _HostClock:
         return utc_text(self._zero + timedelta(microseconds=at_ns / 1e3))
 
 
-def _gauge(kind: str, found: Mapping[str, Any]) -> dict[str, Any]:
+def _gauge(kind: str, found: Plain) -> Plain:
     missing = str(found["missing"])
     values = {
         quantity: {"value": value, "u": _known(u), "u_calibration": _known(common), "units": UNITS[kind][quantity]}  # type: ignore[index]
@@ -309,7 +309,7 @@ def _known(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _invalid(values: Mapping[str, Any], reason: str) -> dict[str, Any]:
+def _invalid(values: Plain, reason: str) -> Plain:
     """Values that do not hold: every gauge without numbers, with the reason."""
     gauges = {
         name: {**gauge, "valid": False, "reason": reason, "values": {}} for name, gauge in values["gauges"].items()
