@@ -17,6 +17,7 @@ _ROUNDS = 50
 _CONVERGED = 1e-4  # of the standard uncertainty
 _KINK = 1e-9  # of the slopes' power
 _ABOVE_NOISE = 3.0
+_WIDEST = 1.0 / 16.0  # of the sparse series' time: the longest way over which a slope is taken
 _MAX_U = 0.25  # of the common time: an offset known no better is none
 
 
@@ -151,9 +152,21 @@ def _fit(
     misfits = np.array([_misfit(dense, sparse, offset) for offset in tried])
     if not np.isfinite(misfits).any():
         return None
-    best = int(np.nanargmin(misfits))
-    offset, half = float(tried[best]), _interval(sparse[0])
-    scatter = _noise_of(dense[1])
+    begin = float(tried[int(np.nanargmin(misfits))])
+    # slopes over few readings are the noise's where there are many readings a second, over many they miss a knock
+    half, longest = _interval(sparse[0]), float(sparse[0][-1] - sparse[0][0]) * _WIDEST
+    while True:
+        found = _descended(dense, sparse, begin, half, step, within_s)
+        if found is not None or 2.0 * half > longest:
+            return found
+        half *= 2.0
+
+
+def _descended(
+    dense: tuple[Float, Float], sparse: tuple[Float, Float], begin: float, half: float, step: float, within_s: float
+) -> tuple[float, float, float, float, float, int] | None:
+    """As `_fit`, from an offset to begin with and with slopes over ``half`` a second either way."""
+    offset, scatter = begin, _noise_of(dense[1])
     for _ in range(_ROUNDS):
         at, y = _common(dense, sparse, offset, half)
         if len(at) < _MIN_READINGS:

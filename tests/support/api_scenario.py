@@ -163,6 +163,7 @@ def run(client: httpx.Client, description: dict[str, Any]) -> Session:
     session.call("get_noise_file", noise["noise_id"])
     test = _test(session, calibration)
     analysis = _analysis(session, test)
+    _live(session, test)
     _results(session, test, analysis)
     _ends(session, test, analysis, calibration, noise["noise_id"])
     return session
@@ -395,6 +396,39 @@ def _analysis(session: Session, test: str) -> str:
     call("get_certificate_report", certificate_id)
     call("withdraw_certificate", certificate_id, body={"reason": "The lens of camera 2 was exchanged."})
     return str(made["analysis_id"])
+
+
+def _live(session: Session, test: str) -> None:
+    """Measure live while the plate is loaded, with a channel whose clock is a quarter of a second behind."""
+    call, client = session.call, session.client
+    scene = {"scene": "plate", "load": 0.0}
+    client.put(f"{API}/sim/scene", json=scene).raise_for_status()
+    gauges = {
+        "extensometers": [{"name": "e1", "a_px": [128, 95], "b_px": [128, 145]}],
+        "points": [{"name": "p1", "xy_px": [128, 120]}],
+        "field": True,
+    }
+    call("begin_live", test, summary="An extensometer, a point and the coarse field", body=gauges)
+
+    def number() -> int:
+        return int(client.get(f"{API}/tests/{test}/live").json()["values"]["number"])
+
+    _until(lambda: number() > 1)
+    began, readings = time.monotonic(), []
+    while (now := time.monotonic()) < began + 9.0:
+        scene["load"] = min(max(now - began - 3.0, 0.0) * 100.0, 300.0)
+        readings.append({"time_s": now - 0.25, "channels": {"pressure_kpa": scene["load"]}})
+        client.put(f"{API}/sim/scene", json=scene).raise_for_status()
+        time.sleep(0.02)
+    last = number()
+    _until(lambda: number() > last + 1)
+    call("post_live_channels", test, summary="What the load frame read", body={"readings": readings[:2]})
+    client.post(f"{API}/tests/{test}/live/channels", json={"readings": readings[2:]}).raise_for_status()
+    asked = {"channel": "pressure_kpa", "gauge": "p1", "quantity": "w_mm"}
+    call("align_channel", test, summary="By the ramp that both have seen", body=asked)
+    for operation in ("get_live", "live_history", "live_field", "live_events", "stop_live"):
+        call(operation, test)
+    client.put(f"{API}/sim/scene", json={"scene": "plate", "load": 20.0}).raise_for_status()
 
 
 def _until(true: Callable[[], bool], seconds: float = 240.0) -> None:
