@@ -394,7 +394,12 @@ def _analysis(session: Session, test: str) -> str:
     call("list_certificates")
     call("get_certificate", certificate_id)
     call("get_certificate_report", certificate_id)
-    call("withdraw_certificate", certificate_id, body={"reason": "The lens of camera 2 was exchanged."})
+    call(
+        "withdraw_certificate",
+        certificate_id,
+        summary="With the reason",
+        body={"reason": "The lens of camera 2 was exchanged."},
+    )
     return str(made["analysis_id"])
 
 
@@ -420,10 +425,11 @@ def _live(session: Session, test: str) -> None:
         readings.append({"time_s": now - 0.25, "channels": {"pressure_kpa": scene["load"]}})
         client.put(f"{API}/sim/scene", json=scene).raise_for_status()
         time.sleep(0.02)
+    early = [{"time_s": t, "channels": {"pressure_kpa": 0.0}} for t in (1.0, 1.02)]
     last = number()
     _until(lambda: number() > last + 1)
-    call("post_live_channels", test, summary="What the load frame read", body={"readings": readings[:2]})
-    client.post(f"{API}/tests/{test}/live/channels", json={"readings": readings[2:]}).raise_for_status()
+    call("post_live_channels", test, summary="What the load frame read", body={"readings": early})
+    client.post(f"{API}/tests/{test}/live/channels", json={"readings": readings}).raise_for_status()
     asked = {"channel": "pressure_kpa", "gauge": "p1", "quantity": "w_mm"}
     call("align_channel", test, summary="By the ramp that both have seen", body=asked)
     for operation in ("get_live", "live_history", "live_field", "live_events", "stop_live"):
