@@ -31,7 +31,7 @@ from tests.support.service_model import Lab, Modelled, Request, Trashed, copy_fo
 from tests.support.service_rig import true_cameras
 
 #: requests and kills; the deep form, and how many of them are one case
-OPERATIONS = int(os.environ.get("STEREORIG_MODEL_OPERATIONS", "4000"))
+OPERATIONS = int(os.environ.get("STEREORIG_MODEL_OPERATIONS", "2000"))
 STEPS = 80
 CONFIG = parse_config(RIG)
 CALIBRATION = true_cameras(RIG)
@@ -390,6 +390,6 @@ def test_a_service_that_forgets_its_keys_is_found(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.timeout(7200)
-@pytest.mark.parametrize("operations", [400, pytest.param(OPERATIONS, marks=pytest.mark.deep)])
+@pytest.mark.parametrize("operations", [250, pytest.param(OPERATIONS, marks=pytest.mark.deep)])
 def test_the_service_holds_what_the_model_holds(operations: int) -> None:
     print(f"{search(operations)} requests, kills and starts")
