@@ -435,7 +435,7 @@ def test_a_test_is_measured_live_and_its_curves_are_drawn(page: Watched, client:
     shown = page.open(f"#/test/{plate}")
     panel = shown.get_by_role("region", name="Live values")
     panel.get_by_role("button", name="Measure live").click()
-    expect(panel.locator('[data-role="live-values"] tr', has_text="e1")).to_contain_text("±", timeout=SLOW)
+    expect(panel.locator('[data-role="live-values"] tr', has_text="e1")).to_contain_text("µm/m", timeout=SLOW)
     expect(
         panel.locator('[data-role="live-curves"]').get_by_role("img", name="Live curves of the gauges")
     ).to_be_visible(timeout=SLOW)

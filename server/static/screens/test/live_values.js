@@ -1,7 +1,7 @@
 // A test measured while it runs: a switch, the newest values of its gauges, and their curves against time or a channel.
 import * as api from "../../lib/api.js";
 import { chart } from "../../widgets/plots.js";
-import { amount, uncertain } from "../../lib/units.js";
+import { amount, shown, uncertain } from "../../lib/units.js";
 import { h, action, badge, field, notify, problemText, replace, select, table } from "../../lib/dom.js";
 
 /** @import { Ends } from "#dom" */
@@ -15,8 +15,13 @@ const CHANNELS_MS = 1000;
 const SHOWN = { extensometer: "strain", area: "eyy", point: "w_mm" };
 const UNITS = { extensometer: "1", area: "1", point: "mm" };
 const KINDS = /** @type {const} */ (["extensometer", "area", "point"]);
-/** A number without a unit is shown without one. @param {string} unit */
-const plain = (unit) => (unit === "1" ? "" : unit);
+/** Strain is told in µm/m. @param {string} unit */
+const plain = (unit) => (unit === "1" ? { unit: "µm/m", factor: 1e6 } : { unit, factor: 1 });
+/** @param {{ value: number, u: number | null, units: string }} number */
+const inUnits = ({ value, u, units }) => {
+  const { unit, factor } = plain(units);
+  return u === null ? amount(factor * value, unit) : uncertain(factor * value, factor * u, unit);
+};
 const WORDS = { extensometer: "extensometers: strain", area: "areas: εyy", point: "points: W" };
 
 /**
@@ -147,7 +152,7 @@ export async function liveValuesPanel(testId, ends) {
     const rows = Object.entries(newest?.gauges ?? {}).map(([name, gauge]) => ({ name, gauge, number: gauge.values[SHOWN[gauge.kind]] }));
     replace(values, rows.length ? table([
       ["Gauge", (row) => row.name], ["Quantity", (row) => WORDS[row.gauge.kind].split(": ")[1]],
-      ["Value", (row) => (row.number ? (row.number.u === null ? amount(row.number.value, plain(row.number.units)) : uncertain(row.number.value, row.number.u, plain(row.number.units))) : `not valid: ${row.gauge.reason}`)],
+      ["Value", (row) => (row.number ? inUnits(row.number) : `not valid: ${row.gauge.reason}`)],
     ], rows, { caption: "Newest values, ± standard uncertainty" }) : null);
     if (!drawing) drawCurves().catch(notify);
   }
@@ -163,15 +168,17 @@ export async function liveValuesPanel(testId, ends) {
         const x = at === "time" ? moment.time_s - zero : channels.get(moment.number)?.[at];
         return x === undefined ? [] : [{ x, moment }];
       }).toSorted((a, b) => a.x - b.x);
-      const data = /** @type {any} */ ([points.map((one) => one.x), ...names.map((name) => points.map(({ moment }) => moment.values[name]?.[SHOWN[wanted]] ?? null))]);
-      const key = JSON.stringify([wanted, names, at]);
+      const base = plain(UNITS[wanted]);
+      const to = shown(base.unit);
+      const scaled = (/** @type {number | undefined} */ value) => (value === undefined ? null : value * base.factor * to.factor);
+      const data = /** @type {any} */ ([points.map((one) => one.x), ...names.map((name) => points.map(({ moment }) => scaled(moment.values[name]?.[SHOWN[wanted]])))]);
+      const key = JSON.stringify([wanted, names, at, to.unit]);
       if (key === plotted && plot) {
         plot.set(data);
         return;
       }
       plot?.close();
-      const unit = UNITS[wanted] === "mm" ? " (mm)" : "";
-      plot = await chart(curves, { x: at === "time" ? "time (s)" : at, y: `${WORDS[wanted].split(": ")[1]}${unit}`, height: 260, data, series: names.map((name) => ({ label: name })), label: "Live curves of the gauges" });
+      plot = await chart(curves, { x: at === "time" ? "time (s)" : at, y: `${WORDS[wanted].split(": ")[1]} (${to.unit})`, height: 260, data, series: names.map((name) => ({ label: name })), label: "Live curves of the gauges" });
       plotted = key;
     } finally {
       drawing = false;
