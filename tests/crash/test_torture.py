@@ -77,7 +77,8 @@ def lies() -> dict[str, Any]:
         "/tests": {"tests": []},
         "/trash": {"trash": []},
         "/calibrations": {"calibrations": []},
-        "/tests/t1": {"steps": [{"n": 0}], "incomplete_steps": []},
+        "/tests/t1": {"incomplete_steps": []},
+        "/tests/t1/steps": {"steps": [{"n": 0}]},
         "/jobs/j1": {"state": "interrupted"},
     }
 
@@ -86,9 +87,9 @@ def lies() -> dict[str, Any]:
     ("answers", "complaint"),
     [
         ({}, None),
-        ({"/tests/t1": {"steps": [], "incomplete_steps": []}}, "are lost"),
-        ({"/tests/t1": {"steps": [{"n": 0}], "incomplete_steps": [1]}}, "0 steps had no answer"),
-        ({"/tests/t1": {"steps": [{"n": 0}, {"n": 1}], "incomplete_steps": []}}, "0 steps had no answer"),
+        ({"/tests/t1/steps": {"steps": []}}, "are lost"),
+        ({"/tests/t1": {"incomplete_steps": [1]}}, "0 steps had no answer"),
+        ({"/tests/t1/steps": {"steps": [{"n": 0}, {"n": 1}]}}, "0 steps had no answer"),
         ({"/tests/t1/steps/0": {"n": 0, "label": "another"}}, "is not what was acknowledged"),
         ({"/tests/t1/steps/0/cam1": b"other pixels"}, "cam1 of step 0"),
         ({"/jobs/j1": {"state": "running"}}, "reads running"),

@@ -86,6 +86,18 @@ def _share(job: dict[str, Any]) -> float:
     return 0.5 * share if shown["phase"] in ("views", "frames", "waiting") else 0.5 + 0.5 * share
 
 
+def steps_of(client: httpx.Client, test_id: str) -> set[int]:
+    """Numbers of a test's steps, page by page: its own document holds the first hundred."""
+    found: set[int] = set()
+    cursor = ""
+    while True:
+        page = client.get(f"/tests/{test_id}/steps", params={"cursor": cursor} if cursor else {}).json()
+        found |= {step["n"] for step in page["steps"]}
+        cursor = page.get("next_cursor") or ""
+        if not cursor:
+            return found
+
+
 @dataclass
 class Asked:
     """A request without an answer."""
@@ -302,7 +314,7 @@ class Lab:
     def _check_steps(self, client: httpx.Client, in_flight: list[Asked]) -> None:
         for test_id in {t for t, _ in self.steps} | {a.test_id for a in in_flight}:
             shown = client.get(f"/tests/{test_id}").json()
-            here = {s["n"] for s in shown["steps"]}
+            here = steps_of(client, test_id)
             mine = {n for t, n in self.steps if t == test_id}
             if mine - here:
                 self.complain(f"acknowledged steps {sorted(mine - here)} of test {test_id} are lost")
@@ -317,7 +329,7 @@ class Lab:
                 )
             for asked in waiting:  # sent again, it has one effect
                 self._make(client, asked)
-            now = {s["n"] for s in client.get(f"/tests/{test_id}").json()["steps"]}
+            now = steps_of(client, test_id)
             if now != {n for t, n in self.steps if t == test_id}:
                 self.complain(f"after sending {len(waiting)} requests again, test {test_id} has steps {sorted(now)}")
         # the files of all are compared below; over HTTP the new ones, and some of the others
