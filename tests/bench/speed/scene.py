@@ -140,7 +140,8 @@ def sequence_files(
 
 def _covariances(rig: Rig) -> dict[str, Any]:
     """What a calibration with stages is expected to know of the cameras, by cause: results have a common factor by it."""
-    target = GridTarget(pitch_mm=3.0, lines=(11, 11), line_width_mm=0.15, node_tolerance_mm=0.002)
+    pitch_mm = 3.0 * min(rig.size_px) / min(SEQUENCE_SIZE)  # it fills the same share of a smaller image
+    target = GridTarget(pitch_mm=pitch_mm, lines=(11, 11), line_width_mm=0.05 * pitch_mm, node_tolerance_mm=0.002)
     one, two = (
         NominalCamera(
             rig.size_px,
