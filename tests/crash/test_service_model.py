@@ -390,6 +390,6 @@ def test_a_service_that_forgets_its_keys_is_found(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.timeout(7200)
-@pytest.mark.parametrize("operations", [250, pytest.param(OPERATIONS, marks=pytest.mark.deep)])
+@pytest.mark.parametrize("operations", [100, pytest.param(OPERATIONS, marks=pytest.mark.deep)])
 def test_the_service_holds_what_the_model_holds(operations: int) -> None:
     print(f"{search(operations)} requests, kills and starts")
