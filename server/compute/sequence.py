@@ -280,7 +280,8 @@ class SequenceMeasurement:
         if in_service:  # first: where the result is, they are
             write_bytes(path.with_suffix(".json"), to_json(summary))
             if result.starts is not None and keep_starts:
-                write_starts(starts_file(path), result, reference=step.n == self.reference.n)
+                exact = step.n == self.reference.n or self.settings.reference_update != "never"
+                write_starts(starts_file(path), result, exact=exact)
         write_field(path, shown, self._provenance(step, result, about), strain, measured=result, checksum=in_service)
         return FinishedStep(
             n=step.n, field=shown, summary={**summary, "write_s": round(time.perf_counter() - began, 3)}

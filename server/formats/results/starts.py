@@ -26,16 +26,16 @@ def starts_file(result: Path) -> Path:
     return result.with_name(result.stem.replace("step_", "starts_") + ".npz")
 
 
-def write_starts(path: Path, measured: Field, *, reference: bool) -> None:
+def write_starts(path: Path, measured: Field, *, exact: bool) -> None:
     """Write durably the parts of a measured field that its result file does not hold.
 
     Parameters
     ----------
     measured
         The field, with its starts.
-    reference
-        Also keep in double precision what the result file has in single: every step's errors are computed from the
-        reference's.
+    exact
+        Also keep in double precision what the result file has in single: of the reference, whose errors every step's
+        are computed from, and of a step that may become a later reference.
 
     Raises
     ------
@@ -45,7 +45,7 @@ def write_starts(path: Path, measured: Field, *, reference: bool) -> None:
     starts = measured.starts
     assert starts is not None
     arrays = {"w": starts.w} if starts.G is None else {"w": starts.w, "G": starts.G}
-    if reference:
+    if exact:
         arrays |= {name: getattr(measured, name) for name in _SINGLE}
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)  # type: ignore[arg-type]  # its stubs take a name for a flag
