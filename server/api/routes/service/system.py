@@ -6,7 +6,7 @@ import time
 from collections.abc import AsyncIterator
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Depends, Header
+from fastapi import APIRouter, Depends, Header, Request
 from fastapi.responses import PlainTextResponse, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import BaseModel, Field
@@ -45,11 +45,13 @@ class HealthReply(BaseModel):
         description="Tests that are still to be read into the catalogue, after a start that no clean stop came before; "
         "one that is asked for is read at once.",
     )
+    live_test_id: str | None = Field(None, description="Test that is measured live now; null: none.")
 
 
 @router.get("/healthz", summary="Liveness")
-def healthz(service: ServiceDep) -> HealthReply:
+def healthz(request: Request, service: ServiceDep) -> HealthReply:
     """Answer quickly, whatever else is going on, with the parts that are not well."""
+    live = request.app.state.live_runs.current
     return HealthReply.model_validate(
         {
             "status": "ok",
@@ -57,6 +59,7 @@ def healthz(service: ServiceDep) -> HealthReply:
             "uptime_s": round(time.monotonic() - service.started_monotonic, 1),
             "rig": "fault" if service.rig.fault else "ok",
             "tests_to_read": service.index.waiting(),
+            "live_test_id": live.test_id if live is not None and live.active else None,
             "worker": "ready" if service.worker.ready.is_set() else "starting",
         }
     )

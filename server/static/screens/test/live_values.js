@@ -186,7 +186,9 @@ export async function liveValuesPanel(testId, ends) {
   }
   kind.addEventListener("change", () => drawCurves().catch(notify));
   against.addEventListener("change", () => askChannels().then(drawCurves).catch(notify));
-  await look();
+  // a test that is not measured live has nothing to be asked for
+  if ((await api.get("/healthz")).live_test_id === testId) await look();
+  else stop.hidden = true;
   ends.push(() => { close(); clearTimeout(later); plot?.close(); });
   return h("section.panel", { "aria-label": "Live values" }, h("div.spread", h("h2", "Live values"), state),
     h("p.quiet", "Each frame is measured as it comes, and not stored; captures and analyses go on beside it."),
