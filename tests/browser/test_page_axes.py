@@ -86,7 +86,7 @@ def test_a_tension_along_the_images_vertical_reads_as_one_and_files_keep_the_sys
     # and on the page by choice, which the address keeps
     at.get_by_label("Axes", exact=True).select_option("system")
     expect(at.get_by_text("axes: the calibration's")).to_be_visible()
-    reads(at, 1e6 * (TENSION - LATERAL) / 2.0, 5.0)
+    reads(at, 1e6 * (LATERAL - TENSION) / 2.0, 5.0)  # of a tensor turned by 45 degrees about Z
     expect(at.locator(".triad")).to_have_attribute("aria-label", re.compile("the calibration's"))
     half = 0.5**0.5
     assert [abs(v) for v in directions(at)] == pytest.approx([half] * 4, abs=0.01)
