@@ -108,7 +108,7 @@ class _Kept:
 class LiveMeasurement:
     """Measures the frames of a test as they come.
 
-    Parameters
+    Attributes
     ----------
     reference
         The reference pair's images and the calibrated cameras.
