@@ -31,7 +31,7 @@ from tests.support.service_model import Lab, Modelled, Request, Trashed, copy_fo
 from tests.support.service_rig import true_cameras
 
 #: requests and kills; the deep form, and how many of them are one case
-OPERATIONS = int(os.environ.get("STEREORIG_MODEL_OPERATIONS", "2000"))
+OPERATIONS = int(os.environ.get("STEREORIG_MODEL_OPERATIONS", "800"))
 STEPS = 80
 CONFIG = parse_config(RIG)
 CALIBRATION = true_cameras(RIG)

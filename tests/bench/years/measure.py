@@ -101,6 +101,8 @@ def running(folder: Path) -> Iterator[tuple[psutil.Process, httpx.Client, float]
     finally:
         process.kill()
         process.wait()
+        assert process.stdout is not None
+        process.stdout.close()
 
 
 def cpu_s(process: psutil.Process) -> float:

@@ -162,6 +162,8 @@ class Work:
     def _new_test(self, client: httpx.Client, calibration: str, index: int) -> None:
         if self.analysis:
             self.ask(client, "POST", f"{self.analysis}:finish", busy=(409,))
+        if self.soak.live and self.test:  # one is measured live at a time
+            self.ask(client, "POST", f"/tests/{self.test}/live:stop", busy=(404, 409))
         made = self.ask(client, "POST", "/tests", json={"name": f"soak {index}", "calibration_id": calibration})
         self.test = made.json()["id"]
 
@@ -171,7 +173,8 @@ class Work:
         if made is not None:
             self.analysis = f"/tests/{self.test}/analyses/{made.json()['analysis_id']}"
             self.count("analyses")
-        if self.soak.live and self.ask(client, "POST", f"/tests/{self.test}/live", json=body, busy=(409, 503)):
+        live = {"region": REGION, "field": True, "areas": [{"name": "a1", **REGION}]}
+        if self.soak.live and self.ask(client, "POST", f"/tests/{self.test}/live", json=live, busy=(409, 503)):
             self.count("live measurements")
 
     def exports(self, client: httpx.Client) -> None:
