@@ -218,9 +218,7 @@ def align_3_2_1(field: Field, positions_px: ArrayLike, *, shared: SharedPixels) 
         )
     x = positions.of(field.xyz_mm)
     R, origin = three_two_one(x)
-    first, second = (i.ravel() for i in np.meshgrid(np.arange(6), np.arange(6), indexing="ij"))
-    blocks = positions.covariance(shared, first, second)[:, :3, :3].reshape(6, 6, 3, 3)
-    joint = own = np.swapaxes(blocks, 1, 2).reshape(18, 18)
+    joint = own = positions.position_covariance(shared)
     common, shift = positions.common(), None
     if common is not None:
         shift = common[:, :3].reshape(18, -1)

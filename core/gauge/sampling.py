@@ -109,6 +109,13 @@ class Samples:
                 out[k : k + _AT_ONCE] = np.einsum("kij,kijac,kijac->kac", w, shared.factors(*lag, n), each)
         return out
 
+    def position_covariance(self, shared: SharedPixels) -> Float:
+        """Return (3 m, 3 m) mm^2: :meth:`covariance` of X, Y, Z of all m positions together."""
+        m = len(self.xy_px)
+        first, second = (i.ravel() for i in np.meshgrid(np.arange(m), np.arange(m), indexing="ij"))
+        blocks = self.covariance(shared, first, second)[:, :3, :3].reshape(m, m, 3, 3)
+        return np.swapaxes(blocks, 1, 2).reshape(3 * m, 3 * m)
+
 
 def sample(field: Field, xy_px: ArrayLike) -> Samples:
     """Sample a field between its points.

@@ -168,9 +168,7 @@ def place_by_markers(
             "The markers lie on one line of the model.", code="gauge_unusable", remedy="Give markers that span an area."
         )
     m = len(xy)
-    first, second = (i.ravel() for i in np.meshgrid(np.arange(m), np.arange(m), indexing="ij"))
-    blocks = found.covariance(shared, first, second)[:, :3, :3].reshape(m, m, 3, 3)
-    joint = np.swapaxes(blocks, 1, 2).reshape(3 * m, 3 * m) + sigma_mm**2 * np.eye(3 * m)
+    joint = found.position_covariance(shared) + sigma_mm**2 * np.eye(3 * m)
     weight = np.linalg.inv(joint + 1e-18 * np.eye(3 * m))
     R = Rotation.align_vectors(at - at.mean(axis=0), x - x.mean(axis=0))[0].as_matrix()
     centre = at.mean(axis=0)

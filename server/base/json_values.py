@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, TypeVar
 
+from pydantic import TypeAdapter, ValidationError
 from typing_extensions import TypeAliasType
+
+from core.errors import InputError
+
+Asked = TypeVar("Asked")
 
 #: rows of numbers, nested as deep as an array has axes; null where a value is missing
 Nested = TypeAliasType("Nested", "list[float | int | str | Nested | None]")
@@ -20,3 +25,30 @@ def without_nan(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [without_nan(v) for v in value]
     return value
+
+
+def asked_in(text: str, kind: TypeAdapter[Asked], *, named: str, code: str, remedy: str) -> Asked:
+    """Return what a JSON text asks for.
+
+    Parameters
+    ----------
+    text, kind
+        The text, and what it must hold.
+    named
+        What it is to name, in the error: ``frame``.
+    code, remedy
+        Of the error.
+
+    Raises
+    ------
+    InputError
+        ``code``, with the first thing that is wrong.
+    """
+    try:
+        return kind.validate_json(text)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(
+            f"{text[:60]!r} names no {named}: {f'{where}: ' if where else ''}{first['msg']}.", code=code, remedy=remedy
+        ) from error

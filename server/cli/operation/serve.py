@@ -13,6 +13,7 @@ from pathlib import Path
 
 from core.errors import FileFormatError, InputError
 from server.base import logs
+from server.cli.ports import port_unusable
 from server.http.access import KeyFile
 
 DEFAULT_CONFIG = "sim_paper.toml"
@@ -163,11 +164,7 @@ def _listen(host: str, port: int) -> socket.socket:
         listener.bind((host, port))
     except (OSError, OverflowError) as error:
         listener.close()
-        raise InputError(
-            f"Port {port} of {host} cannot be used: {error}.",
-            code="port_unusable",
-            remedy="Give another --port; 0 takes any.",
-        ) from error
+        raise port_unusable(f"{port} of {host}", error) from error
     return listener
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import threading
 
-from core.errors import InputError
 from server.cli.operation.live import add_service, client_of
+from server.cli.ports import check_port, port_unusable
 from sim.load_frame import LoadFrame
 
 
@@ -22,8 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the load frame until interrupted."""
-    if not 0 <= args.port <= 65535:
-        raise InputError(f"--port {args.port} is not from 0 to 65535.")
+    check_port(args)
     with client_of(args) as client:
 
         def pull(strain: float) -> None:
@@ -33,11 +32,7 @@ def run(args: argparse.Namespace) -> int:
         try:
             frame = LoadFrame(pull, port=args.port)
         except OSError as error:
-            raise InputError(
-                f"Port {args.port} cannot be used: {error}.",
-                code="port_unusable",
-                remedy="Give another --port; 0 takes any.",
-            ) from error
+            raise port_unusable(str(args.port), error) from error
         with frame:
             print(f"simulated load frame on 127.0.0.1:{frame.port}", flush=True)
             threading.Event().wait()

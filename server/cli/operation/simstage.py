@@ -6,6 +6,7 @@ import argparse
 import threading
 
 from core.errors import InputError
+from server.cli.ports import check_port, port_unusable
 from sim.controllers.registry import make_controller
 from sim.controllers.server import ControllerServer
 
@@ -36,19 +37,14 @@ def run(args: argparse.Namespace) -> int:
     highest = 3 if args.driver == "esp301" else 31
     if not all(1 <= axis <= highest for axis in args.axes):
         raise InputError(f"--axes {args.axes} are not all from 1 to {highest}.")
-    if not 0 <= args.port <= 65535:
-        raise InputError(f"--port {args.port} is not from 0 to 65535.")
+    check_port(args)
     if not args.travel[0] < 0.0 < args.travel[1]:
         raise InputError(f"--travel {args.travel} does not lie on both sides of home, 0.")
     controller = make_controller(args.driver, args.axes, travel_mm=tuple(args.travel))
     try:
         server = ControllerServer(controller, "pty" if args.pty else "socket", port=args.port).start()
     except OSError as error:
-        raise InputError(
-            f"Port {args.port} cannot be used: {error}.",
-            code="port_unusable",
-            remedy="Give another --port; 0 takes any.",
-        ) from error
+        raise port_unusable(str(args.port), error) from error
     with server:
         print(f'simulated {args.driver} with axes {args.axes}: url = "{server.url}"', flush=True)
         threading.Event().wait()

@@ -9,12 +9,13 @@ from typing import Literal
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from core.errors import FileFormatError, InputError, RegionError
+from core.errors import FileFormatError, RegionError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
 from core.gauge.align import Alignment, align_3_2_1, align_given, align_plane, image_rows
 from core.gauge.area import points_within
 from core.gauge.sampling import sample
+from server.base.json_values import asked_in
 from server.results.gauges.request import Alignment as Asked
 from server.results.gauges.request import GivenAlignment, PlaneAlignment
 
@@ -88,16 +89,8 @@ def frame_asked(text: str | None, of_test: Asked) -> Asked | None:
         return None
     if text == "specimen":
         return of_test
-    try:
-        return _ASKED.validate_json(text or "")
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise InputError(
-            f"{(text or '')[:60]!r} names no frame: {f'{where}: ' if where else ''}{first['msg']}.",
-            code="frame_invalid",
-            remedy='Give system, specimen, or JSON such as {"kind": "plane", "x_direction": [1, -1, 0]}.',
-        ) from error
+    remedy = 'Give system, specimen, or JSON such as {"kind": "plane", "x_direction": [1, -1, 0]}.'
+    return asked_in(text or "", _ASKED, named="frame", code="frame_invalid", remedy=remedy)
 
 
 def lay(asked: Asked, field: Field, shared: SharedPixels) -> Alignment:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, StringConstraints, TypeAdapter
 
-from core.errors import InputError
 from core.settings import Real
+from server.base.json_values import asked_in
 from server.base.models import Number, Request, StepNumber, Switch
 from server.formats.models.read import UNITS, Unit
 from server.results.gauges.request import GivenAlignment, PositionPx, PositionXyz
@@ -154,13 +154,5 @@ def placement_in(text: str | None) -> ModelPlacement:
     """
     if text is None:
         return GivenPlacement(kind="given")
-    try:
-        return _PLACEMENT.validate_json(text)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise InputError(
-            f"{text[:60]!r} names no alignment of a model: {f'{where}: ' if where else ''}{first['msg']}.",
-            code="alignment_invalid",
-            remedy='Give JSON such as {"kind": "given", "origin_mm": [1, 0, 0]}; or 3-2-1, markers, best-fit.',
-        ) from error
+    remedy = 'Give JSON such as {"kind": "given", "origin_mm": [1, 0, 0]}; or 3-2-1, markers, best-fit.'
+    return asked_in(text, _PLACEMENT, named="alignment of a model", code="alignment_invalid", remedy=remedy)

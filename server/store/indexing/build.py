@@ -26,7 +26,6 @@ from server.store.tests import TestStore
 _log = logging.getLogger("stereorig.service")
 #: the background's share of a processor: requests come first
 _REST = 1.0
-_REST_EVERY_S = 0.02
 
 
 class Index:
