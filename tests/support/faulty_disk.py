@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Literal
 
-from server.formats.disk import Disk
+from tests.support.hooked_disk import HookedDisk
 
 Way = Literal["full", "write_error", "short_write", "sync_error", "rename_error", "read_only"]
 WAYS: tuple[Way, ...] = ("full", "write_error", "short_write", "sync_error", "rename_error", "read_only")
@@ -29,7 +29,7 @@ _CALLS = {
 }
 
 
-class FaultyDisk(Disk):
+class FaultyDisk(HookedDisk):
     """Fails the n-th of the calls that the way concerns; a full or read-only disk stays so.
 
     Parameters
@@ -55,28 +55,10 @@ class FaultyDisk(Disk):
         self.calls += 1
         return self.calls >= self.n if self.way in ("full", "read_only") else self.calls == self.n
 
-    def _fail(self, path: Path) -> OSError:
-        number = _NUMBERS[self.way]
-        return OSError(number, os.strerror(number), str(path))
-
-    def write(self, path: Path, data: bytes) -> None:
-        if self._count("write"):
+    def before(self, call: str, path: Path, data: bytes = b"") -> None:
+        """Fail, if it is this call's turn."""
+        if self._count(call):
             if self.way == "short_write":
                 path.write_bytes(data[: len(data) // 2])
-            raise self._fail(path)
-        super().write(path, data)
-
-    def sync(self, path: Path) -> None:
-        if self._count("sync"):
-            raise self._fail(path)
-        super().sync(path)
-
-    def replace(self, path: Path, target: Path) -> None:
-        if self._count("replace"):
-            raise self._fail(path)
-        super().replace(path, target)
-
-    def make_folder(self, path: Path) -> None:
-        if self._count("make_folder"):
-            raise self._fail(path)
-        super().make_folder(path)
+            number = _NUMBERS[self.way]
+            raise OSError(number, os.strerror(number), str(path))

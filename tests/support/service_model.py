@@ -16,8 +16,8 @@ import httpx
 import server.formats.disk
 from server.api.app import create_app
 from server.config.rig_file import RigConfig
-from server.formats.disk import Disk
 from server.workflows.service import Service
+from tests.support.hooked_disk import HookedDisk
 from tests.support.power_loss.recording import ThreadWorker
 
 _OWN = ("catalog.", "service.lock", "audit.log")
@@ -51,7 +51,7 @@ class Request:
     made: dict[str, Any] | None = None  # what it answered; None: no answer came
 
 
-class KillingDisk(Disk):
+class KillingDisk(HookedDisk):
     """The real disk; before its n-th call it puts a copy of the folder aside, as a kill then would leave it.
 
     Parameters
@@ -73,31 +73,12 @@ class KillingDisk(Disk):
         came, self._left = self._left == 0, -1
         return came
 
-    def _count(self) -> None:
+    def before(self, call: str, path: Path, data: bytes = b"") -> None:
+        """Put the copy aside, if it is this call's turn."""
         if self._left > 0:
             self._left -= 1
             if self._left == 0:
                 copy_folder(self.data, self._aside)
-
-    def write(self, path: Path, data: bytes) -> None:
-        """As the real one."""
-        self._count()
-        super().write(path, data)
-
-    def sync(self, path: Path) -> None:
-        """As the real one."""
-        self._count()
-        super().sync(path)
-
-    def replace(self, path: Path, target: Path) -> None:
-        """As the real one."""
-        self._count()
-        super().replace(path, target)
-
-    def make_folder(self, path: Path) -> None:
-        """As the real one."""
-        self._count()
-        super().make_folder(path)
 
 
 def copy_folder(data: Path, aside: Path) -> None:
