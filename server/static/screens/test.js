@@ -129,15 +129,24 @@ async function one(root, id) {
   steps.onchange((/** @type {typeof test} */ fresh) => { test = fresh; measure.steps(fresh); });
   drawHead();
   drawAnalyses();
-  /** @type {number | undefined} */
-  let later;
+  // at most five times a second, and once more after the last one: a burst's steps come faster than they rest
+  let later = 0;
+  let more = false;
+  function soon() {
+    more = true;
+    if (later) return;
+    later = window.setTimeout(async () => {
+      more = false;
+      await steps.refresh().catch(notify);
+      later = 0;
+      if (more) soon();
+    }, 200);
+  }
   ends.push(
     events.on("step", (event) => {
-      if (event.test_id !== id) return;
-      clearTimeout(later);
-      later = setTimeout(() => steps.refresh().catch(notify), 200);
+      if (event.test_id === id) soon();
     }),
-    () => clearTimeout(later),
+    () => { clearTimeout(later); more = false; },
   );
   replace(root, h("div.spread", title, measure.head, h("a", { href: "#/test" }, "All tests")), h("div.grid", head, steps.root, measure.root, liveValues, analyses));
   return () => ends.forEach((end) => end());
