@@ -400,6 +400,8 @@ def test_tab_reaches_everything_and_the_focus_is_seen(page: Watched, bench: Benc
     expect(at.get_by_role("button", name="Save the file")).to_be_visible()
     if mode == "Side by side":
         expect(at.locator('canvas[data-role="map-other"]')).to_have_attribute("data-shown", "2 w_mm reference")
+    elif mode == "3-D surface":  # a focus on what it replaces would go to the whole panel
+        expect(at.locator(".surface-note")).to_contain_text("axes in mm")
     elif mode == "Image":
         given(at, LINE, (80, 90, 160, 90))
         at.get_by_role("button", name="Use").first.click()

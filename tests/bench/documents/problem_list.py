@@ -41,6 +41,10 @@ _MORE = {
 _UNKNOWN_KEY = (401, "Send 'Authorization: Bearer KEY' with a key made by 'stereorig keys add'.")
 
 
+#: functions that raise for their caller, with the arguments ``code`` and ``remedy``: class and cause
+_RAISERS = {"asked_in": ("InputError", "{{...}} names no {named}: {{...}}.")}
+
+
 class Kind:
     """A class of the exception tree, by its source."""
 
@@ -205,6 +209,8 @@ def scan() -> dict[str, dict[str, Any]]:
             name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
             if name in classes:
                 _error(found, classes[name], call, names)
+            elif name in _RAISERS:
+                _raised_for(found, classes, name, call, names)
             elif name in _MAKERS and path.is_relative_to(ROOT / "server" / "api"):
                 _answer(found, name, call, names)
         for node in module.body:  # what controllers' own errors are called
@@ -239,6 +245,17 @@ def _error(found: dict[str, Found], cls: Kind, call: ast.Call, names: dict[str, 
         # a remedy that is put together of several is named by its class
         remedy = (_text(given["remedy"], names) if "remedy" in given else None) or cls.remedy
         found.setdefault(code, Found()).add(cls.status(code), cause, remedy, kind=cls)
+
+
+def _raised_for(
+    found: dict[str, Found], classes: dict[str, Kind], name: str, call: ast.Call, names: dict[str, list[ast.expr]]
+) -> None:
+    kind, cause = _RAISERS[name]
+    texts = {keyword.arg: _text(keyword.value, names) for keyword in call.keywords if keyword.arg}
+    for code in {w for k in call.keywords if k.arg == "code" for w in _words(k.value, names)}:
+        found.setdefault(code, Found()).add(
+            classes[kind].status(code), cause.format(**texts), texts.get("remedy"), kind=classes[kind]
+        )
 
 
 def _answer(found: dict[str, Found], name: str, call: ast.Call, names: dict[str, list[ast.expr]]) -> None:
