@@ -1,4 +1,4 @@
-"""A reference extensometer's own record beside a certificate: in agreement, off by 1 %, in another unit, without one."""
+"""A reference extensometer's record beside a certificate: in agreement, off by 1 %, in another unit, without one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 from typing import Any
 
 import httpx

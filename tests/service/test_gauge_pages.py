@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -139,7 +138,10 @@ def test_a_history_is_columns_with_what_the_probe_says(client: httpx.Client) -> 
             continue
         found = history.json()
         assert (found["row"], found["col"]) == (probe["row"], probe["col"])
-        assert (found["value"][2], found["sigma"][2]) == (probe["values"][name]["value"], probe["values"][name]["sigma"])
+        assert (found["value"][2], found["sigma"][2]) == (
+            probe["values"][name]["value"],
+            probe["values"][name]["sigma"],
+        )
         assert found["units"] == probe["values"][name]["units"]
 
 

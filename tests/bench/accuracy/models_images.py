@@ -32,7 +32,7 @@ from tests.support.model_bench import Array, mesh
 
 SUBSET, STEP, NOISE = 31, 12, 2.0
 RECT = (50, 50, 450, 430)  # of camera 1's picture
-TEXTURES, COPIES = 4, 8
+TEXTURES, COPIES = 12, 5
 KNOT_MM = 0.016  # half a pixel
 HALF_MM = 11.0
 _TURNS = 8  # of the iteration: each divides the error by the strain, 1e-2 at most
@@ -93,7 +93,7 @@ def _grid(rig: Rig, hole_mm: float) -> PointGrid:
         at = _state(rig.pair.cam1, rig.size_px, None).material_mm[:, :, 4]
         reach = 0.75 * SUBSET * 0.033
         mask &= np.hypot(at[..., 0], at[..., 1]) > hole_mm + reach
-    return PointGrid.from_mask(mask, spacing_px=STEP)
+    return PointGrid.mask(mask, spacing_px=STEP)
 
 
 def _measured(rig: Rig, clean: list[Array], grid: PointGrid, rng: np.random.Generator) -> Field:
@@ -131,13 +131,17 @@ def models_images(figures: Path) -> Section:
     number = TEXTURES * COPIES
     for name, of, hole in CASES:
         right, wrong = _case(rig, of, hole, rng)
-        rows.append(Row(f"{name}: points compared", float(np.mean([c.displacement.overall.points for c in right])), "1"))
+        rows.append(
+            Row(
+                f"{name}: points compared",
+                float(np.mean([np.isfinite(c.displacement.z[..., 0]).sum() for c in right])),
+                "1",
+            )
+        )
         taken = sum(c.accepted for c in right)
         interval = binomtest(taken, number).proportion_ci(0.95)
         rows.append(Row(f"{name}: right model accepted, of {number}", taken / number, "1", 0.9, at_least=True))
-        rows.append(
-            Row(f"{name}: the same, upper end of its 95 % interval", interval.high, "1", 0.95, at_least=True)
-        )
+        rows.append(Row(f"{name}: the same, upper end of its 95 % interval", interval.high, "1", 0.95, at_least=True))
         z = [(c.factor - 1.0) / c.factor_sigma for c in right]
         rows.append(Row(f"{name}: mean of the factor less 1", float(np.mean([c.factor for c in right])) - 1.0, "1"))
         sigma = float(np.mean([c.factor_sigma for c in right]))
@@ -155,14 +159,22 @@ def models_images(figures: Path) -> Section:
         f"of {NOISE:g} grey levels in all four pictures of each; {SUBSET} px subsets, step {STEP} px, calibration exact. The "
         "pictures are made from the formulas by a renderer of their own (tests/bench/accuracy/models_images.py).",
         rows,
-        [("accuracy_models_images.png", "Measured over modelled displacement, right and 2 % too stiff; z of one replicate")],
-        [],
+        [
+            (
+                "accuracy_models_images.png",
+                "Measured over modelled displacement, right and 2 % too stiff; z of one replicate",
+            )
+        ],
+        [
+            "Each verdict is on a new measurement: the wrong model is compared with the same fields as the right one. Interpolation and "
+            "rounding are in these fields; no systematic size was stated for them."
+        ],
     )
 
 
 def _draw(shown: list[tuple[str, list[Comparison], list[Comparison]]], path: Path) -> None:
     fig, axes = plt.subplots(1, 1 + len(shown), figsize=(11.0, 3.6))
-    for k, (name, right, wrong) in enumerate(shown):
+    for k, (_, right, wrong) in enumerate(shown):
         for found, label, colour in ((right, "right", "C0"), (wrong, "2 % too stiff", "C3")):
             at = np.full(len(found), k) + (0.0 if label == "right" else 0.25) + np.linspace(-0.08, 0.08, len(found))
             error = [2.0 * c.factor_sigma for c in found]

@@ -1,7 +1,7 @@
 """A laboratory's day on the service itself, recorded down to every change of its data folder.
 
-Captures, a burst, imports, calibrations, noise, an analysis, models, certificates, recipes, deletion and restoring, over
-HTTP and one after the other: after each answer, the folder as it is then is what was acknowledged.
+Captures, a burst, imports, calibrations, noise, an analysis, models, certificates, recipes, deletion and restoring,
+over HTTP and one after the other: after each answer, the folder as it is then is what was acknowledged.
 """
 
 from __future__ import annotations
