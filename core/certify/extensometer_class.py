@@ -3,6 +3,10 @@
 A class holds where every reading's error, the resolution and the gauge length lie within its limits. Of the relative
 and the absolute limit the larger one counts. The reference's expanded uncertainty (k = 2) is to be a third of the
 permitted error at most.
+
+The limits are those commonly quoted of ISO 9513:2012. Errors follow one rule, published for class 0.5: c percent, and
+3 c micrometres below 300 um (http://laserextensometer.net/en/products/lex/calib05.html); gauge length and resolution
+have no source that can be read freely, and were not compared with the standard's text.
 """
 
 from __future__ import annotations

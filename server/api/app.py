@@ -24,6 +24,7 @@ from server.api.routes.analyses import (
     comparison,
     exports,
     gauges,
+    history,
     picking,
     previews,
     region,
@@ -34,7 +35,7 @@ from server.api.routes.analyses import (
 from server.api.routes.calibrations import calibrations, guide, noise, repair, review
 from server.api.routes.calibrations import checks as calibration_checks
 from server.api.routes.calibrations import exports as calibration_exports
-from server.api.routes.certificates import certificates
+from server.api.routes.certificates import certificates, procedure
 from server.api.routes.rig import cameras, devices, live_check, stage
 from server.api.routes.service import jobs, session, system
 from server.api.routes.tests import channels, frame, live, metadata, models, recipes, tests, watch, workspace
@@ -165,11 +166,13 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         region,
         repetition,
         results,
+        history,
         gauges,
         comparison,
         exports,
         report,
         certificates,
+        procedure,
         jobs,
         previews,
     ):

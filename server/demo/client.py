@@ -180,7 +180,14 @@ class ServiceClient:
     def gauges(self, analysis: AnalysisHandle, **request: Any) -> Sequence[StepReadings]:
         """Read gauges in every step; the request as ``POST .../gauges`` takes it."""
         path = f"/tests/{analysis.test_id}/analyses/{analysis.analysis_id}/gauges"
-        return _READINGS.validate_python(self.call("POST", path, json=request).json()["steps"])
+        found: list[object] = []
+        cursor: dict[str, str] = {}
+        while True:
+            page = self.call("POST", path, json=request, params=cursor).json()
+            found += page["steps"]
+            if page.get("next_cursor") is None:
+                return _READINGS.validate_python(found)
+            cursor = {"cursor": page["next_cursor"]}
 
     def export(self, analysis: AnalysisHandle, step: int) -> bytes:
         """Fetch the result file of one step."""

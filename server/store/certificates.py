@@ -5,7 +5,10 @@ What a certificate rests on is protected from deletion until it is withdrawn; it
 
 from __future__ import annotations
 
+import os
+import threading
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 from core.errors import FileFormatError, StateError
 from server.base.errors import NotFoundError
@@ -17,12 +20,36 @@ from server.store.folder import DataFolder, is_id, now_utc
 _DOCUMENT, _PAGE, _WITHDRAWN = "certificate.json", "certificate.html", "withdrawn.json"
 
 
+@dataclass(frozen=True)
+class _Base:
+    """What a certificate rests on."""
+
+    test_id: str | None
+    analysis_id: str | None
+    steps: frozenset[str]
+
+    def holds(self, kind: str, ids: Mapping[str, object]) -> bool:
+        """Return True if a thing of its test is part of it."""
+        match kind:
+            case "test":
+                return True
+            case "analysis":
+                return self.analysis_id == ids.get("analysis_id")
+            case "step":
+                return str(ids.get("n")) in self.steps
+        return False
+
+
 class CertificateStore:
     """The certificates of one data folder."""
 
     def __init__(self, folder: DataFolder) -> None:
         self._folder = folder
         self._root = folder.root / "certificates"
+        # each is read once, and never changed after: what it rests on is kept in memory
+        self._reading = threading.Lock()
+        self._known: set[str] = set()
+        self._in_force: dict[str, dict[str, _Base]] = {}  # by test and certificate
 
     def reserve_ids(self) -> None:
         """Reserve the ids that exist, of folders that a kill left unfinished too."""
@@ -97,18 +124,41 @@ class CertificateStore:
             )
         write_json(self._root / certificate_id / _WITHDRAWN, {"utc": now_utc(), "by": by, "reason": reason})
 
-    def resting_on(self, kind: str, ids: Mapping[str, object]) -> str | None:
-        """Return a certificate in force that rests on a test, step or analysis; None without one."""
-        if kind not in ("test", "step", "analysis"):
-            return None  # a test keeps its own copy of the calibration
-        for certificate_id in self.ids():
+    def learn(self) -> None:
+        """Read the certificates that were not read before; a service does it behind its start."""
+        with self._reading:
+            self._learn()
+
+    def _learn(self) -> None:
+        try:
+            there = os.listdir(self._root)  # noqa: PTH208 - names, not paths
+        except FileNotFoundError:
+            return
+        for certificate_id in sorted(name for name in there if name not in self._known and is_id(name, "v")):
+            path = self._root / certificate_id / _DOCUMENT
+            if not path.is_file():
+                continue  # not whole yet, or never
             try:
-                made_of = read_record(CertificateRecord, self._root / certificate_id / _DOCUMENT).made_of
+                made_of = read_record(CertificateRecord, path).made_of
             except FileFormatError:
                 continue  # `verify` tells of one that is damaged; it must not keep everything from being deleted
-            if made_of.test_id != ids.get("test_id") or self.withdrawn(certificate_id) is not None:
-                continue
-            rests = kind == "test" or (kind == "analysis" and made_of.analysis_id == ids.get("analysis_id"))
-            if rests or (kind == "step" and str(ids.get("n")) in made_of.steps):
-                return certificate_id
+            self._known.add(certificate_id)
+            if self.withdrawn(certificate_id) is None:
+                base = _Base(made_of.test_id, made_of.analysis_id, frozenset(made_of.steps))
+                self._in_force.setdefault(str(made_of.test_id), {})[certificate_id] = base
+
+    def resting_on(self, kind: str, ids: Mapping[str, object]) -> str | None:
+        """Return a certificate in force that rests on a test, step or analysis; None without one.
+
+        Its cost is that of the test's own certificates, however many the folder holds, and of those that are new.
+        """
+        if kind not in ("test", "step", "analysis"):
+            return None  # a test keeps its own copy of the calibration
+        with self._reading:
+            self._learn()
+            mine = self._in_force.get(str(ids.get("test_id")), {})
+            for certificate_id in [one for one, base in sorted(mine.items()) if base.holds(kind, ids)]:
+                if self.withdrawn(certificate_id) is None:
+                    return certificate_id
+                del mine[certificate_id]
         return None

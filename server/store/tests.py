@@ -204,6 +204,15 @@ class TestStore:
         """Replace what is drawn and set for a test; durable when this returns."""
         write_json(self._to_change(test_id) / "workspace.json", document)
 
+    def procedure(self, test_id: str) -> dict[str, object]:
+        """Return a test's verification procedure; empty where there is none."""
+        path = self.path(test_id) / "certificate_plan.json"
+        return read_json(path) if path.is_file() else {}
+
+    def put_procedure(self, test_id: str, document: Mapping[str, object]) -> None:
+        """Replace a test's verification procedure; durable when this returns."""
+        write_json(self._to_change(test_id) / "certificate_plan.json", document)
+
     def is_calibrated(self, test_id: str) -> bool:
         """Return True if the test has a calibration to measure with."""
         return calibration_in(self.path(test_id)).is_file()
@@ -326,6 +335,13 @@ class TestStore:
         there = set(self._complete(test_id, marks))
         return [n for n in map(int, marks) if n not in there]
 
+    def next_number(self, test_id: str) -> int:
+        """Return the number that the next step gets: none is given twice, also not that of an incomplete step."""
+        deleted = self.deleted_steps(test_id)
+        if not deleted and self.first_step(test_id) is None:
+            return 0
+        return 1 + max([*deleted, *(n for name in self._names(test_id) if (n := number_of(name)) is not None)])
+
     def add_step(self, test_id: str, images: dict[str, bytes], metadata: Mapping[str, object]) -> StepRecord:
         """Commit a step: both images, then ``step.json`` with their checksums.
 
@@ -333,14 +349,11 @@ class TestStore:
         """
         steps = self._to_change(test_id) / "steps"
         with self._lock:
-            deleted = self.deleted_steps(test_id)
-            if deleted or self.first_step(test_id) is not None:
-                n = 1 + max([*deleted, *(n for name in self._names(test_id) if (n := number_of(name)) is not None)])
-            else:
+            n = self.next_number(test_id)
+            if n == 0:
                 # an incomplete reference would leave the test without step 0 for good
                 for folder in [p for p in steps.iterdir() if p.name.isdigit()]:
                     quarantine(folder)
-                n = 0
             if n > MAX_STEPS:
                 raise StateError(f"Test {test_id} is full: {n} steps.", code="test_full", remedy="Make a new test.")
             folder = steps / f"{n:04d}"

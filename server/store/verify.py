@@ -41,7 +41,7 @@ _KNOWN = {
     r"(calibration\.json|residuals\.nc)(\.sha256)?|calibration\.checks\.json|views",
     "noise": r"(plan|frames|failure)\.json|noise\.json(\.sha256)?|frames",
     "certificate": r"certificate\.(json|html)(\.sha256)?|withdrawn\.json",
-    "test": r"(test|calibration|watch|workspace)\.json|calibrations|steps|analyses|exports|models",
+    "test": r"(test|calibration|watch|workspace|certificate_plan)\.json|calibrations|steps|analyses|exports|models",
     "step": r"step\.json|cam[12]\.tif",
     "analysis": r"(analysis|jobs|noise|summary)\.json|mask\.png|step_\d+\.(nc|nc\.sha256|json)|starts_\d+\.npz",
 }
@@ -199,7 +199,7 @@ class _Walk:
         if document is not None:
             self.calibrations_of(path, document)
         self.strangers(path, "test")
-        self.documents(path, "watch.json", "workspace.json")
+        self.documents(path, "watch.json", "workspace.json", "certificate_plan.json")
         for step in sorted((path / "steps").iterdir()) if (path / "steps").is_dir() else ():
             self.step(path.name, step)
         for analysis in self.entries(path / "analyses", "a", "analysis.json"):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -48,8 +49,24 @@ class Alignment:
     replace: bool = False
 
 
-def import_channels(service: Service, test_id: str, table: ChannelTable, how: Alignment) -> dict[str, object]:
-    """Give each step the record's channels at its time; all steps or none; return what the API shows.
+@dataclass(frozen=True)
+class Aligned:
+    """What came of a record.
+
+    Attributes
+    ----------
+    summary
+        As the API shows it.
+    steps
+        Of each step: its number, the record's time, the channels that it has now, and why it lacks some.
+    """
+
+    summary: Mapping[str, object]
+    steps: Sequence[Mapping[str, object]]
+
+
+def import_channels(service: Service, test_id: str, table: ChannelTable, how: Alignment) -> Aligned:
+    """Give each step the record's channels at its time; all steps or none.
 
     Raises
     ------
@@ -64,7 +81,8 @@ def import_channels(service: Service, test_id: str, table: ChannelTable, how: Al
     times = {step.n: step_time(step.plain()) for step in steps}
     zero_s = _zero(table, how, times)
     gap_s = _GAPS * table.interval_s if how.max_gap_s is None else how.max_gap_s
-    found, shown = {}, []
+    found: dict[int, dict[str, float]] = {}
+    shown: list[dict[str, object]] = []
     for step in steps:
         taken = times[step.n]
         at_s = None if taken is None else taken.timestamp() - zero_s
@@ -86,13 +104,16 @@ def import_channels(service: Service, test_id: str, table: ChannelTable, how: Al
         for step in steps:
             if found[step.n]:
                 _keep(service, test_id, step, found[step.n], how.load, factor)
-    return {
+    summary = {
         "channels": {name: unit_of(name) for name in table.channels},
         "readings": int(table.time_s.size),
         "interval_s": table.interval_s,
         "max_gap_s": gap_s,
-        "steps": shown,
+        "n_steps": len(shown),
+        "n_aligned": sum(map(bool, found.values())),
+        "reasons": dict(Counter(str(one["missing"]) for one in shown if one["missing"])),
     }
+    return Aligned(summary, shown)
 
 
 def _load_factor(table: ChannelTable, load: str | None) -> float:

@@ -154,6 +154,7 @@ class Service:
             parts.callback(self.begin_end)
             parts.callback(self.stop_streams)
             self._open_rig()
+            threading.Thread(target=self.certificates.learn, name="certificates", daemon=True).start()
             self.index.wait(_INDEX_WAIT_S)
             self._parts = parts.pop_all()
         return self

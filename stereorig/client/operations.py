@@ -50,6 +50,8 @@ Page = TypeVar("Page", bound=Listing)
 Thing = TypeVar("Thing")
 #: seconds that one request waits for a job; shorter where somebody looks at its progress
 _WAIT_S, _LOOK_S = 30.0, 0.5
+#: steps of a page of gauge readings
+_GAUGE_STEPS = 500
 _FINAL = ("succeeded", "failed", "cancelled", "interrupted")
 
 
@@ -329,8 +331,21 @@ def netcdf_of(path: str, name: str | None, step: int | None) -> Operation[dict[i
 
 
 def gauges(path: str, request: GaugeRequest) -> Operation[GaugesReply]:
-    """Read gauges in every step."""
-    return (yield from _posted(f"{path}/gauges", request, GaugesReply))
+    """Read gauges in every step, page by page."""
+    pages: list[GaugesReply] = []
+    asked: dict[str, Any] = {"limit": _GAUGE_STEPS}
+    while True:
+        answer = yield Ask("POST", f"{path}/gauges", json=_body(request), params=dict(asked), key=uuid4().hex)
+        pages.append(_read(answer, GaugesReply))
+        if pages[-1].next_cursor is None:
+            break
+        asked["cursor"] = pages[-1].next_cursor
+    inputs = {name: sha256 for page in pages for name, sha256 in page.inputs_sha256.items()}
+    reasons = list(dict.fromkeys(reason for page in pages for reason in page.stale_reasons))
+    units = {name: unit for page in pages for name, unit in page.channel_units.items()}
+    whole = {"inputs_sha256": inputs, "stale": any(page.stale for page in pages), "stale_reasons": reasons}
+    steps = [step for page in pages for step in page.steps]
+    return pages[0].model_copy(update={**whole, "channel_units": units, "steps": steps, "next_cursor": None})
 
 
 def saved(path: str, into: Path, params: Mapping[str, Any]) -> Operation[Path]:

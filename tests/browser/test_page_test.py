@@ -167,6 +167,34 @@ def test_cameras_off_their_place_are_told_where_one_captures_with_the_way_back(
     page.sound()
 
 
+def test_a_verification_procedure_is_followed_with_ticks(page: Watched, client: httpx.Client) -> None:
+    test_id = new_test(client, name="bench")
+    shown = page.open(f"#/test/{test_id}")
+    panel = shown.locator("[data-role=procedure]")
+    panel.locator("summary").click()
+    said = panel.locator("[data-role=procedure-next]")
+    plan = {"static_steps": [1], "translations": [{"n": 2, "translation_mm": [0.0, 0.0, 0.4]}], "rotations": [{"n": 3}]}
+    panel.locator("textarea").fill("{")
+    panel.get_by_role("button", name="Plan the procedure").click()
+    expect(panel.locator(".problem")).to_contain_text("no JSON")
+    panel.locator("textarea").fill(json.dumps(plan))
+    panel.get_by_role("button", name="Plan the procedure").click()
+    expect(said).to_contain_text("Step 0")
+    for n in (0, 1):
+        panel.get_by_role("button", name="Take the step", exact=True).click()
+        expect(panel.locator("[aria-label=taken]")).to_have_count(n + 1, timeout=SLOW)
+    # this rig's cameras move along axes of their own: the way is a person's
+    expect(said).to_contain_text("Step 2: Move the body by X 0, Y 0, Z 0.4 mm")
+    for n in (2, 3):
+        panel.get_by_role("button", name="It is done: take the step").click()
+        expect(panel.locator("[aria-label=taken]")).to_have_count(n + 1, timeout=SLOW)
+    expect(said).to_contain_text("All steps are taken.")
+    expect(panel.get_by_role("button", name="Make the certificate")).to_be_visible()
+    labels = [step["label"] for step in client.get(f"{API}/tests/{test_id}/steps").json()["steps"]]
+    assert labels == ["reference", "static", "moved 0 0 0.4 mm", "turned"]
+    page.sound_beside_captures(404)  # there is no plan at first
+
+
 def test_pairs_are_imported_in_the_order_of_their_names(page: Watched, client: httpx.Client, tmp_path: Path) -> None:
     test_id = new_test(client, name="imported")
     rng = np.random.default_rng(5)

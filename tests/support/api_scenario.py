@@ -337,6 +337,7 @@ def _test(session: Session, calibration: str) -> str:
     call("put_test_frame", test, summary="X along a line of two positions", body=frame)
     call("get_test_frame", test)
     call("delete_test_frame", test)
+    _procedure(session)
     watch = {"channel": "load_n", "threshold": 500.0, "frames": 1}
     call("put_watch", test, summary="A step at each further 500 N", body=watch)
     call("get_watch", test)
@@ -363,6 +364,18 @@ def _test(session: Session, calibration: str) -> str:
     return test
 
 
+def _procedure(session: Session) -> None:
+    """Plan a verification procedure in a test of its own, and take its reference."""
+    call, client = session.call, session.client
+    test = client.post(f"{API}/tests", json={"name": "verification"}).json()["id"]
+    way = {"n": 4, "translation_mm": [0.0, 0.0, 1.0], "u_mm": 0.0005}
+    plan = {"title": "Bench 2", "static_steps": [1, 2, 3], "translations": [way], "rotations": [{"n": 5}]}
+    call("put_certificate_plan", test, summary="Three static steps, a way and a turn", body={"plan": plan, "frames": 2})
+    taken = call("take_next_step", test, summary="The reference", body={"confirmed": False}).json()
+    wait_for_job(client, taken["job"])
+    call("get_certificate_plan", test)
+
+
 def _analysis(session: Session, test: str) -> str:
     call, client = session.call, session.client
     wanted = {"region": REGION, "subset_px": 21, "spacing_px": 10, "strain": {"window": 3}}
@@ -386,6 +399,7 @@ def _analysis(session: Session, test: str) -> str:
     call("list_analyses", test)
     call("get_analysis", test, made["analysis_id"])
     call("list_analysis_steps", test, made["analysis_id"])
+    call("get_history", test, made["analysis_id"], "w_mm", query={"x_px": 120, "y_px": 120})
     wait_for_job(client, call("reproduce_analysis", test, made["analysis_id"]).json()["job"])
     plan = {"title": "Bench 2", "static_steps": [1], "limits": {"displacement_mpe_um": 5.0}, "valid_days": 180}
     asked = {"test_id": test, "analysis_id": made["analysis_id"], "plan": plan}

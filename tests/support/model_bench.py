@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -155,8 +155,10 @@ def bench(
     return Bench(field, (su, sv, sw))
 
 
-def write_result(folder: Path, field: Field, *, n: int = 1, strain_window: int | None = 7) -> Path:
-    """Write a field as the result of step n."""
+def write_result(
+    folder: Path, field: Field, *, n: int = 1, strain_window: int | None = 7, inputs: Mapping[str, str] | None = None
+) -> Path:
+    """Write a field as the result of step n; ``inputs``: checksums of what it was measured from."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"step_{n:04d}.nc"
     strain = (
@@ -166,7 +168,7 @@ def write_result(folder: Path, field: Field, *, n: int = 1, strain_window: int |
     )
     provenance = Provenance(
         settings={"subset_px": SUBSET_PX, "spacing_px": STEP_PX},
-        inputs={"calibration": "c0" * 32},
+        inputs={"calibration": "c0" * 32} if inputs is None else inputs,
         software_version="test",
         frame="system",
         step=n,

@@ -374,4 +374,5 @@ class GaugesReply(Reply):
     alignment: FrameReading | None = Field(None, description="The frame that was laid, and its uncertainty.")
     uncertainty: Uncertainty = Field(description="What the uncertainties are, and what they include in all steps.")
     channel_units: dict[str, str] = Field(default_factory=dict, description="Unit of each channel, from its name.")
-    steps: list[GaugeStep] = Field(description="Readings of each step.")
+    steps: list[GaugeStep] = Field(description="Readings of each step of the page.")
+    next_cursor: str | None = Field(None, description="Send it as `cursor` for the next page; null: that was all.")

@@ -23,4 +23,12 @@ class ChannelsImported(Reply):
     readings: int = Field(description="Readings over time in the record.")
     interval_s: float = Field(description="Median time between them.")
     max_gap_s: float = Field(description="Readings further apart than this were not joined.")
-    steps: list[StepAligned] = Field(description="Each step of the test.")
+    n_steps: int = Field(0, description="Steps of the test.")
+    n_aligned: int = Field(0, description="Steps that got channels from the record.")
+    reasons: dict[str, int] = Field(
+        default_factory=dict, description="Steps that have none, or not all, by the reason: their number."
+    )
+    steps: list[StepAligned] = Field(description="The first 100 steps, each with what the record says of it.")
+    steps_next_cursor: str | None = Field(
+        None, description="`cursor` of `GET /tests/{id}/steps?channels=true` for the further steps; null: that was all."
+    )

@@ -69,6 +69,9 @@ class StepEntry(Reply):
     captured_utc: str | None = Field(None, description="Time of the capture or import, by the service's clock.")
     skew_ms: float | None = Field(None, description="Difference of the two exposures' beginnings.")
     quality: str | None = Field(None, description="`ok`, or the first thing that is wrong.")
+    channels: dict[str, float] | None = Field(
+        None, description="Scalar readings, by name, where a list was asked for with them; else null."
+    )
 
 
 class AnalysisEntry(Reply):

@@ -6,6 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
+from core.errors import InputError
 from server.cli.terminal import ProgressLine
 from server.formats.files import make_folder, write_bytes
 from server.formats.results.summary import to_json
@@ -21,14 +22,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "Judge a measuring system by static pairs, known translations, known lengths, a rotation and a reference "
         "extensometer, as far as a plan names them: noise floor, errors beside their uncertainty, class of the virtual "
         "extensometer, verdict with reasons and what is suspect. Writes certificate.json and certificate.html. Ends "
-        "with 0 for a pass, 4 for a conditional one, 5 for a fail."
+        "with 0 for a pass, 4 for a conditional one, 5 for a fail. With --run the plan's steps are taken on a running "
+        "service first: the stage moves where it can, a person is asked where it cannot."
     )
     add = parser.add_argument
     add(
         "folder",
         metavar="DATA_OR_RESULTS",
         type=Path,
-        help="a data folder, a test's, an analysis', or what stereorig measure --out wrote",
+        nargs="?",
+        help="a data folder, a test's, an analysis', or what stereorig measure --out wrote; not with --run",
     )
     add("plan", metavar="PLAN", type=Path, help="JSON: what is known of each step, and the limits")
     add("--test", metavar="ID", help="which test of a data folder (its only one)")
@@ -36,10 +39,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--calibration", metavar="FILE", type=Path, help="the calibration, where it is not beside the results")
     add("--out", metavar="DIR", type=Path, default=Path("certificate"), help="folder of the certificate (certificate)")
     add("--json", action="store_true", help="print the certificate as JSON")
+    add(
+        "--run",
+        dest="carry_out",
+        action="store_true",
+        help="carry the plan out on a running service's rig: take its steps, one by one",
+    )
+    add("--frames", metavar="N", type=int, default=1, help="with --run: frames averaged at each step (1)")
+    add("--url", default="http://127.0.0.1:8000", help="with --run: address of the service (default: %(default)s)")
+    add("--key", metavar="KEY", help="with --run: key of the service, where it asks for one")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, judge, write, print; return the verdict's status."""
+    """Read, judge, write, print; return the verdict's status. With --run, take the steps that are to be judged."""
+    if args.carry_out:
+        from server.cli.evidence.procedure import carry_out
+
+        return carry_out(args.plan, args.test, frames=args.frames, url=args.url, key=args.key)
+    if args.folder is None:
+        raise InputError(
+            "There is no data folder and there are no results to judge.",
+            code="option_conflict",
+            remedy="Name the folder before the plan, or take the steps first with --run.",
+        )
     # the reports' library takes a second to load
     from server.report.certificate.document import make_certificate
     from server.report.source import find_source

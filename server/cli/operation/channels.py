@@ -64,4 +64,8 @@ def run(args: argparse.Namespace) -> int:
         parts = [values, f"missing: {step.missing}" if step.missing else ""]
         when = "" if step.time_s is None else f" at {step.time_s:.3f} s"
         print(f"step {step.n}{when}: {'; '.join(part for part in parts if part)}")
+    if found.steps_next_cursor is not None:
+        print(f"... and {found.n_steps - len(found.steps)} further steps; {found.n_aligned} of all have channels now")
+        for reason, count in found.reasons.items():
+            print(f"{count} steps: {reason}")
     return 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -91,7 +91,13 @@ class _Step:
         )
 
 
-def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWriter | None = None) -> GaugeReadings:
+def read_gauges(
+    files: Sequence[Path],
+    request: GaugeRequest,
+    fields: FieldWriter | None = None,
+    *,
+    only: Collection[int] | None = None,
+) -> GaugeReadings:
     """Read a set of gauges in every step.
 
     Parameters
@@ -102,6 +108,9 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
         The gauges.
     fields
         Takes each step's field in the frame and without the motion that was asked for.
+    only
+        Steps to be read of those that are asked for, as of a page; None: all. The first of those that are asked for is
+        read in any case: a frame is laid through it, and positions in mm are found on it.
 
     Raises
     ------
@@ -114,7 +123,10 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
     MeasurementError
         ``too_few_points`` to align.
     """
-    chosen = _chosen(files, request.steps, request.difference_from)
+    chosen = steps_asked(files, request)
+    if only is not None:
+        needed = {*only, request.difference_from, number_of(chosen[0])}
+        chosen = [path for path in chosen if number_of(path) in needed]
     alignment: Alignment | None = None
     first: ResultHead | None = None
     grid: tuple[Float, Float] | None = None
@@ -154,7 +166,7 @@ def read_gauges(files: Sequence[Path], request: GaugeRequest, fields: FieldWrite
     steps = [
         stated(step, Statement(one, request))
         for step, one in zip(steps, included, strict=True)
-        if request.steps is None or step.n in request.steps
+        if (request.steps is None or step.n in request.steps) and (only is None or step.n in only)
     ]
     assert first is not None
     stale = stale_results(chosen, heads)
@@ -186,7 +198,17 @@ def _calibration(path: Path, head: ResultHead) -> dict[str, str | None]:
     return {"id": calibration_id_in(test, sha256), "sha256": sha256}
 
 
-def _chosen(files: Sequence[Path], wanted: Sequence[int] | None, base: int | None) -> list[Path]:
+def steps_asked(files: Sequence[Path], request: GaugeRequest) -> list[Path]:
+    """Return the result files that a request names, that of `difference_from` among them, ascending.
+
+    Raises
+    ------
+    StateError
+        ``no_results`` without files.
+    InputError
+        ``step_missing``.
+    """
+    wanted, base = request.steps, request.difference_from
     if not files:
         raise StateError(
             "There is no result file yet.",

@@ -82,3 +82,41 @@ export async function figuresOf(testId, analysisId, n) {
   const { steps } = await api.get(`/tests/${testId}/analyses/${analysisId}/steps`, { first: n, limit: 1 });
   return steps[0]?.n === n ? steps[0].figures ?? null : null;
 }
+
+/**
+ * The channels of a test's steps by the steps' numbers, page by page.
+ * @param {string} testId
+ */
+export async function channelsOfSteps(testId) {
+  /** @type {Map<number, { [name: string]: number }>} */
+  const found = new Map();
+  /** @type {string | null | undefined} */
+  let cursor;
+  do {
+    const page = await api.get(`/tests/${testId}/steps`, { limit: PAGE, channels: true, cursor });
+    for (const one of page.steps) found.set(one.n, one.channels ?? {});
+    cursor = page.next_cursor;
+  } while (cursor);
+  return found;
+}
+
+/** @import { Body, GaugeReadings } from "#routes" */
+
+/**
+ * Gauge readings of all steps that are asked for, page by page.
+ * @param {string} path of the analysis
+ * @param {Body<"post", "/tests/{test_id}/analyses/{analysis_id}/gauges">} body
+ * @param {{ [name: string]: unknown }} query
+ */
+export async function readGauges(path, body, query) {
+  /** @type {GaugeReadings[]} */
+  const steps = [];
+  /** @type {string | null | undefined} */
+  let cursor;
+  do {
+    const page = await api.post(/** @type {`/tests/${string}/analyses/${string}/gauges`} */ (`${path}/gauges`), body, { ...query, limit: PAGE, cursor });
+    steps.push(...page.steps);
+    cursor = page.next_cursor;
+  } while (cursor);
+  return steps;
+}

@@ -6,6 +6,7 @@ import { stepsPanel } from "./test/steps.js";
 import { liveValuesPanel } from "./test/live_values.js";
 import { metadataPanel } from "./test/metadata.js";
 import { measurePanel } from "./test/measure.js";
+import { procedurePanel } from "./test/procedure.js";
 import { warningsCell } from "./results/warnings.js";
 import { allRight, rule } from "../lib/fields.js";
 import { h, replace, field, select, action, table, when, notify, problemText } from "../lib/dom.js";
@@ -148,6 +149,6 @@ async function one(root, id) {
     }),
     () => { clearTimeout(later); more = false; },
   );
-  replace(root, h("div.spread", title, measure.head, h("a", { href: "#/test" }, "All tests")), h("div.grid", head, steps.root, measure.root, liveValues, analyses));
+  replace(root, h("div.spread", title, measure.head, h("a", { href: "#/test" }, "All tests")), h("div.grid", head, steps.root, procedurePanel(id, ends), measure.root, liveValues, analyses));
   return () => ends.forEach((end) => end());
 }

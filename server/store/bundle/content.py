@@ -20,7 +20,7 @@ UNFINISHED = re.compile(r"analyses/[^/]+/starts_\d+\.npz")
 _ID = r"\d{6}-[0-9a-f]{6}"
 #: names below the test's folder; nothing else ever becomes a path
 _NAMES = re.compile(
-    r"test\.json|workspace\.json|calibration\.json|calibrations/[0-9a-f]{64}\.json|"
+    r"test\.json|workspace\.json|certificate_plan\.json|calibration\.json|calibrations/[0-9a-f]{64}\.json|"
     r"steps/\d{4}/(step\.json|cam[12]\.tif)|steps/\d{4}\.deleted|"
     rf"analyses/a{_ID}/((analysis|jobs|noise|summary)\.json|mask\.png|step_\d{{4}}\.(nc|nc\.sha256|json)|"
     r"starts_\d{4}\.npz)|"

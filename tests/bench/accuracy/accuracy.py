@@ -37,6 +37,7 @@ from tests.bench.accuracy import (
 from tests.bench.accuracy import experiments as accuracy_experiments
 from tests.bench.accuracy import large as accuracy_large
 from tests.bench.accuracy import models as accuracy_models
+from tests.bench.accuracy import models_images as accuracy_models_images
 from tests.bench.accuracy import noise as accuracy_noise
 from tests.bench.accuracy import prefilter as accuracy_prefilter
 from tests.bench.accuracy import reliefs as accuracy_reliefs
@@ -70,6 +71,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     **accuracy_specimen.SECTIONS,
     **gauges.SECTIONS,
     **accuracy_models.SECTIONS,
+    **accuracy_models_images.SECTIONS,
     "cracks": accuracy_cracks.cracks,
     "large": accuracy_large.large_motion,
     "updates": sequence.updates,

@@ -37,7 +37,7 @@ TOPICS = (
     Topic("cracks", "Cracks", ("cracks",)),
     Topic("strain", "Strain", ("strains", "strain-bending", "strain-rim")),
     Topic("gauges", "Gauges", ("gauges",)),
-    Topic("models", "Comparison with a model", ("models",)),
+    Topic("models", "Comparison with a model", ("models", "models-images")),
     Topic("long_sequences", "Long sequences", ("updates",)),
     Topic("smoothing", "Smoothing", ("smoothing",)),
     Topic("faces", "Every face of a part", ("faces-plate", "faces-ball", "faces-misfit", "faces-cylinder")),

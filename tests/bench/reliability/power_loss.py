@@ -1,9 +1,10 @@
 """Opens every state in which a lost power may leave the data folder, and writes what was found.
 
 Days of work are recorded on the service itself, each in another order (tests/support/power_loss). At every instant of a
-day, the states are made that a file system may hold then, and the service starts on each.
+day, the states are made that a file system may hold then, and the service starts on each. The instants of a day are
+taken in passes that each go through the whole day, so that a run that is ended by the clock has seen all of its parts.
 
-    python -m tests.bench.reliability.power_loss [--states 100000] [--seed N] [--write]
+    python -m tests.bench.reliability.power_loss [--states 100000] [--minutes N] [--seed N] [--write]
 """
 
 from __future__ import annotations
@@ -15,21 +16,33 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 from tests.bench.documents.prose import wrapped
 from tests.bench.reliability.torture_lab import Pictures
 from tests.bench.reliability.torture_page import PAGE, table
-from tests.support.power_loss.check import CATALOGS, Verdict, crash_states, look_at_all
-from tests.support.power_loss.recording import record
+from tests.support.power_loss.check import CATALOGS, State, Verdict, crash_states, look_at_all
+from tests.support.power_loss.recording import Recording, record
 
 BEGIN, END = "<!-- power loss: begin -->", "<!-- power loss: end -->"
 _MEMORY = Path("/dev/shm")  # states are made and removed by the ten thousand
 _OF_AN_INSTANT = 200
+_PASSES = 32
 
 
-def run(states: int, seed: int, folder: Path) -> tuple[Verdict, Counter[str]]:
-    """Record days, and look at the states of each, until so many were seen.
+def _states(recording: Recording, seed: int, ends: float) -> Iterator[State]:
+    """Yield the states of a day pass by pass, until the clock says so."""
+    offsets = random.Random(seed).sample(range(_PASSES), _PASSES)
+    for offset in offsets:
+        for state in crash_states(recording, random.Random(seed), _OF_AN_INSTANT, _PASSES, offset):
+            if time.monotonic() > ends:
+                return
+            yield state
+
+
+def run(states: int, seed: int, folder: Path, minutes: float = float("inf")) -> tuple[Verdict, Counter[str]]:
+    """Record days, and look at the states of each, until so many were seen or the time is over.
 
     Returns
     -------
@@ -37,13 +50,13 @@ def run(states: int, seed: int, folder: Path) -> tuple[Verdict, Counter[str]]:
         What was found; the number of days, changes and acknowledged requests.
     """
     total, size, pictures = Verdict(), Counter[str](), Pictures(4)
-    while total.states < states:
+    ends = time.monotonic() + 60.0 * minutes
+    while total.states < states and time.monotonic() < ends:
         day = size["days"]
         top = folder / f"day{day}"
         top.mkdir(parents=True)
         recording = record(top, pictures, seed + day)
-        tried = crash_states(recording, random.Random(seed + day), _OF_AN_INSTANT)
-        found = look_at_all(recording, folder / f"states{day}", tried, print)
+        found = look_at_all(recording, folder / f"states{day}", _states(recording, seed + day, ends), print)
         total = Verdict(total.states + found.states, total.wrong + found.wrong, total.counts + found.counts)
         size.update({"days": 1, "changes": len(recording.journal.changes), "requests": len(recording.answers)})
         print(f"day {day + 1}: {found.states} states, {len(found.wrong)} things wrong", flush=True)
@@ -55,7 +68,7 @@ def run(states: int, seed: int, folder: Path) -> tuple[Verdict, Counter[str]]:
 def section(found: Verdict, size: Counter[str], wall_s: float) -> str:
     """Write the section of the page."""
     text = (
-        f"{found.states:,} states of {size['days']} recorded days ({size['requests']:,} acknowledged requests, "
+        f"{found.states:,} states of {size['days']} recorded {'day' if size['days'] == 1 else 'days'} ({size['requests']:,} acknowledged requests, "
         f"{size['changes']:,} changes of the data folder): {len(found.wrong)} in which something acknowledged was lost, "
         f"something half was shown, or `stereorig verify` disagreed. {wall_s / 60:.0f} minutes."
     )
@@ -68,12 +81,13 @@ def main() -> int:
     """Run, and write the section if asked."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--states", type=int, default=100_000, help="at least so many (100000)")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="end after so many, wherever it is then")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--write", action="store_true", help="write the section of docs/explanation/reliability.md")
     asked = parser.parse_args()
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="power-loss-", dir=_MEMORY if _MEMORY.is_dir() else None) as folder:
-        found, size = run(asked.states, asked.seed, Path(folder))
+        found, size = run(asked.states, asked.seed, Path(folder), asked.minutes)
     text = section(found, size, time.monotonic() - began)
     print(text)
     if asked.write:

@@ -79,7 +79,9 @@ def _files(names: Names, folders: set[int]) -> dict[str, str]:
     return {path: blob for path, blob in tree.items() if blob is not None and _is_data(path, blob)}
 
 
-def crash_states(recording: Recording, rng: random.Random, most: int, every: int = 1) -> Iterator[State]:
+def crash_states(
+    recording: Recording, rng: random.Random, most: int, every: int = 1, offset: int | None = None
+) -> Iterator[State]:
     """Yield states in which power may be lost during a recorded day.
 
     Parameters
@@ -88,12 +90,12 @@ def crash_states(recording: Recording, rng: random.Random, most: int, every: int
         Draws samples and catalogues.
     most
         States of one instant, at most.
-    every
-        Only every so many-th instant, from a drawn one.
+    every, offset
+        Only every so many-th instant, from this one; None: from a drawn one.
     """
     journal = recording.journal
     loss, live = PowerLoss(journal.is_folder, journal.blobs), Names()
-    offset = rng.randrange(every)
+    offset = rng.randrange(every) if offset is None else offset
     ends = [answer.at for answer in recording.answers[1:]] + [len(journal.changes)]
     at = 0
     for answer, older, end in zip(recording.answers, recording.answers[:1] + recording.answers, ends, strict=False):

@@ -1,7 +1,7 @@
 """A laboratory's day on the service itself, recorded down to every change of its data folder.
 
-Captures, a burst, imports, calibrations, noise, an analysis, recipes, deletion and restoring, over HTTP and one after
-the other: after each answer, the folder as it is then is what was acknowledged.
+Captures, a burst, imports, calibrations, noise, an analysis, models, certificates, recipes, deletion and restoring,
+over HTTP and one after the other: after each answer, the folder as it is then is what was acknowledged.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ from tests.support.service_rig import SMALL, served, wait_for_job, wait_for_rig
 
 COPIED = "t000007-abcdef"
 _RIG = SMALL.replace("frames = 2", "frames = 1").replace("time_scale = 2.5", "time_scale = 10.0")
+#: nodes of a finite element result about the plate's face
+_MODEL = b"x,y,z,ux,uy,uz\n" + b"".join(b"%d,%d,0,0,0,0.01\n" % (x, y) for x in (-20, 0, 20) for y in (-20, 0, 20))
 
 
 class ThreadWorker(TaskExecutor):
@@ -207,7 +209,27 @@ class _Day:
         cameras = {"file": ("c.json", json.dumps(self.pictures.calibration))}
         imported = self.ask("POST", "/calibrations:import", files=cameras)["id"]
         self.ask("PATCH", f"/tests/{COPIED}", json={"calibration_id": imported})
+        parts = [self._model, lambda: self._certificates(analysis)]
+        self.random.shuffle(parts)
+        for part in parts:
+            part()
         return [f"/tests/{COPIED}/analyses/{analysis}"]
+
+    def _model(self) -> None:
+        """Keep two models with the copied test, and delete one."""
+        url = f"/tests/{COPIED}/models"
+        model = self.ask("POST", url, files={"file": ("plate.csv", _MODEL)}, data={"unit": "mm"})["id"]
+        self.ask("POST", url, files={"file": ("plate.csv", _MODEL)}, data={"unit": "um"})
+        self.ask("DELETE", f"{url}/{model}")
+
+    def _certificates(self, analysis: str) -> None:
+        """Make certificates of the analysis, and withdraw them, or it could not be deleted."""
+        body = {"test_id": COPIED, "analysis_id": analysis, "plan": {"static_steps": [1, 2]}}
+        for title in ("first", "second"):
+            body["plan"] |= {"title": title}
+            self.ask("POST", "/certificates", json=body)
+        for one in self.client.get("/api/v1/certificates").json()["certificates"]:
+            self.ask("POST", f"/certificates/{one['id']}:withdraw", json={"reason": "the next part of the day"})
 
     def _delete(self, url: str) -> None:
         """Delete, restore, and delete again; for good sometimes."""

@@ -12,13 +12,16 @@ from fastapi.responses import Response
 from core.errors import InputError, MeasurementError
 from server.api.models import GaugesReply
 from server.api.protocol.dependencies import AnalysisId, FrameText, ServiceDep, TestId
+from server.api.protocol.paging import Page, ShortPageDep
 from server.api.protocol.problems import errors
 from server.formats.gauges.matlab import gauges_mat
 from server.formats.gauges.table import gauges_csv
+from server.formats.results.folder import number_of
 from server.results.gauges.fields import FieldWriter
-from server.results.gauges.readings import read_gauges
+from server.results.gauges.readings import read_gauges, steps_asked
 from server.results.gauges.request import GaugeRequest
 from server.workflows.analysis.framed import asked_of
+from server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
 _MATLAB = "application/x-matlab-data"
@@ -72,8 +75,14 @@ def read(
         Literal["json", "csv", "mat"], Query(description="mat: a MATLAB file; its columns are those of the CSV table.")
     ] = "json",
     frame: FrameText = None,
+    *,
+    page: ShortPageDep,
 ) -> dict[str, object] | Response:
-    """Answer at once with what points, extensometers, lines and areas read in the finished steps; nothing is stored."""
+    """Answer at once with what points, extensometers, lines and areas read in the finished steps; nothing is stored.
+
+    JSON holds a page of the steps, 100 unless `limit` says otherwise; `next_cursor` leads to the others. A table is a
+    file with all of them.
+    """
     steps = service.tests.finished_steps(test_id, analysis_id)
     asked = asked_of(service, test_id, frame)
     if asked is not None and body.align is not None:
@@ -81,10 +90,25 @@ def read(
             "The frame is given twice, in `align` and in frame=.", code="option_conflict", remedy="Give one of them."
         )
     body = body if asked is None else body.model_copy(update={"align": asked})
-    readings = read_gauges([service.tests.result_file(test_id, analysis_id, n) for n in steps], body)
     if format == "json":
-        return readings.document()
+        return _page(service, test_id, analysis_id, steps, body, page)
+    readings = read_gauges([service.tests.result_file(test_id, analysis_id, n) for n in steps], body)
     headers = {"Content-Disposition": f'attachment; filename="{test_id}_{analysis_id}_gauges.{format}"'}
     if format == "csv":
         return Response(gauges_csv(readings), media_type="text/csv; charset=utf-8", headers=headers)
     return Response(gauges_mat(readings), media_type=_MATLAB, headers=headers)
+
+
+def _page(
+    service: Service, test_id: str, analysis_id: str, steps: list[int], body: GaugeRequest, page: Page
+) -> dict[str, object]:
+    """Read the gauges in a page of the steps; the files of the others are not touched."""
+    folder = service.tests.analysis_path(test_id, analysis_id)
+    asked = [number_of(path) for path in steps_asked([folder / f"step_{n:04d}.nc" for n in steps], body)]
+    shown = [n for n in asked if body.steps is None or n in body.steps]
+    only = page.of(shown, lambda n: f"{n:04d}")
+    needed = sorted({*only, asked[0], *(() if body.difference_from is None else (body.difference_from,))})
+    files = [service.tests.result_file(test_id, analysis_id, n) for n in needed]
+    readings = read_gauges(files, body.model_copy(update={"steps": needed}), only=only)
+    whole = {"settings": body.model_dump(mode="json"), "next_cursor": page.next_cursor}
+    return readings.document() | whole

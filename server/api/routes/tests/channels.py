@@ -8,6 +8,7 @@ from fastapi import APIRouter, File, Form, UploadFile
 
 from server.api.models.channels import ChannelsImported
 from server.api.protocol.dependencies import ServiceDep, TestId
+from server.api.protocol.paging import WHOLE, cursor_of
 from server.api.protocol.problems import errors
 from server.base.models import FormNumber, Timestamp
 from server.formats.channel_table import read_channel_table
@@ -54,9 +55,13 @@ def import_channels(
 
     A column `Force (kN)` becomes the channel `force_kn`. Times are dates as in `2026-03-01T12:00:00.25Z` (UTC where no
     zone is stated), or seconds of the record's own clock. A step's time is its `timestamp_utc`, else `captured_utc`.
-    Steps outside the record, or in a gap of it, get nothing and are listed with the reason. All steps or none change.
+    Steps outside the record, or in a gap of it, get nothing and are counted by the reason. All steps or none change.
+    The first 100 steps are listed; those after them have their channels in `GET /tests/{id}/steps?channels=true`.
     """
     service.tests.path(test_id)
     table = read_channel_table(file.file.read(), time_column=time_column)
     how = Alignment(starts_utc, at_step, at_s, offset_s, max_gap_s, load, replace)
-    return ChannelsImported.model_validate(align_and_keep(service, test_id, table, how))
+    done = align_and_keep(service, test_id, table, how)
+    first = done.steps[:WHOLE]
+    further = cursor_of(f"{first[-1]['n']:04d}") if len(done.steps) > WHOLE else None
+    return ChannelsImported.model_validate({**done.summary, "steps": first, "steps_next_cursor": further})

@@ -251,11 +251,18 @@ def import_images(
 
 
 @router.get("/{test_id}/steps", summary="A test's steps, in order", responses=errors(404, 422))
-def list_steps(service: ServiceDep, test_id: TestId, page: PageDep) -> StepList:
+def list_steps(
+    service: ServiceDep,
+    test_id: TestId,
+    page: PageDep,
+    channels: Annotated[bool, Query(description="With each step's channels.")] = False,
+) -> StepList:
     """Return the complete steps."""
     service.tests.path(test_id)
     rest = service.catalog.entries("step", test_id, after=page.after, limit=page.limit + 1)
     steps = page.cut(rest, lambda s: f"{s['n']:04d}")
+    if channels:
+        steps = [{**one, "channels": service.tests.step(test_id, one["n"]).document.channels} for one in steps]
     return StepList.model_validate({"steps": steps, "next_cursor": page.next_cursor})
 
 

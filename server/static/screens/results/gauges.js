@@ -1,5 +1,6 @@
 // Gauges drawn on the picture: a line, extensometers, an area; read by the API's gauges operation.
 import * as api from "../../lib/api.js";
+import { readGauges } from "../../lib/steps.js";
 import { chart } from "../../widgets/plots.js";
 import { h, svg, numeric, replace, table, num, tick, count, number, select, field, action, notify, problemText } from "../../lib/dom.js";
 import { nudge, onGrab } from "../../widgets/view.js";
@@ -343,7 +344,7 @@ export function gauges(screen) {
       return;
     }
     if (!answers.extensometer) replace(extTable, h("p.quiet", "Reading …"));
-    answers.extensometer = (await api.post(`${result.path}/gauges`, body({ extensometers: state.extensometers.map((one) => ({ name: one.name, a_px: one.a, b_px: one.b })) }), { frame: result.frame })).steps;
+    answers.extensometer = await readGauges(result.path, body({ extensometers: state.extensometers.map((one) => ({ name: one.name, a_px: one.a, b_px: one.b })) }), { frame: result.frame });
     await against.fill();
     await drawExtensometers();
   }
@@ -402,9 +403,9 @@ export function gauges(screen) {
     if (screen.info.component !== null) return void replace(areaBox, h("p.quiet", "An area needs a scalar field; choose another field."));
     const { name } = screen.info;
     if (!areaBox.firstChild) replace(areaBox, h("p.quiet", "Reading …"));
-    const answer = await api.post(`${result.path}/gauges`, body({ areas: [{ rectangle_px: state.area }], variables: [name] }), { frame: result.frame });
+    const steps = await readGauges(result.path, body({ areas: [{ rectangle_px: state.area }], variables: [name] }), { frame: result.frame });
     await areaAgainst.fill();
-    drawArea(name, answer.steps);
+    drawArea(name, steps);
   }
   /**
    * @param {string} name

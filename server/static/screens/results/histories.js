@@ -1,25 +1,22 @@
 // What histories are drawn against: step number, time, load, a channel, the number in the label; and an area's history.
-import * as api from "../../lib/api.js";
+import { channelsOfSteps } from "../../lib/steps.js";
 import { chart } from "../../widgets/plots.js";
 import { h, select, replace } from "../../lib/dom.js";
 
-/** @import { GaugeReadings, Model } from "#routes" */
+/** @import { GaugeReadings } from "#routes" */
 /** @import { Result } from "./analysis.js" */
 /** @import { Interval } from "./uncertainty.js" */
 
-/** @type {WeakMap<Result, Map<number, Partial<Model<"StepReply">>>>} step -> its document, for channels */
-const documents = new WeakMap();
+/** @type {WeakMap<Result, { steps: number, found: Map<number, { [name: string]: number }> }>} step -> its channels */
+const kept = new WeakMap();
 
 /** @param {Result} result */
 async function channelsOf(result) {
-  const known = documents.get(result) ?? new Map();
-  documents.set(result, known);
-  const wanted = [...new Set([...result.steps, result.reference])].filter((n) => !known.has(n));
-  // channels are in the steps' own documents; a few at a time
-  for (let k = 0; k < wanted.length; k += 8) {
-    await Promise.all(wanted.slice(k, k + 8).map(async (n) => known.set(n, await api.get(`/tests/${result.testId}/steps/${n}`).catch(() => ({})))));
-  }
-  return known;
+  const known = kept.get(result);
+  if (known && known.steps === result.steps.length) return known.found;
+  const found = await channelsOfSteps(result.testId);
+  kept.set(result, { steps: result.steps.length, found });
+  return found;
 }
 
 /** "pressure_kpa" -> "pressure (kPa)": the unit that a channel's name ends in. @param {string} name */
@@ -33,8 +30,8 @@ export function channelText(name) {
 /** The choice of an abscissa. @param {Result} result */
 export function abscissas(result) {
   const choice = select([["n", "step number"]], "n");
-  /** @type {Map<number, Partial<Model<"StepReply">>>} */
-  let documents_ = new Map();
+  /** @type {Map<number, { [name: string]: number }>} */
+  let channels_ = new Map();
   let chosen = false; // by the user
   choice.addEventListener("change", () => { chosen = true; });
   async function fill() {
@@ -42,8 +39,8 @@ export function abscissas(result) {
     const found = [["n", "step number"]];
     if (listed.some((one) => one.captured_utc)) found.push(["time", "time (s)"]);
     if (listed.some((one) => one.load_n !== null && one.load_n !== undefined)) found.push(["load", "load (N)"]);
-    documents_ = await channelsOf(result);
-    const channels = [...new Set([...documents_.values()].flatMap((one) => Object.keys(one.channels ?? {})))];
+    channels_ = await channelsOf(result);
+    const channels = [...new Set([...channels_.values()].flatMap(Object.keys))];
     for (const name of channels) found.push([`channel:${name}`, channelText(name)]);
     if (listed.some((one) => Number.isFinite(parseFloat(one.label ?? "")))) found.push(["label", "number in the label"]);
     const before = choice.value;
@@ -62,7 +59,7 @@ export function abscissas(result) {
     if (choice.value === "time") return (time(step) - time(listed(result.reference))) / 1000;
     if (choice.value === "load") return step?.load_n ?? null;
     if (choice.value === "label") return Number.isFinite(parseFloat(step?.label ?? "")) ? parseFloat(step?.label ?? "") : null;
-    return documents_.get(n)?.channels?.[choice.value.slice(8)] ?? null;
+    return channels_.get(n)?.[choice.value.slice(8)] ?? null;
   }
   return { choice, fill, at, get text() { return choice.selectedOptions[0]?.text ?? ""; } };
 }

@@ -1,5 +1,5 @@
 // Several lines, and lines over the steps, in one plot of the shown field.
-import * as api from "../../lib/api.js";
+import { readGauges } from "../../lib/steps.js";
 import { chart } from "../../widgets/plots.js";
 import { distanceMm, resampled } from "../../lib/along.js";
 import { shown } from "../../lib/units.js";
@@ -69,14 +69,15 @@ export function lines(screen, { kept, current, body, redraw }) {
     }
     const { name, unit: units, text } = screen.info;
     const variables = [...new Set([name, "x_mm", "y_mm", "z_mm"])];
-    const answer = await api.post(`${result.path}/gauges`, body({ lines: each.map((one) => ({ name: one.name, vertices_px: one.ends })), variables, ...(all ? {} : { steps: [screen.step] }) }), { frame: result.frame });
+    const steps = await readGauges(result.path, body({ lines: each.map((one) => ({ name: one.name, vertices_px: one.ends })), variables, steps: all ? result.steps.slice(-MOST) : [screen.step] }), { frame: result.frame });
     if (mine !== asked) return;
     /** @type {Curve[]} */
-    const curves = answer.steps.filter((step) => !step.problem).flatMap((step) => (step.lines ?? []).map((line, k) => ({
+    const curves = steps.filter((step) => !step.problem).flatMap((step) => (step.lines ?? []).map((line, k) => ({
       label: [kept.length ? each[k].name : "", all ? `step ${step.n}` : ""].filter(Boolean).join(", "), colour: kept.length > 1 || !all ? k : step.n,
       x: line.distance_px, mm: distanceMm(["x_mm", "y_mm", "z_mm"].map((axis) => line.values[axis].value)), value: line.values[name]?.value ?? line.distance_px.map(() => null),
     })));
     const drawn = curves.filter((one) => one.value.some((v) => v !== null)).slice(-MOST);
+    const total = all ? result.steps.length * each.length : curves.length;
     const { unit: base, factor } = shownUnit(name, units);
     const to = shown(base, factor * drawn.reduce((most, one) => one.value.reduce((/** @type {number} */ m, v) => Math.max(m, Math.abs(v ?? 0)), most), 0));
     const inMm = drawn.every((one) => one.mm);
@@ -86,7 +87,7 @@ export function lines(screen, { kept, current, body, redraw }) {
     box.dataset.answer = JSON.stringify(drawn.map((one) => ({ label: one.label, value: one.value })));
     plot?.close();
     plot = null;
-    note.textContent = `${drawn.length} ${drawn.length === 1 ? "curve" : "curves"}${curves.length > drawn.length ? ` of ${curves.length}: steps without ${text} are left out, and no more than ${MOST} are drawn` : ""}`;
+    note.textContent = `${drawn.length} ${drawn.length === 1 ? "curve" : "curves"}${total > drawn.length ? ` of ${total}: steps without ${text} are left out, and no more than ${MOST} are drawn` : ""}`;
     plot = await chart(box, { x: inMm ? "distance (mm)" : "distance (px)", y: `${text}${to.unit ? ` (${to.unit})` : ""}`, height: 320, label: `${text} along ${each.length === 1 ? "the line" : "the lines"}`,
       series: drawn.map((one) => ({ label: one.label, colour: one.colour })),
       data: [at, ...drawn.map((one) => resampled(xOf(one), one.value, at).map((v) => (v === null ? null : v * factor * to.factor)))] });

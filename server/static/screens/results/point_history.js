@@ -9,7 +9,7 @@ import { abscissas, isRelative } from "./histories.js";
 /** @import { Viewer } from "../results.js" */
 /** @typedef {{ n: number, value: number | null, u: number | null, why: string }} Reading in the unit of the file */
 
-const AT_ONCE = 6;
+const PAGE = 500;
 
 /** @param {Viewer} screen */
 export function pointHistory(screen) {
@@ -21,25 +21,40 @@ export function pointHistory(screen) {
   const root = h("details.panel", { "data-role": "point" }, h("summary", "Point"), h("div.row", field("History against", against.choice)), text, box, list);
   /** @type {Awaited<ReturnType<typeof chart>> | null} */
   let plot = null;
-  /** @type {Map<string, Promise<Record<string, Reading>>>} by step, point and axes: every variable of it */
+  /** @type {Map<string, Promise<Reading[]>>} by number of steps, variable, point and axes */
   const known = new Map();
   let asked = 0;
 
   /**
-   * @param {number} n
+   * A variable of a point in all steps, in columns.
+   * @param {string} name
    * @param {number} i
    */
-  function read(n, i) {
-    const key = `${result.frame} ${n} ${i}`;
+  function read(name, i) {
+    const key = `${result.steps.length} ${result.frame} ${name} ${i}`;
     const held = known.get(key);
     if (held) return held;
     const { grid } = /** @type {NonNullable<typeof map.now>} */ (map.now);
-    const made = api.get(`${result.path}/probe`, { x_px: Math.max(grid.x[i], 0), y_px: Math.max(grid.y[i], 0), step: n, frame: result.frame }).then((answer) => Object.fromEntries(
-      Object.entries(answer.values).filter(([, one]) => !Array.isArray(one.value)).map(([name, one]) =>
-        [name, { n, value: /** @type {number | null} */ (one.value ?? null), u: one.sigma ?? null, why: answer.status.replace(/_/g, " ") }])));
+    const made = pages(name, { x_px: Math.max(grid.x[i], 0), y_px: Math.max(grid.y[i], 0), frame: result.frame, limit: PAGE });
     known.set(key, made);
     made.catch(() => known.delete(key));
     return made;
+  }
+  /**
+   * @param {string} name
+   * @param {{ x_px: number, y_px: number, frame: string, limit: number }} where
+   */
+  async function pages(name, where) {
+    /** @type {Reading[]} */
+    const found = [];
+    /** @type {string | null | undefined} */
+    let cursor;
+    do {
+      const page = await api.get(`${result.path}/history/${name}`, { ...where, cursor });
+      page.n.forEach((n, k) => found.push({ n, value: page.value[k], u: page.sigma[k], why: page.status[k] === "ok" ? "not in this step" : page.status[k].replace(/_/g, " ") }));
+      cursor = page.next_cursor;
+    } while (cursor);
+    return found;
   }
 
   async function draw() {
@@ -53,13 +68,8 @@ export function pointHistory(screen) {
     }
     if (!box.firstChild) text.textContent = "Reading …";
     const steps = result.steps;
-    /** @type {Reading[]} */
-    const found = [];
-    for (let k = 0; k < steps.length; k += AT_ONCE) {
-      const each = await Promise.all(steps.slice(k, k + AT_ONCE).map((n) => read(n, i)));
-      if (mine !== asked) return;
-      each.forEach((values, at) => found.push(values[info.name] ?? { n: steps[k + at], value: null, u: null, why: "not in this step" }));
-    }
+    const found = await read(info.name, i);
+    if (mine !== asked) return;
     await against.fill();
     if (mine !== asked) return;
     // at the reference a displacement or a strain is zero by definition
