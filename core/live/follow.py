@@ -1,7 +1,7 @@
 """Frames followed: each point starts from where it was in the frame before, moved on by the field's smooth velocity.
 
-From such a start one step of the fit is enough. What one step leaves is a share of the way that it went, and is measured:
-wherever all points are fitted on until they settle, the difference over their standard deviations, per px of that way.
+From such a start one step of the fit is enough. What it leaves is a share of the way that it went, and is measured
+wherever all points are fitted on until they settle: the difference over their standard deviations, per px of that way.
 A frame whose points would be off by more than two hundredths of a standard deviation by that is fitted on, and in any
 frame the points that would be off by a tenth.
 """
@@ -24,7 +24,7 @@ from core.field.points.starts import Starts
 from core.field.region.region import PointGrid
 from core.field.settings import MeasureOptions
 from core.live.converted import Constant, convert
-from core.matching.arguments import flat, given_to_kernels, run_kernel, setting_of
+from core.matching.arguments import flat, given_to_kernels, one_a_thread, run_kernel, setting_of
 from core.matching.image import Box, ImageData, prepare_part
 from core.matching.kernels.drivers import run_points, work_space
 from core.matching.kernels.given import Given
@@ -42,8 +42,7 @@ _AT_ONCE = 256
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """A followed frame: its field, and what one step leaves, standard deviations per px of its way; infinite if not
-    known."""
+    """A followed frame: its field, and what a step leaves, standard deviations per px of its way; infinite: unknown."""
 
     field: Field
     left_per_px: float
@@ -93,6 +92,8 @@ class Follower:
         )
         self._scale = disagreement_scale(self._pair, inputs.rays, depth)
         self._given: dict[int, Given] = {}
+        # kept from frame to frame: the points' partly visible subsets are always the same
+        self._spaces = {d: one_a_thread(make, options.subset_px) for d, make in work_space["motion"].items()}
         self._around: tuple[Field | None, tuple[float, float]] = None, (0.0, 0.0)
         self._smoothing: tuple[Bool | None, Float] = None, np.zeros((0, 0))
         middle, width = self._xy.mean(axis=0), np.maximum(np.ptp(self._xy, axis=0), 1.0)
@@ -155,8 +156,8 @@ class Follower:
             again = had
         if again.any():
             fits, left = self._settled(given, current, fits, again, w, G, ratio)
-            if again is had and way > 0.0:
-                left_per_px = left / way
+            if again is had and way > 0.0:  # over a longer way it would be more per px
+                left_per_px = min(left / way, left_per_px)
         return Followed(self._field(fits, terms, had, previous), left_per_px)
 
     def _settled(
@@ -203,16 +204,21 @@ class Follower:
         one_step: bool,
         constant: Constant | None = None,
     ) -> _Fits:
-        m, terms = w.shape
-        options = (
-            replace(self._inputs.matcher.options, patch="quadratic") if terms == 6 else self._inputs.matcher.options
-        )
-        options = replace(options, first_rate=0.0) if one_step else options
-        matcher = self._inputs.matcher
+        (m, terms), matcher = w.shape, self._inputs.matcher
+        options = replace(matcher.options, first_rate=0.0) if one_step else matcher.options
+        if terms == 6:
+            options = replace(options, patch="quadratic")
         given = given._replace(setting=setting_of(options, [matcher.ref1, matcher.ref2, *current]))
         degree = 2 if terms == 6 else 1
         out = np.full((m, n_motion_out(terms)), np.nan)
-        status, iterations = run_kernel(run_points["motion"][degree], work_space["motion"][degree], given, out)
+        status, iterations = run_kernel(
+            run_points["motion"][degree],
+            work_space["motion"][degree],
+            given,
+            out,
+            kept_space=self._spaces[degree],
+            at_once=_AT_ONCE,
+        )
         status[~had] = PointStatus.NOT_SEEDED
         moved, uvw, covariance = np.full(m, np.nan), np.full((m, 3), np.nan), np.full((m, 6, 6), np.nan)
         arrays = (

@@ -1,10 +1,10 @@
 """The measurement of frames as they come, each from the motion of those before it.
 
 A frame is followed (:mod:`core.live.follow`): every point starts from the last frame's values, moved on, and takes one
-step of the fit, and the checks of single points and of neighbours. What takes longer and changes slowly is measured as a step of a
-sequence is (:class:`core.field.sequence.reference_steps.Updating`), with all its checks: the first frame, every
-``audit_every``-th, a frame whose points were lost, and while some are lost every ``retry_every``-th. What that finds
-of the residuals, the points' standard deviations over those of a fit by itself, holds for the frames that follow it.
+step of the fit, and the checks of single points and of neighbours. What takes longer and changes slowly is measured as
+a step of a sequence is (:class:`core.field.sequence.reference_steps.Updating`), with all its checks: the first frame,
+every ``audit_every``-th, a frame whose points were lost, and while some are lost every ``retry_every``-th. What that
+finds of the residuals, the points' standard deviations over those of a fit by itself, holds for the frames that follow.
 """
 
 from __future__ import annotations
