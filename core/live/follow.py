@@ -94,7 +94,7 @@ class Follower:
         self._given: dict[int, Given] = {}
         # kept from frame to frame: the points' partly visible subsets are always the same
         self._spaces = {d: one_a_thread(make, options.subset_px) for d, make in work_space["motion"].items()}
-        self._around: tuple[Field | None, tuple[float, float]] = None, (0.0, 0.0)
+        self._around: tuple[object, tuple[float, float]] | None = None  # of a patch choice
         self._smoothing: tuple[Bool | None, Float] = None, np.zeros((0, 0))
         middle, width = self._xy.mean(axis=0), np.maximum(np.ptp(self._xy, axis=0), 1.0)
         x, y = ((self._xy - middle) / width).T
@@ -285,7 +285,7 @@ class Follower:
         return found[0], found[1]
 
     def _boxes(self, previous: Field, w: Float, G: Float) -> tuple[Box, Box]:
-        if self._around[0] is not previous.patch or not any(self._around[1]):
+        if self._around is None or self._around[0] is not previous.patch:  # anew with each frame that is a step
             self._around = previous.patch, self._reach_px(w, G)
         boxes = []
         for positions, reach, image in zip(

@@ -211,11 +211,11 @@ class GaugeSet:
         rows = None
         if now.common is not None:
             rows = joined.sum_of(v @ now.common.reshape(n, 6, -1)[used][at])
-        for gauge, *of_gauge in zip(
-            joined.gauges, numbers, own, [None] * len(own) if rows is None else rows, strict=True
-        ):
-            readings = readings_of(*of_gauge, now.causes)
-            found[gauge.name] = GaugeReadings(dict(zip(UNITS[gauge.kind], readings, strict=False)))
+        for k, gauge in enumerate(joined.gauges):
+            many = len(UNITS[gauge.kind])
+            common = None if rows is None else rows[k, :many]
+            readings = readings_of(numbers[k, :many], own[k, :many], common, now.causes)
+            found[gauge.name] = GaugeReadings(dict(zip(UNITS[gauge.kind], readings, strict=True)))
         return found
 
     def _prepare(self, now: Field) -> _Joined:
