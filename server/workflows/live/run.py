@@ -10,7 +10,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -20,6 +20,7 @@ from core.names import CAMERAS
 from drivers.acquisition.pairing import Pair
 from server.base.models import utc_text
 from server.base.problem import JobProblem, problem_of
+from server.config.rig_file import ChannelSection
 from server.jobs.events import EventHub
 from server.rig import Rig
 from server.rig.cameras import PairMark
@@ -27,6 +28,7 @@ from server.worker.embedded import make_worker
 from server.worker.executor import WorkerDiedError
 from server.worker.tasks import LiveTask, Plain, begin_live, measure_live
 from server.workflows.live.account import Account
+from server.workflows.live.read_channels import ReadChannels
 from server.workflows.live.series import LiveSeries, Moment
 
 _log = logging.getLogger("stereorig.live")
@@ -59,6 +61,8 @@ class LiveRun:
         Kernel threads of its process.
     silence_s
         Values older than this are no longer valid.
+    channels
+        Channels that are read beside it.
     """
 
     def __init__(
@@ -70,6 +74,7 @@ class LiveRun:
         *,
         threads: int | None,
         silence_s: float,
+        channels: Sequence[ChannelSection] = (),
     ) -> None:
         self.test_id, self.settings, self.silence_s = test_id, settings, silence_s
         self._task, self._rig = task, rig
@@ -77,6 +82,7 @@ class LiveRun:
         self.hub = EventHub(keep=_KEPT_EVENTS)
         self.account = Account()
         self.series = LiveSeries()
+        self.lines = ReadChannels(channels, self.series)
         self.state = "starting"
         self.problem: JobProblem | None = None
         self.begun: Plain = {}
@@ -99,6 +105,7 @@ class LiveRun:
     def start(self) -> None:
         """Begin; the reference is measured first, in the background."""
         self._worker.start()
+        self.lines.start()
         self._threads[1].start()
 
     def stop(self) -> None:
@@ -107,6 +114,7 @@ class LiveRun:
         for thread in self._threads:
             if thread.ident is not None and thread is not threading.current_thread():
                 thread.join(timeout=5.0)
+        self.lines.stop()
         self._worker.shutdown()
         if self.state != "failed":
             self.state = "ended"

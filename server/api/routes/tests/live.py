@@ -66,10 +66,15 @@ def _shown(request: Request, run: LiveRun) -> LiveReply:
             "reference_points": run.begun.get("points"),
             "values": run.newest(),
             "account": run.account.document(),
-            "channels": run.series.channels(),
+            "channels": _channels(run),
             "tcp_port": request.app.state.lines.port,
         }
     )
+
+
+def _channels(run: LiveRun) -> dict[str, dict[str, object]]:
+    lines, readings = run.lines.document(), run.series.channels()
+    return {name: {**lines.get(name, {}), **readings.get(name, {})} for name in {**lines, **readings}}
 
 
 @router.post("/live", summary="Measure a test live", status_code=201, responses=errors(404, 409, 422, 503))
@@ -185,9 +190,13 @@ def live_field(run: RunDep) -> LiveField:
 
 @router.post("/live/channels", summary="Readings of channels beside it", responses=errors(404, 422))
 def post_live_channels(run: RunDep, body: LiveReadings) -> LiveReadingsReply:
-    """Take readings; between them a channel is known at each frame's exposure. All or none are taken."""
+    """Take readings; between them a channel is known at each frame's exposure. All or none are taken.
+
+    Channels that the rig file names (`[[live.channels]]`) are read by the service, and not posted.
+    """
     arrived = time.monotonic()
     readings = [(arrived if one.time_s is None else one.time_s, one.channels) for one in body.readings]
+    run.lines.refuse_posted({name for _, channels in readings for name in channels})
     return LiveReadingsReply(taken=run.series.put(readings))
 
 
