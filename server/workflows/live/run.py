@@ -78,6 +78,7 @@ class LiveRun:
     ) -> None:
         self.test_id, self.settings, self.silence_s = test_id, settings, silence_s
         self._task, self._rig = task, rig
+        self.whole_field = task.whole_field
         self.kinds = {str(gauge["name"]): str(gauge["kind"]) for gauge in task.gauges}
         self.hub = EventHub(keep=_KEPT_EVENTS)
         self.account = Account()
@@ -86,7 +87,8 @@ class LiveRun:
         self.state = "starting"
         self.problem: JobProblem | None = None
         self.begun: Plain = {}
-        self.field: Any = None
+        self.field: tuple[int, Any] | None = None
+        """Number of the newest frame with a field, and its displacements (r, c, 3), mm."""
         self.since_utc = utc_text(datetime.now(UTC))
         self._worker = make_worker(threads, lowered=False)
         self._newest: Plain = {"number": 0, "valid": False, "reason": "starting", "gauges": {}}
@@ -239,7 +241,7 @@ class LiveRun:
         gauges = {name: _gauge(self.kinds[name], one) for name, one in found["gauges"].items()}
         values = {name: {q: number["value"] for q, number in gauge["values"].items()} for name, gauge in gauges.items()}
         self.series.add(Moment(self._number, exposed_ns / 1e9, values))
-        self.field = found.get("field")
+        self.field = (self._number, found["field"]) if "field" in found else None
         self._publish(
             {
                 "number": self._number,
@@ -307,8 +309,14 @@ class _HostClock:
 def _gauge(kind: str, found: Plain) -> Plain:
     missing = str(found["missing"])
     values = {
-        quantity: {"value": value, "u": _known(u), "u_calibration": _known(common), "units": UNITS[kind][quantity]}  # type: ignore[index]
-        for quantity, (value, u, common) in found["values"].items()
+        quantity: {
+            "value": value,
+            "u": _known(u),
+            "u_calibration": _known(common),
+            "budget": budget,
+            "units": UNITS[kind][quantity],  # type: ignore[index]
+        }
+        for quantity, (value, u, common, budget) in found["values"].items()
     }
     return {"kind": kind, "valid": not missing, "reason": missing, "values": values}
 
