@@ -49,6 +49,32 @@ def reading_of(value: float, own: float, frozen: float | None, common: Float | N
     return Reading(value, float(np.hypot(sigma, part)), part, budget, common, causes)
 
 
+def readings_of(values: Float, own: Float, common: Float | None, causes: Causes | None) -> list[Reading]:
+    """Return the readings of numbers (k,) as :func:`reading_of` does, all at once.
+
+    ``own`` (k,) are their own variances, of which the reference's part is not told apart; ``common`` (k, c) their
+    common factors.
+    """
+    sigma = np.sqrt(np.maximum(own, 0.0))
+    if common is None:
+        return [Reading(v, s, budget=Budget(matching=s)) for v, s in zip(values.tolist(), sigma.tolist(), strict=True)]
+    told = Causes.untold(common.shape[1]) if causes is None else causes
+    parts = {name: np.sqrt(square).tolist() for name, square in told.squares(common).items()}
+    part = np.linalg.norm(common, axis=1)
+    each = zip(values.tolist(), np.hypot(sigma, part).tolist(), part.tolist(), sigma.tolist(), strict=True)
+    return [
+        Reading(
+            value,
+            whole,
+            calibration,
+            Budget(matching=matching, **{name: squares[k] for name, squares in parts.items()}),
+            common[k],
+            causes,
+        )
+        for k, (value, whole, calibration, matching) in enumerate(each)
+    ]
+
+
 def difference(a: Reading, b: Reading) -> Reading:
     """Return b - a, of one quantity in two steps of a test; NaN without either value.
 

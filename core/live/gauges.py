@@ -15,14 +15,14 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import block_diag, csr_array
 from scipy.spatial import cKDTree
 
 from core.arrays import Bool, Float
 from core.errors import RegionError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels, roots_of
-from core.gauge.reading import Reading, reading_of
+from core.gauge.reading import Reading, readings_of
 from core.gauge.sampling import sample
 from core.settings import StrainTensor
 from core.status import PointStatus
@@ -40,6 +40,7 @@ UNITS: Mapping[GaugeKind, Mapping[str, str]] = {
 _ENOUGH = 0.5
 _MIN_POINTS = 3
 _STRAIGHT = 1e-6
+_SUMS, _QUANTITIES = 3, 6  # of a gauge, at most
 _ABOUT = 2  # points on either side of a position that its cubics and their checks use
 
 
@@ -117,6 +118,47 @@ class _Weights:
     missing: str = ""
 
 
+@dataclass(frozen=True, eq=False)
+class _Joined:
+    """The gauges that can be read, as one: a row for each gauge and point that it uses.
+
+    ``gauges`` in order, ``missing`` why the others have no values; ``index`` the points that any uses, ``place`` (m,) a
+    row's point among these, ``gauge_of`` (m,) its gauge, ``first`` each gauge's first row, ``weight`` (m, 3) of the row
+    in the gauge's sums, ``correlation`` (m, m).
+    """
+
+    gauges: Sequence[LiveGauge]
+    missing: Mapping[str, str]
+    index: NDArray[np.int64]
+    place: NDArray[np.int64]
+    gauge_of: NDArray[np.int64]
+    first: NDArray[np.int64]
+    weight: Float
+    correlation: csr_array
+
+    @staticmethod
+    def of(gauges: Sequence[LiveGauge], weights: Sequence[_Weights]) -> _Joined:
+        """Join the gauges that have weights."""
+        missing = {gauge.name: one.missing for gauge, one in zip(gauges, weights, strict=True) if one.missing}
+        there = [(gauge, one) for gauge, one in zip(gauges, weights, strict=True) if not one.missing]
+        if not there:
+            nothing = np.zeros(0, np.int64)
+            return _Joined([], missing, *(nothing,) * 4, np.zeros((0, _SUMS)), csr_array((0, 0)))
+        sizes = np.array([len(one.index) for _, one in there])
+        index, place = np.unique(np.concatenate([one.index for _, one in there]), return_inverse=True)
+        weight = np.zeros((len(place), _SUMS))
+        first = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+        for begin, size, (_, one) in zip(first, sizes, there, strict=True):
+            weight[begin : begin + size, : len(one.weight)] = one.weight.T
+        correlation = csr_array(block_diag([one.correlation for _, one in there], format="csr"))
+        gauge_of = np.repeat(np.arange(len(there)), sizes)
+        return _Joined([gauge for gauge, _ in there], missing, index, place, gauge_of, first, weight, correlation)
+
+    def sum_of(self, rows: Float) -> Float:
+        """Return the sum (g, ...) of rows (m, ...) by gauge."""
+        return np.asarray(np.add.reduceat(rows, self.first, axis=0))
+
+
 @dataclass(eq=False)
 class GaugeSet:
     """Gauges over the fields of one live measurement; weights are kept while the same points are valid.
@@ -134,8 +176,8 @@ class GaugeSet:
     gauges: Sequence[LiveGauge]
     subset_px: float
     shape: Field
-    _weights: list[_Weights] = field(default_factory=list, init=False)
-    _status: NDArray[np.int8] | None = field(default=None, init=False)
+    _joined: _Joined | None = field(default=None, init=False)
+    _status: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8), init=False)
     _curved: bool = field(default=False, init=False)
 
     def needed(self, spacing_px: float) -> Bool:
@@ -145,51 +187,44 @@ class GaugeSet:
 
     def used(self, now: Field) -> Bool:
         """Return (r, c) True for the points whose numbers the gauges use in a field."""
-        self._prepare(now)
         used = np.zeros(now.status.size, bool)
-        for weights in self._weights:
-            used[weights.index] = True
+        used[self._prepare(now).index] = True
         return used.reshape(now.shape)
 
     def read(self, now: Field) -> dict[str, GaugeReadings]:
         """Return the readings of every gauge in a displacement field, by name."""
         assert now.uvw_mm is not None
-        used = np.flatnonzero(self.used(now).ravel())
-        place = np.empty(now.status.size, np.int64)
-        place[used] = np.arange(len(used))
-        n = now.status.size
+        joined, n = self._prepare(now), now.status.size
+        found = {gauge.name: GaugeReadings({}, joined.missing.get(gauge.name, "")) for gauge in self.gauges}
+        if not joined.gauges:
+            return found
+        used, at = joined.index, joined.place
         values = np.concatenate([now.xyz_mm.reshape(n, 3)[used], now.uvw_mm.reshape(n, 3)[used]], axis=1)
-        roots = roots_of(now.covariance.reshape(n, 6, 6)[used])
-        common = None if now.common is None else now.common.reshape(n, 6, -1)[used]
-        normals = now.normal_sys.reshape(n, 3)[used]
-        found = {}
-        for gauge, weights in zip(self.gauges, self._weights, strict=True):
-            if weights.missing:
-                found[gauge.name] = GaugeReadings({}, weights.missing)
-                continue
-            at = place[weights.index]
-            numbers, slopes = _numbers(gauge, weights.weight @ values[at], normals[at].mean(axis=0))
-            v = np.einsum("kqx,qm->kmx", slopes, weights.weight)
-            each = np.einsum("kmx,mxy->mky", v, roots[at])
-            shared = (weights.correlation @ each.reshape(len(at), -1)).reshape(each.shape)
-            own = np.einsum("mky,mky->k", each, shared)
-            rows = None if common is None else np.einsum("kmx,mxc->kc", v, common[at])
-            found[gauge.name] = GaugeReadings(
-                {
-                    name: reading_of(
-                        float(numbers[k]), float(own[k]), None, None if rows is None else rows[k], now.causes
-                    )
-                    for k, name in enumerate(UNITS[gauge.kind])
-                }
-            )
+        sums = joined.sum_of(joined.weight[:, :, None] * values[at][:, None, :])
+        normals = joined.sum_of(now.normal_sys.reshape(n, 3)[used][at])
+        numbers, slopes = _numbers(joined.gauges, sums, normals)
+        # of each row's point on each quantity of its gauge: (rows, k, 6)
+        v = np.einsum("mkqx,mq->mkx", slopes[joined.gauge_of], joined.weight)
+        each = v @ roots_of(now.covariance.reshape(n, 6, 6)[used])[at]
+        shared = (joined.correlation @ each.reshape(len(at), -1)).reshape(each.shape)
+        own = joined.sum_of((each * shared).sum(axis=-1))
+        rows = None
+        if now.common is not None:
+            rows = joined.sum_of(v @ now.common.reshape(n, 6, -1)[used][at])
+        for k, gauge in enumerate(joined.gauges):
+            many = len(UNITS[gauge.kind])
+            common = None if rows is None else rows[k, :many]
+            readings = readings_of(numbers[k, :many], own[k, :many], common, now.causes)
+            found[gauge.name] = GaugeReadings(dict(zip(UNITS[gauge.kind], readings, strict=True)))
         return found
 
-    def _prepare(self, now: Field) -> None:
+    def _prepare(self, now: Field) -> _Joined:
         shared = SharedPixels.of(now, self.subset_px)
-        if self._status is not None and np.array_equal(self._status, now.status) and self._curved == shared.curved:
-            return
-        self._weights = [self._weights_of(gauge, now, shared) for gauge in self.gauges]
-        self._status, self._curved = now.status.copy(), shared.curved
+        known = self._joined
+        if known is None or not np.array_equal(self._status, now.status) or self._curved != shared.curved:
+            known = _Joined.of(self.gauges, [self._weights_of(gauge, now, shared) for gauge in self.gauges])
+            self._joined, self._status, self._curved = known, now.status.copy(), shared.curved
+        return known
 
     def _weights_of(self, gauge: LiveGauge, now: Field, shared: SharedPixels) -> _Weights:
         nothing = np.zeros(0, np.int64), np.zeros((0, 0)), csr_array((0, 0))
@@ -236,32 +271,42 @@ def _at_positions(now: Field, ends_px: Float) -> tuple[NDArray[np.int64], Float,
     return index, weight, ""
 
 
-def _numbers(gauge: LiveGauge, sums: Float, normal: Float) -> tuple[Float, Float]:
-    """Return a gauge's numbers (k,), and their derivatives (k, q, 6) over the sums (q, 6)."""
-    if gauge.kind == "point":
-        return sums[0, 3:], np.eye(6)[3:, None, :]
-    if gauge.kind == "extensometer":
-        return _extensometer(sums)
-    frame = surface_frames(sums[None, 1:, :3].swapaxes(1, 2), normal[None])
-    per_mm = np.asarray(np.linalg.inv(frame.swapaxes(1, 2) @ sums[None, 1:, :3].swapaxes(1, 2)), dtype=np.float64)
-    gradient = sums[None, 1:, 3:].swapaxes(1, 2) @ per_mm
-    strain = strain_of(frame, gradient, gauge.tensor)
-    slopes = np.zeros((6, 3, 6))
-    slopes[:3, 0] = np.eye(6)[3:]
-    slopes[3:, 1:] = strain_slopes(frame, gradient, gauge.tensor, per_mm, strain)[0]
-    return np.concatenate([sums[0, 3:], strain[0]]), slopes
+def _numbers(gauges: Sequence[LiveGauge], sums: Float, normals: Float) -> tuple[Float, Float]:
+    """Return the gauges' numbers (g, k), and their derivatives (g, k, q, 6) over the sums (g, q, 6).
 
-
-def _extensometer(sums: Float) -> tuple[Float, Float]:
-    along0 = sums[1, :3] - sums[0, :3]
-    along = along0 + sums[1, 3:] - sums[0, 3:]
-    length0, length = float(np.linalg.norm(along0)), float(np.linalg.norm(along))
-    d0, d = np.zeros((2, 6)), np.zeros((2, 6))
-    d0[:, :3] = np.stack([-along0, along0]) / length0
-    d[:, :3] = d[:, 3:] = np.stack([-along, along]) / length
-    numbers = np.array([length0, length, length - length0, length / length0 - 1.0, np.log(length / length0)])
-    slopes = np.stack([d0, d, d - d0, d / length0 - length / length0**2 * d0, d / length - d0 / length0])
+    Beyond a gauge's own they are zero. ``normals`` (g, 3) point away from camera 1.
+    """
+    numbers, slopes = np.zeros((len(gauges), _QUANTITIES)), np.zeros((len(gauges), _QUANTITIES, _SUMS, 6))
+    slopes[:, :3, 0] = np.eye(6)[3:]
+    numbers[:, :3] = sums[:, 0, 3:]
+    lines = [k for k, gauge in enumerate(gauges) if gauge.kind == "extensometer"]
+    if lines:
+        slopes[lines] = 0.0
+        numbers[lines, :5], slopes[lines, :5, :2] = _extensometers(sums[lines, :2])
+    for tensor in {gauge.tensor for gauge in gauges if gauge.kind == "area"}:
+        areas = [k for k, gauge in enumerate(gauges) if gauge.kind == "area" and gauge.tensor == tensor]
+        of_motion, of_position = (np.swapaxes(sums[areas, 1:, some], 1, 2) for some in (slice(3, 6), slice(3)))
+        frame = surface_frames(of_position, normals[areas])
+        per_mm = np.asarray(np.linalg.inv(frame.swapaxes(1, 2) @ of_position), dtype=np.float64)
+        gradient = of_motion @ per_mm
+        strain = strain_of(frame, gradient, tensor)
+        numbers[areas, 3:] = strain
+        slopes[areas, 3:, 1:] = strain_slopes(frame, gradient, tensor, per_mm, strain)
     return numbers, slopes
+
+
+def _extensometers(sums: Float) -> tuple[Float, Float]:
+    """Numbers (n, 5) and derivatives (n, 5, 2, 6) of extensometers from their ends (n, 2, 6)."""
+    along0 = sums[:, 1, :3] - sums[:, 0, :3]
+    along = along0 + sums[:, 1, 3:] - sums[:, 0, 3:]
+    length0, length = (np.linalg.norm(a, axis=1)[:, None, None] for a in (along0, along))
+    d0, d = np.zeros((2, len(sums), 2, 6))
+    d0[..., :3] = np.stack([-along0, along0], axis=1) / length0
+    d[..., :3] = d[..., 3:] = np.stack([-along, along], axis=1) / length
+    by_length0 = d / length0 - length / length0**2 * d0
+    slopes = np.stack([d0, d, d - d0, by_length0, d / length - d0 / length0], axis=1)
+    a, b = length0[:, 0, 0], length[:, 0, 0]
+    return np.stack([a, b, b - a, b / a - 1.0, np.log(b / a)], axis=1), slopes
 
 
 def status_counts(now: Field) -> dict[str, int]:

@@ -1,10 +1,10 @@
 """The measurement of frames as they come, each from the motion of those before it.
 
-A frame is followed: every point starts from its last two frames' values and takes one fit, most of them one iteration,
-and the checks of single points and of neighbours. What takes longer and changes slowly is measured as a step of a
-sequence is (:class:`core.field.sequence.reference_steps.Updating`), with all its checks: the first frame, every
-``audit_every``-th, a frame whose points were lost, and while some are lost every ``retry_every``-th. What that finds
-of the residuals, the points' standard deviations over those of a fit by itself, holds for the frames that follow it.
+A frame is followed (:mod:`core.live.follow`): every point starts from the last frame's values, moved on, and takes one
+step of the fit, and the checks of single points and of neighbours. What takes longer and changes slowly is measured as
+a step of a sequence is (:class:`core.field.sequence.reference_steps.Updating`), with all its checks: the first frame,
+every ``audit_every``-th, a frame whose points were lost, and while some are lost every ``retry_every``-th. What that
+finds of the residuals, the points' standard deviations over those of a fit by itself, holds for the frames that follow.
 """
 
 from __future__ import annotations
@@ -21,16 +21,13 @@ from core.cameras.stereo import StereoPair
 from core.common.factor import ParameterCovariance
 from core.errors import InputError, MeasurementError
 from core.field.checks.extrapolated import mark_extrapolated
-from core.field.checks.validity import check_neighbours
 from core.field.common import CommonParts
-from core.field.growth.grow import fit_in_batches
-from core.field.growth.state import SAMPLE_FAR_PX, prepare
-from core.field.points.assemble import assemble
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field
 from core.field.region.find_visible import with_visibility
 from core.field.region.region import PointGrid
 from core.field.settings import MeasureOptions
+from core.live.follow import Follower
 from core.live.gauges import GaugeReadings, GaugeSet, LiveGauge
 from core.matching.image import ImageData
 from core.measure import PreviousStep, ReferencePair, Updating
@@ -100,7 +97,7 @@ class _Kept:
     field: Field
     before: Field | None  # the frame before it, for the velocity
     ratio: Float  # (r, c, 6) standard deviations with all checks over a fit's own
-    rate: Float  # convergence rates of the fit
+    left_per_px: float  # see Followed
     since_audit: int
 
 
@@ -152,6 +149,7 @@ class LiveMeasurement:
             needed = np.ones(whole.shape, bool)
         self.shape = _masked(whole, needed)
         self._set.shape = self.shape
+        self._follower = Follower(self.reference, self.shape, self.grid, self.options)
         self._common = CommonParts(self.pair, self.source)
         self._kept: _Kept | None = None
         self._earlier: dict[int, tuple[tuple[MeasureImage, MeasureImage], Field]] = {}
@@ -187,7 +185,7 @@ class LiveMeasurement:
         SeedError, MeasurementError
             Nothing of the surface was found.
         """
-        images = self._prepared(image1, image2)
+        images = self._named(image1, image2)
         kept = self._kept
         frame = None if kept is None or self._is_due(kept) else self._follow(images, kept)
         how: Literal["followed", "step"] = "followed"
@@ -200,22 +198,25 @@ class LiveMeasurement:
             shown = self._with_common(shown, used)
         return LiveFrame(frame.number, how, shown, self._set.read(shown))
 
-    def _prepared(self, image1: Image, image2: Image) -> tuple[MeasureImage, MeasureImage]:
-        images = tuple(
+    def _named(self, image1: Image, image2: Image) -> tuple[MeasureImage, MeasureImage]:
+        one, two = (
             MeasureImage(image, f"camera {k + 1}'s frame", noise=self.noise[k])
             for k, image in enumerate((image1, image2))
         )
+        return one, two
 
+    def _prepare(self, images: tuple[MeasureImage, MeasureImage]) -> None:
         def prepare_some(first: int, last: int) -> None:
             for k in range(first, last):
                 images[k].prepared(self.options.interpolation, self.options.noise[k], self.options.blur)
 
         run_ranges(prepare_some, 2, 1)
-        return images[0], images[1]
 
     def _is_due(self, kept: _Kept) -> bool:
         """Return True for a frame that is to have all checks, or cannot be followed."""
-        if self.reference_update == "always" or kept.field.references is not None or kept.field.starts is None:
+        if self.reference_update == "always" or self.options.blur is not None:
+            return True
+        if kept.field.references is not None or kept.field.starts is None:
             return True
         lost = bool((self.shape.valid & ~kept.field.valid).any())
         every = min(self.live.retry_every, self.live.audit_every) if lost else self.live.audit_every
@@ -223,24 +224,24 @@ class LiveMeasurement:
 
     def _follow(self, images: tuple[MeasureImage, MeasureImage], kept: _Kept) -> _Kept | None:
         """Measure a frame from those before it; None where points that were there are lost."""
-        field, rate = self._fitted(images, kept.field, kept.before, kept.rate)
-        had = kept.field.valid
+        followed = self._follower.measure(images, kept.field, kept.before, kept.ratio, kept.left_per_px)
+        had, field = kept.field.valid, followed.field
         lost = int((had & ~field.valid & (field.status != PointStatus.OUTSIDE_IMAGE)).sum())
         if lost > _MAY_BE_LOST * had.sum() or not field.valid.any():
             return None
-        covariance = field.covariance * kept.ratio[..., :, None] * kept.ratio[..., None, :]
         return _Kept(
             number=self._count + 1,
             images=images,
-            field=replace(field, covariance=covariance),
+            field=field,
             before=kept.field,
             ratio=kept.ratio,
-            rate=kept.rate if len(kept.rate) else rate,
+            left_per_px=followed.left_per_px,
             since_audit=kept.since_audit + 1,
         )
 
     def _as_step(self, images: tuple[MeasureImage, MeasureImage]) -> _Kept:
         """Measure a frame as a step of a sequence is."""
+        self._prepare(images)
         kept, number = self._kept, self._count + 1
         previous = None if kept is None else PreviousStep(kept.number, kept.field)
         field = self._updating.measure(images, previous)
@@ -251,42 +252,12 @@ class LiveMeasurement:
                 remedy="Check that both cameras see the surface, and that nothing hides it.",
             )
         ratio = np.ones((*field.shape, 6))
-        if field.references is None and field.starts is not None:
-            own = self._fitted(images, field, None, np.zeros(0))[0]
+        if field.references is None and field.starts is not None and self.options.blur is None:
+            own = self._follower.measure(images, field, None, ratio, np.inf).field
             there = field.valid & own.valid
             with_checks, alone = (np.diagonal(f.covariance[there], axis1=1, axis2=2) for f in (field, own))
             ratio[there] = np.sqrt(with_checks / alone)
-        return _Kept(number, images, field, None, ratio, np.zeros(0), 0)
-
-    def _fitted(
-        self, images: tuple[MeasureImage, MeasureImage], previous: Field, before: Field | None, rate: Float
-    ) -> tuple[Field, Float]:
-        """Return the field of one fit of every valid point from its values before, and the fit's convergence rates."""
-        assert previous.starts is not None
-        assert previous.starts.G is not None
-        reference = self.reference.image1, self.reference.image2
-        inputs = prepare(self.pair, reference, images, self.grid, self.options).on_shape(self.shape, previous)
-        n, terms = len(inputs.xy_px), previous.starts.w.shape[-1]
-        w, G = previous.starts.w.reshape(n, terms), previous.starts.G.reshape(n, 3, terms)
-        if before is not None and before.starts is not None and before.starts.G is not None:
-            was = before.starts.G.reshape(n, 3, -1)
-            if was.shape == G.shape:
-                G = np.where(np.isfinite(was), 2.0 * G - was, G)
-        fitter = (inputs.matcher.curved() if terms == 6 else inputs.matcher).converging(rate)
-        points = fitter.empty(n)
-        points.status[:] = previous.status.ravel()
-        index = np.flatnonzero(inputs.usable & previous.valid.ravel())
-        fit_in_batches(fitter, points, index, inputs.xy_px, w[index], G[index], far_px=SAMPLE_FAR_PX)
-        check_neighbours(points, inputs.pair, inputs.grid.shape, inputs.rays, self.options.validity, inputs.visibility)
-        field = assemble(
-            points,
-            pair=self.pair,
-            grid=inputs.grid,
-            fits_image=inputs.fits_image,
-            shape=self.shape,
-            patch=previous.patch,
-        )
-        return field, points.rate[np.isfinite(points.rate)]
+        return _Kept(number, images, field, None, ratio, np.inf, 0)
 
     def _keep(self, frame: _Kept) -> None:
         references = frame.field.references

@@ -109,13 +109,24 @@ def given_to_kernels(
     )
 
 
-def run_kernel(kernel: Any, make_space: Callable[[int], Any], given: Given, out: Float) -> tuple[NDArray[np.int8], Int]:
-    """Run a kernel over all points, on all threads, ``out`` (n, ...) in place; return status and iterations (n,)."""
+def run_kernel(
+    kernel: Any,
+    make_space: Callable[[int], Any],
+    given: Given,
+    out: Float,
+    *,
+    kept_space: Callable[[], Any] | None = None,
+    at_once: int = POINTS_AT_ONCE,
+) -> tuple[NDArray[np.int8], Int]:
+    """Run a kernel over all points, on all threads, ``out`` (n, ...) in place; return status and iterations (n,).
+
+    ``kept_space`` is of :func:`one_a_thread`, from a call before for points with the same partly visible subsets.
+    """
     n = len(given.xy)
     status, iterations = np.ones(n, np.int8), np.zeros(n, np.int32)
-    space = one_a_thread(make_space, given.setting.subset)
+    space = kept_space or one_a_thread(make_space, given.setting.subset)
     run_ranges(
-        lambda first, last: kernel(first, last, given, space(), out, status, iterations), n, POINTS_AT_ONCE, MIN_AT_ONCE
+        lambda first, last: kernel(first, last, given, space(), out, status, iterations), n, at_once, MIN_AT_ONCE
     )
     return status, iterations
 

@@ -23,6 +23,8 @@ from core.matching.slopes import SlopeFilter, slope_filter
 from core.noise import NoiseModel
 from core.settings import Interpolation
 
+Box = tuple[int, int, int, int]
+
 PAD = 4
 """Mirrored coefficients kept around the image, so that no tap needs a test (quintic: 2 left, 3 right, and rounding)."""
 
@@ -196,14 +198,48 @@ def prepare(
     return ImageData(_coefficients(pixels, order), np.array(pixels, order="C"), order, noise)
 
 
+def prepare_part(pixels: NDArray[Any], order: int, noise: NoiseModel | None, box: Box) -> ImageData:
+    """Return an image with its coefficients in a box alone, and NaN elsewhere: a subset that reaches there is refused.
+
+    Parameters
+    ----------
+    pixels
+        (rows, cols) grey levels, checked; they are not copied.
+    order
+        3 or 5.
+    noise
+        As in :func:`prepare`.
+    box
+        First column and row, and one past the last ones, inside the image.
+    """
+    rows, cols = pixels.shape
+    padded = np.full((rows + 2 * PAD, cols + 2 * PAD), np.nan, np.float32)
+    taps = prefilter(order)
+    reach = len(taps) // 2
+    x0, y0, x1, y1 = box
+    left, top = max(x0 - reach, 0), max(y0 - reach, 0)
+    part = pixels[top : y1 + reach, left : x1 + reach]
+    found = np.empty(part.shape, np.float32)
+    correlate(part, taps, taps, found)
+    inner = padded[PAD:-PAD, PAD:-PAD]
+    inner[y0:y1, x0:x1] = found[y0 - top : y1 - top, x0 - left : x1 - left]
+    _mirror(padded)
+    return ImageData(padded, pixels, order, noise)
+
+
 def _coefficients(pixels: NDArray[Any], order: int) -> Float32:
     rows, cols = pixels.shape
     padded = np.empty((rows + 2 * PAD, cols + 2 * PAD), np.float32)
-    inner = padded[PAD:-PAD, PAD:-PAD]
     taps = prefilter(order)
-    correlate(pixels, taps, taps, inner)
+    correlate(pixels, taps, taps, padded[PAD:-PAD, PAD:-PAD])
+    _mirror(padded)
+    return padded
+
+
+def _mirror(padded: Float32) -> None:
+    """Fill the padding."""
+    inner = padded[PAD:-PAD, PAD:-PAD]
     padded[PAD:-PAD, :PAD] = inner[:, PAD:0:-1]
     padded[PAD:-PAD, -PAD:] = inner[:, -2 : -PAD - 2 : -1]
     padded[:PAD] = padded[2 * PAD : PAD : -1]
     padded[-PAD:] = padded[-PAD - 2 : -2 * PAD - 2 : -1]
-    return padded

@@ -64,7 +64,8 @@ def _section(title: str, section: JsonSchemaValue, known: Definitions, *, prefix
         table = _table(field)
         if table is not None:
             numbered = "additionalProperties" in _core(field) or "patternProperties" in _core(field)
-            tables.append((f"`[{prefix}.{key}{'.N' if numbered else ''}]`", known[table]))
+            path = f"[{prefix}.{key}{'.N' if numbered else ''}]"
+            tables.append((f"`[{path}]`" if "items" in _core(field) else f"`{path}`", known[table]))
     lines.append("")
     for name, table_schema in tables:
         lines += _section(name, table_schema, known, prefix=name.strip("`[]"))
@@ -83,12 +84,12 @@ def _target(field: JsonSchemaValue) -> str | None:
 
 
 def _table(field: JsonSchemaValue) -> str | None:
-    """Name of the model behind a key that holds a table of its own, or tables by number."""
+    """Name of the model behind a key that holds a table of its own, tables by number, or a list of them."""
     target = _target(field)
     if target is not None:
         return target
     core = _core(field)
-    for inner in (core.get("additionalProperties"), *core.get("patternProperties", {}).values()):
+    for inner in (core.get("additionalProperties"), core.get("items"), *core.get("patternProperties", {}).values()):
         if isinstance(inner, dict) and "$ref" in inner:
             return str(inner["$ref"]).rsplit("/", 1)[-1]
     return None

@@ -7,6 +7,7 @@ key that is not known is an error, not a silent nothing; errors are one line tha
 from __future__ import annotations
 
 import logging
+import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -363,8 +364,43 @@ class ServiceSection(_Closed):
         return section
 
 
+class ChannelSection(_Closed):
+    """[[live.channels]]: a channel that is read as lines of text while a test is measured live."""
+
+    name: Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]{1,100}$")] = Field(description="Name of the channel.")
+    url: Annotated[str, Field(pattern=r"^(tcp://[^\s/]+:\d{1,5}|/dev/\S+|rfc2217://\S+)$")] = Field(
+        description="`tcp://host:port`, or a serial port: `/dev/ttyUSB0`, `rfc2217://host:port`."
+    )
+    baudrate: int = Field(9600, ge=50, le=10_000_000, description="Of a serial port.")
+    pattern: Annotated[str, Field(min_length=1, max_length=200)] | None = Field(
+        None, description="Regular expression whose first group is the number; left out: `column` counts."
+    )
+    column: int = Field(
+        1, ge=1, le=100, description="Part of a line, set apart by commas, semicolons or blanks, that is the number."
+    )
+    query: Annotated[str, Field(pattern=r"^[\x20-\x7e]{1,100}$")] | None = Field(
+        None, description="Sent as a line each time a value is wanted; left out: the device sends by itself."
+    )
+    rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)] = Field(10.0, description="How often `query` is sent.")
+    unit: Annotated[str, Field(max_length=20)] = Field("", description="Unit of the number, as it is shown.")
+    silence_s: Annotated[float, Field(gt=0.0, le=3600.0)] = Field(
+        1.0, description="A channel without a value for this long is shown as silent."
+    )
+
+    @model_validator(mode="after")
+    def _has_a_group(self) -> Self:
+        if self.pattern is not None:
+            try:
+                groups = re.compile(self.pattern).groups
+            except re.error as error:
+                raise ValueError(f"pattern is no regular expression: {error}") from error
+            if groups < 1:
+                raise ValueError("pattern needs a group, which is the number")
+        return self
+
+
 class LiveSection(_Closed):
-    """[live]: values of a live measurement for test machines, as lines over TCP."""
+    """[live]: values of a live measurement as lines over TCP, for test machines, and channels that are read."""
 
     tcp_port: int | None = Field(
         None, ge=0, le=65535, description="Port of the line protocol; 0: any that is free; left out: it is off."
@@ -378,6 +414,16 @@ class LiveSection(_Closed):
     tcp_token: Annotated[str, Field(pattern=r"^[\x21-\x7e]{8,200}$")] | None = Field(
         None, description="Word that a client sends first, `SYST:PASS <word>`; needed on another address than loopback."
     )
+
+    channels: list[ChannelSection] = Field(default_factory=list, description="Channels that are read.", max_length=50)
+
+    @model_validator(mode="after")
+    def _channels_named_once(self) -> Self:
+        names = [channel.name for channel in self.channels]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise ValueError(f"two channels have the name {twice}")
+        return self
 
     @model_validator(mode="after")
     def _closed_to_others(self) -> Self:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import socket
+import socketserver
 import threading
 import time
 from collections.abc import Iterator
@@ -15,6 +17,7 @@ import httpx
 import numpy as np
 import pytest
 
+from core.errors import FileFormatError
 from server.config.rig_file import parse_config
 from server.http.line_protocol import MAX_LINE
 from server.workflows.service import Service
@@ -23,7 +26,22 @@ from tests.support.service_rig import SMALL, plate_test, served, wait_for_rig
 
 API = "/api/v1"
 pytestmark = pytest.mark.timeout(300)
-LIVE = SMALL.replace("[sim]\n", "[live]\ntcp_port = 0\n\n[sim]\n", 1)
+SECTION = """[live]
+tcp_port = 0
+
+[[live.channels]]
+name = "force"
+url = "tcp://127.0.0.1:{port}"
+pattern = 'F=(\\S+)'
+unit = "N"
+silence_s = 5.0
+
+[[live.channels]]
+name = "absent"
+url = "/dev/no-such-port"
+
+[sim]
+"""
 GAUGES = {
     "extensometers": [{"name": "e1", "a_px": [128, 95], "b_px": [128, 145]}],
     "areas": [{"name": "a1", "rectangle": [105, 95, 150, 145]}, {"name": "c1", "circle": [128, 120, 25]}],
@@ -32,10 +50,25 @@ GAUGES = {
 }
 
 
+class Machine(socketserver.StreamRequestHandler):
+    """A load cell that sends its reading fifty times a second."""
+
+    def handle(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                self.wfile.write(b"t=1 F=812.5\n")
+                time.sleep(0.02)
+
+
 @pytest.fixture(scope="module")
 def live_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    with Service(parse_config(LIVE), tmp_path_factory.mktemp("live") / "data") as service:
-        yield service
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Machine) as machine:
+        machine.daemon_threads = True
+        threading.Thread(target=machine.serve_forever, daemon=True).start()
+        config = SMALL.replace("[sim]\n", SECTION.format(port=machine.server_address[1]), 1)
+        with Service(parse_config(config), tmp_path_factory.mktemp("live") / "data") as service:
+            yield service
+        machine.shutdown()
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +138,7 @@ def test_values_have_a_time_and_an_uncertainty(client: httpx.Client, running: st
         assert gauge["valid"], name
         for quantity, number in gauge["values"].items():
             assert number["u"] > 0.0, (name, quantity)
+            assert np.linalg.norm(list(number["budget"].values())) == pytest.approx(number["u"], rel=1e-6)
     # nothing has moved since the reference: zero within four standard uncertainties
     for name, quantity in (("e1", "strain"), ("a1", "eyy"), ("p1", "w_mm"), ("c1", "exx")):
         number = values["gauges"][name]["values"][quantity]
@@ -166,6 +200,27 @@ def test_events_bring_each_frame(client: httpx.Client, running: str) -> None:
     # the newest comes first, and may come once more
     assert numbers[1:] == list(range(numbers[1], numbers[1] + 4))
     assert numbers[1] - numbers[0] in (0, 1)
+
+
+def test_the_field_is_streamed_at_a_bounded_rate(client: httpx.Client, running: str) -> None:
+    url = f"{API}/tests/{running}/live/field"
+    seen = []
+    with client.stream("GET", f"{url}/events", params={"component": "v_mm", "rate_hz": 5}) as answer:
+        for line in answer.iter_lines():
+            if line.startswith("data:"):
+                seen.append((time.monotonic(), json.loads(line.removeprefix("data:"))))
+            if len(seen) > 3:
+                break
+    whole = client.get(url).json()
+    for _, one in seen:
+        assert one["x_px"] == whole["x_px"]
+        assert np.shape(one["v_mm"]) == (len(whole["y_px"]), len(whole["x_px"]))
+        assert np.nanmax(np.abs(np.array(one["v_mm"], dtype=float))) < 0.01  # nothing moves
+    numbers = [one["number"] for _, one in seen]
+    assert numbers == sorted(set(numbers))
+    # a reader may get an event late, and the next in time: three intervals are not shorter than two
+    assert seen[-1][0] - seen[0][0] > 2 / 5
+    assert client.get(f"{url}/events", params={"rate_hz": 1000}).status_code == 422
 
 
 def port_of(client: httpx.Client) -> int:
@@ -250,6 +305,40 @@ def test_wrong_lines_are_queued_as_errors_and_nothing_dies(client: httpx.Client,
 
 
 # channels -------------------------------------------------------------------------------------------------------
+
+
+def test_channels_of_the_rig_file_are_read_and_known_at_the_exposure(client: httpx.Client, running: str) -> None:
+    url = f"{API}/tests/{running}/live"
+    until = time.monotonic() + 30.0
+    while not (known := client.get(url).json()["channels"])["force"]["readings"]:
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    assert known["force"]["line"]["state"] == "reading"
+    assert (known["force"]["last_value"], known["force"]["unit"]) == (812.5, "N")
+    assert 0.0 <= time.monotonic() - known["force"]["last_time_s"] < 30.0
+    assert known["absent"]["line"]["state"] == "unreachable"
+    assert "no-such-port" in known["absent"]["line"]["reason"]
+    assert (known["absent"]["readings"], known["absent"]["last_value"]) == (0, None)
+    await_frames(client, running, client.get(url).json()["values"]["number"] + 2)
+    time.sleep(0.1)
+    frames = client.get(f"{url}/history", params={"limit": 6000}).json()["frames"]
+    assert any(frame["channels"].get("force") == 812.5 for frame in frames)
+    posted = client.post(f"{url}/channels", json={"readings": [{"channels": {"force": 1.0}}]})
+    assert posted.json()["code"] == "channel_is_read"
+
+
+@pytest.mark.parametrize(
+    ("line", "why"),
+    [
+        ('url = "http://example.org"', "url"),
+        ('url = "tcp://h:1"\npattern = "F=.*"', "group"),
+        ('url = "tcp://h:1"\npattern = "("', "regular expression"),
+    ],
+)
+def test_a_channel_that_cannot_be_read_is_refused_with_the_rig_file(line: str, why: str) -> None:
+    text = SMALL.replace("[sim]\n", f'[[live.channels]]\nname = "f"\n{line}\n\n[sim]\n', 1)
+    with pytest.raises(FileFormatError, match=why):
+        parse_config(text)
 
 
 def test_a_channels_clock_is_found_from_a_ramp_and_its_values_at_the_exposure(

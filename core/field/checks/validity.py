@@ -154,11 +154,17 @@ def _check_epipolar(
 
 
 def neighbour_disagreement(
-    points: PointFits, pair: StereoPair, shape: tuple[int, int], rays: Float, visibility: Visibility | None = None
+    points: PointFits,
+    pair: StereoPair,
+    shape: tuple[int, int],
+    rays: Float,
+    visibility: Visibility | None = None,
+    scale: Float | None = None,
 ) -> tuple[Float, Float, NDArray[np.int32]]:
     """Return (n, 4) disagreement with the neighbours and its local spread in px, and the number of neighbours compared.
 
-    The four are depth, by its effect in camera 2's image, and displacement along x, y and depth, likewise.
+    The four are depth, by its effect in camera 2's image, and displacement along x, y and depth, likewise. ``scale`` is
+    :func:`disagreement_scale` of the points, where it is known already.
     """
     rows, cols = shape
     n = rows * cols
@@ -180,14 +186,20 @@ def neighbour_disagreement(
         count,
     )
     run_ranges(lambda first, last: compare_with_neighbours(first, last, *arrays), rows, _ROWS_AT_ONCE)
-    scale = np.full((n, N_QUANTITIES), np.nan)
-    ok = np.flatnonzero(points.ok)
+    if scale is None:
+        scale = disagreement_scale(pair, rays, np.where(points.ok, points.w[:, 0], np.nan))
+    return difference.reshape(scale.shape) * scale, spread.reshape(scale.shape) * scale, count.reshape(n)
+
+
+def disagreement_scale(pair: StereoPair, rays: Float, w0: Float) -> Float:
+    """Return (n, 4) px per unit of what neighbours are compared by, at inverse depths (n,); NaN where these are."""
+    scale = np.full((len(w0), N_QUANTITIES), np.nan)
+    ok = np.flatnonzero(np.isfinite(w0))
     if len(ok):
-        w0 = points.w[ok, 0]
-        scale[ok, 0] = scale[ok, 3] = w0 / depth_per_px(pair, rays[ok], w0)
+        scale[ok, 0] = scale[ok, 3] = w0[ok] / depth_per_px(pair, rays[ok], w0[ok])
         J = pair.cam1.lens.image_jacobian(rays[ok, :2])
         scale[ok, 1], scale[ok, 2] = np.linalg.norm(J[:, :, 0], axis=1), np.linalg.norm(J[:, :, 1], axis=1)
-    return difference.reshape(scale.shape) * scale, spread.reshape(scale.shape) * scale, count.reshape(n)
+    return scale
 
 
 def check_neighbours(
@@ -197,6 +209,7 @@ def check_neighbours(
     rays: Float,
     options: ValidityOptions,
     visibility: Visibility | None,
+    scale: Float | None = None,
 ) -> int:
     """Reject points that disagree with their neighbours' patches; return their number.
 
@@ -204,8 +217,11 @@ def check_neighbours(
     ----------
     points, pair, shape, rays, options, visibility
         As in :func:`apply_validity_checks`, of which this is one check.
+    scale
+        As in :func:`neighbour_disagreement`.
     """
-    return _check_neighbours(points, pair, shape, rays, options, visibility, few=int(points.ok.sum()) < _FEW)
+    few = int(points.ok.sum()) < _FEW
+    return _check_neighbours(points, pair, shape, rays, options, visibility, few=few, scale=scale)
 
 
 def _check_neighbours(
@@ -217,8 +233,9 @@ def _check_neighbours(
     visibility: Visibility | None,
     *,
     few: bool,
+    scale: Float | None = None,
 ) -> int:
-    difference, spread, count = neighbour_disagreement(points, pair, shape, rays, visibility)
+    difference, spread, count = neighbour_disagreement(points, pair, shape, rays, visibility, scale)
     ok = points.ok
     bad = np.zeros(len(ok), bool)
     used = ok & (count >= 2)

@@ -17,8 +17,8 @@ from core.matching.image import ImageData
 from core.matching.options import MatchOptions
 from core.status import PointStatus
 
-_MAX_EPIPOLAR_PX = 3.0
-_MAX_SHEAR = 4.0
+MAX_EPIPOLAR_PX = 3.0
+MAX_SHEAR = 4.0
 _RATE_FROM, _RATE_QUANTILE = 30, 0.9
 _KEPT = ("w", "G", "epipolar_px", "zncc")
 
@@ -223,7 +223,7 @@ class Fitter:
         with np.errstate(invalid="ignore"):
             low = fits.ok & ~(fits.zncc.min(axis=1) >= self.min_zncc)
             fits.reject(low, PointStatus.LOW_CORRELATION)
-            off = fits.ok & ~(np.abs(fits.epipolar_px) <= _MAX_EPIPOLAR_PX)
+            off = fits.ok & ~(np.abs(fits.epipolar_px) <= MAX_EPIPOLAR_PX)
             fits.reject(off, PointStatus.EPIPOLAR_MISMATCH)
         ok = np.flatnonzero(fits.ok)
         fits.reject(_mask(n, ok[~self._plausible(xy_px[ok], fits.w[ok], fits.G[ok])]), PointStatus.NOT_CONVERGED)
@@ -260,7 +260,7 @@ class Fitter:
         det = np.linalg.det(affine)
         size = np.linalg.norm(affine, axis=(1, 2)) / np.sqrt(2.0)
         with np.errstate(invalid="ignore"):
-            good &= (depth / w[:, 0] > 0.0) & (det > 0.0) & (size < _MAX_SHEAR) & (det > size**2 / _MAX_SHEAR)
+            good &= (depth / w[:, 0] > 0.0) & (det > 0.0) & (size < MAX_SHEAR) & (det > size**2 / MAX_SHEAR)
         return np.asarray(good)
 
 

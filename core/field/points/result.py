@@ -171,7 +171,7 @@ class Field:
     @property
     def valid(self) -> Bool:
         """(r, c) True where the point is valid."""
-        return np.isin(self.status, (PointStatus.OK, PointStatus.EXTRAPOLATED))
+        return np.asarray((self.status == PointStatus.OK) | (self.status == PointStatus.EXTRAPOLATED))
 
     @property
     def total_covariance(self) -> Float:

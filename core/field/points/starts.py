@@ -17,6 +17,9 @@ import numpy as np
 from core.arrays import Float
 from core.cameras.stereo import StereoPair
 
+MIN_COSINE = 0.1
+"""Between a patch's normal and a camera's ray, below which the patch is too steep."""
+
 
 @dataclass(frozen=True, eq=False)
 class Starts:
@@ -75,7 +78,7 @@ def depth_per_px(pair: StereoPair, rays: Float, w0: Float) -> Float:
         return np.asarray(step / np.maximum(image_shift_px(pair, rays, w0, w0 + step), 1e-12))
 
 
-def faces_both_cameras(pair: StereoPair, rays: Float, w: Float, *, min_cosine: float = 0.1) -> np.ndarray:
+def faces_both_cameras(pair: StereoPair, rays: Float, w: Float, *, min_cosine: float = MIN_COSINE) -> np.ndarray:
     """Return (n,) True where the patch's front faces both cameras, no steeper than ``min_cosine``."""
     with np.errstate(invalid="ignore"):
         c1, c2 = view_cosines(pair, rays, w)

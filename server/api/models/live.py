@@ -17,6 +17,9 @@ class LiveNumber(Reply):
     value: float = Field(description="The value.")
     u: float | None = Field(description="Standard uncertainty (k = 1); null where it is not known.")
     u_calibration: float | None = Field(description="The calibration's part of it; null: not known, and not included.")
+    budget: dict[str, float] = Field(
+        description="`u` by where it comes from; the squares add up. `matching` holds the reference's noise too."
+    )
     units: str = Field(description="Unit; `1` of a number without one.")
 
 
@@ -72,14 +75,30 @@ class LiveAccount(Reply):
     rate_hz: float | None = Field(description="Measured frames a second, over the last 500.")
 
 
-class LiveChannel(Reply):
-    """A channel whose readings were sent."""
+class LiveLine(Reply):
+    """The line that a channel is read from."""
 
-    readings: int = Field(description="Readings that are kept.")
-    last_time_s: float = Field(description="Time of the last one, by the channel's clock.")
-    last_value: float = Field(description="Its value.")
-    offset_s: float = Field(description="Added to the channel's times; 0 before it was aligned.")
-    offset_u_s: float | None = Field(description="Standard uncertainty of that; null before it was aligned.")
+    state: Literal["unreachable", "silent", "reading"] = Field(
+        description="`unreachable`: it is opened again and again; `silent`: open, and no value comes."
+    )
+    values: int = Field(description="Lines that had a value.")
+    unreadable: int = Field(description="Lines that had none.")
+    losses: int = Field(description="Times that the open line was lost.")
+    reason: str = Field(description="Why it is not `reading`; empty where it is.")
+
+
+class LiveChannel(Reply):
+    """A channel whose readings were sent, or are read from a line."""
+
+    unit: str = Field("", description="Its unit, where the rig file has one.")
+    line: LiveLine | None = Field(None, description="Of a channel that the rig file names; null of one that is posted.")
+    readings: int = Field(0, description="Readings that are kept.")
+    last_time_s: float | None = Field(
+        None, description="Time of the last one, by the channel's clock: of a line, that of its arrival here."
+    )
+    last_value: float | None = Field(None, description="Its value.")
+    offset_s: float = Field(0.0, description="Added to the channel's times; 0 before it was aligned.")
+    offset_u_s: float | None = Field(None, description="Standard uncertainty of that; null before it was aligned.")
 
 
 class LiveReply(Reply):

@@ -94,7 +94,9 @@ def _plain(frame: LiveFrame) -> Plain:
     gauges = {
         name: {
             "missing": gauge.missing,
-            "values": {q: (r.value, r.sigma, r.sigma_calibration) for q, r in gauge.values.items()},
+            "values": {
+                q: (r.value, r.sigma, r.sigma_calibration, r.budget.document()) for q, r in gauge.values.items()
+            },
         }
         for name, gauge in frame.readings.items()
     }

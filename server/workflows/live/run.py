@@ -10,7 +10,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -20,6 +20,7 @@ from core.names import CAMERAS
 from drivers.acquisition.pairing import Pair
 from server.base.models import utc_text
 from server.base.problem import JobProblem, problem_of
+from server.config.rig_file import ChannelSection
 from server.jobs.events import EventHub
 from server.rig import Rig
 from server.rig.cameras import PairMark
@@ -27,6 +28,7 @@ from server.worker.embedded import make_worker
 from server.worker.executor import WorkerDiedError
 from server.worker.tasks import LiveTask, Plain, begin_live, measure_live
 from server.workflows.live.account import Account
+from server.workflows.live.read_channels import ReadChannels
 from server.workflows.live.series import LiveSeries, Moment
 
 _log = logging.getLogger("stereorig.live")
@@ -59,6 +61,8 @@ class LiveRun:
         Kernel threads of its process.
     silence_s
         Values older than this are no longer valid.
+    channels
+        Channels that are read beside it.
     """
 
     def __init__(
@@ -70,17 +74,21 @@ class LiveRun:
         *,
         threads: int | None,
         silence_s: float,
+        channels: Sequence[ChannelSection] = (),
     ) -> None:
         self.test_id, self.settings, self.silence_s = test_id, settings, silence_s
         self._task, self._rig = task, rig
+        self.whole_field = task.whole_field
         self.kinds = {str(gauge["name"]): str(gauge["kind"]) for gauge in task.gauges}
         self.hub = EventHub(keep=_KEPT_EVENTS)
         self.account = Account()
         self.series = LiveSeries()
+        self.lines = ReadChannels(channels, self.series)
         self.state = "starting"
         self.problem: JobProblem | None = None
         self.begun: Plain = {}
-        self.field: Any = None
+        self.field: tuple[int, Any] | None = None
+        """Number of the newest frame with a field, and its displacements (r, c, 3), mm."""
         self.since_utc = utc_text(datetime.now(UTC))
         self._worker = make_worker(threads, lowered=False)
         self._newest: Plain = {"number": 0, "valid": False, "reason": "starting", "gauges": {}}
@@ -99,6 +107,7 @@ class LiveRun:
     def start(self) -> None:
         """Begin; the reference is measured first, in the background."""
         self._worker.start()
+        self.lines.start()
         self._threads[1].start()
 
     def stop(self) -> None:
@@ -107,6 +116,7 @@ class LiveRun:
         for thread in self._threads:
             if thread.ident is not None and thread is not threading.current_thread():
                 thread.join(timeout=5.0)
+        self.lines.stop()
         self._worker.shutdown()
         if self.state != "failed":
             self.state = "ended"
@@ -231,7 +241,7 @@ class LiveRun:
         gauges = {name: _gauge(self.kinds[name], one) for name, one in found["gauges"].items()}
         values = {name: {q: number["value"] for q, number in gauge["values"].items()} for name, gauge in gauges.items()}
         self.series.add(Moment(self._number, exposed_ns / 1e9, values))
-        self.field = found.get("field")
+        self.field = (self._number, found["field"]) if "field" in found else None
         self._publish(
             {
                 "number": self._number,
@@ -299,8 +309,14 @@ class _HostClock:
 def _gauge(kind: str, found: Plain) -> Plain:
     missing = str(found["missing"])
     values = {
-        quantity: {"value": value, "u": _known(u), "u_calibration": _known(common), "units": UNITS[kind][quantity]}  # type: ignore[index]
-        for quantity, (value, u, common) in found["values"].items()
+        quantity: {
+            "value": value,
+            "u": _known(u),
+            "u_calibration": _known(common),
+            "budget": budget,
+            "units": UNITS[kind][quantity],  # type: ignore[index]
+        }
+        for quantity, (value, u, common, budget) in found["values"].items()
     }
     return {"kind": kind, "valid": not missing, "reason": missing, "values": values}
 

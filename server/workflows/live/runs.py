@@ -89,6 +89,7 @@ class LiveRuns:
                 service.rig,
                 threads=service.config.service.kernel_threads,
                 silence_s=asked.silence_ms / 1e3,
+                channels=service.config.live.channels,
             )
             self._run = run
             service.live_account = lambda: (run.account.counts(), run.active)

@@ -64,6 +64,8 @@ class Run:
     captures: int = 0
     memory_mib: list[tuple[float, float]] = field(default_factory=list)
     load: float = 0.0
+    busy_ms: float = float("nan")
+    """Processor time of the computation a measured pair."""
 
     @property
     def rate_hz(self) -> float:
@@ -150,14 +152,14 @@ def measure(client: httpx.Client, test_id: str, points: int, seconds: float, *, 
             raise RuntimeError(f"it does not measure: {live['problem']}, {live['values']['reason']}")
         time.sleep(0.1)
     port = int(client.base_url.port or 0)
+    worker = _live_worker()
     ours, theirs = multiprocessing.Pipe()
     context = multiprocessing.get_context("spawn")
     reader = context.Process(target=read_values, args=(port, f"{API}/tests/{test_id}/live/ws", theirs, seconds))
     before, began = live["account"], time.monotonic()
     reader.start()
     run = Run(points, seconds)
-    worker = _live_worker()
-    loads = []
+    loads, busy_before = [], _busy_s(worker)
     while time.monotonic() < began + seconds + 0.5:
         if captures:
             run.captures += client.post(f"{API}/tests/{test_id}/steps", json={"label": "beside"}).status_code == 201
@@ -165,17 +167,24 @@ def measure(client: httpx.Client, test_id: str, points: int, seconds: float, *, 
         run.memory_mib.append((held[0], held[1]))
         loads.append(os.getloadavg()[0])
         time.sleep(max(0.0, 1.0 - (time.monotonic() - began) % 1.0))
+    busy_s = _busy_s(worker) - busy_before
     run.load = float(np.mean(loads))
     run.latency_ms = ours.recv()
     reader.join()
     after = client.post(f"{API}/tests/{test_id}/live:stop").json()["account"]
     names = ("frames", "measured", "followed", "step", "skipped", "refused")
     run.account = {name: after[name] - before[name] for name in names}
+    run.busy_ms = 1e3 * busy_s / max(run.account["measured"], 1)
     return run
 
 
+def _busy_s(worker: int | None) -> float:
+    times = None if worker is None else psutil.Process(worker).cpu_times()
+    return float("nan") if times is None else times.user + times.system
+
+
 def _live_worker() -> int | None:
-    """Process of the live measurement: the youngest of the workers."""
+    """Process of the live measurement: the youngest of the workers, as long as no reader runs."""
     children = psutil.Process().children()
     return max((c for c in children), key=lambda c: c.create_time()).pid if children else None
 
@@ -203,6 +212,7 @@ def main() -> int:
 
 def _line(run: Run) -> str:
     figures = ", ".join(f"p{q:g} {run.percentile(q):.1f}" for q in (50.0, 99.0, 99.9))
+    figures += f"; {run.busy_ms:.1f} ms of processor time a pair"
     return f"{run.points} points: {run.rate_hz:.1f} values/s; ms: {figures}; {run.account}; load {run.load:.1f}"
 
 

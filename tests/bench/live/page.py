@@ -1,4 +1,4 @@
-"""Writes ``docs/explanation/live_speed.md`` and its plot from what a run showed."""
+"""Writes ``docs/explanation/live_speed.md`` and its plots from what a run showed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 PAGE = DOCS / "explanation" / "live_speed.md"
-FIGURE = DOCS / "figures" / "live_latency.png"
+FIGURE = DOCS / "figures" / "live_speed.png"
 #: ms, of the distribution
 ASKED = {50.0: 8.0, 99.0: 20.0, 99.9: 40.0}
 RATE_HZ = 50.0
@@ -27,7 +27,7 @@ _IDLE_LOAD = 3.0
 
 def write_page(main: Run, runs: list[Run]) -> None:
     """Write page and plot."""
-    _draw(main)
+    _draw(main, runs)
     rows = "\n".join(
         f"| p{q:g} | {asked:g} | {main.percentile(q):.1f} | {'held' if main.percentile(q) <= asked else '**missed**'} |"
         for q, asked in ASKED.items()
@@ -56,15 +56,16 @@ def write_page(main: Run, runs: list[Run]) -> None:
                     f"Two simulated cameras of 512 x 480 px at {RATE_HZ:g} Hz show pictures that were rendered "
                     "beforehand; the service, the cameras, the computation and the reader share the machine. Latency "
                     "runs from the arrival of the later frame in memory to the value in the reader's process, over a "
-                    "WebSocket."
+                    "WebSocket. The pictures move by 0.2 px a frame, and turn back every twelfth."
                 ),
                 f"## {main.points:,} points and 12 gauges beside a stored step a second",
                 wrapped(
                     f"{main.seconds / 60.0:.1f} minutes, subsets of 21 px, quintic; {main.rate_hz:.1f} values a second; "
-                    f"{main.captures} steps were stored meanwhile."
+                    f"{main.captures} steps were stored meanwhile. The computation took {main.busy_ms:.1f} ms of "
+                    "processor time a pair, all of its threads together."
                 ),
                 f"| latency | asked, ms | measured, ms | |\n| --- | --- | --- | --- |\n{rows}",
-                "![Latency](../figures/live_latency.png)",
+                "![Latency, rate by points and memory](../figures/live_speed.png)",
                 wrapped(
                     f"Of {account['frames']:,} pairs {account['measured']:,} were measured ({account['step']} with all "
                     f"checks), {account['skipped']:,} skipped for a newer one, {account['refused']} refused. Resident "
@@ -81,14 +82,23 @@ def write_page(main: Run, runs: list[Run]) -> None:
     )
 
 
-def _draw(run: Run) -> None:
-    latency = np.sort(run.latency_ms)
-    figure, axes = plt.subplots(figsize=(7.0, 3.6), constrained_layout=True)
-    axes.semilogy(latency, 1.0 - np.arange(len(latency)) / max(len(latency), 1), label="measured")
+def _draw(main: Run, runs: list[Run]) -> None:
+    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(12.0, 3.6), constrained_layout=True)
+    latency = np.sort(main.latency_ms)
+    left.semilogy(latency, 1.0 - np.arange(len(latency)) / max(len(latency), 1), label="measured")
     for q, asked in ASKED.items():
-        axes.plot(asked, 1.0 - q / 100.0, "kv", ms=6, label="asked" if q == 50.0 else None)
-    axes.set_xlabel("latency, ms")
-    axes.set_ylabel("share of values that took longer")
-    axes.legend()
+        left.plot(asked, 1.0 - q / 100.0, "kv", ms=6, label="asked" if q == 50.0 else None)
+    left.set(xlabel="latency, ms", ylabel="share of values that took longer", title=f"{main.points:,} points")
+    left.legend()
+    middle.semilogx([run.points for run in runs], [run.rate_hz for run in runs], "o-")
+    middle.axhline(RATE_HZ, color="gray", lw=0.8, ls="--")
+    middle.set(
+        xlabel="points", ylabel="values a second", ylim=(0.0, 1.1 * RATE_HZ), title="Rate; dashed: of the cameras"
+    )
+    memory = np.array(main.memory_mib)
+    for k, name in enumerate(("service", "computation")):
+        right.plot(np.arange(len(memory)) / 60.0, memory[:, k], label=name)
+    right.set(xlabel="minutes", ylabel="resident memory, MiB", ylim=(0.0, None), title="Memory")
+    right.legend()
     figure.savefig(FIGURE, dpi=110)
     plt.close(figure)

@@ -11,12 +11,17 @@ import pytest
 from core.common.factor import ParameterCovariance
 from core.errors import ImageError, InputError, MeasurementError, RegionError
 from core.field.common import with_common_parts
+from core.field.growth.grow import fit_in_batches
+from core.field.growth.state import prepare
+from core.field.points.assemble import assemble
 from core.field.points.images import MeasureImage
+from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
 from core.gauge.area import area_statistics
 from core.gauge.extensometer import extensometer
 from core.gauge.sampling import sample
 from core.live.clocks import clock_offset, value_at
+from core.live.follow import Follower
 from core.live.gauges import UNITS, GaugeSet, LiveGauge
 from core.live.measurement import LiveMeasurement, LiveOptions
 from core.measure import ReferencePair
@@ -149,6 +154,54 @@ def test_a_followed_frame_is_what_the_step_would_be() -> None:
             seen = frames[-1].readings[name].values[quantity]
             assert abs(seen.value - reading.value) < 0.02 * reading.sigma
             assert seen.sigma == pytest.approx(reading.sigma, rel=0.1)
+
+
+def fitted_by_itself(images: tuple[MeasureImage, MeasureImage], previous: Field, shape: Field) -> Field:
+    """The frame by the parts that a field of any kind is measured with, from the points of another frame."""
+    pair = reference()
+    inputs = prepare(pair.pair, (pair.image1, pair.image2), images, GRID, OPTIONS).on_shape(shape, previous)
+    assert previous.starts is not None
+    assert previous.starts.G is not None
+    n, points = len(inputs.xy_px), inputs.matcher.empty(len(inputs.xy_px))
+    w, G = previous.starts.w.reshape(n, 3), previous.starts.G.reshape(n, 3, 3)
+    index = np.flatnonzero(inputs.usable & previous.valid.ravel())
+    fit_in_batches(inputs.matcher, points, index, inputs.xy_px, w[index], G[index], far_px=3.0)
+    return assemble(points, pair=pair.pair, grid=inputs.grid, fits_image=inputs.fits_image, shape=shape)
+
+
+def test_a_followed_frame_is_converted_as_a_field_is() -> None:
+    pair = reference()
+    shape = pair.shape(GRID, OPTIONS)
+    before, now = (tuple(MeasureImage(image) for image in pictures()[k]) for k in (1, 2))
+    first = pair.motion(*before, GRID, OPTIONS, shape=shape)
+    followed = Follower(pair, shape, GRID, OPTIONS).measure(now, first, None, np.ones((*GRID.shape, 6)), float("inf"))
+    truth = fitted_by_itself(now, first, shape)
+    assert followed.left_per_px < 20.0
+    both = truth.valid & followed.field.valid
+    assert both.sum() == truth.valid.sum()
+    sigma = truth.sigma_mm[both][:, 3:]
+    assert followed.field.uvw_mm is not None
+    assert truth.uvw_mm is not None
+    off = (followed.field.uvw_mm - truth.uvw_mm)[both] / sigma
+    assert np.sqrt(np.mean(off**2)) < 0.02
+    # the normal equations are those of a start a twentieth of a pixel away
+    units = truth.sigma_mm[both]
+    off = (followed.field.covariance[both] - truth.covariance[both]) / (units[:, :, None] * units[:, None, :])
+    assert np.abs(off).max() < 0.01
+    np.testing.assert_allclose(followed.field.zncc[both], truth.zncc[both], atol=1e-3)
+
+
+def test_a_frame_that_jumped_is_fitted_until_it_settles() -> None:
+    live = LiveMeasurement(reference(), GRID, OPTIONS, (), LiveOptions())
+    for k in (1, 2, 1, 2):  # back and forth by half a pixel: the velocity is wrong each time
+        frame = live.measure(*pictures()[k])
+    assert frame.how == "followed"
+    pair = reference()
+    step = pair.motion(*(MeasureImage(image) for image in pictures()[2]), GRID, OPTIONS)
+    assert step.uvw_mm is not None
+    assert frame.field.uvw_mm is not None
+    off = (frame.field.uvw_mm - step.uvw_mm) / step.sigma_mm[..., 3:]
+    assert np.sqrt(np.nanmean(off**2)) < 0.02
 
 
 def test_the_calibrations_part_is_in_the_readings() -> None:

@@ -6,13 +6,14 @@ import json
 import time
 from collections.abc import AsyncIterator
 from dataclasses import asdict
-from typing import Annotated
+from typing import Annotated, Literal, get_args
 
 import anyio
 import numpy as np
 from fastapi import APIRouter, Depends, Query, Request, WebSocket, WebSocketDisconnect
 from fastapi.concurrency import run_in_threadpool
 from fastapi.sse import EventSourceResponse, ServerSentEvent
+from numpy.typing import NDArray
 
 from core.errors import StateError, StereorigError
 from server.api.models.live import (
@@ -34,6 +35,9 @@ from server.workflows.live.runs import LiveRuns
 from server.workflows.service import Service
 
 _MAX_FRAMES = 6000
+_MAX_FIELDS_HZ = 20.0
+Component = Literal["u_mm", "v_mm", "w_mm"]
+_COMPONENTS: tuple[Component, ...] = get_args(Component)
 _REFUSED = 1008
 
 
@@ -52,6 +56,20 @@ def known_run(runs: RunsDep, test_id: TestId) -> LiveRun:
 
 
 RunDep = Annotated[LiveRun, Depends(known_run)]
+
+
+def known_field(run: RunDep) -> None:
+    """Refuse a live measurement without a field, before a stream begins.
+
+    Raises
+    ------
+    StateError
+        ``no_results``.
+    """
+    if not run.whole_field:
+        raise StateError("This live measurement has no field.", code="no_results", remedy="Begin with field = true.")
+
+
 router = APIRouter(prefix="/tests/{test_id}", tags=["live"])
 
 
@@ -66,10 +84,15 @@ def _shown(request: Request, run: LiveRun) -> LiveReply:
             "reference_points": run.begun.get("points"),
             "values": run.newest(),
             "account": run.account.document(),
-            "channels": run.series.channels(),
+            "channels": _channels(run),
             "tcp_port": request.app.state.lines.port,
         }
     )
+
+
+def _channels(run: LiveRun) -> dict[str, dict[str, object]]:
+    lines, readings = run.lines.document(), run.series.channels()
+    return {name: {**lines.get(name, {}), **readings.get(name, {})} for name in {**lines, **readings}}
 
 
 @router.post("/live", summary="Measure a test live", status_code=201, responses=errors(404, 409, 422, 503))
@@ -171,23 +194,62 @@ def live_history(
 @router.get("/live/field", summary="The newest displacements of all points", responses=errors(404, 409))
 def live_field(run: RunDep) -> LiveField:
     """Return the coarse field; 409 `no_results` where it was not asked for, or no frame was measured yet."""
-    number, field, grid = run.newest()["number"], run.field, run.begun.get("field")
-    if field is None or grid is None:
+    newest, grid = run.field, run.begun.get("field")
+    if newest is None or grid is None:
         raise StateError(
             "There is no field yet.", code="no_results", remedy="Begin with field = true, and wait for a frame."
         )
-    names = ("u_mm", "v_mm", "w_mm")
-    known = field.astype(object)
-    known[~np.isfinite(field)] = None
-    parts = {name: known[..., k].tolist() for k, name in enumerate(names)}
+    number, field = newest
+    parts = {name: _with_gaps(field[..., k]) for k, name in enumerate(_COMPONENTS)}
     return LiveField.model_validate({"number": number, **grid, **parts})
+
+
+@router.get(
+    "/live/field/events",
+    summary="One component of the newest field, as server-sent events",
+    response_class=EventSourceResponse,
+    responses=errors(404, 409, 503),
+    dependencies=[EventStream, Depends(known_field)],
+)
+async def live_field_events(
+    service: ServiceDep,
+    run: RunDep,
+    component: Annotated[Component, Query(description="Displacement that is sent.")] = "w_mm",
+    rate_hz: Annotated[float, Query(gt=0.0, le=_MAX_FIELDS_HZ, description="Events a second at most.")] = 10.0,
+) -> AsyncIterator[ServerSentEvent]:
+    """Follow the coarse field for pictures of it: an event `field` for the newest frame, at most so many a second.
+
+    Its data are `number`, `x_px`, `y_px` as in `/live/field`, and the component's values by row and column.
+    """
+    with service.streams.counted("events"):
+        sent, due_s = 0, 0.0
+        async for _ in run.hub.follow(run.hub.last_number):
+            newest, grid, now_s = run.field, run.begun.get("field"), time.monotonic()
+            if newest is None or grid is None or newest[0] == sent or now_s < due_s:
+                continue
+            sent, due_s = newest[0], now_s + 1.0 / rate_hz
+            values = _with_gaps(newest[1][..., _COMPONENTS.index(component)])
+            data = {"number": sent, **grid, component: values}
+            yield ServerSentEvent(data=data, event="field", id=str(sent))
+
+
+def _with_gaps(values: NDArray[np.float32]) -> list[list[float | None]]:
+    """Rows of values, to a nanometre; None without one."""
+    known = np.round(values.astype(np.float64), 6).astype(object)
+    known[~np.isfinite(values)] = None
+    rows: list[list[float | None]] = known.tolist()
+    return rows
 
 
 @router.post("/live/channels", summary="Readings of channels beside it", responses=errors(404, 422))
 def post_live_channels(run: RunDep, body: LiveReadings) -> LiveReadingsReply:
-    """Take readings; between them a channel is known at each frame's exposure. All or none are taken."""
+    """Take readings; between them a channel is known at each frame's exposure. All or none are taken.
+
+    Channels that the rig file names (`[[live.channels]]`) are read by the service, and not posted.
+    """
     arrived = time.monotonic()
     readings = [(arrived if one.time_s is None else one.time_s, one.channels) for one in body.readings]
+    run.lines.refuse_posted({name for _, channels in readings for name in channels})
     return LiveReadingsReply(taken=run.series.put(readings))
 
 

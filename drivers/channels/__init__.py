@@ -1,0 +1,1 @@
+"""Channels of other devices, read as lines of text."""
