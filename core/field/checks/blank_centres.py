@@ -10,6 +10,8 @@ an area that is half a subset wide, and well wider than the texture's own, tells
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +28,7 @@ _WINDOW_PX = 5  # of the variance about a pixel
 _RIM_PX = _WINDOW_PX // 2 + 2  # by which the plain area seems smaller than it is
 _OWN = 0.25  # share of the places amid the field with plain areas, beyond which these are the texture's own
 _PLACE = 2.0  # subsets
+_AT_ONCE = 4096  # points
 _ALONE_SUBSETS, _ALONE_OWN = 0.5, 1.5  # width of an area that tells by itself, over the subset's and the texture's own
 
 
@@ -39,7 +42,7 @@ def reject_blank_centres(
     *,
     shape: tuple[int, int],
     texture: Float,
-    centre_texture: Float,
+    taken: NDArray[Any],
     image: Float32,
     xy_px: Float,
     subset_px: int,
@@ -56,17 +59,18 @@ def reject_blank_centres(
         n = rows x columns points of a shape, changed in place.
     shape
         Rows and columns.
-    texture, centre_texture
-        (n,) grey-level variance of the subset and of its centre, camera 1's reference image.
-    image
-        (rows, cols) that image.
+    texture
+        (n,) grey-level variance of the subset, camera 1's reference image.
+    taken, image
+        (rows, cols) that image as it was taken, which tells of a centre whether it is plain, and as it is compared.
     xy_px
         (n, 2) the points in it.
     subset_px, spacing_px
         Width of the subset, distance of neighbouring points.
     """
     noise = np.nan_to_num(points.noise) ** 2 + 1.0 / 12.0  # rounding's, too
-    plain = (centre_texture < _NOISE * noise) & (centre_texture < _TEXTURE * texture)
+    most = np.minimum(_NOISE * noise, _TEXTURE * texture)
+    plain = _plain_centres(taken, xy_px, points.ok, centre_px(subset_px), most)
     if points.ok.all() and not plain.any():
         return 0
     before = int(points.ok.sum())
@@ -82,6 +86,26 @@ def reject_blank_centres(
     beside = _beside_gaps(points.ok, shape, subset_px / spacing_px)
     points.reject(points.ok & beside & (inside | (plain & (own == centre_px(subset_px)))), PointStatus.LOW_TEXTURE)
     return before - int(points.ok.sum())
+
+
+def _plain_centres(image: NDArray[Any], xy_px: Float, which: Bool, width_px: int, most: Float) -> Bool:
+    """Return (n,) True where the variance in the square of ``width_px`` about a point ``which`` is below ``most`` (n,).
+
+    Nine pixels tell nearly all points that are not: their sum of squares is a part of the square's.
+    """
+    plain = np.zeros(len(xy_px), bool)
+    half = width_px // 2
+    index = np.flatnonzero(which)
+    for left in np.array_split(index, len(index) // _AT_ONCE + 1):
+        for step in (half, 1):
+            offset = np.arange(-half, half + 1, step)
+            x, y = (np.rint(xy_px[left, k]).astype(np.intp)[:, None] + offset for k in (0, 1))
+            rows, cols = np.clip(y, 0, image.shape[0] - 1), np.clip(x, 0, image.shape[1] - 1)
+            grey = image[rows[:, :, None], cols[:, None, :]].astype(np.float64)
+            square = ((grey - grey.mean(axis=(1, 2), keepdims=True)) ** 2).sum(axis=(1, 2))
+            left = left[square < width_px**2 * most[left]]
+        plain[left] = True
+    return plain
 
 
 def _width_of_own(amid: Bool, image: Float32, variance: float, xy_px: Float, subset_px: int) -> int | None:

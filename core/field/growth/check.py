@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from core.field.checks.blank_centres import centre_px, reject_blank_centres
+from core.field.checks.blank_centres import reject_blank_centres
 from core.field.checks.edges import reject_near_edges
 from core.field.checks.residual_test import residual_test
 from core.field.checks.unreached import mark_outside
@@ -65,7 +65,7 @@ def check_edges(inputs: FieldInputs, state: GrowthState) -> None:
         state.points,
         shape=inputs.grid.shape,
         texture=inputs.texture,
-        centre_texture=inputs.ref1.subset_variance(inputs.xy_px, centre_px(options.subset_px)),
+        taken=inputs.ref1.pixels,
         image=inputs.matcher.ref1.pixels,
         xy_px=inputs.xy_px,
         subset_px=options.subset_px,

@@ -43,7 +43,7 @@ def beside_edges(fitter: Fitter, points: PointFits, shape: tuple[int, int], rays
     valid = np.flatnonzero(points.ok)
     if len(valid) < _MIN_PAIRS:
         return flagged.ravel() > 0
-    ray = rays[:, :2].reshape(rows, cols, 2)
+    ray = rays[:, :2].T.reshape(2, rows, cols)
     quantities = [_per_px(values, scale, valid, shape) for values, scale in _quantities(fitter, points, rays, valid)]
     subset = fitter.options.subset_px
     for reach in sorted({max(1, round(f * subset / spacing_px)) for f in (0.5, 1.0)}):
@@ -52,11 +52,12 @@ def beside_edges(fitter: Fitter, points: PointFits, shape: tuple[int, int], rays
                 continue
             here = (slice(0, rows - dr), slice(max(-dc, 0), cols - max(dc, 0)))
             there = (slice(dr, rows), slice(max(dc, 0), cols + min(dc, 0)))
-            step = ray[there] - ray[here]
-            for level, slope, per_px in quantities:
-                mean = 0.5 * (slope[there] + slope[here])
-                off = (level[there] - level[here] - (mean * step).sum(axis=-1)) / per_px[here]
-                known = off.ravel()[spread_indices(off.size, _PAIRS)]
+            x, y = (one[there] - one[here] for one in ray)
+            some = spread_indices(x.size, _PAIRS)
+            for level, along_x, along_y, per_px in quantities:
+                mean_x, mean_y = (0.5 * (slope[there] + slope[here]) for slope in (along_x, along_y))
+                off = (level[there] - level[here] - (mean_x * x + mean_y * y)) / per_px[here]
+                known = off.ravel()[some]
                 known = known[np.isfinite(known)]
                 if len(known) < _MIN_PAIRS:
                     continue
@@ -88,8 +89,8 @@ def _quantities(fitter: Fitter, points: PointFits, rays: Float, valid: NDArray[n
     return [(place[0], one_px), (place[1], one_px), (now, per_px / depth)]
 
 
-def _per_px(values: Float, scale: Float, valid: NDArray[np.intp], shape: tuple[int, int]) -> tuple[Float, Float, Float]:
-    out = np.full((shape[0] * shape[1], 4), np.nan)
-    out[valid, :3], out[valid, 3] = values, scale
-    grid = out.reshape(*shape, 4)
-    return grid[..., 0], grid[..., 1:3], grid[..., 3]
+def _per_px(values: Float, scale: Float, valid: NDArray[np.intp], shape: tuple[int, int]) -> Float:
+    """(4, r, c) value, its slopes along x and y, and its scale; NaN where a point has none."""
+    out = np.full((4, shape[0] * shape[1]), np.nan)
+    out[:3, valid], out[3, valid] = values.T, scale
+    return out.reshape(4, *shape)

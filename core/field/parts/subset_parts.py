@@ -29,6 +29,7 @@ _CENTRES = (1.0 / 6.0, 1.0 / 10.0)  # half of a subset's centre that must be wha
 _CENTRE_LOSS = 0.2  # of the texture's variance
 _CENTRE_SIGMAS = 5.0  # of the mean square of so many pixels, over that of the half that matches best
 _STEPS = 3  # towards that half
+_SOLVED_AT_ONCE = 1024  # normal equations
 _FAINT = 0.5  # of what the smallest other centre adds to a subset's residuals: gain and match take up some of it
 
 
@@ -81,18 +82,20 @@ def pull_of_parts(found: SubsetResiduals, visible: Bool, degree: int) -> Pull:
     masks = _parts()
     shift = np.empty((len(n), 2, len(masks)))
     significance = np.empty_like(shift)
-    for p, mask in enumerate(masks):
-        kept = whole - sums[:, mask].sum(axis=1)
-        left = n - counts[:, mask].sum(axis=1)
+    together = max(_SOLVED_AT_ONCE // max(len(n), 1), 1)  # parts: a few subsets are not worth a step each
+    for first in range(0, len(masks), together):
+        some = masks[first : first + together]
+        kept = np.stack([whole - sums[:, mask].sum(axis=1) for mask in some])
+        left = np.stack([n - counts[:, mask].sum(axis=1) for mask in some])
         of_rest, of_rests = _solved(kept, ridge)
-        scatter = kept[:, k, k] - np.einsum("mi,mi->m", of_rest, kept[:, :k, k])
+        scatter = kept[..., k, k] - np.einsum("pmi,pmi->pm", of_rest, kept[..., :k, k])
         noise = np.maximum(scatter / np.maximum(left - k, 1.0), _TINY_VARIANCE)
-        by_noise = np.maximum(of_rests[:, centre] - variances[:, centre], _LEAST_SHARE * variances[:, centre])
-        shift[:, :, p] = (of_rest - of_whole)[:, centre]
-        enough = left > 3 * k
-        significance[:, :, p] = np.where(
-            enough[:, None], np.abs(shift[:, :, p]) / np.sqrt(by_noise * noise[:, None]), 0.0
-        )
+        by_noise = np.maximum(of_rests[..., centre] - variances[:, centre], _LEAST_SHARE * variances[:, centre])
+        moved = (of_rest - of_whole)[..., centre]
+        sure = np.abs(moved) / np.sqrt(by_noise * noise[..., None])
+        part_of = slice(first, first + len(some))
+        shift[:, :, part_of] = np.moveaxis(moved, 0, -1)
+        significance[:, :, part_of] = np.moveaxis(np.where((left > 3 * k)[..., None], sure, 0.0), 0, -1)
     part = significance.argmax(axis=-1)
     return Pull(
         np.take_along_axis(significance, part[..., None], axis=-1)[..., 0],
@@ -131,10 +134,10 @@ def _sums_of_cells(columns: Float, visible: Bool) -> tuple[Float, Float]:
 
 
 def _solved(sums: Float, ridge: Float) -> tuple[Float, Float]:
-    """Unknowns (m, k) of normal equations, and the diagonal (m, k) of their inverse."""
+    """Unknowns (..., k) of normal equations, and the diagonal (..., k) of their inverse."""
     k = sums.shape[-1] - 1
-    inverse = np.linalg.inv(sums[:, :k, :k] + ridge)
-    return (inverse @ sums[:, :k, k:])[..., 0], np.diagonal(inverse, axis1=1, axis2=2)
+    inverse = np.linalg.inv(sums[..., :k, :k] + ridge)
+    return (inverse @ sums[..., :k, k:])[..., 0], np.diagonal(inverse, axis1=-2, axis2=-1)
 
 
 @lru_cache(maxsize=1)

@@ -83,7 +83,7 @@ class MeasureImage:
     def subset_variance(self, xy_px: Float, subset_px: int, blurred: ImageData | None = None) -> Float:
         """Return the grey-level variance (n,) in the square of ``subset_px`` about the pixels nearest to points (n, 2).
 
-        The last two results are kept: the points of a sequence are the same in every step.
+        The result is kept for the last points given: those of a sequence are the same in every step.
 
         Parameters
         ----------
@@ -113,7 +113,7 @@ class MeasureImage:
             square = cv2.boxFilter(pixels * pixels, -1, size)
             r, c = at[here, 0] - top, at[here, 1]
             out[here] = np.maximum(np.asarray(square)[r, c] - np.asarray(about)[r, c] ** 2, 0.0)
-        self._variance[:] = [(subset_px, blur, np.array(xy_px), out), *self._variance[:1]]
+        self._variance[:] = [(subset_px, blur, np.array(xy_px), out)]
         return out
 
     def contrast(self, box: tuple[float, float, float, float] | None = None) -> tuple[float, float, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.field.checks.blank_centres import centre_px, reject_blank_centres
+from core.field.checks.blank_centres import reject_blank_centres
 from core.field.points.fitter import PointFits
 from core.field.points.images import MeasureImage
 from core.status import PointStatus
@@ -35,7 +35,7 @@ def rejected(image: np.ndarray, unmatched: np.ndarray) -> np.ndarray:
         points,
         shape=SHAPE,
         texture=measured.subset_variance(XY, SUBSET_PX),
-        centre_texture=measured.subset_variance(XY, centre_px(SUBSET_PX)),
+        taken=measured.pixels,
         image=measured.pixels,
         xy_px=XY,
         subset_px=SUBSET_PX,
