@@ -205,7 +205,7 @@ class Blocks:
     def certain(self) -> Iterator[tuple[int, Outcome]]:
         """Yield the steps whose outcome is that of one after another, in their order."""
         for block in self._blocks:
-            if block.joint == "open":
+            if block.joint == "open" or block.stale:
                 return
             for n in block.steps[: block.at if block.again is None else block.again]:
                 if n in block.outcomes:
