@@ -26,6 +26,7 @@ STRAIN_TENSORS: tuple[StrainTensor, ...] = get_args(StrainTensor)
 StrainOrder = Literal[1, 2, "auto"]
 STRAIN_ORDERS: tuple[StrainOrder, ...] = get_args(StrainOrder)
 StartFrom = Literal["previous", "reference"]
+SideBySide = Literal["auto", "never"]
 Pattern = Literal["surface", "projected"]
 DEFAULT_PATCH: PatchSetting = "auto"
 DEFAULT_INTERPOLATION: Interpolation = "quintic"
@@ -239,6 +240,14 @@ class AnalysisSettings(Settings):
         description="Where a step's start values come from. previous: the step before, and steps are measured one "
         "after another. reference: the reference alone; steps need one another for nothing, and a cluster measures as "
         "many at once as it has workers. It needs reference_update = never, which is then the default.",
+    )
+    side_by_side: SideBySide = Field(
+        "auto",
+        description="Whether steps that start from the one before are measured several at once. auto: where there is "
+        "more than one worker, in blocks; each block's first step starts from seeds and is measured again from the "
+        "step before it, and what does not agree with that is measured anew, so that results are those of steps one "
+        "after another within 2 % of their standard uncertainty. never, and always with reference_update = always: "
+        "one after another.",
     )
     pattern: Pattern = Field(
         "surface",

@@ -130,6 +130,11 @@ class CameraWatch:
         )
         return CameraMotion.of(against_calibration, against_reference, against_last)
 
+    def forget(self, n: int) -> None:
+        """Let a step be looked at anew when it is asked for again."""
+        if n != self.reference:
+            self._steps.pop(n, None)
+
     def _of(self, n: int, step: Callable[[], tuple[Field, Images]]) -> StepOffsets | None:
         if n not in self._steps:
             result, images = step()

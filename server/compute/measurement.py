@@ -12,6 +12,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -72,17 +73,24 @@ def measure_step(task: StepTask) -> dict[str, object]:
         The service asked for it.
     """
     channel = current_task()
-    measured = _ahead.take(Asked(_key_of(task), task.step, task.previous), channel)
+    measured = _ahead.take(Asked(_key_of(task), task.step, task.previous, task.from_head, task.against), channel)
     kept = _kept_of(task)
     sequence = kept.sequence
+    sequence.go_on(task.generation)
     sequence.steps |= task.earlier
     if measured is None:
         measured = timed(_measuring(kept, task, task.step, task.previous), channel.progress, channel)
+        if task.against is not None:
+            sequence.keep_head(task.step, measured.field)
+            return {"n": task.step.n, "compute_s": measured.seconds}
     elif task.following is not None:
         kept.ahead = task.following, _reader.submit(sequence.read, task.following)
     if task.following is not None and channel.keeps_going:
         after = Asked(_key_of(task), task.following, task.step.n)
         _ahead.begin(after, _measuring(kept, task, task.following, task.step.n))
+    agrees = {}
+    if task.compared is not None:
+        agrees["agrees"] = sequence.agrees(task.step, measured.field, task.compared)
     try:
         finished = sequence.finish(
             task.step, measured.field, about=task.about, in_service=True, keep_starts=task.keeps_starts
@@ -90,10 +98,10 @@ def measure_step(task: StepTask) -> dict[str, object]:
     except BaseException:
         _ahead.drop()
         raise
-    if task.previous not in (None, task.reference.n):
+    if task.previous not in (None, task.reference.n) and not task.from_head:
         # no later step starts from there
         starts_file(sequence.file_of(task.previous)).unlink(missing_ok=True)
-    return {**finished.summary, "compute_s": measured.seconds}
+    return {**finished.summary, **agrees, "compute_s": measured.seconds}
 
 
 def _measuring(kept: _Kept, task: StepTask, step: StepImages, previous: int | None) -> Measure:
@@ -104,7 +112,8 @@ def _measuring(kept: _Kept, task: StepTask, step: StepImages, previous: int | No
         images = None if step.n == task.reference.n else kept.current_images(step) or sequence.read(step)
         if task.following is not None and step != task.following:
             kept.ahead = task.following, _reader.submit(sequence.read, task.following)
-        return sequence.measure(step, images, previous=previous, progress=progress, cancel=cancel)
+        alone: dict[str, Any] = {} if step != task.step else {"from_head": task.from_head, "against": task.against}
+        return sequence.measure(step, images, previous=previous, progress=progress, cancel=cancel, **alone)
 
     return measure
 

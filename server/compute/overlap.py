@@ -121,11 +121,13 @@ Measure = Callable[[Progress, CancelToken], Field]
 
 @dataclass(frozen=True)
 class Asked:
-    """What a task asks for: a step of a measurement, and the step that it starts from."""
+    """What a task asks for: a step of a measurement, and the step that it starts from, or its head; or a head."""
 
     measurement: str
     step: StepImages
     previous: int | None
+    from_head: bool = False
+    against: int | None = None
 
 
 def timed(measure: Measure, progress: Progress, cancel: CancelToken) -> Measured:

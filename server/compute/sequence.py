@@ -24,6 +24,7 @@ from core.field.points.images import MeasureImage, check_calibrated_size
 from core.field.points.result import Field
 from core.field.region.lay_points import make_grid
 from core.field.seeding.seeds import seeds_of
+from core.field.sequence.joint import agree
 from core.field.settings import MeasureOptions
 from core.measure import PreviousStep, ReferencePair, Updating
 from core.names import CAMERAS
@@ -46,7 +47,7 @@ from server.formats.results.starts import starts_file, with_starts, write_starts
 from server.formats.results.summary import summarise, to_json
 from server.formats.results.writing import Provenance, write_field
 from server.formats.version import software_version
-from server.worker.tasks import StepImages
+from server.worker.tasks import Earlier, StepImages, files_of
 
 Pair = tuple[MeasureImage, MeasureImage]
 
@@ -110,8 +111,10 @@ class SequenceMeasurement:
         self._volume = volume_of(self.calibration)
         self._common = CommonParts(self.calibration.pair, parameter_covariance(self.calibration))
         self._rbe_px = rbe_of(self.calibration)
-        self._fields: dict[int, Field] = {}
+        self._fields: dict[Path, Field] = {}  # by the file that has it, or will have it
         self._previous: int | None = None
+        self._from_head = False
+        self._generation = 0
         self._last_images: tuple[int, Pair] | None = None
         self._sequence: Updating | None = None
         self._motions: dict[int, CameraMotion | None] = {}
@@ -132,6 +135,13 @@ class SequenceMeasurement:
         self.grid = make_grid(self.settings, self.mask, images[0].shape)
         self.pair = ReferencePair(self.calibration.pair, *images)
 
+    def go_on(self, generation: int) -> None:
+        """Forget fields of steps, and what was begun at them, if their results have been replaced since."""
+        if generation != self._generation:
+            own = self.file_of(self.reference.n)
+            self._fields = {path: f for path, f in self._fields.items() if path == own}
+            self._sequence, self._generation = None, generation
+
     def read(self, step: StepImages) -> Pair:
         """Read both images of a step; everything derived from them is computed on the calling thread."""
         one, two = (
@@ -149,6 +159,8 @@ class SequenceMeasurement:
         images: Pair | None = None,
         *,
         previous: int | None = None,
+        from_head: bool = False,
+        against: int | None = None,
         progress: Progress | None = None,
         cancel: CancelToken | None = None,
     ) -> Field:
@@ -160,6 +172,10 @@ class SequenceMeasurement:
             The step's, if they were read already.
         previous
             The step measured before, whose field gives start values.
+        from_head
+            Take the previous step's field from its head, see :meth:`keep_head`.
+        against
+            Reference to match the step against from seeds, without a previous step.
 
         Raises
         ------
@@ -176,7 +192,7 @@ class SequenceMeasurement:
         seeds = seeds_of(self.settings)
         if seeds is not None:
             more["seeds"] = seeds
-        self.steps[step.n], self._previous = step, previous
+        self.steps[step.n], self._previous, self._from_head = step, previous, from_head
         if step.n == self.reference.n:
             own = self.pair.image1, self.pair.image2
             result = self._matched(step.n, own, lambda: self.pair.shape(self.grid, self.options, **more))
@@ -186,8 +202,13 @@ class SequenceMeasurement:
             if previous is not None and previous != self.reference.n:
                 previous_step = PreviousStep(previous, self._field(previous))
             images = images or self.read(step)
+            if against is not None:
+                return self._matched(step.n, images, lambda: self._updating(shape).begin_at(images, against, **more))
             result = self._matched(step.n, images, lambda: self._updating(shape).measure(images, previous_step, **more))
             self._last_images = None if self.settings.reference_update == "never" else (step.n, images)
+        self._watch.forget(step.n)  # it may have been measured before
+        if from_head and previous is not None:
+            self._watch.forget(previous)
         self._motions[step.n] = self._watch.judge(
             step.n,
             result,
@@ -197,8 +218,34 @@ class SequenceMeasurement:
             before=lambda n: (self._field(n), self._previous_images(n)),
         )
         self._terms[step.n] = self._systematic(result, images)
-        self._fields = {n: f for n, f in self._fields.items() if n == self.reference.n} | {step.n: result}
+        if from_head and previous is not None:
+            self._watch.forget(previous)
+        self._keep(self.file_of(step.n), result)
         return result
+
+    def _keep(self, file: Path, field: Field) -> None:
+        """Keep a field beside the reference's, for the step after it."""
+        own = self.file_of(self.reference.n)
+        self._fields = {path: f for path, f in self._fields.items() if path == own} | {file: field}
+
+    def keep_head(self, step: StepImages, result: Field) -> None:
+        """Write the field of a block's first step, which is measured again from the step before it.
+
+        Raises
+        ------
+        StorageError
+            ``storage_full`` or ``storage_failed``.
+        """
+        path = self.file_of(step.n, "head")
+        if result.starts is not None:
+            write_starts(starts_file(path), result, exact=self.settings.reference_update != "never")
+        write_field(path, result, self._provenance(step, result, {}), None, checksum=False)
+        self._keep(path, result)
+
+    def agrees(self, step: StepImages, result: Field, earlier: Earlier) -> bool:
+        """Return True if steps that were measured from what is there of a step stand, see :func:`agree`."""
+        path = self.file_of(step.n, earlier)
+        return path.exists() and agree(result, read_measured(path))
 
     def _systematic(self, result: Field, images: Pair | None) -> Systematic:
         """Systematic terms of a step's field; ``images`` are the step's, which the reference itself needs none of."""
@@ -287,9 +334,9 @@ class SequenceMeasurement:
             n=step.n, field=shown, summary={**summary, "write_s": round(time.perf_counter() - began, 3)}
         )
 
-    def file_of(self, n: int) -> Path:
-        """Return the path of a step's result."""
-        return self.folder / f"step_{n:04d}.nc"
+    def file_of(self, n: int, kind: Earlier = "step") -> Path:
+        """Return the path of a step's result, or of its head."""
+        return self.folder / files_of(n, kind)[0]
 
     def _updating(self, shape: Field) -> Updating:
         if self._sequence is None:
@@ -324,9 +371,9 @@ class SequenceMeasurement:
 
         Later steps propagate the noise of its images; the calibration's error is added once, to the total.
         """
-        if n not in self._fields:
+        path = self.file_of(n, "head" if self._from_head and n == self._previous else "step")
+        if path not in self._fields:
             known = n in (self.reference.n, self._previous)
-            path = self.file_of(n)
             if not path.exists():
                 raise FileFormatError(
                     f"The result of step {n} is missing.", code="file_missing", remedy="Start the analysis again."
@@ -336,8 +383,8 @@ class SequenceMeasurement:
                 measured = with_starts(measured, starts_file(path))
             if n != self.reference.n:
                 return measured
-            self._fields[n] = measured
-        return self._fields[n]
+            self._fields[path] = measured
+        return self._fields[path]
 
     def _provenance(self, step: StepImages, result: Field, about: Mapping[str, str]) -> Provenance:
         inputs = {"calibration": self.calibration.sha256, **self.inputs}

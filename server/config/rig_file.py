@@ -445,7 +445,17 @@ class ComputeSection(_Closed):
         description="Way a cluster's workers get images: by path, where they see the data folder under the same name, "
         "or sent with each step.",
     )
-    threads_per_worker: int = Field(1, ge=1, le=256, description="Kernel threads of each of the cluster's workers.")
+    threads_per_worker: int = Field(
+        1, ge=1, le=256, description="Kernel threads of each of the cluster's workers, or of each of `processes`."
+    )
+    processes: int = Field(
+        1,
+        ge=1,
+        le=256,
+        description="Worker processes of the service's own that measure an analysis' steps side by side, where no "
+        "scheduler is named; each holds the reference and a step in memory. 1: the one process with `kernel_threads` "
+        "that everything else is computed in.",
+    )
 
 
 class RigConfig(_Closed):

@@ -532,7 +532,8 @@ class TestStore:
 
     def drop_starts(self, test_id: str, analysis_id: str) -> None:
         """Remove files that only an unfinished analysis needs, see :mod:`server.formats.results.starts`."""
-        for path in self._analysis_to_change(test_id, analysis_id).glob("starts_[0-9]*.npz"):
+        folder = self._analysis_to_change(test_id, analysis_id)
+        for path in (*folder.glob("starts_[0-9]*.npz"), *folder.glob("head_*")):
             path.unlink(missing_ok=True)
 
     def drop_half_written(self, test_id: str, analysis_id: str) -> list[Path]:

@@ -20,7 +20,7 @@ from typing import Any
 
 from server.worker import process as worker_process
 from server.worker.process import TaskChannel
-from server.worker.tasks import StepTask
+from server.worker.tasks import StepTask, files_of
 
 _REPORT_S = 0.2
 _MAX_STOPPED = 10_000
@@ -128,7 +128,7 @@ def run_with_files(
     moved = task.moved(folder, there)
     answer = run(name, topic, threads, function, moved)
     written = {}
-    for file in (f"starts_{task.step.n:04d}.npz", f"step_{task.step.n:04d}.nc"):  # the result last
+    for file in reversed(files_of(task.step.n, "step" if task.against is None else "head")):  # the result last
         if (folder / file).is_file():
             written[file] = (folder / file).read_bytes()
     with contextlib.suppress(OSError):  # read once

@@ -9,13 +9,15 @@ import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from core.names import CAMERAS
 from core.settings import StoredSettings
 
 #: what crosses the process' border: numbers, texts, lists and objects of them
 Plain = dict[str, Any]
+#: what a step's field was measured as: the step after another one, or the head of a block
+Earlier = Literal["step", "head"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +84,16 @@ class StepTask:
         them.
     keeps_starts
         True if later steps start from what this one finds.
+    against
+        Reference that the step is matched against from seeds, without the steps between: the head of a block of steps
+        that are measured side by side with others. Its field goes to ``head_<nnnn>.nc``, and there is no result.
+    from_head
+        True if the previous step's field is that of its head.
+    compared
+        What is there of the step already, its head or its result: the summary has under ``agrees`` whether steps that
+        were measured from it stand. None: nothing.
+    generation
+        Larger once results have been replaced: what a process has kept of them is not theirs any more.
     """
 
     folder: Path
@@ -95,6 +107,10 @@ class StepTask:
     noise: Path | None = None
     earlier: dict[int, StepImages] = field(default_factory=dict)
     keeps_starts: bool = True
+    against: int | None = None
+    from_head: bool = False
+    compared: Earlier | None = None
+    generation: int = 0
 
     def files(self) -> list[Path]:
         """Return every file that the step reads, as far as they are there."""
@@ -105,7 +121,10 @@ class StepTask:
         if self.step.n != self.reference.n:
             results = {self.reference.n, *([] if self.previous is None else [self.previous]), *self.earlier}
             for n in sorted(results - {self.step.n}):
-                paths += [self.folder / f"step_{n:04d}.nc", self.folder / f"starts_{n:04d}.npz"]
+                paths += [self.folder / name for name in files_of(n)]
+            for n in {self.step.n, *([] if self.previous is None else [self.previous])}:
+                paths += [self.folder / name for name in files_of(n, "head")]
+            paths += [self.folder / name for name in files_of(self.step.n)] if self.compared == "step" else []
         paths.append(self.folder / "mask.png")
         return [path for path in dict.fromkeys(paths) if path.is_file()]
 
@@ -125,6 +144,12 @@ class StepTask:
             noise=None if self.noise is None else there[self.noise],
             earlier={n: at(step) for n, step in self.earlier.items()},
         )
+
+
+def files_of(n: int, kind: Earlier = "step") -> tuple[str, str]:
+    """Return the names of a step's field and of the starts beside it: of its result, or of its head."""
+    starts = "starts" if kind == "step" else "head_starts"
+    return f"{kind}_{n:04d}.nc", f"{starts}_{n:04d}.npz"
 
 
 @dataclass(frozen=True)

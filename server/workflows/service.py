@@ -41,6 +41,7 @@ from server.store.trash import Trash
 from server.worker.dask_cluster import ClusterExecutor
 from server.worker.embedded import ComputeWorker, make_worker
 from server.worker.executor import TaskExecutor
+from server.worker.pool import WorkerPool
 from server.workflows.analysis.checks import AnalysisChecks
 from server.workflows.analysis.framed import FramedResults
 
@@ -98,6 +99,9 @@ class Service:
             self.executor = ClusterExecutor(
                 config.compute.scheduler, images=config.compute.images, threads=config.compute.threads_per_worker
             )
+        elif config.compute.processes > 1:
+            threads = config.compute.threads_per_worker
+            self.executor = WorkerPool([make_worker(threads) for _ in range(config.compute.processes)])
         self.rig = Rig(config, self.hardware, self.hub.publish, record=record)
         self.finder = DeviceFinder()
         self.checks = AnalysisChecks(self.tests)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
-from typing import Any
+from typing import Any, Self
 
 from core.errors import Cancelled
 from server.jobs.job import Job
@@ -55,33 +56,72 @@ def run_side_by_side(
     progress
         Called with a task's number, its stage and the share of it that is done.
     """
-    running: dict[TaskFuture, int] = {}
+    with SideBySide(executor, job, progress) as side:
+        more = True
+        while more or side.running:
+            while more and side.has_room:
+                number, make = next(tasks, (None, None))
+                if number is None or make is None:
+                    more = False
+                    break
+                side.submit(number, function, make())
+            for number, future in side.ended():
+                ended(number, future)
 
-    def stop() -> None:
-        for future in list(running):
+
+class SideBySide:
+    """Tasks of a job that run at once, as many as the executor takes; leaving the ``with`` block ends them.
+
+    Parameters
+    ----------
+    progress
+        Called with a task's number, its stage and the share of it that is done.
+    """
+
+    def __init__(self, executor: TaskExecutor, job: Job, progress: Callable[[int, str, float], None]) -> None:
+        self._executor, self._job, self._progress = executor, job, progress
+        self.running: dict[TaskFuture, int] = {}
+        self._waiting = contextlib.ExitStack()
+
+    @property
+    def has_room(self) -> bool:
+        """True while another task could begin at once."""
+        return len(self.running) < self._executor.width
+
+    def submit(self, number: int, function: Callable[..., Any], *args: Any) -> TaskFuture:
+        """Begin a task."""
+        self._job.check()
+        future = self._executor.submit(function, *args)
+        future.on_progress = lambda phase, done, of: self._progress(
+            number, phase, min(done / of, 1.0) if of > 0 else 0.0
+        )
+        self.running[future] = number
+        return future
+
+    def ended(self) -> Iterator[tuple[int, TaskFuture]]:
+        """Wait a moment, and yield number and future of each task that has ended.
+
+        Raises
+        ------
+        Cancelled
+            The job is to stop.
+        """
+        self._job.check()
+        finished, _ = wait(list(self.running), timeout=0.05, return_when=FIRST_COMPLETED)
+        for one in finished:
+            self._job.check()
+            future: TaskFuture = one  # type: ignore[assignment]  # wait() forgets what it was given
+            yield self.running.pop(future), future
+
+    def _stop(self) -> None:
+        for future in list(self.running):
             future.request_stop()
 
-    def shown(number: int) -> Progress:
-        return lambda phase, done, of: progress(number, phase, min(done / of, 1.0) if of > 0 else 0.0)
+    def __enter__(self) -> Self:
+        self._waiting.enter_context(self._job.waiting(self._stop))
+        return self
 
-    with job.waiting(stop):
-        try:
-            more = True
-            while more or running:
-                job.check()
-                while more and len(running) < executor.width:
-                    number, make = next(tasks, (None, None))
-                    if number is None or make is None:
-                        more = False
-                        break
-                    future = executor.submit(function, make())
-                    future.on_progress = shown(number)
-                    running[future] = number
-                finished, _ = wait(list(running), timeout=0.05, return_when=FIRST_COMPLETED)
-                for one in finished:
-                    if job.cancelled:
-                        break
-                    ended(running.pop(one), one)  # type: ignore[call-overload]  # wait() forgets what it was given
-        finally:
-            stop()
-            wait(list(running), timeout=_STOPPING_S)  # what a job leaves running would write after its end
+    def __exit__(self, *_: object) -> None:
+        with self._waiting:
+            self._stop()
+            wait(list(self.running), timeout=_STOPPING_S)  # what a job leaves running would write after its end

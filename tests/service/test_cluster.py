@@ -2,111 +2,30 @@
 
 from __future__ import annotations
 
-import importlib.util
-import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
 
-from server.config.rig_file import parse_config
-from server.workflows.service import Service
-from tests.support.copied_tests import CONFIG, write_test_folder
-from tests.support.requirements import ROOT, missing
+from tests.support.copied_tests import write_test_folder
+from tests.support.dask_bench import Cluster, Host, cluster_of
 from tests.support.running_analyses import API, BODY, begin, contents, folder_of, wait_for_steps
-from tests.support.service_rig import a_second, served, wait_for_job
+from tests.support.service_rig import a_second, wait_for_job
 
 STEPS = 7
 INDEPENDENT = {"start_from": "reference"}
 
 
-class Cluster:
-    """A scheduler and its workers, each a process."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._file = folder / "scheduler.json"
-        self._log = (folder / "cluster.log").open("wb")
-        self.workers: list[subprocess.Popen[bytes]] = []
-        self._scheduler = self._start(
-            "dask_scheduler", "--port", "0", "--host", "127.0.0.1", "--scheduler-file", str(self._file)
-        )
-        try:
-            deadline = time.monotonic() + 120
-            while not self._file.exists() and time.monotonic() < deadline:
-                time.sleep(0.05)
-            self.address: str = json.loads(self._file.read_text())["address"]
-        except BaseException:
-            self.close()
-            raise
-
-    def _start(self, module: str, *arguments: str) -> subprocess.Popen[bytes]:
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-        return subprocess.Popen(
-            [sys.executable, "-m", f"distributed.cli.{module}", "--no-dashboard", *arguments],
-            cwd=self._folder,
-            stdout=self._log,
-            stderr=self._log,
-            env=environment,
-        )
-
-    def add_worker(self) -> subprocess.Popen[bytes]:
-        worker = self._start(
-            "dask_worker",
-            "--scheduler-file",
-            str(self._file),
-            "--nthreads",
-            "1",
-            "--no-nanny",
-            "--host",
-            "127.0.0.1",
-            "--local-directory",
-            str(self._folder),
-        )
-        self.workers.append(worker)
-        return worker
-
-    def close(self) -> None:
-        for process in [*self.workers, self._scheduler]:
-            process.kill()
-            process.wait()
-        self._log.close()
-
-
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    if importlib.util.find_spec("distributed") is None:
-        missing("distributed (pip install distributed)")
-    made = Cluster(tmp_path_factory.mktemp("cluster"))
-    try:
-        for _ in range(2):
-            made.add_worker()
+    with cluster_of(2, tmp_path_factory.mktemp("cluster")) as made:
         yield made
-    finally:
-        made.close()
-
-
-class Host:
-    """A service whose analyses run here or there."""
-
-    def __init__(self, data: Path, compute: str) -> None:
-        self.data = data
-        self.service = Service(parse_config(f"{CONFIG}\n{compute}"), data).start()
-        self._context = served(self.service)
-        self.client: httpx.Client = self._context.__enter__()
-
-    def close(self) -> None:
-        self._context.__exit__(None, None, None)
-        self.service.close()
 
 
 @pytest.fixture(scope="module")

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from core.cameras.stereo import StereoPair
+from core.names import CAMERAS
 from server.config.rig_file import parse_config
 from server.formats.images import encode_tiff
 from sim.rig import SimRig
@@ -26,17 +29,26 @@ def write_test_folder(folder: Path, steps: int, load_a_step: float = 0.0) -> Non
     rig = SimRig.from_dict(config.model_dump(exclude_none=True))
     world = SimWorld(rig, lambda _: 0.0)
     rng = np.random.default_rng(5)
+
+    def images() -> Iterator[Sequence[np.ndarray]]:
+        for n in range(steps):
+            world.set_scene("plate", load=n * load_a_step)
+            yield [world.expose(cam, exposure_ms=10.0, gain_db=0.0, rng=rng) for cam in CAMERAS]  # type: ignore[arg-type]
+
+    write_test_of(folder, world.true_pair(), images())
+
+
+def write_test_of(folder: Path, pair: StereoPair, images: Iterable[Sequence[np.ndarray]]) -> None:
+    """Write a test of given pairs of images, calibrated with the cameras that took them."""
     (folder / "analyses").mkdir(parents=True)
-    pair = world.true_pair()
     calibration = {"cam1": pair.cam1.paper_parameters(), "cam2": pair.cam2.paper_parameters()}
     (folder / "calibration.json").write_text(json.dumps(calibration))
-    for n in range(steps):
-        world.set_scene("plate", load=n * load_a_step)
+    for n, both in enumerate(images):
         step = folder / "steps" / f"{n:04d}"
         step.mkdir(parents=True)
         sha256 = {}
-        for cam in ("cam1", "cam2"):
-            content = encode_tiff(world.expose(cam, exposure_ms=10.0, gain_db=0.0, rng=rng))  # type: ignore[arg-type]
+        for cam, image in zip(CAMERAS, both, strict=True):
+            content = encode_tiff(image)
             (step / f"{cam}.tif").write_bytes(content)
             sha256[cam] = hashlib.sha256(content).hexdigest()
         metadata = {

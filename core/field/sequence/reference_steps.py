@@ -133,7 +133,7 @@ class Updating:
             if reference == previous.step:
                 raise
             return self._against(previous.step, step)
-        if reference == previous.step or not _fails(field, previous.field, self._held_by(reference)):
+        if reference == previous.step or not _fails(field, previous.field.valid, self._held_by(reference)):
             return field
         lost = _lost(field, previous.field.valid)
         before, subset_px = self._images_of(previous.step), self._options.subset_px
@@ -144,6 +144,47 @@ class Updating:
         except MeasurementError:
             return field
         return updated if _finds_it(updated, field, previous.field) else field
+
+    def begin_at(
+        self,
+        images: Pair,
+        reference: int,
+        *,
+        seeds: Seeds | None = None,
+        progress: Progress | None = None,
+        cancel: CancelToken | None = None,
+    ) -> Field:
+        """Measure a step against a given reference without the steps between, from seeds that are found.
+
+        Parameters
+        ----------
+        images
+            Both cameras' images.
+        reference
+            Number of the first reference, or of an earlier step whose images and field can be had.
+        seeds, progress, cancel
+            As in :meth:`measure`.
+
+        Returns
+        -------
+        Field
+            The chain's, as far as the steps between do not matter to it: steps after it can be measured from it, and
+            whether it is the chain's own shows where that arrives (see :mod:`core.field.sequence.joint`).
+
+        Raises
+        ------
+        SeedError
+            As :meth:`measure`, and where the reference does not serve: the chain would have looked for a later one.
+        """
+        if reference == self._first:
+            field = self._total(_Step(images, None, seeds, progress, cancel))
+        else:
+            begun = PreviousStep(reference, self._field_of(reference))
+            field = self._by_segment(reference, _Step(images, begun, seeds, progress, cancel))
+        held = self._held_by(reference)
+        if self._mode == "auto" and _fails(field, held, held):
+            raise SeedError(f"the images have changed too much since step {reference} to be matched against it.")
+        return field
 
     def _held_by(self, step: int) -> Bool:
         return self._shape.valid if step == self._first else self._segment(step).has.reshape(self._grid.shape)
@@ -277,11 +318,11 @@ def _lost(field: Field, before: Bool) -> Bool:
     return np.asarray(before & ~field.valid & np.isin(field.status, _BY_THE_MATCH))
 
 
-def _fails(field: Field, before: Field, held: Bool) -> bool:
+def _fails(field: Field, before: Bool, held: Bool) -> bool:
     """Return True if a reference lost more of its points than checks reject by chance, some of them in this step."""
     n = int(held.sum())
     chance = MAY_BE_LOST * n + SIGMAS * np.sqrt(MAY_BE_LOST * n)
-    return bool(_lost(field, held).sum() > chance and _lost(field, before.valid).sum() > BETTER_SIGMAS**2)
+    return bool(_lost(field, held).sum() > chance and _lost(field, before).sum() > BETTER_SIGMAS**2)
 
 
 def _finds_it(updated: Field, field: Field, before: Field) -> bool:

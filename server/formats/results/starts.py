@@ -23,7 +23,8 @@ _SINGLE = ("covariance", "zncc", "epipolar_px", "noise_grey")
 
 def starts_file(result: Path) -> Path:
     """Path of the starts that belong to a result file."""
-    return result.with_name(result.stem.replace("step_", "starts_") + ".npz")
+    name = result.stem.replace("head_", "head_starts_") if result.stem.startswith("head") else result.stem
+    return result.with_name(name.replace("step_", "starts_") + ".npz")
 
 
 def write_starts(path: Path, measured: Field, *, exact: bool) -> None:

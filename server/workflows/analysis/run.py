@@ -7,14 +7,17 @@ measures each step from the same steps before it in any case.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
+from dataclasses import replace
 from typing import Any
 
 from core.errors import Cancelled, MeasurementError, StereorigError, StorageError
 from server.base.json_values import without_nan
 from server.base.problem import problem_of
+from server.formats.results.settings import stored_settings
 from server.formats.results.summary import SequenceSummary
 from server.formats.version import software_version
 from server.jobs.job import Job, Waiting
@@ -24,12 +27,13 @@ from server.store.folder import now_utc
 from server.store.indexing.entries import analysis_entry
 from server.store.tests import StepFiles
 from server.worker.dask_cluster import ClusterError
-from server.worker.executor import WorkerDiedError
+from server.worker.executor import TaskFuture, WorkerDiedError
 from server.worker.tasks import StepTask, measure_step
+from server.workflows.analysis.blocks import SHORTEST, Ask, Blocks, Outcome
 from server.workflows.analysis.tasks import is_independent, task_of
 from server.workflows.camera_identity import check_same_cameras
 from server.workflows.service import Service
-from server.workflows.waiting import run_side_by_side, run_task
+from server.workflows.waiting import SideBySide, run_side_by_side, run_task
 
 
 class StepsFailedError(MeasurementError):
@@ -131,15 +135,21 @@ class AnalysisRun:
         if is_independent(self._document):
             self._measure_side_by_side(job)
             return
+        if self._in_blocks():
+            self._measure_in_blocks(job)
+            return
         while self._next < len(steps):
-            n = steps[self._next]
-            if n in self._summaries:
-                self._done[n] = self._service.tests.step(self._test_id, n)
-            else:
-                job.check()
-                self._service.require_room()  # while what the job ends with can still be written
-                self._measure_one(job, self._next, n)
-            self._next += 1
+            self._measure_next(job)
+
+    def _measure_next(self, job: Job) -> None:
+        n = self._document.steps[self._next]
+        if n in self._summaries:
+            self._done[n] = self._service.tests.step(self._test_id, n)
+        else:
+            job.check()
+            self._service.require_room()  # while what the job ends with can still be written
+            self._measure_one(job, self._next, n)
+        self._next += 1
 
     def _measure_one(self, job: Job, index: int, n: int) -> None:
         service, document, steps = self._service, self._document, self._document.steps
@@ -157,7 +167,93 @@ class AnalysisRun:
         except StereorigError as error:
             self._note_failure(job, n, error)
             return
-        self._note(job, n, summary, started)
+        self._note(job, n, summary, time.monotonic() - started)
+
+    def _in_blocks(self) -> bool:
+        """Return True if what is left is measured in blocks side by side, see :class:`Blocks`."""
+        steps, settings = self._document.steps[self._next :], stored_settings(self._document.settings)
+        if settings.side_by_side == "never" or settings.reference_update == "always":
+            return False
+        left = [n for n in steps if n not in self._summaries and n != self._document.steps[0]]
+        return len(left) >= 2 * SHORTEST and self._service.executor.width > 1
+
+    def _measure_in_blocks(self, job: Job) -> None:
+        """Measure steps that follow one another in blocks, several at once."""
+        steps = self._document.steps
+        while self._next < len(steps) and (self._next == 0 or steps[self._next] in self._summaries):
+            self._measure_next(job)  # the reference, and what goes on without a gap
+        references = [found.plain().get("reference_step") for n, found in self._summaries.items() if n in self._done]
+        later = [int(str(n)) for n in dict.fromkeys(references) if n is not None and n != steps[0]]
+        order = steps[self._next :]
+        plan = Blocks(
+            order,
+            previous=next(reversed(self._done)),
+            reference=later[-1] if later else steps[0],
+            first=steps[0],
+            width=self._service.executor.width,
+            references=later,
+            known={n: self._summaries[n].plain() for n in order if n in self._summaries},
+        )
+        shares: dict[int, float] = {}
+        certain = 0
+
+        def progress(number: int, phase: str, share: float) -> None:  # noqa: ARG001
+            shares[number] = share
+            done = self._next + plan.ahead + sum(shares.values())
+            job.progress(f"{len(shares)} steps at once", round(1000 * min(done, len(steps))), 1000 * len(steps))
+
+        with SideBySide(self._service.executor, job, progress) as side:
+            asked: dict[TaskFuture, tuple[Ask, float]] = {}
+            while not plan.through:
+                while side.has_room and (ask := plan.ask()) is not None:
+                    self._service.require_room()
+                    try:
+                        self._check_cameras(ask.n)
+                        task = self._task_of(ask)
+                    except StereorigError as error:
+                        self._raise_what_ends_all(ask.n, error)
+                        plan.ended(ask, error)
+                        continue
+                    asked[side.submit(ask.n, measure_step, task)] = ask, time.monotonic()
+                for n, future in side.ended():
+                    shares.pop(n, None)
+                    ask, started = asked.pop(future)
+                    plan.ended(ask, self._outcome(n, future, time.monotonic() - started))
+                    for n, outcome in itertools.islice(plan.certain(), certain, None):
+                        certain += 1
+                        self._take(job, n, outcome)
+        self._next = len(steps)
+
+    def _task_of(self, ask: Ask) -> StepTask:
+        tests = self._service.tests
+        needed = [n for n in ask.references if n != ask.previous] + ([] if ask.previous is None else [ask.previous])
+        earlier = {n: tests.step(self._test_id, n) for n in needed}
+        return replace(
+            task_of(tests, self._document, ask.n, earlier, None),
+            previous=ask.previous,
+            against=ask.against,
+            from_head=ask.from_head,
+            compared=ask.compared,
+            generation=ask.generation,
+        )
+
+    def _outcome(self, n: int, future: TaskFuture, seconds: float) -> Outcome:
+        try:
+            return {**future.result(), "wall_s": seconds}
+        except StereorigError as error:
+            self._raise_what_ends_all(n, error)
+            return error
+
+    def _take(self, job: Job, n: int, outcome: Outcome) -> None:
+        """Note a step whose outcome is that of one after another."""
+        if isinstance(outcome, StereorigError):
+            self._summaries.pop(n, None)
+            self._note_failure(job, n, outcome)
+        elif n in self._summaries and self._summaries[n].plain() == outcome:
+            self._done[n] = self._service.tests.step(self._test_id, n)  # measured in another run
+        else:
+            found = {name: value for name, value in outcome.items() if name != "agrees"}
+            self._note(job, n, found, float(str(found["wall_s"])))
 
     def _measure_side_by_side(self, job: Job) -> None:
         """Measure steps that need no other than the reference, as many at once as there are workers."""
@@ -194,27 +290,30 @@ class AnalysisRun:
             except StereorigError as error:
                 self._note_failure(job, n, error)
             else:
-                self._note(job, n, summary, began)
+                self._note(job, n, summary, time.monotonic() - began)
 
         run_side_by_side(self._service.executor, job, measure_step, tasks(), ended, progress)
         self._next = len(steps)
 
     def _note_failure(self, job: Job, n: int, error: StereorigError) -> None:
         """Keep and show a step's own failure; raise what is not its doing, or what nothing can go on without."""
-        displacement = self._document.kind == "displacement"
-        if isinstance(error, Cancelled | StorageError | WorkerDiedError | ClusterError):
-            raise error
-        if displacement and n == self._document.steps[0]:
-            raise error
+        self._raise_what_ends_all(n, error)
         self._failed[n] = error
         self._publish(job)
         about = {"test_id": self._test_id, "analysis_id": self._document.id, "n": n, "job_id": job.id}
         self._service.hub.publish("step_failed", {**about, "problem": problem_of(error).plain()})
 
-    def _note(self, job: Job, n: int, summary: Mapping[str, object], started: float) -> None:
+    def _raise_what_ends_all(self, n: int, error: StereorigError) -> None:
+        displacement = self._document.kind == "displacement"
+        if isinstance(error, Cancelled | StorageError | WorkerDiedError | ClusterError):
+            raise error
+        if displacement and n == self._document.steps[0]:
+            raise error
+
+    def _note(self, job: Job, n: int, summary: Mapping[str, object], seconds: float) -> None:
         """A step is finished: durable first, then announced."""
         service, analysis_id = self._service, self._document.id
-        seconds = round(time.monotonic() - started, 3)
+        seconds = round(seconds, 3)
         found = without_nan({**summary, "wall_s": seconds, "seconds": seconds})
         service.tests.put_step_summary(self._test_id, analysis_id, n, found)
         self._summaries[n] = StepOutcome.model_validate(found)

@@ -1,0 +1,339 @@
+"""Plan of a sequence in blocks that are measured side by side, with the results of one after the other.
+
+Steps of a block follow one another. The first of a block, its head, is matched against the current reference from
+seeds; once the block before is through, it is measured again from that one's last step: the joint. Where both agree,
+the block stands. Where they do not, its steps are measured again from the joint on, until one agrees with what was
+there. A step that went over to another reference gives all later blocks new heads. A block whose head cannot be found
+waits, and goes on where the one before ends.
+
+Decisions only: what is to be measured next, and what follows from an outcome. Nothing here measures or waits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+from core.errors import StereorigError
+from server.worker.tasks import Earlier
+
+Summary = Mapping[str, object]
+Outcome = Summary | StereorigError
+Kind = Literal["head", "step", "joint", "again"]
+
+#: a head and a joint cost two to four steps
+SHORTEST = 4
+#: a change of the reference in a block is what later ones wait for
+LONGEST = 32
+
+
+@dataclass(frozen=True, eq=False)
+class Ask:
+    """A measurement that can be done now.
+
+    Attributes
+    ----------
+    block, kind, n
+        For which block, what, and the step.
+    previous
+        Step that gives the start values, None of a head; ``from_head``: as the head of its block measured it.
+    against
+        Of a head: the reference.
+    compared
+        What the measurement is held against.
+    references
+        Steps that have been references so far, the first one not among them.
+    generation
+        Larger once results have been replaced.
+    """
+
+    block: _Block
+    kind: Kind
+    n: int
+    previous: int | None
+    from_head: bool
+    against: int | None
+    compared: Earlier | None
+    references: tuple[int, ...]
+    generation: int
+
+
+@dataclass(eq=False)
+class _Block:
+    steps: list[int]
+    against: int | None  # reference of its head; None: it goes on where the block before ends
+    head: Literal["none", "open", "there", "missing"] = "none"
+    joint: Literal["none", "open", "through"] = "none"
+    compared: Earlier | None = "head"
+    at: int = 0  # index of the step to be measured next
+    again: int | None = None  # index of the step to be measured again next
+    at_least: int = 0  # index before which agreement does not end that: an earlier round was to go on there
+    running: Ask | None = None
+    stale: bool = False  # the step before the one that runs was replaced
+    outcomes: dict[int, Outcome] = field(default_factory=dict)
+
+    @property
+    def through(self) -> bool:
+        """True if all its steps are measured, and none again."""
+        return self.at == len(self.steps) and self.again is None
+
+    def good(self, n: int) -> bool:
+        """Return True if a step is measured."""
+        return n in self.outcomes and not isinstance(self.outcomes[n], StereorigError)
+
+
+class Blocks:
+    """The plan: :meth:`ask` for what to do, tell its outcome by :meth:`ended`.
+
+    Parameters
+    ----------
+    order
+        The steps to measure, in their order; at least one.
+    previous
+        The last good step before them: the first reference at the beginning.
+    reference
+        Reference that the next step is matched against first; the first one is ``first``.
+    width
+        Number of measurements that run at once.
+    known
+        Summaries of steps in ``order`` that were measured, but not from the steps before them.
+    """
+
+    def __init__(
+        self,
+        order: Sequence[int],
+        *,
+        previous: int,
+        reference: int,
+        first: int,
+        width: int,
+        references: Sequence[int] = (),
+        known: Mapping[int, Summary] | None = None,
+    ) -> None:
+        self._before, self._first, self._reference = previous, first, reference
+        self._references = list(references)
+        self._generation = 0
+        self._busy: set[int] = set()
+        known = dict(known or {})
+        length = min(max(-(-len(order) // max(width, 1)), SHORTEST), LONGEST)
+        self._blocks: list[_Block] = []
+        for run in _runs(order, known):
+            if run[0] in known:
+                outcomes: dict[int, Outcome] = {n: known[n] for n in run}
+                reference = _reference_of(known[run[0]], first)
+                block = _Block(run, reference, "there", "open", "step", at=len(run), outcomes=outcomes)
+                self._blocks.append(block)
+                reference = _reference_of(known[run[-1]], first)
+            else:
+                for start in range(0, len(run), length):
+                    whole = self._blocks and len(run) - start >= SHORTEST
+                    head: Literal["none", "open"] = "open" if whole else "none"
+                    self._blocks.append(_Block(run[start : start + length], reference, head))
+                    if start + length < len(run) < start + length + SHORTEST:  # too short for one of its own
+                        self._blocks[-1].steps += run[start + length :]
+                        break
+
+    @property
+    def through(self) -> bool:
+        """True if nothing is left to do."""
+        return all(b.through and b.joint != "open" and b.running is None for b in self._blocks)
+
+    @property
+    def ahead(self) -> int:
+        """Number of steps that are measured, whether or not they stand."""
+        return sum(b.at for b in self._blocks)
+
+    def ask(self) -> Ask | None:
+        """Return what can be measured now, the earliest first; None if nothing can before another one has ended."""
+        for i, block in enumerate(self._blocks):
+            if block.running is None:
+                ask = self._of(i, block)
+                if ask is not None and ask.n not in self._busy:
+                    block.running = ask
+                    self._busy.add(ask.n)
+                    return ask
+        return None
+
+    def ended(self, ask: Ask, outcome: Outcome) -> None:
+        """Take up what came of an ask: a step's summary, or why it could not be measured."""
+        self._busy.discard(ask.n)
+        block = ask.block
+        block.running = None
+        if block not in self._blocks:
+            return  # of another reference
+        i = self._blocks.index(block)
+        if ask.kind == "head":
+            if isinstance(outcome, StereorigError):
+                block.head = "missing"
+            else:
+                block.head, block.joint, block.at = "there", "open", 1
+        elif ask.kind == "step":
+            block.at += 1
+            if block.stale:  # from a step that has been replaced
+                block.stale = False
+                self._from_start(block)
+            self._put(i, ask.n, outcome)
+        elif ask.kind == "joint" and block.stale:
+            block.stale, block.compared = False, None  # what it was held against is overwritten
+        elif ask.kind == "joint":
+            block.joint = "through"
+            self._put(i, ask.n, outcome)
+            agreed = _agrees(outcome)
+            if not agreed:
+                self._generation += 1
+                block.again = 1 if block.at > 1 else None
+                self._replaced(i, ask.n)
+            if block.again is None and not any(map(block.good, block.steps[1:])):
+                self._if_last(i)
+        else:
+            assert block.again is not None
+            block.again += 1
+            self._put(i, ask.n, outcome)
+            agreed = _agrees(outcome)
+            if not agreed:
+                self._replaced(i, ask.n)
+            if block.stale:
+                block.stale = False
+                self._from_start(block)
+            elif agreed and block.again >= block.at_least:
+                block.again, block.at_least = None, 0
+            elif block.again == block.at:
+                block.again, block.at_least = None, 0
+                self._if_last(i)
+
+    def certain(self) -> Iterator[tuple[int, Outcome]]:
+        """Yield the steps whose outcome is that of one after another, in their order."""
+        for block in self._blocks:
+            if block.joint == "open" or block.stale:
+                return
+            for n in block.steps[: block.at if block.again is None else block.again]:
+                if n in block.outcomes:
+                    yield n, block.outcomes[n]
+            if not block.through or block.head == "open":
+                return
+
+    # what can be done ------------------------------------------------------------------------------------------
+
+    def _of(self, i: int, block: _Block) -> Ask | None:
+        through_before = all(b.through for b in self._blocks[max(i - 1, 0) : i])
+        if block.again == 0 and not through_before:
+            return None
+        if block.again is not None:
+            n = block.steps[block.again]
+            return self._make(block, "again", n, previous=self._good_before(i, block.again), compared="step")
+        if block.head == "open":
+            return self._make(block, "head", block.steps[0], against=block.against)
+        if block.joint == "open" and through_before and block.at > 0:
+            return self._make(block, "joint", block.steps[0], previous=self._good_before(i, 0), compared=block.compared)
+        if block.at < len(block.steps) and (block.at > 0 or through_before):
+            from_head = block.joint == "open" and not any(map(block.good, block.steps[1 : block.at]))
+            previous = block.steps[0] if from_head else self._good_before(i, block.at)
+            return self._make(block, "step", block.steps[block.at], previous=previous, from_head=from_head)
+        return None
+
+    def _make(
+        self,
+        block: _Block,
+        kind: Kind,
+        n: int,
+        *,
+        previous: int | None = None,
+        from_head: bool = False,
+        against: int | None = None,
+        compared: Earlier | None = None,
+    ) -> Ask:
+        return Ask(block, kind, n, previous, from_head, against, compared, tuple(self._references), self._generation)
+
+    def _good_before(self, i: int, index: int) -> int:
+        """Return the last step that was measured before one of a block."""
+        for k in range(i, -1, -1):
+            block = self._blocks[k]
+            for n in reversed(block.steps[: index if k == i else len(block.steps)]):
+                if block.good(n):
+                    return n
+        return self._before
+
+    # what follows ----------------------------------------------------------------------------------------------
+
+    def _put(self, i: int, n: int, outcome: Outcome) -> None:
+        """Take an outcome; if the step went over to a later reference, later blocks begin anew from that."""
+        block, old = self._blocks[i], set()
+        if block.good(n):
+            old.add(_reference_of(block.outcomes[n], self._first))
+        block.outcomes[n] = outcome
+        if isinstance(outcome, StereorigError):
+            return
+        reference = _reference_of(outcome, self._first)
+        old.add(self._reference_before(i, n))
+        if reference not in (self._first, *self._references):
+            self._references.append(reference)
+        if old != {reference}:
+            self._begin_anew(i, old - {reference}, reference)
+
+    def _reference_before(self, i: int, n: int) -> int:
+        """Return the reference of the last step before one."""
+        block = self._blocks[i]
+        index = block.steps.index(n)
+        own = [k for k in block.steps[:index] if block.good(k)]
+        if not own and index > 0 and block.joint == "open" and block.against is not None:
+            return block.against  # as its head
+        last = own[-1] if own else self._good_before(i, 0)
+        for one in self._blocks:
+            if one.good(last):
+                return _reference_of(one.outcomes[last], self._first)
+        return self._reference
+
+    def _begin_anew(self, i: int, old: set[int], reference: int) -> None:
+        anew = [k for k in range(i + 1, len(self._blocks)) if self._blocks[k].against in old]
+        for k in anew:
+            self._blocks[k] = _Block(self._blocks[k].steps, reference, "open")
+        for k in anew:
+            self._if_last(k)
+
+    def _replaced(self, i: int, n: int) -> None:
+        """Begin anew what is matched against a step that was measured again with another outcome."""
+        if n in self._references:
+            self._begin_anew(i, {n}, n)
+
+    def _if_last(self, i: int) -> None:
+        """The last step of a block may be another one now: what began there is measured again."""
+        if i + 1 == len(self._blocks):
+            return
+        after = self._blocks[i + 1]
+        running = None if after.running is None else after.running.kind
+        alone = after.joint == "none"
+        if running == "joint" or (alone and (running == "again" or (running == "step" and after.at == 0))):
+            after.stale = True
+        elif after.joint == "through":
+            after.joint, after.compared = "open", "step"
+        elif alone and after.at > 0:
+            self._from_start(after)
+
+    def _from_start(self, block: _Block) -> None:
+        """Measure a block without a head again, since the step before it was replaced."""
+        if block.again is not None:
+            block.at_least = max(block.at_least, block.again + 1)
+        block.again = 0
+        self._generation += 1
+
+
+def _runs(order: Sequence[int], known: Mapping[int, Summary]) -> Iterator[list[int]]:
+    """Yield the steps cut where measured and other ones meet."""
+    run: list[int] = []
+    for n in order:
+        if run and (n in known) != (run[-1] in known):
+            yield run
+            run = []
+        run.append(n)
+    if run:
+        yield run
+
+
+def _reference_of(outcome: Outcome, first: int) -> int:
+    found = None if isinstance(outcome, StereorigError) else outcome.get("reference_step")
+    return first if found is None else int(str(found))
+
+
+def _agrees(outcome: Outcome) -> bool:
+    return not isinstance(outcome, StereorigError) and bool(outcome.get("agrees"))
