@@ -154,7 +154,9 @@ def test_what_is_under_the_mouse_is_the_probes(page: Watched, bench: Bench) -> N
     expect(row).to_contain_text(two_digits_of_u(w["value"], w["sigma"]))
     # what matters stands first
     expect(pinned.locator("table caption").first).to_have_text("Displacement")
-    # and its history: zero at the reference, then what each step measured
+    # and its history: zero at the reference, then what each step measured; one request, not one a step
+    asked: list[str] = []
+    at.on("request", lambda request: asked.append(request.url))
     at.locator('[data-role="point"] summary').click()
     steps = [
         bench.client.get(
@@ -165,6 +167,8 @@ def test_what_is_under_the_mouse_is_the_probes(page: Watched, bench: Bench) -> N
     got = answer_of(at, "point-chart")
     assert got["value"] == [0, *(one["value"] for one in steps)]
     assert got["sigma"] == [0, *(one["sigma"] for one in steps)]
+    assert len([url for url in asked if "/history/w_mm?" in url]) == 1
+    assert not [url for url in asked if "/probe?" in url or re.search(r"/steps/\d+$", url)]
     page.sound()
 
 

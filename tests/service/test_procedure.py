@@ -56,6 +56,12 @@ def test_a_step_that_needs_the_body_in_place_after_one_by_hand_is_refused() -> N
     assert refused.value.code == "procedure_order"
 
 
+def test_a_plan_with_a_number_far_out_is_refused() -> None:
+    with pytest.raises(InputError) as refused:
+        planned("target", rotations=[{"n": 9000}])
+    assert refused.value.code == "procedure_long"
+
+
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, httpx.Client]]:
     """A rig whose one stage axis moves the target, with its own true cameras as calibration."""

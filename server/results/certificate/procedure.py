@@ -17,6 +17,7 @@ Kind = Literal["reference", "static", "translation", "rotation", "length", "free
 By = Literal["rest", "stage", "hand"]
 #: what the stage moves as a whole, so that one of its moves is a way of the specimen
 _WHOLE = ("target", "both_cameras")
+_MOST = 1000
 
 
 class PlannedProcedure(Request):
@@ -84,7 +85,8 @@ def procedure_of(plan: CertificatePlan, *, moves: str) -> tuple[ProcedureStep, .
     Raises
     ------
     InputError
-        ``procedure_order`` where a step rests on the specimen standing as it did, after one that was moved by hand.
+        ``procedure_order`` where a step rests on the specimen standing as it did, after one that was moved by hand;
+        ``procedure_long``.
     """
     static = static_numbers(plan)
     ways, turns = {one.n: one for one in plan.translations}, {one.n: one for one in plan.rotations}
@@ -92,7 +94,14 @@ def procedure_of(plan: CertificatePlan, *, moves: str) -> tuple[ProcedureStep, .
     whole = moves in _WHOLE
     steps = [ProcedureStep(0, "reference", "rest", "Put the speckled body before the cameras.", "reference", None)]
     by_hand: int | None = None
-    for n in range(1, 1 + max([*static, *_named(plan)], default=0)):
+    last = max([*static, *_named(plan)], default=0)
+    if last > _MOST:
+        raise InputError(
+            f"The plan names step {last}; a procedure has at most {_MOST} steps after its reference.",
+            code="procedure_long",
+            remedy="Number the steps as the test will give them, without gaps.",
+        )
+    for n in range(1, 1 + last):
         if n in ways:
             step = _way(n, ways[n], whole)
         elif n in turns:

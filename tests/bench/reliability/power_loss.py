@@ -4,7 +4,7 @@ Days of work are recorded on the service itself, each in another order (tests/su
 day, the states are made that a file system may hold then, and the service starts on each. The instants of a day are
 taken in passes that each go through the whole day, so that a run that is ended by the clock has seen all of its parts.
 
-    python -m tests.bench.reliability.power_loss [--states 100000] [--minutes N] [--seed N] [--write]
+    python -m tests.bench.reliability.power_loss [--states 100000] [--minutes N] [--seed N] [--write | --add]
 """
 
 from __future__ import annotations
@@ -77,6 +77,14 @@ def section(found: Verdict, size: Counter[str], wall_s: float) -> str:
     )
 
 
+def write(text: str, *, add: bool) -> None:
+    """Put a section into the page, in place of what is there or before it."""
+    before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
+    old, _, after = rest.partition(END)
+    whole = f"{text}\n\nA run before:\n\n{old.strip()}" if add else text
+    PAGE.write_text(f"{before}{BEGIN}\n{whole}\n{END}{after}", encoding="utf-8")
+
+
 def main() -> int:
     """Run, and write the section if asked."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -84,15 +92,15 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=float("inf"), help="end after so many, wherever it is then")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--write", action="store_true", help="write the section of docs/explanation/reliability.md")
+    parser.add_argument("--add", action="store_true", help="write it before what the section holds")
     asked = parser.parse_args()
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="power-loss-", dir=_MEMORY if _MEMORY.is_dir() else None) as folder:
         found, size = run(asked.states, asked.seed, Path(folder), asked.minutes)
     text = section(found, size, time.monotonic() - began)
     print(text)
-    if asked.write:
-        before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
-        PAGE.write_text(f"{before}{BEGIN}\n{text}\n{END}{rest.partition(END)[2]}", encoding="utf-8")
+    if asked.write or asked.add:
+        write(text, add=asked.add)
     return bool(found.wrong)
 
 

@@ -224,10 +224,9 @@ class _Day:
 
     def _certificates(self, analysis: str) -> None:
         """Make certificates of the analysis, and withdraw them, or it could not be deleted."""
-        body = {"test_id": COPIED, "analysis_id": analysis, "plan": {"static_steps": [1, 2]}}
         for title in ("first", "second"):
-            body["plan"] |= {"title": title}
-            self.ask("POST", "/certificates", json=body)
+            plan = {"title": title, "static_steps": [1, 2]}
+            self.ask("POST", "/certificates", json={"test_id": COPIED, "analysis_id": analysis, "plan": plan})
         for one in self.client.get("/api/v1/certificates").json()["certificates"]:
             self.ask("POST", f"/certificates/{one['id']}:withdraw", json={"reason": "the next part of the day"})
 
