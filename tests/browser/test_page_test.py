@@ -443,7 +443,7 @@ def test_a_test_is_measured_live_and_its_curves_are_drawn(page: Watched, client:
     # the field is drawn over the image, and again with a later frame
     map_of_field = panel.locator('[data-role="live-field"]')
     expect(map_of_field).to_have_attribute("data-frame", re.compile(r"\d+"), timeout=SLOW)
-    expect(panel.get_by_role("img", name=re.compile("Colour bar from .* mm"))).to_be_visible()
+    expect(panel.get_by_role("img", name=re.compile("Colour bar from .*m"))).to_be_visible()
     first = map_of_field.get_attribute("data-frame") or ""
     expect(map_of_field).not_to_have_attribute("data-frame", first, timeout=SLOW)
     coloured = "c => c.getContext('2d').getImageData(c.width / 2, c.height / 2, 1, 1).data[3]"

@@ -46,7 +46,8 @@ export function liveField(testId) {
   view.canvas.dataset.role = "live-field";
   view.canvas.style.opacity = "0.8";
   const scale = new Scale(() => {}, false);
-  const component = select(COMPONENTS.map(([key, text]) => [key, `${text} (mm)`]), "w_mm");
+  scale.legend.style.marginTop = "0.6rem";
+  const component = select(COMPONENTS.map(([key, text]) => [key, text]), "w_mm");
   const root = h("div", { hidden: true }, h("div.row", field("Displacement", component)), scale.legend, view.root);
 
   /**
