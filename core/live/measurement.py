@@ -38,6 +38,7 @@ from core.threads import run_ranges
 
 Image = np.ndarray | ImageData | MeasureImage
 
+_FURTHEST = 3.0  # intervals over which a velocity is trusted
 _MAY_BE_LOST = 0.02  # of the points: a frame that loses more is measured anew, as a step
 
 
@@ -231,14 +232,14 @@ class LiveMeasurement:
         """Measure a frame from those before it; None where points that were there are lost."""
         before = None if kept.before is None else (kept.before, _intervals(kept.before_s, kept.time_s, time_s))
         followed = self._follower.measure(images, kept.field, before, kept.ratio, kept.left_per_px)
-        had, field = kept.field.valid, followed.field
-        lost = int((had & ~field.valid & (field.status != PointStatus.OUTSIDE_IMAGE)).sum())
-        if lost > _MAY_BE_LOST * had.sum() or not field.valid.any():
+        if before is not None and self._lost(kept.field, followed.field):  # the motion may have turned
+            followed = self._follower.measure(images, kept.field, None, kept.ratio, kept.left_per_px)
+        if self._lost(kept.field, followed.field):
             return None
         return _Kept(
             number=self._count + 1,
             images=images,
-            field=field,
+            field=followed.field,
             time_s=time_s,
             before=kept.field,
             before_s=kept.time_s,
@@ -246,6 +247,12 @@ class LiveMeasurement:
             left_per_px=followed.left_per_px,
             since_audit=kept.since_audit + 1,
         )
+
+    @staticmethod
+    def _lost(before: Field, now: Field) -> bool:
+        """Return True where more points are lost than may be in a followed frame."""
+        lost = int((before.valid & ~now.valid & (now.status != PointStatus.OUTSIDE_IMAGE)).sum())
+        return lost > _MAY_BE_LOST * before.valid.sum() or not now.valid.any()
 
     def _as_step(self, images: tuple[MeasureImage, MeasureImage], time_s: float | None) -> _Kept:
         """Measure a frame as a step of a sequence is."""
@@ -289,10 +296,13 @@ class LiveMeasurement:
 
 
 def _intervals(before_s: float | None, last_s: float | None, now_s: float | None) -> float:
-    """Return the time to a frame over that between the two before it; 1 where it is not known."""
+    """Return the time to a frame over that between the two before it, of which no more is known after a while.
+
+    1 where it is not known.
+    """
     if before_s is None or last_s is None or now_s is None or not before_s < last_s < now_s:
         return 1.0
-    return (now_s - last_s) / (last_s - before_s)
+    return min((now_s - last_s) / (last_s - before_s), _FURTHEST)
 
 
 def _masked(field: Field, left: Bool) -> Field:
