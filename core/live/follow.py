@@ -108,7 +108,7 @@ class Follower:
         self,
         images: tuple[MeasureImage, MeasureImage],
         previous: Field,
-        before: Field | None,
+        before: tuple[Field, float] | None,
         ratio: Float,
         left_per_px: float,
     ) -> Followed:
@@ -118,8 +118,11 @@ class Follower:
         ----------
         images
             Both cameras' images.
-        previous, before
-            The frame before it, and the one before that; without it the points start where they were.
+        previous
+            The frame before it.
+        before
+            The frame before that, and the time since the previous one over the time between these two; without it the
+            points start where they were.
         ratio
             (r, c, 6) standard deviations with all checks over a fit's own.
         left_per_px
@@ -140,10 +143,10 @@ class Follower:
         had = previous.valid.ravel()[self._index]
         w = previous.starts.w.reshape(-1, terms)[self._index]
         G = previous.starts.G.reshape(-1, 3, terms)[self._index]
-        if before is not None and before.starts is not None and before.starts.G is not None:
-            was = before.starts.G.reshape(self._inputs.xy_px.shape[0], 3, -1)[self._index]
+        if before is not None and before[0].starts is not None and before[0].starts.G is not None:
+            was = before[0].starts.G.reshape(self._inputs.xy_px.shape[0], 3, -1)[self._index]
             if was.shape == G.shape:
-                G = G + self._smooth(G - was)
+                G = G + before[1] * self._smooth(G - was)
         current = self._prepared(images, previous, w, G)
         given = self._given_for(terms, current)._replace(w=w, G=G)
         ratio = ratio.reshape(-1, 6)[self._index]

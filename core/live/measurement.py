@@ -38,6 +38,7 @@ from core.threads import run_ranges
 
 Image = np.ndarray | ImageData | MeasureImage
 
+_FURTHEST = 3.0  # intervals over which a velocity is trusted
 _MAY_BE_LOST = 0.02  # of the points: a frame that loses more is measured anew, as a step
 
 
@@ -95,7 +96,9 @@ class _Kept:
     number: int
     images: tuple[MeasureImage, MeasureImage]
     field: Field
+    time_s: float | None
     before: Field | None  # the frame before it, for the velocity
+    before_s: float | None
     ratio: Float  # (r, c, 6) standard deviations with all checks over a fit's own
     left_per_px: float  # see Followed
     since_audit: int
@@ -170,13 +173,16 @@ class LiveMeasurement:
         """The calibrated cameras."""
         return self.reference.pair
 
-    def measure(self, image1: Image, image2: Image) -> LiveFrame:
+    def measure(self, image1: Image, image2: Image, time_s: float | None = None) -> LiveFrame:
         """Measure a frame; one that raises leaves the measurement as it was.
 
         Parameters
         ----------
         image1, image2
             (rows, cols) camera 1's and camera 2's image.
+        time_s
+            Time of their exposure, by any clock: a frame after skipped ones has moved on further. Where it is not
+            known, frames are taken to be evenly spaced.
 
         Raises
         ------
@@ -187,10 +193,10 @@ class LiveMeasurement:
         """
         images = self._named(image1, image2)
         kept = self._kept
-        frame = None if kept is None or self._is_due(kept) else self._follow(images, kept)
+        frame = None if kept is None or self._is_due(kept) else self._follow(images, kept, time_s)
         how: Literal["followed", "step"] = "followed"
         if frame is None:
-            how, frame = "step", self._as_step(images)
+            how, frame = "step", self._as_step(images, time_s)
         self._keep(frame)
         shown = mark_extrapolated(frame.field, self.volume)
         used = self._set.used(shown)
@@ -222,24 +228,33 @@ class LiveMeasurement:
         every = min(self.live.retry_every, self.live.audit_every) if lost else self.live.audit_every
         return kept.since_audit + 1 >= every
 
-    def _follow(self, images: tuple[MeasureImage, MeasureImage], kept: _Kept) -> _Kept | None:
+    def _follow(self, images: tuple[MeasureImage, MeasureImage], kept: _Kept, time_s: float | None) -> _Kept | None:
         """Measure a frame from those before it; None where points that were there are lost."""
-        followed = self._follower.measure(images, kept.field, kept.before, kept.ratio, kept.left_per_px)
-        had, field = kept.field.valid, followed.field
-        lost = int((had & ~field.valid & (field.status != PointStatus.OUTSIDE_IMAGE)).sum())
-        if lost > _MAY_BE_LOST * had.sum() or not field.valid.any():
+        before = None if kept.before is None else (kept.before, _intervals(kept.before_s, kept.time_s, time_s))
+        followed = self._follower.measure(images, kept.field, before, kept.ratio, kept.left_per_px)
+        if before is not None and self._lost(kept.field, followed.field):  # the motion may have turned
+            followed = self._follower.measure(images, kept.field, None, kept.ratio, kept.left_per_px)
+        if self._lost(kept.field, followed.field):
             return None
         return _Kept(
             number=self._count + 1,
             images=images,
-            field=field,
+            field=followed.field,
+            time_s=time_s,
             before=kept.field,
+            before_s=kept.time_s,
             ratio=kept.ratio,
             left_per_px=followed.left_per_px,
             since_audit=kept.since_audit + 1,
         )
 
-    def _as_step(self, images: tuple[MeasureImage, MeasureImage]) -> _Kept:
+    @staticmethod
+    def _lost(before: Field, now: Field) -> bool:
+        """Return True where more points are lost than may be in a followed frame."""
+        lost = int((before.valid & ~now.valid & (now.status != PointStatus.OUTSIDE_IMAGE)).sum())
+        return lost > _MAY_BE_LOST * before.valid.sum() or not now.valid.any()
+
+    def _as_step(self, images: tuple[MeasureImage, MeasureImage], time_s: float | None) -> _Kept:
         """Measure a frame as a step of a sequence is."""
         self._prepare(images)
         kept, number = self._kept, self._count + 1
@@ -257,7 +272,7 @@ class LiveMeasurement:
             there = field.valid & own.valid
             with_checks, alone = (np.diagonal(f.covariance[there], axis1=1, axis2=2) for f in (field, own))
             ratio[there] = np.sqrt(with_checks / alone)
-        return _Kept(number, images, field, None, ratio, np.inf, 0)
+        return _Kept(number, images, field, time_s, None, None, ratio, np.inf, 0)
 
     def _keep(self, frame: _Kept) -> None:
         references = frame.field.references
@@ -278,6 +293,16 @@ class LiveMeasurement:
         """Return the field with the common factor of the points that gauges use."""
         found = self._common.of(_masked(shown, used))
         return replace(shown, common=found.common, causes=found.causes)
+
+
+def _intervals(before_s: float | None, last_s: float | None, now_s: float | None) -> float:
+    """Return the time to a frame over that between the two before it, of which no more is known after a while.
+
+    1 where it is not known.
+    """
+    if before_s is None or last_s is None or now_s is None or not before_s < last_s < now_s:
+        return 1.0
+    return min((now_s - last_s) / (last_s - before_s), _FURTHEST)
 
 
 def _masked(field: Field, left: Bool) -> Field:

@@ -363,9 +363,9 @@ def begin_live(task: LiveTask) -> Plain:
     return begun
 
 
-def measure_live(pixels: tuple[Any, Any]) -> Plain:
+def measure_live(pixels: tuple[Any, Any], time_s: float) -> Plain:
     """Measure a frame of the live measurement that was begun; returns readings and counts of points by status."""
-    found: Plain = _heavy("server.compute.live.frames").measure(pixels)
+    found: Plain = _heavy("server.compute.live.frames").measure(pixels, time_s)
     return found
 
 

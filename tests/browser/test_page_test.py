@@ -462,11 +462,20 @@ def test_a_test_is_measured_live_and_its_curves_are_drawn(page: Watched, client:
     client.put(f"{API}/sim/scene", json={"scene": "plate", "load": 0.0}).raise_for_status()
     shown = page.open(f"#/test/{plate}")
     panel = shown.get_by_role("region", name="Live values")
+    panel.get_by_label("with a coarse field").check()
     panel.get_by_role("button", name="Measure live").click()
     expect(panel.locator('[data-role="live-values"] tr', has_text="e1")).to_contain_text("µm/m", timeout=SLOW)
     expect(
         panel.locator('[data-role="live-curves"]').get_by_role("img", name="Live curves of the gauges")
     ).to_be_visible(timeout=SLOW)
+    # the field is drawn over the image, and again with a later frame
+    map_of_field = panel.locator('[data-role="live-field"]')
+    expect(map_of_field).to_have_attribute("data-frame", re.compile(r"\d+"), timeout=SLOW)
+    expect(panel.get_by_role("img", name=re.compile("Colour bar from .*m"))).to_be_visible()
+    first = map_of_field.get_attribute("data-frame") or ""
+    expect(map_of_field).not_to_have_attribute("data-frame", first, timeout=SLOW)
+    coloured = "c => c.getContext('2d').getImageData(c.width / 2, c.height / 2, 1, 1).data[3]"
+    assert map_of_field.evaluate(coloured) == 255
     # a channel whose readings are posted is there to be chosen
     number = client.get(f"{API}/tests/{plate}/live").json()["values"]["number"]
     client.post(

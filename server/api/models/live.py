@@ -18,7 +18,8 @@ class LiveNumber(Reply):
     u: float | None = Field(description="Standard uncertainty (k = 1); null where it is not known.")
     u_calibration: float | None = Field(description="The calibration's part of it; null: not known, and not included.")
     budget: dict[str, float] = Field(
-        description="`u` by where it comes from; the squares add up. `matching` holds the reference's noise too."
+        default_factory=dict,
+        description="`u` by where it comes from; the squares add up. `matching` holds the reference's noise too.",
     )
     units: str = Field(description="Unit; `1` of a number without one.")
 

@@ -68,8 +68,8 @@ def begin(task: LiveTask) -> Plain:
     }
 
 
-def measure(pixels: tuple[Any, Any]) -> Plain:
-    """Measure a frame.
+def measure(pixels: tuple[Any, Any], time_s: float) -> Plain:
+    """Measure a frame, exposed at a time.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def measure(pixels: tuple[Any, Any]) -> Plain:
     """
     if _running is None:
         raise StateError("No live measurement was begun here.", code="live_ended", remedy="Begin it again.")
-    return _plain(_running.measure(*pixels))
+    return _plain(_running.measure(*pixels, time_s))
 
 
 def _gauge(given: Plain, x_px: Float, y_px: Float) -> LiveGauge:

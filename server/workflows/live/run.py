@@ -210,7 +210,7 @@ class LiveRun:
 
     def _begin(self) -> None:
         self.state = "starting"
-        self.begun = self._result(begin_live, self._task, _BEGIN_S)
+        self.begun = self._result(_BEGIN_S, begin_live, self._task)
         self.state = "running"
 
     def _next(self) -> Pair:
@@ -223,9 +223,10 @@ class LiveRun:
             return taken
 
     def _measure_one(self, pair: Pair) -> None:
-        pixels = tuple(pair[cam].pixels for cam in CAMERAS)
+        pixels, frame = tuple(pair[cam].pixels for cam in CAMERAS), pair.cam1
+        exposed_ns = frame.host_ns if frame.exposed_ns is None else frame.exposed_ns
         try:
-            found = self._result(measure_live, pixels, _FRAME_S)
+            found = self._result(_FRAME_S, measure_live, pixels, exposed_ns / 1e9)
         except (WorkerDiedError, _Ended):
             raise
         except StereorigError as error:
@@ -233,8 +234,6 @@ class LiveRun:
             self._lost(error.code)
             return
         self._number += 1
-        frame = pair.cam1
-        exposed_ns = frame.host_ns if frame.exposed_ns is None else frame.exposed_ns
         # arrival in memory: of the later frame
         latency_ms = 1e3 * (time.monotonic() - max(pair[cam].host_ns for cam in CAMERAS) / 1e9)
         self.account.measured(found["how"], latency_ms, time.monotonic())
@@ -260,8 +259,8 @@ class LiveRun:
             }
         )
 
-    def _result(self, function: Any, argument: Any, patience_s: float) -> Plain:
-        future = self._worker.submit(function, argument)
+    def _result(self, patience_s: float, function: Any, *arguments: Any) -> Plain:
+        future = self._worker.submit(function, *arguments)
         deadline = time.monotonic() + patience_s
         while True:
             try:

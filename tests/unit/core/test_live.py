@@ -204,6 +204,16 @@ def test_a_frame_that_jumped_is_fitted_until_it_settles() -> None:
     assert np.sqrt(np.nanmean(off**2)) < 0.02
 
 
+def test_after_skipped_frames_points_start_further_on() -> None:
+    live = LiveMeasurement(reference(), GRID, OPTIONS, (), LiveOptions())
+    at_rest = capture(plate(), 9)
+    for k in (0, 1, 2, 4):
+        frame = live.measure(*(pictures()[k] if k else at_rest), 0.02 * k)
+    assert frame.how == "followed"
+    # one step is enough where the plate moves evenly in time, though twice as far as before
+    assert np.mean(frame.field.iterations[frame.field.valid] == 1) > 0.9
+
+
 def test_the_calibrations_part_is_in_the_readings() -> None:
     source = ParameterCovariance(rig().pair, ("cam1.phd_px",), np.array([[4.0]]))
     live = LiveMeasurement(reference(), GRID, OPTIONS, GAUGES, source=source)

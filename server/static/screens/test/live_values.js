@@ -1,6 +1,7 @@
-// A test measured while it runs: a switch, the newest values of its gauges, and their curves against time or a channel.
+// A test measured while it runs: a switch, the newest values of its gauges, their curves against time or a channel, and a field.
 import * as api from "../../lib/api.js";
 import { chart } from "../../widgets/plots.js";
+import { coarse, liveField } from "./live_field.js";
 import { amount, shown, uncertain } from "../../lib/units.js";
 import { h, action, badge, field, notify, problemText, replace, select, table } from "../../lib/dom.js";
 
@@ -63,6 +64,9 @@ export async function liveValuesPanel(testId, ends) {
   const against = select([["time", "time (s)"]], "time");
   const start = action("Measure live", begin, { kind: "primary" });
   const stop = action("Stop", end);
+  const withField = h("input", { type: "checkbox" });
+  const withFieldLabel = h("label.check", withField, "with a coarse field");
+  const picture = liveField(testId);
   /** @type {{ number: number, time_s: number, values: Record<string, Record<string, number>> }[]} */
   let moments = [];
   /** @type {Map<number, Record<string, number>>} channels at the exposure, by frame */
@@ -79,10 +83,12 @@ export async function liveValuesPanel(testId, ends) {
   let asking = 0;
 
   async function begin() {
-    const body = /** @type {any} */ (liveGauges(await api.get(`/tests/${testId}/workspace`)));
+    const drawn = await api.get(`/tests/${testId}/workspace`);
+    const body = /** @type {any} */ (liveGauges(drawn));
     const none = !(body.points?.length || body.extensometers?.length || body.areas?.length);
     const size = (await api.get("/rig")).cameras.cam1.nominal.image_size_px;
-    take(await api.post(`/tests/${testId}/live`, { ...(none ? middle(size) : body), silence_ms: 1000 }));
+    const points = withField.checked ? coarse(drawn.region, size) : {};
+    take(await api.post(`/tests/${testId}/live`, { ...(none ? middle(size) : body), ...points, silence_ms: 1000 }));
     if (none) notify("No gauge is drawn for this test (Results, Gauges): an extensometer over the middle of the image is read.");
   }
   async function end() {
@@ -94,6 +100,9 @@ export async function liveValuesPanel(testId, ends) {
     const on = live.state === "starting" || live.state === "running";
     start.hidden = on;
     stop.hidden = !on;
+    withFieldLabel.hidden = on;
+    const asked = /** @type {{ field?: boolean, reference?: number }} */ (live.settings);
+    picture.follow(on && asked.field ? asked.reference ?? 0 : null);
     replace(said, live.problem ? problemText(live.problem) : null);
     newest = live.values;
     if (on && !source) follow();
@@ -140,7 +149,9 @@ export async function liveValuesPanel(testId, ends) {
     } catch (error) {
       if (!(error instanceof api.Problem) || error.status !== 404) throw error;
       start.hidden = false;
+      withFieldLabel.hidden = false;
       stop.hidden = true;
+      picture.follow(null);
       close();
     }
   }
@@ -189,8 +200,8 @@ export async function liveValuesPanel(testId, ends) {
   // a test that is not measured live has nothing to be asked for
   if ((await api.get("/healthz")).live_test_id === testId) await look();
   else stop.hidden = true;
-  ends.push(() => { close(); clearTimeout(later); plot?.close(); });
+  ends.push(() => { close(); clearTimeout(later); plot?.close(); picture.close(); });
   return h("section.panel", { "aria-label": "Live values" }, h("div.spread", h("h2", "Live values"), state),
     h("p.quiet", "Each frame is measured as it comes, and not stored; captures and analyses go on beside it."),
-    h("div.row", start, stop, field("Show", kind), field("Against", against)), said, values, curves);
+    h("div.row", start, withFieldLabel, stop, field("Show", kind), field("Against", against)), said, values, curves, picture.root);
 }
