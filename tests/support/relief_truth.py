@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.cameras.stereo import StereoPair
-from core.field.points.result import Field
 from core.field.region.region import PointGrid
 from core.status import PointStatus
 from tests.support.relief_parts import calibrated
@@ -17,6 +17,22 @@ from tests.support.relief_rig import Body, Optics, ReliefCamera, Seen, exposed, 
 
 WRONG_SIGMAS = 5.0
 _ROUNDING_MM = 1e-9
+
+
+class Measured(Protocol):
+    """What of a field is held against the truth: (r, c) or (r, c, ...), mm."""
+
+    @property
+    def valid(self) -> NDArray[np.bool_]: ...
+
+    @property
+    def status(self) -> NDArray[np.int8]: ...
+
+    @property
+    def xyz_mm(self) -> NDArray[np.float64]: ...
+
+    @property
+    def sigma_mm(self) -> NDArray[np.float64]: ...
 
 
 @dataclass(frozen=True)
@@ -91,7 +107,7 @@ class Part:
         a, b = (exposed(grey, noise, rng) for grey in self.clean)
         return a, b
 
-    def beside_truth(self, field: Field, grid: PointGrid, subset_px: int) -> Found:
+    def beside_truth(self, field: Measured, grid: PointGrid, subset_px: int) -> Found:
         seen = _truth_everywhere(self, subset_px)
         x, y = (np.rint(v).astype(int) for v in (grid.x_px, grid.y_px))
         assert (x == grid.x_px).all()

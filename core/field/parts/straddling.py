@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from core.arrays import Bool, Float
 from core.field.checks.block_median import SIGMAS_OF_QUARTER, SIGMAS_OF_TENTH, least_about, reach_of
 from core.field.parts.beside_edges import beside_edges
-from core.field.parts.subset_parts import pull_of_parts
+from core.field.parts.subset_parts import Pull, pull_of_parts
 from core.field.parts.subset_residuals import SubsetResiduals, subset_residuals
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.starts import depth_per_px
@@ -136,7 +136,7 @@ def _usual_factors(fitter: Fitter, points: PointFits, xy_px: Float, least: float
     """
     ok = np.flatnonzero(points.ok)
     found, visible = subset_residuals(fitter, points, ok[spread_indices(len(ok), _USUAL)], xy_px)
-    pulls = [pull_of_parts(one, visible, 2 if fitter.terms == 6 else 1) for one in found[-2:]]
+    pulls = _pulls(fitter, found[-2:], visible)
     # edges pull at many points: those that are changed least are the measure
     quarter, tenth = np.log(np.quantile([pull.significance for pull in pulls], (0.25, 0.1), axis=1))
     scatter = np.maximum((quarter - tenth) / (SIGMAS_OF_TENTH - SIGMAS_OF_QUARTER), _SCATTER_OF_WHITE)
@@ -151,9 +151,8 @@ def _pulled(
     """Return (m,) True where a part of the subset is off by too much; what others change goes into the covariance."""
     least = np.where(edges, _EDGE_SIGMAS, _PART_SIGMAS)
     found, visible = subset_residuals(fitter, points, index, xy_px)
-    degree = 2 if fitter.terms == 6 else 1
     # a motion's reference pair was compared in its shape: it counts where something has changed since
-    pulls = [pull_of_parts(one, visible, degree) for one in found[-2:]]
+    pulls = _pulls(fitter, found[-2:], visible)
     unit = _unit_px(fitter, points, index, rays)
     covariance = points.covariance[index]
     bad = np.zeros(len(index), bool)
@@ -170,7 +169,7 @@ def _pulled(
         shift = np.take_along_axis(pull.shift_px[:, direction], pull.part[:, direction, None], axis=1)[:, 0]
         if len(pulls) == 2 and unknown == 3:  # what camera 2 shows at both times is the shape's
             some = np.flatnonzero(sure > 1.0)
-            before = pull_of_parts(SubsetResiduals(*(values[some] for values in found[0])), visible[some], degree)
+            before = _pulls(fitter, [SubsetResiduals(*(values[some] for values in found[0]))], visible[some])[0]
             shift[some] -= before.shift_px[np.arange(len(some)), direction, pull.part[some, direction]]
         far = np.abs(shift) > _FAR_SIGMAS * sd
         counts = (sure > np.sqrt(correlated)) | ((sure > np.sqrt(noise_factor)) & far)
@@ -185,6 +184,12 @@ def _pulled(
     for pull in pulls:
         bad |= pull.centre > 1.0
     return bad
+
+
+def _pulls(fitter: Fitter, found: list[SubsetResiduals], visible: Bool) -> list[Pull]:
+    """What parts do in each comparison; a fold is the shape's, and is looked for where its patch can hide it."""
+    curved = fitter.terms == 6
+    return [pull_of_parts(one, visible, 2 if curved else 1, folds=curved and fitter.comparisons == 1) for one in found]
 
 
 def _unit_px(fitter: Fitter, points: PointFits, index: NDArray[np.intp], rays: Float) -> Float:

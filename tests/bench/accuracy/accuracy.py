@@ -35,6 +35,7 @@ from tests.bench.accuracy import (
     sequence,
 )
 from tests.bench.accuracy import experiments as accuracy_experiments
+from tests.bench.accuracy import faces_before as accuracy_faces_before
 from tests.bench.accuracy import large as accuracy_large
 from tests.bench.accuracy import models as accuracy_models
 from tests.bench.accuracy import models_images as accuracy_models_images
@@ -78,6 +79,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "adversarial": accuracy_adversarial.adversarial,
     **accuracy_adversarial_reliefs.SECTIONS,
     **accuracy_reliefs.SECTIONS,
+    **accuracy_faces_before.SECTIONS,
     "noise-random": accuracy_noise.random_error,
     "noise-mean": accuracy_noise.mean_error,
     "noise-model": accuracy_noise.camera_noise,

@@ -40,7 +40,9 @@ TOPICS = (
     Topic("models", "Comparison with a model", ("models", "models-images")),
     Topic("long_sequences", "Long sequences", ("updates",)),
     Topic("smoothing", "Smoothing", ("smoothing",)),
-    Topic("faces", "Every face of a part", ("faces-plate", "faces-ball", "faces-misfit", "faces-cylinder")),
+    Topic(
+        "faces", "Every face of a part", ("faces-plate", "faces-ball", "faces-misfit", "faces-cylinder", "faces-before")
+    ),
     Topic("difficult_images", "Difficult images", ("adversarial", "adversarial-reliefs")),
     Topic("experiments", "The paper's experiments, simulated", ("plate", "steel", "panel")),
     Topic("coverage", "Does the uncertainty cover", ("coverage",)),

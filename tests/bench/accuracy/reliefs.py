@@ -6,6 +6,7 @@ whole, on one smooth face.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -13,6 +14,7 @@ from typing import NamedTuple
 import cv2
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -23,7 +25,7 @@ from tests.bench.accuracy.kept import kept
 from tests.bench.accuracy.table import Row, Section
 from tests.support.relief_parts import relief_plate
 from tests.support.relief_rig import CYLINDER, PLATEAU, RIDGE, VALLEY, Body, Feature, two_cameras
-from tests.support.relief_truth import Found, Part
+from tests.support.relief_truth import Found, Measured, Part
 
 SIZE = (640, 512)
 SUBSETS_PX = (21, 27, 33)
@@ -177,30 +179,37 @@ def rough(figures: Path) -> Section:
     )
 
 
-def maps(path: Path, field: Field, found: Found) -> None:
+def maps(path: Path, field: Measured, found: Found) -> None:
     """Draw status, error over sigma, and shape into a file."""
     fig = drawn(field, found)
     fig.savefig(path, dpi=110)
     plt.close(fig)
 
 
-def drawn(field: Field, found: Found) -> Figure:
+def drawn(field: Measured, found: Found) -> Figure:
     """Return a figure of status, error over sigma, and shape with its valleys."""
     fig, axes = plt.subplots(1, 3, figsize=(12, 3.4), layout="constrained")
+    draw_row(fig, axes, field, found)
+    return fig
+
+
+def draw_row(
+    fig: Figure, axes: Sequence[Axes], field: Measured, found: Found, most_sigmas: float | None = None
+) -> None:
+    """Draw status, error over sigma up to ``most_sigmas`` (None: the largest), and shape into three axes."""
     kinds = np.where(field.valid, 0, np.where(found.on_one_face, 2, 1))
     shown = axes[0].imshow(kinds, cmap=plt.get_cmap("viridis", 3), vmin=-0.5, vmax=2.5)
     bar = fig.colorbar(shown, ax=axes[0], ticks=[0, 1, 2])
     bar.ax.set_yticklabels(["valid", "on an edge or hidden", "lost"])
-    for ax, values, least, name in (
-        (axes[1], found.error_sigmas, 0.0, "error over sigma"),
-        (axes[2], -field.xyz_mm[..., 2], None, "height, mm"),
+    for ax, values, limits, name in (
+        (axes[1], found.error_sigmas, (0.0, most_sigmas), "error over sigma"),
+        (axes[2], -field.xyz_mm[..., 2], (None, None), "height, mm"),
     ):
-        fig.colorbar(ax.imshow(values, vmin=least), ax=ax)
+        fig.colorbar(ax.imshow(values, vmin=limits[0], vmax=limits[1]), ax=ax)
         ax.set_title(name)
     axes[0].set_title("status")
     for ax in axes:
         ax.set_axis_off()
-    return fig
 
 
 SECTIONS = {"faces-plate": plate, "faces-ball": ball, "faces-misfit": misfit, "faces-cylinder": rough}

@@ -74,3 +74,35 @@ def test_a_part_that_is_off_beside_the_middle_is_none_of_the_middles() -> None:
 @pytest.mark.parametrize("noise", [2.0, 30.0])
 def test_what_all_of_a_subset_loses_is_no_other_centre(noise: float) -> None:
     assert subsets(0.0, 0, noise=noise).centre.max() < 1.0
+
+
+def folded(rise_px: float, degrees: float) -> Pull:
+    """Soft speckle on a surface with a fold through each subset's middle, as a curved patch leaves it."""
+    rng = np.random.default_rng(5)
+    texture = gaussian_filter(rng.normal(size=(N, WIDTH, WIDTH)), (0.0, 1.8, 1.8))
+    texture *= 50.0 / texture.std()
+    gx, gy = np.gradient(texture, axis=2), np.gradient(texture, axis=1)
+    v, u = (np.mgrid[:WIDTH, :WIDTH] - WIDTH // 2) / (WIDTH // 2)
+    angle = np.deg2rad(degrees)
+    rise = rise_px * np.abs(np.cos(angle) * u + np.sin(angle) * v)
+    residual = rng.normal(0.0, np.sqrt(2.0) * NOISE, texture.shape) + rise * gx
+    for one, g in zip(residual, gx, strict=True):  # the parabola that is next to it
+        patch = np.stack([g * b for b in (np.ones_like(u), u, v, u * u, u * v, v * v)], axis=-1).reshape(-1, 6)
+        one -= (patch @ np.linalg.lstsq(patch, one.ravel(), rcond=None)[0]).reshape(one.shape)
+    reference = texture - texture.mean(axis=(1, 2), keepdims=True)
+    return pull_of_parts(SubsetResiduals(residual, gx, gy, reference), np.ones(texture.shape, bool), 2, folds=True)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 10.0, 67.0])
+def test_a_fold_that_a_curved_patch_hides_is_found_and_what_it_does_to_the_middle(degrees: float) -> None:
+    pull = folded(1.5, degrees)
+    found = np.take_along_axis(pull.shift_px[:, 0], pull.part[:, 0, None], axis=1)[:, 0]
+    sure = pull.significance[:, 0] > 5.0
+    assert sure.mean() > 0.9
+    # a parabola fitted to |t| over -1 < t < 1 lies 3/16 above it in the middle; over a square's corners somewhat more
+    assert np.median(found[sure]) == pytest.approx(-1.5 * 3.0 / 16.0, rel=0.3)
+
+
+def test_where_there_is_no_fold_none_is_found() -> None:
+    pull = folded(0.0, 0.0)
+    assert (pull.significance[:, 0] < 5.0).mean() > 0.97
