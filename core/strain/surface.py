@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from core.arrays import Bool, Float, Float32
-from core.common.factor import FINE, rounded
+from core.common.factor import FINE, round_in_place, sample_of
 from core.errors import InputError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
@@ -73,11 +73,13 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
     covariance[..., range(3), range(3)] += left
     common = None
     if field.common is not None:
-        common = np.full((*field.shape, 3, field.common.shape[-1]), np.nan, np.float32)
-        # slopes hold the points' own rounding: finer digits would be noise
-        part = _common_part(field, slopes, surface, options)
+        common = _common_part(field, slopes, surface, options)
         typical = np.sqrt(np.median(covariance[good][:, range(3), range(3)], axis=0)) if good.any() else None
-        common[good] = rounded(part, typical, fine=2.0 * FINE)
+        # slopes hold the points' own rounding: finer digits would be noise
+        some = np.flatnonzero(good)
+        some = some[sample_of(len(some))]
+        round_in_place(common, common.reshape(-1, *common.shape[2:])[some], typical, fine=2.0 * FINE)
+        common[~good] = np.nan
     spacing_px = _step(field)
     # of smoothed displacements it begins with the width of the smoothing
     gauge_px = (options.window - 1) * spacing_px + shared.reach_px
@@ -97,15 +99,14 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
 
 
 def _common_part(field: Field, slopes: Slopes, surface: OnSurface, options: StrainOptions) -> Float32:
-    """(n, 3, k) common factor of the strain: that of the points through the windows' weights."""
+    """(r, c, 3, k) common factor of the strain: that of the points through the windows' weights."""
     assert field.common is not None
     good = slopes.status == StrainStatus.OK
     by_slope = np.zeros((*field.shape, 3, 12), np.float32)
     by_slope[good] = strain_slopes(
         surface.frame, surface.gradient, options.tensor, surface.per_mm, surface.strain
     ).reshape(-1, 3, 12)
-    part = common_part(field.common, field.valid, slopes, by_slope, options.window // 2)
-    return np.asarray(part[good])
+    return common_part(field.common, field.valid, slopes, by_slope, options.window // 2)
 
 
 def surface_slopes(

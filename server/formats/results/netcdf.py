@@ -25,7 +25,7 @@ library = threading.RLock()
 _NEARLY_FULL_BYTES = 1 << 20
 
 
-class NewDataset(netCDF4.Dataset):  # type: ignore[misc]
+class NewDataset(netCDF4.Dataset):
     """An empty data set whose values are written once all is defined: :meth:`put` and :meth:`finish`."""
 
     def __init__(self, *args: Any, **more: Any) -> None:
@@ -39,7 +39,7 @@ class NewDataset(netCDF4.Dataset):  # type: ignore[misc]
 
     def finish(self) -> None:
         """Close the definitions and write what waits."""
-        super()._enddef()
+        super()._enddef()  # type: ignore[misc]
         waiting = self.__dict__["_waiting"]
         while waiting:
             variable, values = waiting.pop(0)
