@@ -142,27 +142,25 @@ def surface_slopes(
 
 
 def _on_surface(slopes: Slopes, field: Field, options: StrainOptions) -> OnSurface:
-    around = _mean_around(field.covariance, field.valid, options.window)
-    return _at(slopes.status == StrainStatus.OK, around, slopes, field, options)
+    good = slopes.status == StrainStatus.OK
+    around = _mean_around(field.covariance, field.valid, options.window, good)
+    return _at(good, around, slopes, field, options)
 
 
 def _replaced(surface: OnSurface, slopes: Slopes, field: Field, options: StrainOptions, raised: Bool) -> OnSurface:
-    """Return what holds at all points, made anew where quadratics took the place of planes."""
+    """Return what holds at all points, made anew, in the same arrays, where quadratics took the place of planes."""
     good = slopes.status == StrainStatus.OK
     again = raised[good]
     if not again.any():
         return surface
-    around = np.empty((*field.shape, 6, 6))
-    around[good] = surface.around
-    part = _at(raised & good, around, slopes, field, options)
-    made = {f.name: getattr(surface, f.name).copy() for f in fields(surface)}
-    for name, values in made.items():
-        values[again] = getattr(part, name)
-    return OnSurface(**made)
+    part = _at(raised & good, surface.around[again], slopes, field, options)
+    for f in fields(surface):
+        getattr(surface, f.name)[again] = getattr(part, f.name)
+    return surface
 
 
 def _at(good: Bool, around: Float, slopes: Slopes, field: Field, options: StrainOptions) -> OnSurface:
-    """Windows' slopes on the surface at the points ``good``; ``around`` is (r, c, 6, 6) the mean covariance."""
+    """Windows' slopes on the surface at the n points ``good``; ``around`` is (n, 6, 6) the mean covariance there."""
     slope, second, moments = slopes.slope[good], slopes.second[good], slopes.moments[good]
     before = missed_slope(slope[:, :3], second[:, :3], moments)
     now = missed_slope(slope[:, :3] + slope[:, 3:], second[:, 3:], moments)
@@ -170,7 +168,7 @@ def _at(good: Bool, around: Float, slopes: Slopes, field: Field, options: Strain
     frame = surface_frames(slope[:, :3], field.normal_sys[good])
     per_mm = np.linalg.inv(np.swapaxes(frame, -1, -2) @ slope[:, :3])
     gradient = slope[:, 3:] @ per_mm
-    return OnSurface(frame, per_mm, gradient, around[good], strain_of(frame, gradient, options.tensor))
+    return OnSurface(frame, per_mm, gradient, around, strain_of(frame, gradient, options.tensor))
 
 
 def surface_frames(tangents: Float, towards: Float) -> Float:
@@ -180,13 +178,18 @@ def surface_frames(tangents: Float, towards: Float) -> Float:
     return tangent_frames(normal)[..., :2]
 
 
-def _mean_around(covariance: Float, valid: Bool, window: int) -> Float:
-    """Mean (r, c, 6, 6) of the valid points' covariance over each window."""
-    size = (window, window, 1, 1)
-    kept = np.where(valid[..., None, None], covariance, 0.0)
+def _mean_around(covariance: Float, valid: Bool, window: int, good: Bool) -> Float:
+    """Mean (n, 6, 6) of the valid points' covariance over each window about the points ``good``."""
+    # it is symmetric: half of it is filtered
+    i, j = np.triu_indices(6)
+    total = np.take(covariance.reshape(-1, 36), 6 * i + j, axis=1).reshape(*valid.shape, len(i))
+    total[~valid] = 0.0
+    ndimage.uniform_filter(total, size=(window, window, 1), mode="constant", output=total)
     share = ndimage.uniform_filter(valid.astype(np.float64), size=window, mode="constant")
-    total = ndimage.uniform_filter(kept, size=size, mode="constant")
-    return np.asarray(total / np.maximum(share, 0.5 / window**2)[..., None, None])
+    half = total[good] / np.maximum(share[good], 0.5 / window**2)[:, None]
+    place = np.zeros((6, 6), np.int64)
+    place[i, j] = place[j, i] = np.arange(len(i))
+    return np.take(half, place.ravel(), axis=1).reshape(-1, 6, 6)
 
 
 def _patch_strain(field: Field, options: StrainOptions) -> Float | None:
