@@ -29,6 +29,7 @@ _CENTRES = (1.0 / 6.0, 1.0 / 10.0)  # half of a subset's centre that must be wha
 _CENTRE_LOSS = 0.2  # of the texture's variance
 _CENTRE_SIGMAS = 5.0  # of the mean square of so many pixels, over that of the half that matches best
 _STEPS = 3  # towards that half
+_VALUES_AT_ONCE = 1_000_000
 _FAINT = 0.5  # of what the smallest other centre adds to a subset's residuals: gain and match take up some of it
 
 
@@ -78,21 +79,23 @@ def pull_of_parts(found: SubsetResiduals, visible: Bool, degree: int) -> Pull:
     of_whole, variances = _solved(whole, ridge)
     residual = whole[:, k, k] - np.einsum("mi,mi->m", of_whole, whole[:, :k, k])
     residual = np.maximum(residual / np.maximum(n - k, 1.0), _TINY_VARIANCE)
-    masks = _parts()
+    masks = _parts().astype(np.float64)
     shift = np.empty((len(n), 2, len(masks)))
     significance = np.empty_like(shift)
-    for p, mask in enumerate(masks):
-        kept = whole - sums[:, mask].sum(axis=1)
-        left = n - counts[:, mask].sum(axis=1)
-        of_rest, of_rests = _solved(kept, ridge)
-        scatter = kept[:, k, k] - np.einsum("mi,mi->m", of_rest, kept[:, :k, k])
+    at_once = max(_VALUES_AT_ONCE // (len(masks) * (k + 1) ** 2), 1)
+    for first in range(0, len(n), at_once):
+        some = slice(first, first + at_once)
+        taken = masks @ sums[some].reshape(-1, masks.shape[1], (k + 1) ** 2)  # (m, p, ...), of all parts together
+        kept = whole[some, None] - taken.reshape(-1, len(masks), k + 1, k + 1)
+        left = n[some, None] - counts[some] @ masks.T
+        of_rest, of_rests = _solved(kept, ridge[some, None])
+        scatter = kept[..., k, k] - np.einsum("mpi,mpi->mp", of_rest, kept[..., :k, k])
         noise = np.maximum(scatter / np.maximum(left - k, 1.0), _TINY_VARIANCE)
-        by_noise = np.maximum(of_rests[:, centre] - variances[:, centre], _LEAST_SHARE * variances[:, centre])
-        shift[:, :, p] = (of_rest - of_whole)[:, centre]
-        enough = left > 3 * k
-        significance[:, :, p] = np.where(
-            enough[:, None], np.abs(shift[:, :, p]) / np.sqrt(by_noise * noise[:, None]), 0.0
-        )
+        of_all = variances[some, None][..., centre]
+        by_noise = np.maximum(of_rests[..., centre] - of_all, _LEAST_SHARE * of_all)
+        change = (of_rest - of_whole[some, None])[..., centre]
+        sure = np.where((left > 3 * k)[..., None], np.abs(change) / np.sqrt(by_noise * noise[..., None]), 0.0)
+        shift[some], significance[some] = np.swapaxes(change, 1, 2), np.swapaxes(sure, 1, 2)
     part = significance.argmax(axis=-1)
     return Pull(
         np.take_along_axis(significance, part[..., None], axis=-1)[..., 0],
@@ -131,10 +134,10 @@ def _sums_of_cells(columns: Float, visible: Bool) -> tuple[Float, Float]:
 
 
 def _solved(sums: Float, ridge: Float) -> tuple[Float, Float]:
-    """Unknowns (m, k) of normal equations, and the diagonal (m, k) of their inverse."""
+    """Unknowns (..., k) of normal equations, and the diagonal (..., k) of their inverse."""
     k = sums.shape[-1] - 1
-    inverse = np.linalg.inv(sums[:, :k, :k] + ridge)
-    return (inverse @ sums[:, :k, k:])[..., 0], np.diagonal(inverse, axis1=1, axis2=2)
+    inverse = np.linalg.inv(sums[..., :k, :k] + ridge)
+    return (inverse @ sums[..., :k, k:])[..., 0], np.diagonal(inverse, axis1=-2, axis2=-1)
 
 
 @lru_cache(maxsize=1)
