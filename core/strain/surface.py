@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 from scipy import ndimage
@@ -71,6 +71,7 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
     strain[good] = surface.strain
     covariance[good] = surface.covariance(slopes.spread[good], options.tensor)
     covariance[..., range(3), range(3)] += left
+    surface = replace(surface, around=surface.around[:0].copy())  # the largest array; it has served
     common = None
     if field.common is not None:
         common = _common_part(field, slopes, surface, options)
