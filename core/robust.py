@@ -14,6 +14,18 @@ BIWEIGHT_REACH = 4.685
 _GOLDEN_SECTION = 0.6180339887498949
 
 
+def median(values: Float) -> float:
+    """Return the median of numbers (n,); NaN where one of them is.
+
+    As ``np.median``, which takes several times as long for a thousand numbers.
+    """
+    n = len(values)
+    parted = np.partition(values, [(n - 1) // 2, n // 2, n - 1])
+    if np.isnan(parted[-1]):  # sorted last
+        return float("nan")
+    return 0.5 * float(parted[(n - 1) // 2] + parted[n // 2])
+
+
 def biweight(squared: Float) -> Float:
     """Return Tukey's weights, from one down to zero.
 

@@ -1,10 +1,15 @@
 """Checkerboards, ChArUco boards and grids of dots: their description, their points in an image, and any target's."""
 
-from core.boards.board import BOARD_KINDS, DEFAULT_DICTIONARY, BoardKind, BoardTarget
-from core.boards.detect import detect_board, find_board
-from core.boards.eccentricity import dot_centre_offset_px
-from core.boards.targets import detect_target, find_target
-from core.boards.view import BoardView
+from typing import TYPE_CHECKING
+
+from core.lazy import names_of
+
+if TYPE_CHECKING:
+    from core.boards.board import BOARD_KINDS, DEFAULT_DICTIONARY, BoardKind, BoardTarget
+    from core.boards.detect import detect_board, find_board
+    from core.boards.eccentricity import dot_centre_offset_px
+    from core.boards.targets import detect_target, find_target
+    from core.boards.view import BoardView
 
 __all__ = [
     "BOARD_KINDS",
@@ -18,3 +23,14 @@ __all__ = [
     "find_board",
     "find_target",
 ]
+
+__getattr__, __dir__ = names_of(
+    __name__,
+    {
+        "board": ("BOARD_KINDS", "DEFAULT_DICTIONARY", "BoardKind", "BoardTarget"),
+        "detect": ("detect_board", "find_board"),
+        "eccentricity": ("dot_centre_offset_px",),
+        "targets": ("detect_target", "find_target"),
+        "view": ("BoardView",),
+    },
+)

@@ -1,19 +1,24 @@
 """Calibration of the pair from views of the grid: ten parameters a camera, checks, verdict."""
 
-from core.calibration.checks.distance import DistanceCheck, check_known_distance
-from core.calibration.checks.measures import CheckMeasures, Measures, measure_points
-from core.calibration.inputs import (
-    AnyTarget,
-    CalibrationOptions,
-    CalibrationView,
-    NominalCamera,
-    TargetLike,
-    inner_nodes_mm,
-)
-from core.calibration.prepare import predict_uncertainty
-from core.calibration.result import COVARIANCE_NAMES, CalibrationResult, CheckDone, Verdict, ViewResult
-from core.calibration.solve import calibrate
-from core.calibration.uncertainty import VolumeUncertainty, volume_uncertainty
+from typing import TYPE_CHECKING
+
+from core.lazy import names_of
+
+if TYPE_CHECKING:
+    from core.calibration.checks.distance import DistanceCheck, check_known_distance
+    from core.calibration.checks.measures import CheckMeasures, Measures, measure_points
+    from core.calibration.inputs import (
+        AnyTarget,
+        CalibrationOptions,
+        CalibrationView,
+        NominalCamera,
+        TargetLike,
+        inner_nodes_mm,
+    )
+    from core.calibration.prepare import predict_uncertainty
+    from core.calibration.result import COVARIANCE_NAMES, CalibrationResult, CheckDone, Verdict, ViewResult
+    from core.calibration.solve import calibrate
+    from core.calibration.uncertainty import VolumeUncertainty, volume_uncertainty
 
 __all__ = [
     "COVARIANCE_NAMES",
@@ -37,3 +42,23 @@ __all__ = [
     "predict_uncertainty",
     "volume_uncertainty",
 ]
+
+__getattr__, __dir__ = names_of(
+    __name__,
+    {
+        "checks.distance": ("DistanceCheck", "check_known_distance"),
+        "checks.measures": ("CheckMeasures", "Measures", "measure_points"),
+        "inputs": (
+            "AnyTarget",
+            "CalibrationOptions",
+            "CalibrationView",
+            "NominalCamera",
+            "TargetLike",
+            "inner_nodes_mm",
+        ),
+        "prepare": ("predict_uncertainty",),
+        "result": ("COVARIANCE_NAMES", "CalibrationResult", "CheckDone", "Verdict", "ViewResult"),
+        "solve": ("calibrate",),
+        "uncertainty": ("VolumeUncertainty", "volume_uncertainty"),
+    },
+)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +30,6 @@ FINE = 1 / 128
 """Of a component's common standard deviation: what a factor is rounded to, to be short in files."""
 _SAMPLE = 500  # points by which columns are chosen
 _OWN_FINE = 1 / 1024
-_Either = TypeVar("_Either", Float, Float32)
 _DEPTHS = (0.97, 1.0, 1.03)  # of the stand-off: points by which columns are ordered
 
 
@@ -271,7 +270,9 @@ class FactorColumns:
 
     def at(self, estimator: Estimator) -> Float32:
         """Return the factor (n, 3 or 6, k) at an estimator's points."""
-        return _to_step(estimator.through(self.names, self.directions), self.step).astype(np.float32)
+        factor = estimator.through(self.names, self.directions)
+        _to_step(factor, self.step)
+        return factor.astype(np.float32)
 
 
 def sample_of(count: int) -> slice:
@@ -306,16 +307,25 @@ def factor_of(
     return Factor(columns.at(Estimator.at(source.pair, points_mm, displaced_mm)), columns.causes)
 
 
-def rounded(factor: _Either, own: Float | None = None, *, fine: float = FINE) -> _Either:
-    """Return a factor (n, m, k) rounded to a small part of each component's standard deviation, as a power of two.
+def round_in_place(factor: Floats, sample: Floats, own: Float | None = None, *, fine: float = FINE) -> None:
+    """Round a factor (..., m, k) to a small part of each component's standard deviation, as a power of two.
 
     It stays far below what the points' own noise and the columns left out change, and is the same in memory and in
-    single precision in a file, where smooth columns of few digits take little room. ``own`` (m,) are standard
-    deviations of the points' own: rounding never needs to be finer than 1/1024 of them.
+    single precision in a file, where smooth columns of few digits take little room.
+
+    Parameters
+    ----------
+    factor
+        Changed in place.
+    sample
+        (n, m, k) :func:`sample_of` its points; nothing is rounded where there are none.
+    own
+        (m,) standard deviations of the points' own: rounding never needs to be finer than 1/1024 of them.
+    fine
+        The part of the standard deviation.
     """
-    if not factor.size:
-        return factor
-    return _to_step(factor, _rounding(factor[sample_of(len(factor))], own, fine))
+    if sample.size:
+        _to_step(factor, _rounding(sample, own, fine))
 
 
 def _rounding(some: Floats, own: Float | None, fine: float) -> Float:
@@ -328,14 +338,12 @@ def _rounding(some: Floats, own: Float | None, fine: float) -> Float:
     return np.asarray(2.0 ** np.floor(np.log2(np.where(step > 0.0, step, 1e-300))))
 
 
-def _to_step(factor: _Either, step: Float) -> _Either:
-    """Round a factor (n, m, k) to steps (m,): exact in either precision, but for steps that hold nothing."""
-    by = np.asarray(step[:, None], dtype=factor.dtype)
-    out = factor.copy()
-    np.divide(out, np.where(by > 0.0, by, 1.0), out=out)
-    np.rint(out, out=out)
-    out *= by
-    return out
+def _to_step(factor: Floats, step: Float) -> None:
+    """Round a factor (..., m, k) in place to steps (m,): exact in either precision, but for steps that hold nothing."""
+    by: Any = step[:, None].astype(factor.dtype)
+    np.divide(factor, np.where(by > 0.0, by, 1.0), out=factor)
+    np.rint(factor, out=factor)
+    np.multiply(factor, by, out=factor)
 
 
 def common_factor(source: ParameterCovariance, points_mm: Float, displaced_mm: Float | None = None) -> Float32:

@@ -102,8 +102,9 @@ class CommonParts:
                 return view if len(index) == len(view.ray) else view.at(index)
         place = np.full(valid.shape, -1, np.int64)
         place[valid] = np.arange(len(points))
-        self._known = place, ReferenceView.of(self.pair, points)
-        return self._known[1]
+        view = ReferenceView.of(self.pair, points)
+        self._known = (place, view) if len(points) <= _KEPT_POINTS else None
+        return view
 
 
 def with_common_parts(field: Field, source: ParameterCovariance | None, pair: StereoPair) -> Field:

@@ -1,7 +1,12 @@
 """Grid detection from the target's description alone: section 3.2.2's image processing, and a better localiser."""
 
-from core.grid.detect import detect_grid, find_grid, lines_shown
-from core.grid.view import GridOptions, GridOverlay, GridView, LineModel, LineOffsets, Localiser, Orientation
+from typing import TYPE_CHECKING
+
+from core.lazy import names_of
+
+if TYPE_CHECKING:
+    from core.grid.detect import detect_grid, find_grid, lines_shown
+    from core.grid.view import GridOptions, GridOverlay, GridView, LineModel, LineOffsets, Localiser, Orientation
 
 __all__ = [
     "GridOptions",
@@ -15,3 +20,11 @@ __all__ = [
     "find_grid",
     "lines_shown",
 ]
+
+__getattr__, __dir__ = names_of(
+    __name__,
+    {
+        "detect": ("detect_grid", "find_grid", "lines_shown"),
+        "view": ("GridOptions", "GridOverlay", "GridView", "LineModel", "LineOffsets", "Localiser", "Orientation"),
+    },
+)

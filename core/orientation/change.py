@@ -119,7 +119,7 @@ def plausible_bump(pair: StereoPair) -> Float:
     unit = centre / np.linalg.norm(centre)
     of_camera1 = np.zeros((5, 3))
     of_camera1[:3] = -pair.cam2_from_cam1.rotation
-    of_camera1[3:] = np.array([[axis @ np.cross(turn, unit) for turn in np.eye(3)] for axis in axes])
+    of_camera1[3:] = axes @ np.cross(np.eye(3), unit).T
     of_camera2 = np.zeros((5, 3))
     of_camera2[:3] = np.eye(3)
     of_shift = np.zeros((5, 2))
@@ -138,7 +138,7 @@ def pinhole_shift(pair: StereoPair, change: Float) -> tuple[Float, Float]:
     of_2[:, 3:] = np.eye(2)
     of_1 = of_2.copy()
     back = -pair.cam2_from_cam1.rotation.T  # camera 1's turn, in its own frame, that looks like camera 2's
-    of_1[:, :3] = -np.array([[axis @ np.cross(turn, unit) for turn in np.eye(3)] for axis in axes]) @ back
+    of_1[:, :3] = -axes @ np.cross(np.eye(3), unit).T @ back
     ways = [(J @ change, J) for J in (of_2, of_1)]
     return min(ways, key=lambda way: float(np.linalg.norm(way[0])))
 

@@ -23,6 +23,7 @@ from core.orientation.noise import blocks_of, effective_variance, robust_weights
 _SMALLEST_RAD, _LARGEST_RAD = 2e-5, 0.1
 _FIRST_RAD = 0.01
 _ITERATIONS = 60
+_RANK = 1e-9
 SYSTEMATIC_PX = 0.001
 """Standard deviation of smooth errors of the offsets that do not average out (interpolation, lens), a term."""
 
@@ -96,7 +97,9 @@ def estimate_change(
     """
     xy1, xy2 = points.xy1_px, points.xy2_px
     unit, size = plausible_bump(pair), _FIRST_RAD if bump_rad is None else bump_rad
+    firm = np.linalg.inv(unit)
     terms = smooth_terms(xy1)
+    basis = orthonormal(terms)
     blocks = blocks_of(xy1, points.step) if blocks is None else blocks
     change = np.zeros(5) if start is None else np.array(start, dtype=np.float64)
     J = offset_slopes(pair, change, xy1, xy2) if slopes is None or start is not None else slopes.offset
@@ -110,16 +113,16 @@ def estimate_change(
         residual = left_at(change)
         if offset_px is None:
             J = offset_slopes(pair, change, xy1, xy2)
-        weights, _ = robust_weights(residual - smooth_surface(terms, residual))
+        weights, _ = robust_weights(residual - smooth_surface(basis, residual))
         variance = effective_variance(J, weights, residual, blocks)
         information = (J * weights[:, None]).T @ J / variance
-        prior = np.linalg.inv(unit) / size**2
+        prior = firm / size**2
         posterior = np.linalg.inv(information + prior)
         step = -posterior @ ((J * weights[:, None]).T @ residual / variance + prior @ change)
         change = change + step
         determined = 5.0 - float(np.trace(prior @ posterior))
         if bump_rad is None:
-            found = float(change @ np.linalg.solve(unit, change)) / max(determined, 1.0)
+            found = float(change @ firm @ change) / max(determined, 1.0)
             size = float(np.clip(np.sqrt(found), _SMALLEST_RAD, _LARGEST_RAD))
         if np.abs(step).max() < 1e-8:
             break
@@ -127,7 +130,7 @@ def estimate_change(
     weights, noise = robust_weights(residual)
     variance = effective_variance(J, weights, residual, blocks)
     information = (J * weights[:, None]).T @ J / variance
-    prior = np.linalg.inv(unit) / size**2
+    prior = firm / size**2
     posterior = np.linalg.inv(information + prior)
     response = -posterior @ (J * weights[:, None]).T / variance
     systematic = response @ terms * SYSTEMATIC_PX
@@ -143,10 +146,21 @@ def estimate_change(
     )
 
 
-def smooth_surface(terms: Float, values: Float) -> Float:
-    """Surface of :func:`smooth_terms` through values with outliers: least squares, then without those far off."""
+def orthonormal(terms: Float) -> Float:
+    """Return an orthonormal basis (n, k) of what terms (n, m) span."""
+    basis, size, _ = np.linalg.svd(terms, full_matrices=False)
+    return np.asarray(basis[:, size > _RANK * size[0]])
+
+
+def smooth_surface(basis: Float, values: Float) -> Float:
+    """Surface through values (n,) with outliers: least squares, then without those far off.
+
+    ``basis`` is :func:`orthonormal` of :func:`smooth_terms`.
+    """
     weights = np.ones(len(values))
     for _ in range(4):
-        surface = terms @ np.linalg.lstsq(terms * weights[:, None], values * weights, rcond=1e-9)[0]
-        weights = np.sqrt(robust_weights(values - surface)[0])
+        weighed = basis * weights[:, None]
+        # six by six, and of unit size but for the weights
+        surface = basis @ np.linalg.lstsq(weighed.T @ basis, weighed.T @ values, rcond=_RANK)[0]
+        weights = robust_weights(values - surface)[0]
     return np.asarray(surface)

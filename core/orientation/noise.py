@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arrays import Float
-from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight
+from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight, median
 
 _BLOCKS = 8
 _FLOOR_PX = 1e-6
@@ -14,7 +14,7 @@ _FLOOR_PX = 1e-6
 
 def robust_weights(residual_px: Float) -> tuple[Float, float]:
     """Return Tukey's weights (n,) of residuals about zero, and their standard deviation, px."""
-    sigma = max(MAD_TO_SIGMA * float(np.median(np.abs(residual_px))), _FLOOR_PX)
+    sigma = max(MAD_TO_SIGMA * median(np.abs(residual_px)), _FLOOR_PX)
     return biweight((residual_px / (BIWEIGHT_REACH * sigma)) ** 2), sigma
 
 

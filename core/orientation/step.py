@@ -7,6 +7,8 @@ matched on its own, at a sample of the points.
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 
 from core.arrays import Float
@@ -20,6 +22,7 @@ from core.robust import spread_indices
 from core.status import PointStatus
 
 SAMPLE = 1000
+_LARGE_PIXELS = 8_000_000  # from here on an image's gradients are made for this match alone: 12 bytes a pixel
 
 
 def step_points(
@@ -60,6 +63,8 @@ def step_points(
     if len(xy) == 0:
         return None
     images = [image.prepared(options.interpolation, None, options.blur) for image in (image1, image2)]
+    if images[0].raw.size > _LARGE_PIXELS:
+        images[0] = copy.copy(images[0])
     fit = fit_shape(pair, images[0], images[1], xy, start, options.match_options())
     good = (fit.status == PointStatus.OK) & (fit.zncc.min(axis=1) >= options.min_zncc) & np.isfinite(fit.epipolar_px)
     if not good.any():

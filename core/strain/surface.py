@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 from scipy import ndimage
 
 from core.arrays import Bool, Float, Float32
-from core.common.factor import FINE, rounded
+from core.common.factor import FINE, round_in_place, sample_of
 from core.errors import InputError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
@@ -71,13 +71,16 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
     strain[good] = surface.strain
     covariance[good] = surface.covariance(slopes.spread[good], options.tensor)
     covariance[..., range(3), range(3)] += left
+    surface = replace(surface, around=surface.around[:0].copy())  # the largest array; it has served
     common = None
     if field.common is not None:
-        common = np.full((*field.shape, 3, field.common.shape[-1]), np.nan, np.float32)
-        # slopes hold the points' own rounding: finer digits would be noise
-        part = _common_part(field, slopes, surface, options)
+        common = _common_part(field, slopes, surface, options)
         typical = np.sqrt(np.median(covariance[good][:, range(3), range(3)], axis=0)) if good.any() else None
-        common[good] = rounded(part, typical, fine=2.0 * FINE)
+        # slopes hold the points' own rounding: finer digits would be noise
+        some = np.flatnonzero(good)
+        some = some[sample_of(len(some))]
+        round_in_place(common, common.reshape(-1, *common.shape[2:])[some], typical, fine=2.0 * FINE)
+        common[~good] = np.nan
     spacing_px = _step(field)
     # of smoothed displacements it begins with the width of the smoothing
     gauge_px = (options.window - 1) * spacing_px + shared.reach_px
@@ -97,15 +100,14 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
 
 
 def _common_part(field: Field, slopes: Slopes, surface: OnSurface, options: StrainOptions) -> Float32:
-    """(n, 3, k) common factor of the strain: that of the points through the windows' weights."""
+    """(r, c, 3, k) common factor of the strain: that of the points through the windows' weights."""
     assert field.common is not None
     good = slopes.status == StrainStatus.OK
     by_slope = np.zeros((*field.shape, 3, 12), np.float32)
     by_slope[good] = strain_slopes(
         surface.frame, surface.gradient, options.tensor, surface.per_mm, surface.strain
     ).reshape(-1, 3, 12)
-    part = common_part(field.common, field.valid, slopes, by_slope, options.window // 2)
-    return np.asarray(part[good])
+    return common_part(field.common, field.valid, slopes, by_slope, options.window // 2)
 
 
 def surface_slopes(
@@ -141,27 +143,25 @@ def surface_slopes(
 
 
 def _on_surface(slopes: Slopes, field: Field, options: StrainOptions) -> OnSurface:
-    around = _mean_around(field.covariance, field.valid, options.window)
-    return _at(slopes.status == StrainStatus.OK, around, slopes, field, options)
+    good = slopes.status == StrainStatus.OK
+    around = _mean_around(field.covariance, field.valid, options.window, good)
+    return _at(good, around, slopes, field, options)
 
 
 def _replaced(surface: OnSurface, slopes: Slopes, field: Field, options: StrainOptions, raised: Bool) -> OnSurface:
-    """Return what holds at all points, made anew where quadratics took the place of planes."""
+    """Return what holds at all points, made anew, in the same arrays, where quadratics took the place of planes."""
     good = slopes.status == StrainStatus.OK
     again = raised[good]
     if not again.any():
         return surface
-    around = np.empty((*field.shape, 6, 6))
-    around[good] = surface.around
-    part = _at(raised & good, around, slopes, field, options)
-    made = {f.name: getattr(surface, f.name).copy() for f in fields(surface)}
-    for name, values in made.items():
-        values[again] = getattr(part, name)
-    return OnSurface(**made)
+    part = _at(raised & good, surface.around[again], slopes, field, options)
+    for f in fields(surface):
+        getattr(surface, f.name)[again] = getattr(part, f.name)
+    return surface
 
 
 def _at(good: Bool, around: Float, slopes: Slopes, field: Field, options: StrainOptions) -> OnSurface:
-    """Windows' slopes on the surface at the points ``good``; ``around`` is (r, c, 6, 6) the mean covariance."""
+    """Windows' slopes on the surface at the n points ``good``; ``around`` is (n, 6, 6) the mean covariance there."""
     slope, second, moments = slopes.slope[good], slopes.second[good], slopes.moments[good]
     before = missed_slope(slope[:, :3], second[:, :3], moments)
     now = missed_slope(slope[:, :3] + slope[:, 3:], second[:, 3:], moments)
@@ -169,7 +169,7 @@ def _at(good: Bool, around: Float, slopes: Slopes, field: Field, options: Strain
     frame = surface_frames(slope[:, :3], field.normal_sys[good])
     per_mm = np.linalg.inv(np.swapaxes(frame, -1, -2) @ slope[:, :3])
     gradient = slope[:, 3:] @ per_mm
-    return OnSurface(frame, per_mm, gradient, around[good], strain_of(frame, gradient, options.tensor))
+    return OnSurface(frame, per_mm, gradient, around, strain_of(frame, gradient, options.tensor))
 
 
 def surface_frames(tangents: Float, towards: Float) -> Float:
@@ -179,13 +179,18 @@ def surface_frames(tangents: Float, towards: Float) -> Float:
     return tangent_frames(normal)[..., :2]
 
 
-def _mean_around(covariance: Float, valid: Bool, window: int) -> Float:
-    """Mean (r, c, 6, 6) of the valid points' covariance over each window."""
-    size = (window, window, 1, 1)
-    kept = np.where(valid[..., None, None], covariance, 0.0)
+def _mean_around(covariance: Float, valid: Bool, window: int, good: Bool) -> Float:
+    """Mean (n, 6, 6) of the valid points' covariance over each window about the points ``good``."""
+    # it is symmetric: half of it is filtered
+    i, j = np.triu_indices(6)
+    total = np.take(covariance.reshape(-1, 36), 6 * i + j, axis=1).reshape(*valid.shape, len(i))
+    total[~valid] = 0.0
+    ndimage.uniform_filter(total, size=(window, window, 1), mode="constant", output=total)
     share = ndimage.uniform_filter(valid.astype(np.float64), size=window, mode="constant")
-    total = ndimage.uniform_filter(kept, size=size, mode="constant")
-    return np.asarray(total / np.maximum(share, 0.5 / window**2)[..., None, None])
+    half = total[good] / np.maximum(share[good], 0.5 / window**2)[:, None]
+    place = np.zeros((6, 6), np.int64)
+    place[i, j] = place[j, i] = np.arange(len(i))
+    return np.take(half, place.ravel(), axis=1).reshape(-1, 6, 6)
 
 
 def _patch_strain(field: Field, options: StrainOptions) -> Float | None:

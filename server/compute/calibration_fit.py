@@ -179,4 +179,4 @@ def _write_residuals(path: Path, result: CalibrationResult, grids: dict[str, Tar
 def _put(data: Any, name: str, values: NDArray[np.float64], text: str) -> None:
     variable = data.createVariable(name, "f8", ("view", "i", "j", "xy"), compression="zlib", fill_value=np.nan)
     variable.setncatts({"units": "pixel", "long_name": text})
-    variable[...] = values
+    data.put(variable, values)

@@ -195,10 +195,10 @@ def _netcdf(part: FieldPart) -> bytes:
             data.setncattr("uncertainty", part.note)
         for name, indices in (("row", part.rows), ("col", part.cols)):
             data.createDimension(name, len(indices))
-            data.createVariable(name, "i4", (name,))[:] = indices
+            data.put(data.createVariable(name, "i4", (name,)), indices)
         for name, values in pixels.items():
             position = data.createVariable(name, "f8", ("row", "col"))
-            position[:] = values
+            data.put(position, values)
             position.units = "pixel"
         if part.name not in ("x_px", "y_px"):
             more = tuple(f"component_{k}" for k in range(part.values.ndim - 2))
@@ -207,7 +207,7 @@ def _netcdf(part: FieldPart) -> bytes:
             kind = {"b": "i1", "i": "i4", "u": "i4"}.get(part.values.dtype.kind, part.values.dtype.str[1:])
             missing = np.nan if kind.startswith("f") else None
             variable = data.createVariable(part.name, kind, ("row", "col", *more), fill_value=missing)
-            variable[:] = part.values
+            data.put(variable, part.values)
             variable.units, variable.long_name = part.variable.units, part.variable.long_name
 
     return dataset_bytes(fill)

@@ -25,6 +25,7 @@ CENTRE = 1.0 / 3.0
 _NOISE = 4.0  # variances of the noise: what a plain centre shows at most
 _TEXTURE = 0.02  # of the subset's variance
 _WINDOW_PX = 5  # of the variance about a pixel
+_BAND_ROWS = 512
 _RIM_PX = _WINDOW_PX // 2 + 2  # by which the plain area seems smaller than it is
 _OWN = 0.25  # share of the places amid the field with plain areas, beyond which these are the texture's own
 _PLACE = 2.0  # subsets
@@ -76,12 +77,13 @@ def reject_blank_centres(
     before = int(points.ok.sum())
     level = _NOISE * float(np.median(noise[points.ok])) if before else 0.0
     amid = points.ok & ~_beside_gaps(points.ok, shape, subset_px / spacing_px)
-    own = _width_of_own(amid, image, level, xy_px, subset_px)
+    plain_pixels = _plain_pixels(image, level)
+    own = _width_of_own(amid, plain_pixels, xy_px, subset_px)
     if own is None:
         return 0
     alone = max(_ALONE_SUBSETS * subset_px, _ALONE_OWN * own)
-    points.reject(points.ok & (_plain_areas(image, level, round(alone) | 1, xy_px) > 0), PointStatus.LOW_TEXTURE)
-    area = _plain_areas(image, level, own, xy_px)
+    points.reject(points.ok & (_plain_areas(plain_pixels, round(alone) | 1, xy_px) > 0), PointStatus.LOW_TEXTURE)
+    area = _plain_areas(plain_pixels, own, xy_px)
     inside = (area > 0) & np.isin(area, area[~points.ok])
     beside = _beside_gaps(points.ok, shape, subset_px / spacing_px)
     points.reject(points.ok & beside & (inside | (plain & (own == centre_px(subset_px)))), PointStatus.LOW_TEXTURE)
@@ -108,11 +110,11 @@ def _plain_centres(image: NDArray[Any], xy_px: Float, which: Bool, width_px: int
     return plain
 
 
-def _width_of_own(amid: Bool, image: Float32, variance: float, xy_px: Float, subset_px: int) -> int | None:
+def _width_of_own(amid: Bool, plain_pixels: NDArray[np.uint8], xy_px: Float, subset_px: int) -> int | None:
     """Return the least width, px, of plain areas that are not the texture's own; None if all are."""
     place = xy_px[amid] / (_PLACE * subset_px)
     for width in range(centre_px(subset_px), subset_px + 1, 2):
-        if not _of_the_texture((_plain_areas(image, variance, width, xy_px) > 0)[amid], place):
+        if not _of_the_texture((_plain_areas(plain_pixels, width, xy_px) > 0)[amid], place):
             return width
     return None
 
@@ -129,16 +131,23 @@ def _of_the_texture(plain: Bool, place: Float) -> bool:
     return with_plain > _OWN * every
 
 
-def _plain_areas(image: Float32, variance: float, width_px: int, xy_px: Float) -> NDArray[np.int32]:
+def _plain_pixels(image: Float32, variance: float) -> NDArray[np.uint8]:
+    """Return (rows, cols) one where the grey levels about a pixel scatter less than a variance, else zero."""
+    window, half, rows = (_WINDOW_PX, _WINDOW_PX), _WINDOW_PX // 2, image.shape[0]
+    out, mean = np.empty(image.shape, np.uint8), np.float32(image.mean())
+    for first in range(0, rows, _BAND_ROWS):  # of a large image the sums would take half a gigabyte
+        last, top = min(first + _BAND_ROWS, rows), max(first - half, 0)
+        about = image[top : last + half] - mean
+        scatter = cv2.blur(about * about, window) - cv2.blur(about, window) ** 2
+        out[first:last] = scatter[first - top : last - top] < variance
+    return out
+
+
+def _plain_areas(plain_pixels: NDArray[np.uint8], width_px: int, xy_px: Float) -> NDArray[np.int32]:
     """Return (n,) the area of at least ``width_px`` without texture that each point lies in, 0: in none."""
-    window = (_WINDOW_PX, _WINDOW_PX)
-    about = image - np.float32(image.mean())
-    scatter = cv2.blur(about * about, window) - cv2.blur(about, window) ** 2
-    wide = cv2.morphologyEx(
-        (scatter < variance).astype(np.uint8), cv2.MORPH_OPEN, np.ones((width_px, width_px), np.uint8)
-    )
+    wide = cv2.morphologyEx(plain_pixels, cv2.MORPH_OPEN, np.ones((width_px, width_px), np.uint8))
     rim = 2 * _RIM_PX + 1
     areas = cv2.connectedComponents(cv2.dilate(wide, np.ones((rim, rim), np.uint8)))[1]
-    rows, cols = image.shape
+    rows, cols = plain_pixels.shape
     x, y = (np.clip(np.rint(xy_px[:, k]), 0, last - 1).astype(int) for k, last in ((0, cols), (1, rows)))
     return np.asarray(areas[y, x], dtype=np.int32)

@@ -15,7 +15,8 @@ from server.exports.run import export
 from server.exports.source import find_source
 from server.formats.figures.options import COLOURS, MAX_LEVELS, FigureStyle
 from server.formats.files import make_folder
-from server.results.gauges.framed import FRAME_HELP, asked_at, in_frame
+from server.results.gauges import FRAME_HELP
+from server.results.gauges.framed import asked_at, in_frame
 from server.results.gauges.frames import part_of
 
 

@@ -17,8 +17,9 @@ from server.formats.gauges.readings import GaugeReadings, LineReading, Number, S
 from server.formats.gauges.table import gauges_csv
 from server.formats.results.folder import first_results
 from server.formats.results.summary import to_json
+from server.results.gauges import FRAME_HELP
 from server.results.gauges.fields import FieldWriter
-from server.results.gauges.framed import FRAME_HELP, asked_at
+from server.results.gauges.framed import asked_at
 from server.results.gauges.readings import read_gauges
 from server.results.gauges.request import Alignment, GaugeRequest
 from server.wording import problems_in

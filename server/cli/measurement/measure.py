@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from core.errors import FileFormatError, InputError, RegionError
 from core.field.prefilter import check_prefilter
@@ -42,11 +43,12 @@ from server.formats.images import read_mask
 from server.formats.noise_json import load_noise
 from server.formats.results.reading import read_head
 from server.formats.results.summary import to_json
-from server.results.gauges.framed import FRAME_HELP, put_into_frame
-from server.results.gauges.frames import frame_asked, frame_of_test
-from server.results.gauges.request import Alignment
+from server.results.gauges import FRAME_HELP
 from server.results.images.projected_pattern import check_settings
 from server.store.durable import known_json
+
+if TYPE_CHECKING:
+    from server.results.gauges.request import Alignment
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -161,7 +163,7 @@ def run(args: argparse.Namespace) -> int:
         job = _prepare(args, progress)
         summary = measure_sequence(job, progress)
         files = [job.out / one["file"] for one in summary["steps"]]
-        frame = read_head(files[-1]).frame if asked is None else put_into_frame(files, asked)
+        frame = read_head(files[-1]).frame if asked is None else _put_into(asked, files)
         write_bytes(job.out / "summary.json", to_json({**summary, "frame": frame}))
         progress.note(f"frame of the files: {frame}")
     finally:
@@ -171,8 +173,18 @@ def run(args: argparse.Namespace) -> int:
 
 def _frame(args: argparse.Namespace) -> Alignment | None:
     """Return the frame that is asked for; None: the system frame."""
+    if args.frame is None:
+        return None
+    from server.results.gauges.frames import frame_asked, frame_of_test  # gauges are slow to load
+
     kept = None if args.folder is None else known_json(Path(args.folder) / "test.json").get("frame")
     return frame_asked(args.frame, frame_of_test(kept if isinstance(kept, dict) else None))
+
+
+def _put_into(asked: Alignment, files: list[Path]) -> str:
+    from server.results.gauges.framed import put_into_frame
+
+    return put_into_frame(files, asked)
 
 
 def _missing(option: str) -> InputError:

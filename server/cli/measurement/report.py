@@ -9,7 +9,8 @@ from pathlib import Path
 from core.errors import InputError
 from server.cli.measurement.coverage import add_coverage, coverage_from
 from server.formats.files import make_folder, write_bytes
-from server.results.gauges.framed import FRAME_HELP, asked_at, in_frame
+from server.results.gauges import FRAME_HELP
+from server.results.gauges.framed import asked_at, in_frame
 from server.results.metadata import load_metadata
 
 

@@ -1,4 +1,9 @@
-"""NetCDF files, opened for reading and for writing by this module alone, under one lock."""
+"""NetCDF files, opened for reading and for writing by this module alone, under one lock.
+
+In the classic model the library closes the definitions, and flushes all of the file, after every variable and attribute
+that is added, as soon as it may: half a millisecond each. A new file's definitions are therefore all made before they
+are closed once; its values follow.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +23,33 @@ from server.formats.files import written_temporary
 #: the netCDF and HDF5 libraries are not built for several threads at once
 library = threading.RLock()
 _NEARLY_FULL_BYTES = 1 << 20
+
+
+class NewDataset(netCDF4.Dataset):
+    """An empty data set whose values are written once all is defined: :meth:`put` and :meth:`finish`."""
+
+    def __init__(self, *args: Any, **more: Any) -> None:
+        # what is set in the usual way becomes an attribute of the file
+        self.__dict__["_waiting"] = []
+        super().__init__(*args, **more)
+
+    def put(self, variable: Any, values: Any) -> None:
+        """Write a variable's values when the definitions are closed; they must not change until then."""
+        self.__dict__["_waiting"].append((variable, values))
+
+    def finish(self) -> None:
+        """Close the definitions and write what waits."""
+        super()._enddef()  # type: ignore[misc]
+        waiting = self.__dict__["_waiting"]
+        while waiting:
+            variable, values = waiting.pop(0)
+            variable[...] = values
+
+    def _redef(self) -> None:
+        """Stay in the definitions, which a new file begins with; the base class calls it before each of them."""
+
+    def _enddef(self) -> None:
+        """Stay in the definitions; the base class calls it after each of them."""
 
 
 @contextlib.contextmanager
@@ -44,7 +76,7 @@ def opened(path: Path) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def written_dataset(path: Path, *, classic: bool = True, checksum: bool = False) -> Iterator[Any]:
-    """Yield an empty NetCDF-4 data set; on leaving, it is the file; see :func:`server.formats.files.written_temporary`.
+    """Yield a :class:`NewDataset`; on leaving, it is the file; see :func:`server.formats.files.written_temporary`.
 
     Parameters
     ----------
@@ -60,9 +92,10 @@ def written_dataset(path: Path, *, classic: bool = True, checksum: bool = False)
         try:
             with (
                 library,
-                netCDF4.Dataset(str(temporary), "w", format="NETCDF4_CLASSIC" if classic else "NETCDF4") as dataset,
+                NewDataset(str(temporary), "w", format="NETCDF4_CLASSIC" if classic else "NETCDF4") as dataset,
             ):
                 yield dataset
+                dataset.finish()
         except RuntimeError as error:  # the HDF5 library's failed writes come without an errno
             full = shutil.disk_usage(temporary.parent).free < _NEARLY_FULL_BYTES
             raise OSError(errno.ENOSPC if full else errno.EIO, str(error)) from error
@@ -90,6 +123,7 @@ def rename_axes(path: Path, old: str, new: str) -> None:
 def dataset_bytes(fill: Callable[[Any], None]) -> bytes:
     """Return the bytes of a NetCDF-4 file that ``fill`` puts into an empty data set."""
     with library:
-        dataset = netCDF4.Dataset("field.nc", "w", memory=1 << 16, format="NETCDF4_CLASSIC")
+        dataset = NewDataset("field.nc", "w", memory=1 << 16, format="NETCDF4_CLASSIC")
         fill(dataset)
+        dataset.finish()
         return bytes(dataset.close())

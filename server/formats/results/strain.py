@@ -85,7 +85,7 @@ def put_strain(dataset: Any, strain: StrainField, *, included: str, sparse: bool
         )
         names = ", ".join(name for name, _ in _COMPONENTS)
         common.setncatts({"units": "1", "long_name": f"F: what all points share of the uncertainty of {names}"})
-        common[...] = strain.common
+        dataset.put(common, strain.common.astype(np.float32, copy=False))
     status = dataset.createVariable(
         "strain_status", "i1", ("row", "col"), fill_value=False, compression="zlib", complevel=1
     )
@@ -98,7 +98,7 @@ def put_strain(dataset: Any, strain: StrainField, *, included: str, sparse: bool
             "comment": "; ".join(f"{s.value} = {s.name.lower()}: {STRAIN_STATUS_MEANINGS[s]}" for s in StrainStatus),
         }
     )
-    status[...] = strain.status
+    dataset.put(status, strain.status)
     document = {
         **asdict(strain.options),
         "spacing_px": strain.spacing_px,
@@ -113,7 +113,7 @@ def _variable(dataset: Any, name: str, values: Any, units: str, long_name: str, 
     pack = {"compression": "zlib", "complevel": 1, "shuffle": True} if sparse else {}
     variable = dataset.createVariable(name, "f4", ("row", "col"), fill_value=np.nan, **pack)
     variable.setncatts({"units": units, "long_name": long_name})
-    variable[...] = values
+    dataset.put(variable, np.asarray(values, dtype=np.float32))
     return variable
 
 

@@ -101,7 +101,7 @@ def _put(
         pack = COLUMN_BY_COLUMN | {"chunksizes": (*values.shape[:2], 1, 1)}
     variable = dataset.createVariable(name, dtype, dims, fill_value=fill, **pack)
     variable.setncatts({"units": units, "long_name": long_name})
-    variable[...] = values
+    dataset.put(variable, values.astype(dtype, copy=False))
 
 
 def _put_status(dataset: Any, status: NDArray[np.int8]) -> None:
@@ -269,7 +269,7 @@ def _put_causes(dataset: Any, causes: Causes) -> None:
         }
     )
     if causes.columns:
-        variable[...] = np.array(causes.columns, dtype=f"S{width}")
+        dataset.put(variable, np.array(causes.columns, dtype=f"S{width}"))
 
 
 def _put_rejected(dataset: Any, rejected: Rejected) -> None:

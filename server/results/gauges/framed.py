@@ -15,8 +15,6 @@ from server.results.gauges.readings import read_gauges
 from server.results.gauges.request import Alignment, GaugeRequest
 from server.store.durable import known_json
 
-FRAME_HELP = "axes of positions, displacements and strain: system, specimen, or JSON as of a gauge's align (system)"
-
 
 def write_framed(files: Sequence[Path], asked: Alignment, folder: Path, *, strain: bool = True) -> list[Path]:
     """Write result files in a frame that is laid through the first of them; return their paths.

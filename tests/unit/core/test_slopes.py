@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.ndimage import correlate1d, gaussian_filter
+from scipy.ndimage import correlate, correlate1d, gaussian_filter
 
 from core.matching.filters import derivative
+from core.matching.odd_filters import filter_both
 from core.matching.slopes import slope_filter
+from core.threads import available_threads, set_threads
+from core.threads import threads as numbers_of_threads
 
 SHAPE = (400, 420)
 
@@ -49,6 +52,23 @@ def test_more_information_than_the_spline_and_nothing_to_take_out(kind, noise, k
     gained = found.apply(np.random.default_rng(6).normal(size=SHAPE))
     assert np.mean([g.var() for g in gained]) == pytest.approx(found.gain, rel=0.02)
     np.testing.assert_array_equal(found.along_x, -found.along_x[::-1, ::-1])
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_both_filters_are_scipys_correlation_on_a_mirrored_image(threads):
+    rng = np.random.default_rng(3)
+    taps = rng.normal(size=(2, 7, 7))
+    before = numbers_of_threads()
+    set_threads(min(threads, available_threads()))
+    try:
+        for shape, kind in (((261, 70), np.uint8), ((129, 40), np.uint16), ((16, 20), np.float64)):
+            image = rng.uniform(0.0, 255.0, shape).astype(kind)
+            for one, found in zip(taps, filter_both(image, *taps), strict=True):
+                exact = correlate(image.astype(np.float64), one, mode="mirror")
+                # float32: 49 products of 255 and taps of about 1
+                np.testing.assert_allclose(found, exact, atol=2e-3)
+    finally:
+        set_threads(before)
 
 
 @pytest.mark.parametrize("kind", ["fine", "coarse"])
