@@ -43,7 +43,7 @@ def measured(host: Host, **changes: Any) -> str:
     url, job = begin(host.client, URL, **{**BODY, **changes})
     done = wait_for_job(host.client, job)
     assert done["state"] == "succeeded", done["problem"]
-    assert [step["n"] for step in done["result"]["steps"]] == list(range(STEPS))
+    assert host.client.get(url).json()["steps_finished"] == list(range(STEPS))
     return url
 
 
@@ -76,9 +76,10 @@ def assert_as_chain(found: list[dict[str, Any]], chain: list[dict[str, Any]]) ->
     for n, (one, two) in enumerate(zip(chain, found, strict=True)):
         assert one.keys() == two.keys()
         np.testing.assert_array_equal(two["status"], one["status"], err_msg=str(n))
+        if "reference_step" in one:  # not in a step that was matched against the first one
+            np.testing.assert_array_equal(two["reference_step"], one["reference_step"], err_msg=str(n))
         if n == 0:
             continue
-        np.testing.assert_array_equal(two["reference_step"], one["reference_step"], err_msg=str(n))
         for name in "uvw":
             off = (two[f"{name}_mm"] - one[f"{name}_mm"]) / one[f"sigma_{name}_mm"]
             assert np.nanmax(np.abs(off)) < AGREE_SIGMAS, (n, name)

@@ -24,8 +24,8 @@ Kind = Literal["head", "step", "joint", "again"]
 
 #: a head and a joint cost two to four steps
 SHORTEST = 4
-#: a change of the reference in a block is what later ones wait for
-LONGEST = 32
+#: what is certain grows block by block
+LONGEST = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +145,14 @@ class Blocks:
         return sum(b.at for b in self._blocks)
 
     def ask(self) -> Ask | None:
-        """Return what can be measured now, the earliest first; None if nothing can before another one has ended."""
+        """Return what can be measured now, the earliest first; None if nothing can before another one has ended.
+
+        Whoever asks has nothing to do: where no block has work, the one with the most steps left is cut in two.
+        """
+        found = self._next()
+        return self._next() if found is None and self._cut() else found
+
+    def _next(self) -> Ask | None:
         for i, block in enumerate(self._blocks):
             if block.running is None:
                 ask = self._of(i, block)
@@ -212,6 +219,22 @@ class Blocks:
                     yield n, block.outcomes[n]
             if not block.through or block.head == "open":
                 return
+
+    def _cut(self) -> bool:
+        """Make a block of its own of the last steps of another one; return False if all are short."""
+        left = [len(b.steps) - b.at if b.at > 0 or b.running is not None else 0 for b in self._blocks]
+        i = left.index(max(left))
+        if left[i] < 2 * SHORTEST + 1:
+            return False
+        block = self._blocks[i]
+        half = len(block.steps) - left[i] // 2
+        steps, block.steps = block.steps[half:], block.steps[:half]
+        measured = [n for n in block.steps if block.good(n)]
+        reference = self._reference_before(i, block.steps[block.at])
+        if measured:
+            reference = _reference_of(block.outcomes[measured[-1]], self._first)
+        self._blocks.insert(i + 1, _Block(steps, reference, "open"))
+        return True
 
     # what can be done ------------------------------------------------------------------------------------------
 

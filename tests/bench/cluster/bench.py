@@ -1,0 +1,206 @@
+"""Measures docs/explanation/cluster.md: a long test in its default settings on one and two workers, and on 64 simulated ones.
+
+Run from the repository's root::
+
+    python -m tests.bench.cluster.bench [--steps N] [--spacing PX] [--simulated-only]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import tempfile
+import time
+from collections import defaultdict
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+from server.workflows.analysis.blocks import Ask, Blocks
+from tests.bench.cluster.page import write_page
+from tests.bench.cluster.scheduler import Overhead, Simulated, dask_overhead, simulate
+from tests.support import sequence_bench as scenes
+from tests.support.copied_tests import write_test_of
+from tests.support.dask_bench import Cluster, Host, cluster_of
+from tests.support.running_analyses import API, begin, contents, folder_of
+from tests.support.service_rig import wait_for_job
+
+URL = f"{API}/tests/t000001-abcdef"
+REGION = [110, 100, 410, 380]
+SIMULATED_WORKERS = (1, 2, 4, 8, 16, 32, 64, 128)
+SIMULATED_STEPS = 2048
+ASKED_WORKERS = 64
+
+
+@dataclass
+class Run:
+    """One analysis.
+
+    Attributes
+    ----------
+    wall_s, service_s
+        Wall time, and processor time of the service.
+    busy_s
+        Processor time of each worker.
+    tasks
+        Wall time of the measurements by kind, as the service saw them; a chain's are all ``step``.
+    """
+
+    workers: int
+    wall_s: float
+    service_s: float
+    busy_s: list[float]
+    tasks: dict[str, list[float]]
+    steps: int
+    points: int = 0
+
+
+@dataclass
+class Figures:
+    """What the page shows."""
+
+    steps: int
+    load: tuple[float, float]
+    runs: list[Run]
+    worst_sigma: float
+    status_changed: int
+    bytes_a_task: int
+    overhead: Overhead
+    simulated: list[Simulated]
+    changed: list[Simulated] = field(default_factory=list)
+
+
+class Watched:
+    """Times between a plan's asks and their ends."""
+
+    def __init__(self) -> None:
+        self.tasks: dict[str, list[float]] = defaultdict(list)
+        self._begun: dict[int, float] = {}
+        self._ask, self._ended = Blocks.ask, Blocks.ended
+
+    def __enter__(self) -> Watched:
+        def ask(plan: Blocks) -> Ask | None:
+            found = self._ask(plan)
+            if found is not None:
+                self._begun[id(found)] = time.monotonic()
+            return found
+
+        def ended(plan: Blocks, found: Ask, outcome: Any) -> None:
+            self.tasks[found.kind].append(time.monotonic() - self._begun.pop(id(found)))
+            self._ended(plan, found, outcome)
+
+        Blocks.ask, Blocks.ended = ask, ended  # type: ignore[method-assign]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        Blocks.ask, Blocks.ended = self._ask, self._ended  # type: ignore[method-assign]
+
+
+def write_data(folder: Path, steps: int) -> None:
+    """A plate that turns, moves and stretches; no reference is left."""
+    images = (
+        scenes.capture(
+            scenes.plate(0.1 * n, np.array([0.01, -0.006, 0.004]) * n, np.diag([1 + 4e-4 * n, 1 - 2e-4 * n])), seed=n
+        )
+        for n in range(steps)
+    )
+    write_test_of(folder / "tests" / "t000001-abcdef", scenes.rig().pair, images)
+
+
+def measured(data: Path, cluster: Cluster, spacing_px: int, steps: int) -> tuple[Run, list[dict[str, Any]]]:
+    """Measure the test on the cluster; return what it took, and the results."""
+    body = {"region": {"rectangle": REGION}, "subset_px": 33, "spacing_px": spacing_px}
+    host = Host(data, f'[compute]\nscheduler = "{cluster.address}"')
+    try:
+        processes = [psutil.Process(worker.pid) for worker in cluster.workers]
+        wait_for_job(host.client, begin(host.client, URL, **body, steps=[1])[1])  # kernels are loaded now
+        with Watched() as watched:
+            busy, own, began = [_busy_s(p) for p in processes], _own_s(), time.monotonic()
+            url, job = begin(host.client, URL, **body)
+            done = wait_for_job(host.client, job, seconds=3600.0)
+            wall_s, service_s = time.monotonic() - began, _own_s() - own
+        if done["state"] != "succeeded":
+            raise RuntimeError(str(done["problem"]))
+        found = [contents(folder_of(host, url) / f"step_{n:04d}.nc") for n in range(steps)]
+        used = [_busy_s(p) - b for p, b in zip(processes, busy, strict=True)]
+        points = int((found[0]["status"] == 0).sum())
+        return Run(len(processes), wall_s, service_s, used, dict(watched.tasks), steps - 1, points), found
+    finally:
+        host.close()
+
+
+def _busy_s(process: psutil.Process) -> float:
+    return float(sum(process.cpu_times()[:2]))
+
+
+def _own_s() -> float:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def difference(one: list[dict[str, Any]], two: list[dict[str, Any]]) -> tuple[float, int]:
+    """Return the largest difference of a displacement over its standard deviation, and the points with another status."""
+    worst, changed = 0.0, 0
+    for a, b in zip(one[1:], two[1:], strict=True):
+        changed += int((a["status"] != b["status"]).sum())
+        for name in "uvw":
+            off = np.abs(a[f"{name}_mm"] - b[f"{name}_mm"]) / a[f"sigma_{name}_mm"]
+            worst = max(worst, float(np.nanmax(off)))
+    return worst, changed
+
+
+def main() -> int:
+    """Measure, simulate, write the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=int, default=65, help="steps of the measured test, the reference among them")
+    parser.add_argument("--spacing", type=int, default=4, help="distance of points, px")
+    parser.add_argument("--dry", action="store_true", help="print the figures, write no page")
+    args = parser.parse_args()
+    before = os.getloadavg()[0]
+    runs, results = [], []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_data(folder / "data", args.steps)
+        size = sum(p.stat().st_size for p in (folder / "data").rglob("0001/*.tif"))
+        for workers in (1, 2):
+            with cluster_of(workers, folder) as cluster:
+                cluster.await_workers(workers)
+                run, found = measured(folder / "data", cluster, args.spacing, args.steps)
+            runs.append(run)
+            results.append(found)
+            print(json.dumps(asdict(run)), flush=True)
+        result = folder / "data" / "tests" / "t000001-abcdef" / "analyses"
+        size += max(p.stat().st_size for p in result.rglob("step_0001.nc"))
+    worst, changed = difference(*results)
+    times = costs(runs)
+    overhead = dask_overhead(ASKED_WORKERS, times["step"], size)
+    simulated = [
+        simulate(SIMULATED_STEPS, w, times, runs[1].service_s / args.steps, overhead) for w in SIMULATED_WORKERS
+    ]
+    changes = [
+        simulate(SIMULATED_STEPS, ASKED_WORKERS, times, runs[1].service_s / args.steps, overhead, changes=count)
+        for count in (1, 3)
+    ]
+    load = (before, os.getloadavg()[0])
+    figures = Figures(args.steps, load, runs, worst, changed, size, overhead, simulated, changes)
+    print(json.dumps({**asdict(figures), "runs": len(runs)}), flush=True)
+    if not args.dry:
+        write_page(figures, times)
+    return 0
+
+
+def costs(runs: list[Run]) -> dict[str, float]:
+    """Processor time of each kind of task on its worker, s: of a step from the chain, of others in proportion to their wall time."""
+    chain, blocks = runs
+    step = sum(chain.busy_s) / chain.steps
+    wall = {kind: float(np.median(found)) for kind, found in blocks.tasks.items()}
+    return {kind: step * wall[kind] / wall["step"] for kind in ("step", "head", "joint")}
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
