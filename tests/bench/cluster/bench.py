@@ -11,6 +11,7 @@ import argparse
 import json
 import os
 import resource
+import shutil
 import tempfile
 import time
 from collections import defaultdict
@@ -21,6 +22,8 @@ from typing import Any
 import numpy as np
 import psutil
 
+from server.worker.executor import TaskExecutor, TaskFuture
+from server.worker.tasks import StepTask
 from server.workflows.analysis.blocks import Ask, Blocks
 from tests.bench.cluster.page import write_page
 from tests.bench.cluster.scheduler import Overhead, Simulated, dask_overhead, simulate
@@ -35,6 +38,7 @@ REGION = [110, 100, 410, 380]
 SIMULATED_WORKERS = (1, 2, 4, 8, 16, 32, 64, 128)
 SIMULATED_STEPS = 2048
 ASKED_WORKERS = 64
+INSTANT_STEPS = 512
 
 
 @dataclass
@@ -70,6 +74,7 @@ class Figures:
     worst_sigma: float
     status_changed: int
     bytes_a_task: int
+    service_s: float
     overhead: Overhead
     simulated: list[Simulated]
     changed: list[Simulated] = field(default_factory=list)
@@ -118,13 +123,12 @@ def measured(data: Path, cluster: Cluster, spacing_px: int, steps: int) -> tuple
     host = Host(data, f'[compute]\nscheduler = "{cluster.address}"')
     try:
         processes = [psutil.Process(worker.pid) for worker in cluster.workers]
-        wait_for_job(host.client, begin(host.client, URL, **body, steps=[1])[1])  # kernels are loaded now
+        alone = {"start_from": "reference", "steps": [1, 2, 3, 4]}
+        wait_for_job(host.client, begin(host.client, URL, **body, **alone)[1])  # all have loaded their kernels now
         with Watched() as watched:
             busy, own, began = [_busy_s(p) for p in processes], _own_s(), time.monotonic()
             url, job = begin(host.client, URL, **body)
-            # seldom: who waits asks the service, whose time is measured
-            while (done := host.client.get(f"{API}/jobs/{job['id']}").json())["state"] in ("queued", "running"):
-                time.sleep(2.0)
+            done = wait_for_end(host, job)
             wall_s, service_s = time.monotonic() - began, _own_s() - own
         if done["state"] != "succeeded":
             raise RuntimeError(str(done["problem"]))
@@ -134,6 +138,57 @@ def measured(data: Path, cluster: Cluster, spacing_px: int, steps: int) -> tuple
         return Run(len(processes), wall_s, service_s, used, dict(watched.tasks), steps - 1, points), found
     finally:
         host.close()
+
+
+class Instant(TaskExecutor):
+    """Workers that have done at once what they are asked, so that what is left is the service's own work."""
+
+    width = ASKED_WORKERS
+
+    def __init__(self, summary: dict[str, Any]) -> None:
+        self._summary = summary
+        self.tasks = 0
+
+    def submit(self, _fn: Any, /, *args: Any, **_kwargs: Any) -> TaskFuture:
+        """Answer with a summary of the step that was asked for."""
+        task: StepTask = args[0]
+        self.tasks += 1
+        future = TaskFuture()
+        future.set_result({**self._summary, "n": task.step.n, "step": task.step.n, "agrees": True})
+        return future
+
+
+def service_cost(data: Path, folder: Path, steps: int) -> float:
+    """Return the service's processor time per task, s, with as many steps and workers that answer at once."""
+    test = folder / "tests" / "t000001-abcdef"
+    shutil.copytree(data / "tests" / "t000001-abcdef", test, ignore=shutil.ignore_patterns("analyses"))
+    (test / "analyses").mkdir()
+    there = len(list((test / "steps").iterdir()))
+    for n in range(there, steps + 1):
+        shutil.copytree(test / "steps" / f"{n % (there - 1) + 1:04d}", test / "steps" / f"{n:04d}")
+        mark = test / "steps" / f"{n:04d}" / "step.json"
+        mark.write_text(json.dumps({**json.loads(mark.read_text()), "n": n}))
+    summaries = sorted((data / "tests").rglob("step_0001.json"))
+    host = Host(folder, "")
+    try:
+        executor = Instant(json.loads(summaries[-1].read_text()))
+        host.service.executor = executor
+        own = _own_s()
+        _, job = begin(host.client, URL, region={"rectangle": REGION}, subset_px=33, spacing_px=8)
+        if wait_for_end(host, job)["state"] != "succeeded":
+            raise RuntimeError("the service's own work could not be measured")
+        return (_own_s() - own) / executor.tasks
+    finally:
+        host.close()
+
+
+def wait_for_end(host: Host, job: dict[str, Any]) -> dict[str, Any]:
+    """Wait for a job, asking seldom: who waits asks the service, whose time is measured."""
+    while True:
+        found: dict[str, Any] = host.client.get(f"{API}/jobs/{job['id']}").json()
+        if found["state"] not in ("queued", "running"):
+            return found
+        time.sleep(2.0)
 
 
 def _busy_s(process: psutil.Process) -> float:
@@ -178,20 +233,16 @@ def main() -> int:
             runs.append(run)
             results.append(found)
             print(json.dumps(asdict(run)), flush=True)
+        service_s = service_cost(folder / "data", folder / "instant", INSTANT_STEPS)
         result = folder / "data" / "tests" / "t000001-abcdef" / "analyses"
         size += max(p.stat().st_size for p in result.rglob("step_0001.nc"))
     worst, changed = difference(*results)
     times = costs(runs)
     overhead = dask_overhead(ASKED_WORKERS, times["step"], size)
-    simulated = [
-        simulate(SIMULATED_STEPS, w, times, runs[1].service_s / args.steps, overhead) for w in SIMULATED_WORKERS
-    ]
-    changes = [
-        simulate(SIMULATED_STEPS, ASKED_WORKERS, times, runs[1].service_s / args.steps, overhead, changes=count)
-        for count in (1, 3)
-    ]
+    simulated = [simulate(SIMULATED_STEPS, w, times, service_s, overhead) for w in SIMULATED_WORKERS]
+    changes = [simulate(SIMULATED_STEPS, ASKED_WORKERS, times, service_s, overhead, changes=count) for count in (1, 3)]
     load = (before, os.getloadavg()[0])
-    figures = Figures(args.steps, load, runs, worst, changed, size, overhead, simulated, changes)
+    figures = Figures(args.steps, load, runs, worst, changed, size, service_s, overhead, simulated, changes)
     print(json.dumps({**asdict(figures), "runs": len(runs)}), flush=True)
     if not args.dry:
         write_page(figures, times)

@@ -75,8 +75,9 @@ def write_page(figures: Figures, times: dict[str, float]) -> None:
         wrapped(
             "The same plan, asked for work by up to 128 simulated workers. Tasks take the processor time measured "
             f"above: a step {times['step']:.3f} s, a head {times['head']:.3f} s, a joint {times['joint']:.3f} s. Service "
-            "and scheduler are one queue: the service's processor time per step as measured above "
-            f"({1e3 * two.service_s / figures.steps:.1f} ms), and per task {1e3 * figures.overhead.serial_s:.1f} ms of "
+            "and scheduler are one queue: the service's own processor time per task, "
+            f"{1e3 * figures.service_s:.1f} ms as measured with workers that answer at once, and per task "
+            f"{1e3 * figures.overhead.serial_s:.1f} ms of "
             f"Dask's scheduler and client with {1e3 * figures.overhead.latency_s:.0f} ms of latency, measured on a real "
             f"scheduler with {figures.overhead.workers} workers in one process whose {figures.overhead.tasks} tasks "
             f"sleep as long as a step takes and carry {figures.bytes_a_task / 2**20:.1f} MiB, what a step's images and "
