@@ -26,7 +26,8 @@ from server.store.tests import StepFiles
 from server.worker.dask_cluster import ClusterError
 from server.worker.executor import WorkerDiedError
 from server.worker.tasks import StepTask, measure_step
-from server.workflows.analysis.blocks import Blocks, Outcome
+from server.workflows.analysis.block import Outcome
+from server.workflows.analysis.blocks import Blocks
 from server.workflows.analysis.side_by_side import goes_in_blocks, is_certain, measure_in_blocks
 from server.workflows.analysis.tasks import is_independent, task_of
 from server.workflows.camera_identity import check_same_cameras

@@ -13,7 +13,8 @@ from server.jobs.job import Job
 from server.store.documents import AnalysisRecord, StepOutcome
 from server.worker.executor import TaskFuture
 from server.worker.tasks import StepTask, measure_step
-from server.workflows.analysis.blocks import SHORTEST, Ask, Blocks, Outcome
+from server.workflows.analysis.block import Ask, Outcome
+from server.workflows.analysis.blocks import SHORTEST, Blocks
 from server.workflows.analysis.tasks import task_of
 from server.workflows.service import Service
 from server.workflows.waiting import SideBySide

@@ -24,7 +24,8 @@ import psutil
 
 from server.worker.executor import TaskExecutor, TaskFuture
 from server.worker.tasks import StepTask
-from server.workflows.analysis.blocks import Ask, Blocks
+from server.workflows.analysis.block import Ask
+from server.workflows.analysis.blocks import Blocks
 from tests.bench.cluster.page import write_page
 from tests.bench.cluster.scheduler import Overhead, Simulated, dask_overhead, simulate
 from tests.support import sequence_bench as scenes

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from core.errors import SeedError
-from server.workflows.analysis.blocks import LONGEST, Ask, Blocks
+from server.workflows.analysis.block import Ask
+from server.workflows.analysis.blocks import LONGEST, Blocks
 
 _TASKS_A_WORKER = 6
 
