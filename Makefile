@@ -15,7 +15,7 @@ ARGS ?=
 # only compile the same kernels again
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n > 3 ? 4 : n + 1)))
 
-.PHONY: help wheel demo quick test test-deep serve check check-page kernels bench format accuracy coverage fuzz load years soak openapi reference docs torture powerloss livebench pagespeed pagepictures clean
+.PHONY: help wheel demo quick test test-deep serve check check-page kernels bench format accuracy coverage fuzz load years soak openapi reference docs torture powerloss livebench clusterbench pagespeed pagepictures clean
 
 help:
 	@echo "make demo    start the service on the simulated paper rig and run the plate experiment over HTTP"
@@ -25,6 +25,7 @@ help:
 	@echo "make serve   start the service on the simulated paper rig (ARGS='--config FILE --port N')"
 	@echo "make check   lint, format check, types, import walls, docstrings; lint and types of the page's scripts"
 	@echo "make bench   time everything on this machine, beside pyvale, and write docs/explanation/performance.md (ARGS=--quick: a few minutes)"
+	@echo "make clusterbench  a long test on one and two workers, and on 64 simulated ones; writes docs/explanation/cluster.md (ARGS='--steps N')"
 	@echo "make load    ten minutes of captures, readers, slow streams, analyses and stops; writes docs/explanation/reliability.md (ARGS='--minutes N')"
 	@echo "make torture  kill the service 1,000 times at work, look each time that nothing is lost, write docs/explanation/reliability.md (ARGS='--kills N')"
 	@echo "make powerloss  open 100,000 states in which a lost power may leave the data folder, write docs/explanation/reliability.md (ARGS='--states N')"
@@ -120,6 +121,9 @@ bench: $(STAMP) $(PEER_STAMP)
 # a live measurement's latency, ten minutes; ARGS="--minutes 1" for less
 livebench: $(STAMP)
 	$(BIN)/python -m tests.bench.live.live --page $(ARGS)
+
+clusterbench: $(STAMP)
+	$(BIN)/python -m tests.bench.cluster.bench $(ARGS)
 
 accuracy: $(STAMP)
 	$(BIN)/python -m tests.bench.accuracy.accuracy $(ARGS)

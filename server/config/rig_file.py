@@ -445,6 +445,13 @@ class ComputeSection(_Closed):
         description="Way a cluster's workers get images: by path, where they see the data folder under the same name, "
         "or sent with each step.",
     )
+    tasks_at_once: int | None = Field(
+        None,
+        ge=1,
+        le=4096,
+        description="Tasks that the cluster gets at once, where it adds workers while tasks wait: as many as it may "
+        "grow to. Left out: as many as it has workers.",
+    )
     threads_per_worker: int = Field(
         1, ge=1, le=256, description="Kernel threads of each of the cluster's workers, or of each of `processes`."
     )

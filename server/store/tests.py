@@ -536,6 +536,10 @@ class TestStore:
         for path in (*folder.glob("starts_[0-9]*.npz"), *folder.glob("head_*")):
             path.unlink(missing_ok=True)
 
+    def has_heads(self, test_id: str, analysis_id: str) -> bool:
+        """Return True if steps of an unfinished analysis were measured in blocks."""
+        return next(self.analysis_path(test_id, analysis_id).glob("head_[0-9]*.nc"), None) is not None
+
     def drop_half_written(self, test_id: str, analysis_id: str) -> list[Path]:
         """Remove the remains of a result of a worker that was ended: half a file, a checksum without its result.
 

@@ -44,7 +44,7 @@ _KNOWN = {
     "test": r"(test|calibration|watch|workspace|certificate_plan)\.json|calibrations|steps|analyses|exports|models",
     "step": r"step\.json|cam[12]\.tif",
     "analysis": r"(analysis|jobs|noise|summary)\.json|mask\.png|step_\d+\.(nc|nc\.sha256|json)|starts_\d+\.npz|"
-    r"head_\d+\.nc|head_starts_\d+\.npz",
+    r"head_\d+\.nc(\.sha256)?|head_starts_\d+\.npz",
 }
 _WRITING_S = 1.0  # longer than a file is under way
 _FOLDERS = frozenset({"calibrations", "tests", "noise", "recipes", "certificates", "trash", ".exports"})

@@ -64,6 +64,8 @@ class ClusterExecutor(TaskExecutor):
         ``path``: workers see the service's data folder under the same path. ``scatter``: files travel with the step.
     threads
         Kernel threads of each worker.
+    at_least
+        Number of tasks to be given to it at once, however few workers it has now: one that grows while tasks wait.
 
     Raises
     ------
@@ -71,7 +73,7 @@ class ClusterExecutor(TaskExecutor):
         ``dask_missing`` when Dask is not installed.
     """
 
-    def __init__(self, scheduler: str, *, images: Images = "path", threads: int = 1) -> None:
+    def __init__(self, scheduler: str, *, images: Images = "path", threads: int = 1, at_least: int = 1) -> None:
         try:
             import distributed
         except ImportError as error:
@@ -84,6 +86,7 @@ class ClusterExecutor(TaskExecutor):
         self._scheduler = scheduler
         self._images = images
         self._threads = threads
+        self._at_least = at_least
         self._topic = f"stereorig-{secrets.token_hex(6)}"
         self._lock = threading.Lock()
         self._client: Any = None
@@ -113,11 +116,11 @@ class ClusterExecutor(TaskExecutor):
 
     @property
     def width(self) -> int:
-        """Number of tasks that run at once: one a worker."""
+        """Number of tasks that run at once: one a worker, or as many as it is to have."""
         if time.monotonic() > self._count_again:
             self._count_again = time.monotonic() + _COUNT_S
             self._workers = len(self._connected().scheduler_info(n_workers=-1)["workers"])
-        return max(1, self._workers)
+        return max(self._at_least, self._workers)
 
     def _on_event(self, event: tuple[Any, dict[str, Any]]) -> None:
         report = event[1]

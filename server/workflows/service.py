@@ -97,7 +97,10 @@ class Service:
         self.executor: TaskExecutor = self.worker  # of analyses
         if config.compute.scheduler is not None:
             self.executor = ClusterExecutor(
-                config.compute.scheduler, images=config.compute.images, threads=config.compute.threads_per_worker
+                config.compute.scheduler,
+                images=config.compute.images,
+                threads=config.compute.threads_per_worker,
+                at_least=config.compute.tasks_at_once or 1,
             )
         elif config.compute.processes > 1:
             threads = config.compute.threads_per_worker

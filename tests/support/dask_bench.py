@@ -67,6 +67,13 @@ class Cluster:
         self.workers.append(worker)
         return worker
 
+    def await_workers(self, count: int, seconds: float = 120.0) -> None:
+        """Wait until so many workers are known to the scheduler."""
+        import distributed
+
+        with distributed.Client(self.address, set_as_default=False) as client:  # type: ignore[no-untyped-call]
+            client.wait_for_workers(count, timeout=seconds)
+
     def close(self) -> None:
         for process in [*self.workers, self._scheduler]:
             process.kill()

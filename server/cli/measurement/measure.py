@@ -41,6 +41,7 @@ from server.formats.calibrations.recognise import LoadedCalibration, load_calibr
 from server.formats.files import write_bytes
 from server.formats.images import read_mask
 from server.formats.noise_json import load_noise
+from server.formats.object_storage import copied
 from server.formats.results.reading import read_head
 from server.formats.results.summary import to_json
 from server.results.gauges import FRAME_HELP
@@ -55,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     add = parser.add_argument
     add("folder", nargs="?", metavar="FOLDER", help="a test's folder: steps/<nnnn>/cam1.tif ..., calibration.json")
-    add("--cam1", nargs="+", metavar="GLOB", help="camera 1's images: a quoted pattern or several paths")
+    add("--cam1", nargs="+", metavar="GLOB", help="camera 1's images: a quoted pattern, several paths, or s3://...")
     add("--cam2", nargs="+", metavar="GLOB", help="camera 2's images; files are paired in sorted order")
     add(
         "--calibration",
@@ -242,7 +243,8 @@ def _pairs(args: argparse.Namespace, progress: ProgressLine) -> list[ImagePair]:
             raise _missing(f"--{option}")
     lists = []
     for option in ("cam1", "cam2"):
-        files, note = expand(f"--{option}", getattr(args, option))
+        items = copied(f"--{option}", getattr(args, option), Path(args.out) / "images" / option)
+        files, note = expand(f"--{option}", items)
         lists.append(files)
         if note:
             progress.note(f"note: {note}")

@@ -15,7 +15,7 @@ FORMAT = 1
 MANIFEST = "stereorig-bundle.json"
 CRATE = "ro-crate-metadata.json"
 #: files that only an unfinished analysis needs, and that go when it is finished
-UNFINISHED = re.compile(r"analyses/[^/]+/(starts_\d+\.npz|head_\d+\.nc|head_starts_\d+\.npz)")
+UNFINISHED = re.compile(r"analyses/[^/]+/(starts_\d+\.npz|head_\d+\.nc(\.sha256)?|head_starts_\d+\.npz)")
 
 _ID = r"\d{6}-[0-9a-f]{6}"
 #: names below the test's folder; nothing else ever becomes a path

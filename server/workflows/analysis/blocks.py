@@ -12,75 +12,16 @@ Decisions only: what is to be measured next, and what follows from an outcome. N
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Literal
 
 from core.errors import StereorigError
 from server.worker.tasks import Earlier
-
-Summary = Mapping[str, object]
-Outcome = Summary | StereorigError
-Kind = Literal["head", "step", "joint", "again"]
+from server.workflows.analysis.block import Ask, Block, Kind, Outcome, Summary, agrees, reference_of
 
 #: a head and a joint cost two to four steps
 SHORTEST = 4
-#: a change of the reference in a block is what later ones wait for
-LONGEST = 32
-
-
-@dataclass(frozen=True, eq=False)
-class Ask:
-    """A measurement that can be done now.
-
-    Attributes
-    ----------
-    block, kind, n
-        For which block, what, and the step.
-    previous
-        Step that gives the start values, None of a head; ``from_head``: as the head of its block measured it.
-    against
-        Of a head: the reference.
-    compared
-        What the measurement is held against.
-    references
-        Steps that have been references so far, the first one not among them.
-    generation
-        Larger once results have been replaced.
-    """
-
-    block: _Block
-    kind: Kind
-    n: int
-    previous: int | None
-    from_head: bool
-    against: int | None
-    compared: Earlier | None
-    references: tuple[int, ...]
-    generation: int
-
-
-@dataclass(eq=False)
-class _Block:
-    steps: list[int]
-    against: int | None  # reference of its head; None: it goes on where the block before ends
-    head: Literal["none", "open", "there", "missing"] = "none"
-    joint: Literal["none", "open", "through"] = "none"
-    compared: Earlier | None = "head"
-    at: int = 0  # index of the step to be measured next
-    again: int | None = None  # index of the step to be measured again next
-    at_least: int = 0  # index before which agreement does not end that: an earlier round was to go on there
-    running: Ask | None = None
-    stale: bool = False  # the step before the one that runs was replaced
-    outcomes: dict[int, Outcome] = field(default_factory=dict)
-
-    @property
-    def through(self) -> bool:
-        """True if all its steps are measured, and none again."""
-        return self.at == len(self.steps) and self.again is None
-
-    def good(self, n: int) -> bool:
-        """Return True if a step is measured."""
-        return n in self.outcomes and not isinstance(self.outcomes[n], StereorigError)
+#: what is certain grows block by block
+LONGEST = 64
 
 
 class Blocks:
@@ -117,19 +58,19 @@ class Blocks:
         self._busy: set[int] = set()
         known = dict(known or {})
         length = min(max(-(-len(order) // max(width, 1)), SHORTEST), LONGEST)
-        self._blocks: list[_Block] = []
+        self._blocks: list[Block] = []
         for run in _runs(order, known):
             if run[0] in known:
                 outcomes: dict[int, Outcome] = {n: known[n] for n in run}
-                reference = _reference_of(known[run[0]], first)
-                block = _Block(run, reference, "there", "open", "step", at=len(run), outcomes=outcomes)
+                reference = reference_of(known[run[0]], first)
+                block = Block(run, reference, "there", "open", "step", at=len(run), outcomes=outcomes)
                 self._blocks.append(block)
-                reference = _reference_of(known[run[-1]], first)
+                reference = reference_of(known[run[-1]], first)
             else:
                 for start in range(0, len(run), length):
                     whole = self._blocks and len(run) - start >= SHORTEST
                     head: Literal["none", "open"] = "open" if whole else "none"
-                    self._blocks.append(_Block(run[start : start + length], reference, head))
+                    self._blocks.append(Block(run[start : start + length], reference, head))
                     if start + length < len(run) < start + length + SHORTEST:  # too short for one of its own
                         self._blocks[-1].steps += run[start + length :]
                         break
@@ -145,7 +86,14 @@ class Blocks:
         return sum(b.at for b in self._blocks)
 
     def ask(self) -> Ask | None:
-        """Return what can be measured now, the earliest first; None if nothing can before another one has ended."""
+        """Return what can be measured now, the earliest first; None if nothing can before another one has ended.
+
+        Whoever asks has nothing to do: where no block has work, the one with the most steps left is cut in two.
+        """
+        found = self._next()
+        return self._next() if found is None and self._cut() else found
+
+    def _next(self) -> Ask | None:
         for i, block in enumerate(self._blocks):
             if block.running is None:
                 ask = self._of(i, block)
@@ -179,7 +127,7 @@ class Blocks:
         elif ask.kind == "joint":
             block.joint = "through"
             self._put(i, ask.n, outcome)
-            agreed = _agrees(outcome)
+            agreed = agrees(outcome)
             if not agreed:
                 self._generation += 1
                 block.again = 1 if block.at > 1 else None
@@ -190,7 +138,7 @@ class Blocks:
             assert block.again is not None
             block.again += 1
             self._put(i, ask.n, outcome)
-            agreed = _agrees(outcome)
+            agreed = agrees(outcome)
             if not agreed:
                 self._replaced(i, ask.n)
             if block.stale:
@@ -213,9 +161,25 @@ class Blocks:
             if not block.through or block.head == "open":
                 return
 
+    def _cut(self) -> bool:
+        """Make a block of its own of the last steps of another one; return False if all are short."""
+        left = [len(b.steps) - b.at if b.at > 0 or b.running is not None else 0 for b in self._blocks]
+        i = left.index(max(left))
+        if left[i] < 2 * SHORTEST + 1:
+            return False
+        block = self._blocks[i]
+        half = len(block.steps) - left[i] // 2
+        steps, block.steps = block.steps[half:], block.steps[:half]
+        measured = [n for n in block.steps if block.good(n)]
+        reference = self._reference_before(i, block.steps[block.at])
+        if measured:
+            reference = reference_of(block.outcomes[measured[-1]], self._first)
+        self._blocks.insert(i + 1, Block(steps, reference, "open"))
+        return True
+
     # what can be done ------------------------------------------------------------------------------------------
 
-    def _of(self, i: int, block: _Block) -> Ask | None:
+    def _of(self, i: int, block: Block) -> Ask | None:
         through_before = all(b.through for b in self._blocks[max(i - 1, 0) : i])
         if block.again == 0 and not through_before:
             return None
@@ -234,7 +198,7 @@ class Blocks:
 
     def _make(
         self,
-        block: _Block,
+        block: Block,
         kind: Kind,
         n: int,
         *,
@@ -260,11 +224,11 @@ class Blocks:
         """Take an outcome; if the step went over to a later reference, later blocks begin anew from that."""
         block, old = self._blocks[i], set()
         if block.good(n):
-            old.add(_reference_of(block.outcomes[n], self._first))
+            old.add(reference_of(block.outcomes[n], self._first))
         block.outcomes[n] = outcome
         if isinstance(outcome, StereorigError):
             return
-        reference = _reference_of(outcome, self._first)
+        reference = reference_of(outcome, self._first)
         old.add(self._reference_before(i, n))
         if reference not in (self._first, *self._references):
             self._references.append(reference)
@@ -281,13 +245,13 @@ class Blocks:
         last = own[-1] if own else self._good_before(i, 0)
         for one in self._blocks:
             if one.good(last):
-                return _reference_of(one.outcomes[last], self._first)
+                return reference_of(one.outcomes[last], self._first)
         return self._reference
 
     def _begin_anew(self, i: int, old: set[int], reference: int) -> None:
         anew = [k for k in range(i + 1, len(self._blocks)) if self._blocks[k].against in old]
         for k in anew:
-            self._blocks[k] = _Block(self._blocks[k].steps, reference, "open")
+            self._blocks[k] = Block(self._blocks[k].steps, reference, "open")
         for k in anew:
             self._if_last(k)
 
@@ -310,7 +274,7 @@ class Blocks:
         elif alone and after.at > 0:
             self._from_start(after)
 
-    def _from_start(self, block: _Block) -> None:
+    def _from_start(self, block: Block) -> None:
         """Measure a block without a head again, since the step before it was replaced."""
         if block.again is not None:
             block.at_least = max(block.at_least, block.again + 1)
@@ -328,12 +292,3 @@ def _runs(order: Sequence[int], known: Mapping[int, Summary]) -> Iterator[list[i
         run.append(n)
     if run:
         yield run
-
-
-def _reference_of(outcome: Outcome, first: int) -> int:
-    found = None if isinstance(outcome, StereorigError) else outcome.get("reference_step")
-    return first if found is None else int(str(found))
-
-
-def _agrees(outcome: Outcome) -> bool:
-    return not isinstance(outcome, StereorigError) and bool(outcome.get("agrees"))

@@ -7,17 +7,14 @@ measures each step from the same steps before it in any case.
 from __future__ import annotations
 
 import contextlib
-import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
-from dataclasses import replace
 from typing import Any
 
 from core.errors import Cancelled, MeasurementError, StereorigError, StorageError
 from server.base.json_values import without_nan
 from server.base.problem import problem_of
-from server.formats.results.settings import stored_settings
 from server.formats.results.summary import SequenceSummary
 from server.formats.version import software_version
 from server.jobs.job import Job, Waiting
@@ -27,13 +24,15 @@ from server.store.folder import now_utc
 from server.store.indexing.entries import analysis_entry
 from server.store.tests import StepFiles
 from server.worker.dask_cluster import ClusterError
-from server.worker.executor import TaskFuture, WorkerDiedError
+from server.worker.executor import WorkerDiedError
 from server.worker.tasks import StepTask, measure_step
-from server.workflows.analysis.blocks import SHORTEST, Ask, Blocks, Outcome
+from server.workflows.analysis.block import Outcome
+from server.workflows.analysis.blocks import Blocks
+from server.workflows.analysis.side_by_side import goes_in_blocks, is_certain, measure_in_blocks
 from server.workflows.analysis.tasks import is_independent, task_of
 from server.workflows.camera_identity import check_same_cameras
 from server.workflows.service import Service
-from server.workflows.waiting import SideBySide, run_side_by_side, run_task
+from server.workflows.waiting import run_side_by_side, run_task
 
 
 class StepsFailedError(MeasurementError):
@@ -135,7 +134,7 @@ class AnalysisRun:
         if is_independent(self._document):
             self._measure_side_by_side(job)
             return
-        if self._in_blocks():
+        if goes_in_blocks(self._service, self._document, steps[self._next :], self._summaries):
             self._measure_in_blocks(job)
             return
         while self._next < len(steps):
@@ -169,21 +168,13 @@ class AnalysisRun:
             return
         self._note(job, n, summary, time.monotonic() - started)
 
-    def _in_blocks(self) -> bool:
-        """Return True if what is left is measured in blocks side by side, see :class:`Blocks`."""
-        steps, settings = self._document.steps[self._next :], stored_settings(self._document.settings)
-        if settings.side_by_side == "never" or settings.reference_update == "always":
-            return False
-        left = [n for n in steps if n not in self._summaries and n != self._document.steps[0]]
-        return len(left) >= 2 * SHORTEST and self._service.executor.width > 1
-
     def _measure_in_blocks(self, job: Job) -> None:
         """Measure steps that follow one another in blocks, several at once."""
         steps = self._document.steps
-        while self._next < len(steps) and (self._next == 0 or steps[self._next] in self._summaries):
+        while self._next < len(steps) and (self._next == 0 or is_certain(self._summaries.get(steps[self._next]))):
             self._measure_next(job)  # the reference, and what goes on without a gap
-        references = [found.plain().get("reference_step") for n, found in self._summaries.items() if n in self._done]
-        later = [int(str(n)) for n in dict.fromkeys(references) if n is not None and n != steps[0]]
+        before = [self._summaries[n].plain().get("reference_step") for n in self._done]
+        later = [int(str(n)) for n in dict.fromkeys(before) if n is not None and n != steps[0]]
         order = steps[self._next :]
         plan = Blocks(
             order,
@@ -194,66 +185,28 @@ class AnalysisRun:
             references=later,
             known={n: self._summaries[n].plain() for n in order if n in self._summaries},
         )
-        shares: dict[int, float] = {}
-        certain = 0
 
-        def progress(number: int, phase: str, share: float) -> None:  # noqa: ARG001
-            shares[number] = share
-            done = self._next + plan.ahead + sum(shares.values())
-            job.progress(f"{len(shares)} steps at once", round(1000 * min(done, len(steps))), 1000 * len(steps))
+        def prepare(n: int) -> None:
+            self._service.require_room()
+            self._check_cameras(n)
 
-        with SideBySide(self._service.executor, job, progress) as side:
-            asked: dict[TaskFuture, tuple[Ask, float]] = {}
-            while not plan.through:
-                while side.has_room and (ask := plan.ask()) is not None:
-                    self._service.require_room()
-                    try:
-                        self._check_cameras(ask.n)
-                        task = self._task_of(ask)
-                    except StereorigError as error:
-                        self._raise_what_ends_all(ask.n, error)
-                        plan.ended(ask, error)
-                        continue
-                    asked[side.submit(ask.n, measure_step, task)] = ask, time.monotonic()
-                for n, future in side.ended():
-                    shares.pop(n, None)
-                    ask, started = asked.pop(future)
-                    plan.ended(ask, self._outcome(n, future, time.monotonic() - started))
-                    for n, outcome in itertools.islice(plan.certain(), certain, None):
-                        certain += 1
-                        self._take(job, n, outcome)
-        self._next = len(steps)
+        def progress(measured: float) -> None:
+            done = min(self._next + measured, len(steps))
+            job.progress("steps side by side", round(1000 * done), 1000 * len(steps))
 
-    def _task_of(self, ask: Ask) -> StepTask:
-        tests = self._service.tests
-        needed = [n for n in ask.references if n != ask.previous] + ([] if ask.previous is None else [ask.previous])
-        earlier = {n: tests.step(self._test_id, n) for n in needed}
-        return replace(
-            task_of(tests, self._document, ask.n, earlier, None),
-            previous=ask.previous,
-            against=ask.against,
-            from_head=ask.from_head,
-            compared=ask.compared,
-            generation=ask.generation,
+        measure_in_blocks(
+            self._service, self._document, job, plan, prepare, self._raise_what_ends_all, self._take, progress
         )
-
-    def _outcome(self, n: int, future: TaskFuture, seconds: float) -> Outcome:
-        try:
-            return {**future.result(), "wall_s": seconds}
-        except StereorigError as error:
-            self._raise_what_ends_all(n, error)
-            return error
+        self._next = len(steps)
 
     def _take(self, job: Job, n: int, outcome: Outcome) -> None:
         """Note a step whose outcome is that of one after another."""
         if isinstance(outcome, StereorigError):
             self._summaries.pop(n, None)
             self._note_failure(job, n, outcome)
-        elif n in self._summaries and self._summaries[n].plain() == outcome:
-            self._done[n] = self._service.tests.step(self._test_id, n)  # measured in another run
         else:
             found = {name: value for name, value in outcome.items() if name != "agrees"}
-            self._note(job, n, found, float(str(found["wall_s"])))
+            self._note(job, n, found, float(str(found.get("wall_s") or 0.0)))
 
     def _measure_side_by_side(self, job: Job) -> None:
         """Measure steps that need no other than the reference, as many at once as there are workers."""

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from core.errors import MeasurementError, SeedError, StereorigError
-from server.workflows.analysis.blocks import LONGEST, Ask, Blocks
+from server.workflows.analysis.block import Ask
+from server.workflows.analysis.blocks import LONGEST, Blocks
 
 FIRST = 0
 

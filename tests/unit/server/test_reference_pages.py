@@ -36,7 +36,7 @@ def test_every_status_has_a_remedy_and_every_key_a_meaning() -> None:
 
 
 def test_the_options_named_for_settings_are_settings() -> None:
-    without = {"start_from"}  # of the service alone
+    without = {"start_from", "side_by_side"}  # of the service alone
     assert set(settings_pages.OPTIONS) == set(AnalysisSettings.model_fields) - without
 
 

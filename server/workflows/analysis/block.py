@@ -1,0 +1,82 @@
+"""A block of a sequence, and what a plan of blocks asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from core.errors import StereorigError
+from server.worker.tasks import Earlier
+
+Summary = Mapping[str, object]
+Outcome = Summary | StereorigError
+Kind = Literal["head", "step", "joint", "again"]
+
+
+@dataclass(frozen=True, eq=False)
+class Ask:
+    """A measurement that can be done now.
+
+    Attributes
+    ----------
+    block, kind, n
+        For which block, what, and the step.
+    previous
+        Step that gives the start values, None of a head; ``from_head``: as the head of its block measured it.
+    against
+        Of a head: the reference.
+    compared
+        What the measurement is held against.
+    references
+        Steps that have been references so far, the first one not among them.
+    generation
+        Larger once results have been replaced.
+    """
+
+    block: Block
+    kind: Kind
+    n: int
+    previous: int | None
+    from_head: bool
+    against: int | None
+    compared: Earlier | None
+    references: tuple[int, ...]
+    generation: int
+
+
+@dataclass(eq=False)
+class Block:
+    """Steps that follow one another, and how far they are."""
+
+    steps: list[int]
+    against: int | None  # reference of its head; None: it goes on where the block before ends
+    head: Literal["none", "open", "there", "missing"] = "none"
+    joint: Literal["none", "open", "through"] = "none"
+    compared: Earlier | None = "head"
+    at: int = 0  # index of the step to be measured next
+    again: int | None = None  # index of the step to be measured again next
+    at_least: int = 0  # index before which agreement does not end that: an earlier round was to go on there
+    running: Ask | None = None
+    stale: bool = False  # the step before the one that runs was replaced
+    outcomes: dict[int, Outcome] = field(default_factory=dict)
+
+    @property
+    def through(self) -> bool:
+        """True if all its steps are measured, and none again."""
+        return self.at == len(self.steps) and self.again is None
+
+    def good(self, n: int) -> bool:
+        """Return True if a step is measured."""
+        return n in self.outcomes and not isinstance(self.outcomes[n], StereorigError)
+
+
+def reference_of(outcome: Outcome, first: int) -> int:
+    """Return the reference that a step was matched against; the first one of a step that failed."""
+    found = None if isinstance(outcome, StereorigError) else outcome.get("reference_step")
+    return first if found is None else int(str(found))
+
+
+def agrees(outcome: Outcome) -> bool:
+    """Return True if what was measured from the same step before stands."""
+    return not isinstance(outcome, StereorigError) and bool(outcome.get("agrees"))
