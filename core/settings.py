@@ -57,6 +57,8 @@ SPACING_PX = Range(1, 1000, False, 10)
 STRAIN_WINDOW = Range(3, 101, True, 9)
 #: no default window: displacements are smoothed only on request
 SMOOTHING_WINDOW = Range(3, 51, True, 5)
+#: no default in a measurement: a dense field is made only on request; beyond 20 px it is no denser than a usual grid
+DENSE_STEP_PX = Range(1, 20, False, 2)
 #: a wider Gaussian would leave a handful of independent pixels in the subset
 PREFILTER_OF_SUBSET = 0.25
 #: beyond it a match is as likely one speckle off

@@ -1,0 +1,91 @@
+"""Arguments, work space and results of the kernels: named tuples, which numba supports."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from core.matching.kernels.given import ComparedImage, ReferenceImage
+
+
+class Lattice(NamedTuple):
+    """Points of the ordinary field and vectors between them.
+
+    Column and row of the first point, px; distance of points and of vectors, px; first column of vectors and the one after the last; points
+    beyond the field on each side.
+    """
+
+    x0: float
+    y0: float
+    spacing: float
+    step: int
+    first: int
+    last: int
+    rim: int
+
+
+class DenseGiven(NamedTuple):
+    """Images, cameras, prediction and settings.
+
+    ``blocked`` (rows, cols) uint8 of camera 1's image, 1 where a pixel does not count, or empty. ``nodes``, ``known``,
+    ``cells``: see :class:`core.dense.prediction.Prediction`. ``state`` (r, c, 5) w0, G00, G10, G20 and the epipolar
+    offset at the points. ``levels`` (1 + images,) grey levels that are taken off the images, so that sums keep their
+    digits. ``variances``: of the images' noise at weight 1, or all one.
+    """
+
+    reference: ReferenceImage
+    blocked: Any
+    images: tuple[ComparedImage, ...]
+    lens1: Any
+    lens2: Any
+    R: Any
+    t: Any
+    to_sys: Any
+    lattice: Lattice
+    nodes: Any
+    known: Any
+    cells: Any
+    state: Any
+    levels: Any
+    subset: int
+    order: int
+    variances: tuple[float, ...]
+    first_order: bool
+
+
+class DenseSpace(NamedTuple):
+    """Work space of a thread: rows of pixels in a ring, sums of columns, sums of windows, and small matrices."""
+
+    ring: Any
+    place: Any
+    values: Any
+    tap: Any
+    tx: Any
+    ty: Any
+    sums: Any
+    scratch: Any
+    windows: Any
+    gram: Any
+    inverse: Any
+    rhs: Any
+    levels: Any
+    weights: Any
+    normal: Any
+    small: Any
+
+
+class DenseOut(NamedTuple):
+    """Results over (rows, cols) vectors, NaN where there is none.
+
+    ``values`` (..., 6) position and displacement, mm, system frame; ``covariance`` (..., 21) its upper triangle for
+    noise of variance 1; ``epipolar`` px; ``zncc``, ``misfit`` (residual's squares per weight, reference grey levels),
+    ``moved`` (px of each image) (..., images); ``sigma`` px for noise of variance 1; ``status`` int8.
+    """
+
+    values: Any
+    covariance: Any
+    epipolar: Any
+    zncc: Any
+    misfit: Any
+    moved: Any
+    sigma: Any
+    status: Any

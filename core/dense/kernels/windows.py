@@ -1,0 +1,544 @@
+"""The vectors of a band of rows: warp once, sum once, one Gauss-Newton step each.
+
+Row by row of pixels, each image is interpolated where the prediction sees it, and the products that the normal
+equations need are added to the sums of columns, which run down the image over a window's height. Along a row of vectors
+these sums run over a window's width. Moments of x and y are taken about the image's corner and moved to each vector,
+all in double precision.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from core.dense.kernels import rows as q
+from core.dense.kernels.cameras import factor, invert_lower, positions
+from core.dense.kernels.given import DenseSpace
+from core.dense.kernels.rows import add_row, columns_of, interpolate_cubic, interpolate_quintic
+from core.matching.image import PAD
+from core.matching.kernels.naming import inner, kernel
+from core.matching.kernels.noise import CONTRAST, DENSITY, N_LEVELS, joint_weights
+from core.matching.kernels.point import LOW_TEXTURE, OK, OUTSIDE_IMAGE, SINGULAR, epipolar_shift
+from core.matching.kernels.vectors import LANES
+from core.matching.kernels.warp import undistort
+from core.status import PointStatus
+
+MASKED = int(PointStatus.MASKED)
+N_ROWS = 6
+"""Rows of a row of pixels before the images': counts, weight, f, gradients times weight, one over the weight."""
+_MIN_CONTRAST2 = 1e-6
+
+
+class DenseKernels(NamedTuple):
+    """The kernel of a band and the maker of its work space."""
+
+    band: Any
+    space: Callable[[int, int, int, int], DenseSpace]
+
+
+def x_moments(images: int) -> tuple[list[int], list[int]]:
+    """Return the sums of columns that are summed over a window times x, and those times x^2 too."""
+    once = [q.GXX, q.GXX + 1, q.GXY, q.GXY + 1, q.GYY, q.GYY + 1, q.GX, q.GY, q.FGX, q.FGY]
+    for k in range(images):
+        once += [q.FIRST + q.EACH * k + q.GGX, q.FIRST + q.EACH * k + q.GGY]
+    return once, [q.GXX, q.GXY, q.GYY]
+
+
+@inner
+def _along_row(nodes, row, t, image, cols, line):
+    """Values and slopes along x of one image's two coordinates at the points of a lattice row, ``t`` below ``row``."""
+    tt = t * t
+    h01 = tt * (3.0 - 2.0 * t)
+    h00 = 1.0 - h01
+    h10 = t * (1.0 - t) * (1.0 - t)
+    h11 = tt * (t - 1.0)
+    for c in range(cols):
+        for i in range(2):
+            top, low = nodes[row, c, 2 * image + i], nodes[row + 1, c, 2 * image + i]
+            line[2 * i, c] = h00 * top[0] + h01 * low[0] + h10 * top[2] + h11 * low[2]
+            line[2 * i + 1, c] = h00 * top[1] + h01 * low[1] + h10 * top[3] + h11 * low[3]
+
+
+@inner
+def _cubic(a, b, c, e, u):
+    """Value of the cubic with values a, c and slopes b, e at 0 and 1."""
+    return a + u * (b + u * (3.0 * (c - a) - 2.0 * b - e + u * (2.0 * (a - c) + b + e)))
+
+
+@inner
+def _row_of_pixels(y, reference, blocked, images, lattice, nodes, known, grey, order, n_images, row, values, tap, tx, ty):
+    """Fill one row of pixels: what is seen, weights, the reference, and the images where the prediction sees them."""
+    pixels, grad_x, grad_y, weights = reference
+    cols = pixels.shape[1]
+    along = (y - lattice.y0) / lattice.spacing + lattice.rim
+    cell_row = int(math.floor(along))
+    for x in range(cols):
+        row[0, x] = 1.0
+    if y >= pixels.shape[0] or cell_row < 0 or cell_row + 1 >= known.shape[0]:
+        for r in range(row.shape[0]):
+            for x in range(cols):
+                row[r, x] = 0.0
+        return
+    lead = 1 if order == 3 else 2
+    n_cells = known.shape[1] - 1
+    blocks = np.int64((cols + LANES - 1) // LANES)
+    for k in range(n_images):
+        coefficients, high, wide, stride = images[k]
+        _along_row(nodes, cell_row, along - cell_row, k, n_cells + 1, values)
+        begin = 0
+        for cell in range(n_cells):
+            x_here = lattice.x0 + (cell - lattice.rim) * lattice.spacing
+            first = min(max(int(math.ceil(x_here)), begin), cols)
+            last = min(max(int(math.ceil(x_here + lattice.spacing)), first), cols)
+            for x in range(begin, first):
+                tap[x], row[0, x] = 0, 0.0
+            begin = last
+            whole = (
+                known[cell_row, cell] != 0
+                and known[cell_row, cell + 1] != 0
+                and known[cell_row + 1, cell] != 0
+                and known[cell_row + 1, cell + 1] != 0
+            )
+            if not whole:
+                for x in range(first, last):
+                    tap[x], row[0, x] = 0, 0.0
+                continue
+            ax, bx, cx, ex = values[0, cell], values[1, cell], values[0, cell + 1], values[1, cell + 1]
+            ay, by, cy, ey = values[2, cell], values[3, cell], values[2, cell + 1], values[3, cell + 1]
+            for x in range(first, last):
+                u = (x - x_here) / lattice.spacing
+                px, py = _cubic(ax, bx, cx, ex, u), _cubic(ay, by, cy, ey, u)
+                if px >= 0.0 and py >= 0.0 and px <= wide - 1.0 and py <= high - 1.0:
+                    ix, iy = int(px), int(py)
+                    tap[x] = (iy + PAD - lead) * stride + ix + PAD - lead
+                    tx[x], ty[x] = px - ix, py - iy
+                else:
+                    tap[x] = 0
+                    if row[0, x] == 1.0:
+                        row[0, x] = 1.0 / 4096.0  # off an image: told from what is not predicted by the count
+        for x in range(begin, cols):
+            tap[x], row[0, x] = 0, 0.0
+        if order == 3:
+            interpolate_cubic(coefficients, np.int64(stride), tap, tx, ty, blocks, row[N_ROWS + k])
+        else:
+            interpolate_quintic(coefficients, np.int64(stride), tap, tx, ty, blocks, row[N_ROWS + k])
+        level = np.float32(grey[1 + k])
+        for x in range(cols):
+            row[N_ROWS + k, x] -= level
+    level = np.float32(grey[0])
+    masked, weighted = blocked.shape[0] > 0, weights.shape[0] > 0
+    for x in range(cols):
+        if masked and blocked[y, x] != 0:
+            row[0, x] = 0.0
+        one = np.float32(1.0)
+        if weighted:
+            one = weights[y, x]
+        if row[0, x] != 1.0:
+            one = np.float32(0.0)
+        row[1, x] = one
+        row[2, x] = pixels[y, x] - level
+        row[3, x] = one * grad_x[y, x]
+        row[4, x] = one * grad_y[y, x]
+        row[5, x] = np.float32(1.0) / one if one > 0.0 else np.float32(0.0)
+
+
+@inner
+def _slide(column, first, wide, step, n, out):
+    """Sums ``out`` (n,) of ``wide`` neighbours, the first of them at ``first``, then ``step`` further on each time."""
+    s = 0.0
+    for x in range(first, first + wide):
+        s += column[x]
+    out[0] = s
+    for i in range(1, n):
+        at = first + (i - 1) * step
+        change = 0.0
+        for j in range(step):
+            change += column[at + wide + j] - column[at + j]
+        s += change
+        out[i] = s
+
+
+def make_windows(images: int) -> DenseKernels:
+    """Compile the kernel for a shape (1 image compared) or a motion (3)."""
+    once, twice = x_moments(images)
+    times_x, times_xx = np.array(once), np.array(twice)
+    n_columns = columns_of(images)
+    n_windows = n_columns + len(once) + len(twice)
+    add = add_row[images]
+    n_ring_rows = N_ROWS + images
+    unknowns = 5 if images == 3 else 2
+    n_unit = n_columns
+    # places of the moments in x among the sums of windows
+    at_x = {c: n_columns + i for i, c in enumerate(once)}
+    at_xx = {c: n_columns + len(once) + i for i, c in enumerate(twice)}
+    X_XX, X_XXY = at_x[q.GXX], at_x[q.GXX + 1]
+    X_XY, X_XYY = at_x[q.GXY], at_x[q.GXY + 1]
+    X_YY, X_YYY = at_x[q.GYY], at_x[q.GYY + 1]
+    XX_XX, XX_XY, XX_YY = at_xx[q.GXX], at_xx[q.GXY], at_xx[q.GYY]
+    X_GX, X_GY, X_FGX, X_FGY = (at_x[c] for c in (q.GX, q.GY, q.FGX, q.FGY))
+    X_IMAGE = at_x[q.FIRST + q.GGX]
+
+    def space(width: int, subset: int, cells: int, vectors: int) -> DenseSpace:
+        wide = (width + LANES - 1) // LANES * LANES
+        return DenseSpace(
+            ring=np.zeros((subset, n_ring_rows, wide), np.float32),
+            place=np.zeros(subset),
+            values=np.zeros((4, cells + 1)),
+            tap=np.zeros(wide, np.int32),
+            tx=np.zeros(wide, np.float32),
+            ty=np.zeros(wide, np.float32),
+            sums=np.zeros((n_columns, wide)),
+            scratch=np.zeros(wide),
+            windows=np.zeros((n_windows, vectors)),
+            gram=np.zeros((3, 6, 6)),
+            inverse=np.zeros((6, 6)),
+            rhs=np.zeros((images + 2, 6)),
+            levels=np.zeros((images, N_LEVELS)),
+            weights=np.zeros((images, images)),
+            normal=np.zeros((2, 5, 5)),
+            small=np.zeros((24, 6)),
+        )
+
+    @kernel(f"{images}")
+    def set_up_gram(s, i, x, y, p, f2, gram, sum_g, sum_fg):
+        """Sums about the vector, with gain and offset taken out."""
+        # columns gx, gx X, gx Y, gy, gy X, gy Y with X, Y px from the vector
+        for a in range(2):
+            g, xg, f, xf = (q.GX, X_GX, q.FGX, X_FGX) if a == 0 else (q.GY, X_GY, q.FGY, X_FGY)
+            mean = s[q.F, i] / p
+            sum_g[3 * a] = s[g, i]
+            sum_g[3 * a + 1] = s[xg, i] - x * s[g, i]
+            sum_g[3 * a + 2] = s[g + 1, i] - y * s[g, i]
+            sum_fg[3 * a] = s[f, i] - mean * sum_g[3 * a]
+            sum_fg[3 * a + 1] = s[xf, i] - x * s[f, i] - mean * sum_g[3 * a + 1]
+            sum_fg[3 * a + 2] = s[f + 1, i] - y * s[f, i] - mean * sum_g[3 * a + 2]
+        for b in range(3):
+            if b == 0:
+                c, xc, xyc, xxc = q.GXX, X_XX, X_XXY, XX_XX
+            elif b == 1:
+                c, xc, xyc, xxc = q.GXY, X_XY, X_XYY, XX_XY
+            else:
+                c, xc, xyc, xxc = q.GYY, X_YY, X_YYY, XX_YY
+            m = s[c, i]
+            mx, my = s[xc, i] - x * m, s[c + 1, i] - y * m
+            mxx = s[xxc, i] - x * (s[xc, i] + mx)
+            myy = s[c + 2, i] - y * (s[c + 1, i] + my)
+            mxy = s[xyc, i] - x * s[c + 1, i] - y * mx
+            r, k = (0, 0) if b == 0 else ((0, 3) if b == 1 else (3, 3))
+            gram[r, k] = m
+            gram[r + 1, k + 1], gram[r + 2, k + 2] = mxx, myy
+            gram[r + 1, k] = gram[r, k + 1] = mx
+            gram[r + 2, k] = gram[r, k + 2] = my
+            gram[r + 1, k + 2] = gram[r + 2, k + 1] = mxy
+        for r in range(3):
+            for k in range(3):
+                gram[3 + k, r] = gram[r, 3 + k]
+        for r in range(6):
+            a, b = sum_g[r] / p, sum_fg[r] / f2
+            for k in range(6):
+                gram[r, k] -= a * sum_g[k] + b * sum_fg[k]
+
+    @kernel(f"{images}")
+    def vector(s, i, at, ray_lens, given, shown, nodes, state, space_parts, first_order, out, r, c):
+        """One vector; status."""
+        lens1, lens2, R, t, to_sys, variances = given
+        gram, inverse, rhs, levels, weights, normal, small = space_parts
+        x_px, y_px, x, y, cell_r, cell_c, u, v = at
+        values, covariance, epipolar, zncc, misfit, moved, sigma, _ = out
+        p = s[q.P, i]
+        f2 = s[q.FF, i] - s[q.F, i] * s[q.F, i] / p
+        if not f2 > 1e-3 * p:
+            return LOW_TEXTURE
+        sum_g, sum_fg = rhs[images], rhs[images + 1]
+        set_up_gram(s, i, x, y, p, f2, gram[0], sum_g, sum_fg)
+        n = 6
+        if not first_order:
+            gram[0, 0, 1] = gram[0, 1, 0] = gram[0, 0, 3]
+            gram[0, 1, 1] = gram[0, 3, 3]
+            n = 2
+        if not factor(gram[0], n):
+            return LOW_TEXTURE
+        # displacement's own covariance: two columns of the inverse
+        second = 3 if first_order else 1
+        invert_lower(gram[0], n, inverse)
+        c00, c01, c11 = 0.0, 0.0, 0.0
+        for k in range(n):
+            a = inverse[k, 0]
+            b = inverse[k, second] if k >= second else 0.0
+            c00 += a * a
+            c01 += a * b
+            c11 += b * b
+        measured, predicted, turn = small[0], small[1], small[2]
+        for k in range(images):
+            base = q.FIRST + q.EACH * k
+            mean = s[base + q.G, i] / p
+            g2 = s[base + q.GG, i] - mean * s[base + q.G, i]
+            if not g2 > _MIN_CONTRAST2 * f2:
+                return LOW_TEXTURE
+            contrast = math.sqrt(g2 / f2)
+            correlation = (s[base + q.FG, i] - mean * s[q.F, i]) / math.sqrt(f2 * g2)
+            levels[k, CONTRAST] = contrast
+            b = rhs[k]
+            for a in range(2):
+                g, xg = base + q.GGX + 2 * a, X_IMAGE + 2 * k + a
+                b[3 * a] = s[g, i]
+                b[3 * a + 1] = s[xg, i] - x * s[g, i]
+                b[3 * a + 2] = s[g + 1, i] - y * s[g, i]
+            for j in range(6):
+                b[j] = (b[j] - mean * sum_g[j]) / contrast - sum_fg[j]
+            if not first_order:
+                b[1] = b[3]
+            left = 2.0 * f2 * (1.0 - correlation)
+            sx, sy = 0.0, 0.0
+            for row in range(n):
+                z = 0.0
+                for j in range(row + 1):
+                    z += inverse[row, j] * b[j]
+                left -= z * z
+                sx -= inverse[row, 0] * z
+                if row >= second:
+                    sy -= inverse[row, second] * z
+            left = max(left, 0.0)
+            zncc[r, c, k] = 1.0 - 0.5 * left / f2
+            misfit[r, c, k] = left / p
+            # the prediction's own place and slopes at the vector
+            for j in range(2):
+                corner = small[3]
+                for m in range(2):
+                    top, low = nodes[cell_r, cell_c + m, 2 * k + j], nodes[cell_r + 1, cell_c + m, 2 * k + j]
+                    corner[m] = _cubic(top[0], top[2], low[0], low[2], v)
+                    corner[2 + m] = _cubic(top[1], top[3], low[1], low[3], v)
+                    d = low[0] - top[0]
+                    small[4, m] = top[2] + v * (6.0 * d - 4.0 * top[2] - 2.0 * low[2]) + v * v * (
+                        3.0 * (top[2] + low[2]) - 6.0 * d
+                    )
+                    d = low[1] - top[1]
+                    small[4, 2 + m] = top[3] + v * (6.0 * d - 4.0 * top[3] - 2.0 * low[3]) + v * v * (
+                        3.0 * (top[3] + low[3]) - 6.0 * d
+                    )
+                d = corner[1] - corner[0]
+                predicted[j] = _cubic(corner[0], corner[2], corner[1], corner[3], u)
+                turn[2 * j] = corner[2] + u * (6.0 * d - 4.0 * corner[2] - 2.0 * corner[3]) + u * u * (
+                    3.0 * (corner[2] + corner[3]) - 6.0 * d
+                )
+                turn[2 * j + 1] = _cubic(small[4, 0], small[4, 2], small[4, 1], small[4, 3], u)
+            for j in range(4):
+                turn[j] /= ray_lens
+            measured[2 * k] = predicted[0] + turn[0] * sx + turn[1] * sy
+            measured[2 * k + 1] = predicted[1] + turn[2] * sx + turn[3] * sy
+            det = turn[0] * turn[3] - turn[1] * turn[2]
+            if not abs(det) > 1e-6:
+                return SINGULAR
+            levels[k, DENSITY] = min(max(abs(det), 0.01), 100.0)
+            into = small[5 + k]
+            into[0], into[1], into[2], into[3] = turn[3] / det, -turn[1] / det, -turn[2] / det, turn[0] / det
+            moved[r, c, k] = math.sqrt(sx * sx + sy * sy)
+        joint_weights(levels, variances, images, weights)
+        # from pixels to the unknowns: B_k = (d patch px / d image px) (d image px / d unknown), C the patch's covariance
+        xc, yc = undistort(lens1, x_px, y_px)
+        ray, shift, at_state = small[8], small[9], small[10]
+        ray[0], ray[1] = xc, yc
+        nu_x, nu_y, along = epipolar_shift(lens2, R, t, xc, yc, state[0])
+        if not along > 0.0:
+            return SINGULAR
+        shift[0], shift[1] = nu_x, nu_y
+        for j in range(5):
+            at_state[j] = state[j]
+        slopes = small[12:18]
+        positions(lens1, lens2, R, t, ray, at_state, shift, images, predicted, slopes)
+        det = c00 * c11 - c01 * c01
+        i00, i01, i11 = c11 / det, -c01 / det, c00 / det
+        B = small[18:24]
+        last = 5 if images == 3 else 2
+        for k in range(images):
+            into = small[5 + k]
+            dx, dy = measured[2 * k] - predicted[2 * k], measured[2 * k + 1] - predicted[2 * k + 1]
+            measured[2 * k] = into[0] * dx + into[1] * dy
+            measured[2 * k + 1] = into[2] * dx + into[3] * dy
+            for j in range(last):
+                from_j = j if images == 3 else 4 * j
+                a, b = slopes[2 * k, from_j], slopes[2 * k + 1, from_j]
+                B[2 * k, j] = into[0] * a + into[1] * b
+                B[2 * k + 1, j] = into[2] * a + into[3] * b
+        N, pull = normal[0], small[3]
+        for j in range(last):
+            pull[j] = 0.0
+            for m in range(last):
+                N[j, m] = 0.0
+        for k in range(images):
+            for o in range(images):
+                weight = weights[k, o]
+                w00, w01, w11 = weight * i00, weight * i01, weight * i11
+                for j in range(last):
+                    a, b = B[2 * k, j], B[2 * k + 1, j]
+                    if a == 0.0 and b == 0.0:
+                        continue
+                    ca, cb = w00 * a + w01 * b, w01 * a + w11 * b
+                    pull[j] += ca * measured[2 * o] + cb * measured[2 * o + 1]
+                    for m in range(j + 1):
+                        N[j, m] += ca * B[2 * o, m] + cb * B[2 * o + 1, m]
+        if not factor(N, last):
+            return SINGULAR
+        L = normal[1]
+        invert_lower(N, last, L)
+        step = small[4]
+        for j in range(last):
+            z = 0.0
+            for m in range(j + 1):
+                z += L[j, m] * pull[m]
+            step[j] = z
+        for j in range(last):
+            z = 0.0
+            for m in range(j, last):
+                z += L[m, j] * step[m]
+            pull[j] = z
+        if images == 3:
+            for j in range(5):
+                at_state[j] += pull[j]
+        else:
+            at_state[0] += pull[0]
+            at_state[4] += pull[1]
+        w0 = at_state[0]
+        if not w0 > 0.0:
+            return SINGULAR
+        epipolar[r, c] = at_state[4]
+        # px, as the ordinary fit judges: along and across camera 2's epipolar line, both ways in camera 1
+        for j in range(last):
+            z = 0.0
+            for m in range(j, last):
+                z += L[m, j] * L[m, j]
+            step[j] = z
+        sigma[r, c] = math.sqrt(max(step[0] * along * along, step[last - 1]))
+        if images == 3:
+            sigma[r, c] = max(sigma[r, c], math.sqrt(max(step[1], step[2])) * lens1[1] / at_state[3])
+        # to the system frame, and L times the derivatives: covariance J L' L J'
+        J = slopes
+        for j in range(3):
+            along_ray = (to_sys[j, 0] * xc + to_sys[j, 1] * yc + to_sys[j, 2]) / w0
+            values[r, c, j] = along_ray + to_sys[j, 3]
+            J[j, 0] = -along_ray / w0
+            for m in range(1, 4):
+                J[j, m] = 0.0
+        if images == 3:
+            for j in range(3):
+                d0, d1, d2 = at_state[1] - xc, at_state[2] - yc, at_state[3] - 1.0
+                motion = (to_sys[j, 0] * d0 + to_sys[j, 1] * d1 + to_sys[j, 2] * d2) / w0
+                values[r, c, 3 + j] = motion
+                J[3 + j, 0] = -motion / w0
+                for m in range(3):
+                    J[3 + j, 1 + m] = to_sys[j, m] / w0
+        used = 4 if images == 3 else 1
+        root = B
+        n_values = 6 if images == 3 else 3
+        for j in range(n_values):
+            for m in range(last):
+                z = 0.0
+                for k in range(min(m + 1, used)):
+                    z += L[m, k] * J[j, k]
+                root[j, m] = z
+        slot = 0
+        for j in range(n_values):
+            for k in range(j, n_values):
+                z = 0.0
+                for m in range(last):
+                    z += root[j, m] * root[k, m]
+                covariance[r, c, slot] = z
+                slot += 1
+        return OK
+
+    @kernel(f"{images}")
+    def band(first, last, given, space, out):
+        """Compute rows ``first`` to ``last`` of vectors."""
+        (
+            reference,
+            blocked,
+            shown,
+            lens1,
+            lens2,
+            R,
+            t,
+            to_sys,
+            lattice,
+            nodes,
+            known,
+            cells,
+            state,
+            grey,
+            subset,
+            order,
+            variances,
+            first_order,
+        ) = given
+        ring, place, values, tap, tx, ty, sums, scratch, windows, gram, inverse, rhs, levels, weights, normal, small = space
+        status = out.status
+        cols = reference.pixels.shape[1]
+        half = subset // 2
+        blocks = np.int64((cols + LANES - 1) // LANES)
+        for a in range(sums.shape[0]):
+            for x in range(sums.shape[1]):
+                sums[a, x] = 0.0
+        cameras = (lens1, lens2, R, t, to_sys, variances)
+        parts = (gram, inverse, rhs, levels, weights, normal, small)
+        left = int(math.floor(lattice.x0 + 0.5))
+        full = float(subset * subset)
+        below = -1  # first row of pixels that is not summed yet
+        local = np.zeros(5)
+        for r in range(first, last):
+            y_px = lattice.y0 + r * lattice.step
+            top = int(math.floor(y_px + 0.5)) - half
+            if below < 0:
+                below = top
+                origin = top
+            for y in range(below, top + subset):
+                slot = y % subset
+                if y >= origin + subset:
+                    add(ring[slot], place[slot], -1.0, blocks, sums)
+                _row_of_pixels(
+                    y, reference, blocked, shown, lattice, nodes, known, grey, order, images, ring[slot], values, tap, tx, ty
+                )
+                place[slot] = float(y - origin)
+                add(ring[slot], place[slot], 1.0, blocks, sums)
+            below = top + subset
+            start, n = left - half + lattice.first * lattice.step, lattice.last - lattice.first
+            for a in range(n_unit):
+                _slide(sums[a], start, subset, lattice.step, n, windows[a])
+            for a in range(len(times_x)):
+                c = times_x[a]
+                for x in range(cols):
+                    scratch[x] = x * sums[c, x]
+                _slide(scratch, start, subset, lattice.step, n, windows[n_unit + a])
+            for a in range(len(times_xx)):
+                c = times_xx[a]
+                for x in range(cols):
+                    scratch[x] = x * (x * sums[c, x])
+                _slide(scratch, start, subset, lattice.step, n, windows[n_unit + len(times_x) + a])
+            along = r * lattice.step / lattice.spacing
+            cell_r = min(int(along), cells.shape[0] - 1)
+            v = along - cell_r
+            for i in range(n):
+                c = i + lattice.first
+                across = c * lattice.step / lattice.spacing
+                cell_c = min(int(across), cells.shape[1] - 1)
+                u = across - cell_c
+                if cells[cell_r, cell_c] == 0:
+                    status[r, c] = MASKED
+                    continue
+                count = windows[q.COUNT, i]
+                if count < full - 0.5 or count > full + 0.5:
+                    missing = full - count
+                    status[r, c] = OUTSIDE_IMAGE if missing - math.floor(missing) > 1e-6 else MASKED
+                    continue
+                x_px = lattice.x0 + c * lattice.step
+                for j in range(5):
+                    local[j] = (1.0 - v) * (
+                        (1.0 - u) * state[cell_r, cell_c, j] + u * state[cell_r, cell_c + 1, j]
+                    ) + v * ((1.0 - u) * state[cell_r + 1, cell_c, j] + u * state[cell_r + 1, cell_c + 1, j])
+                at = (x_px, y_px, x_px, y_px - origin, cell_r + lattice.rim, cell_c + lattice.rim, u, v)
+                status[r, c] = vector(
+                    windows, i, at, lattice.spacing, cameras, shown, nodes, local, parts, first_order, out, r, c
+                )
+
+    return DenseKernels(band, space)
