@@ -50,7 +50,7 @@ def dense_shape(
     images
         Camera 1's and camera 2's reference image.
     shape
-        The ordinary shape, as it was measured, with its ``starts``.
+        The ordinary shape, as it was measured.
     grid, options
         With which it was measured.
     step_px
@@ -66,7 +66,7 @@ def dense_shape(
     Raises
     ------
     InputError
-        ``dense_step_invalid``; ``dense_needs_starts`` for a field without the matcher's unknowns.
+        ``dense_step_invalid``.
     """
     return _measure(pair, images, shape, None, None, grid, options, step_px)
 
@@ -91,7 +91,7 @@ def dense_motion(
     images
         Camera 1's and camera 2's reference image, camera 1's and camera 2's current image.
     shape, motion
-        The ordinary shape and displacement, as they were measured, with their ``starts``.
+        The ordinary shape and displacement, as they were measured: not smoothed.
     dense
         The dense shape on the same step, whose positions each step shows.
     grid, options, step_px
@@ -126,7 +126,7 @@ def _measure(
     _check(ordinary, grid, step_px)
     prepared = [image.prepared(options.interpolation, noise, options.blur) for image, noise in
                 zip(images, (*options.noise, *options.noise), strict=False)]  # fmt: skip
-    state = _state(ordinary)
+    state = _state(pair, ordinary)
     measured = ordinary.valid & shape.valid
     prediction = predict(
         grid.xy_px,
@@ -163,20 +163,14 @@ def _check(field: Field, grid: PointGrid, step_px: int) -> None:
             code="dense_step_invalid",
             remedy=f"Give {DENSE_STEP_PX.default}, for example.",
         )
-    if field.starts is None:
-        raise InputError(
-            "the field does not hold the matcher's unknowns.",
-            code="dense_needs_starts",
-            remedy="Give the field as it was measured, not one that was read from a file.",
-        )
 
 
-def _state(field: Field) -> Float:
+def _state(pair: StereoPair, field: Field) -> Float:
     """Inverse depth, current position over depth, epipolar offset: (r, c, 5)."""
-    assert field.starts is not None
-    w, G = field.starts.w, field.starts.G
-    place = np.zeros((*field.shape, 3)) if G is None else G[..., 0]
-    return np.concatenate([w[..., :1], place, field.epipolar_px[..., None]], axis=-1)
+    at_reference = pair.cam1.cam_from_sys.apply(field.xyz_mm)
+    w = 1.0 / at_reference[..., 2:]
+    now = at_reference if field.uvw_mm is None else pair.cam1.cam_from_sys.apply(field.xyz_mm + field.uvw_mm)
+    return np.concatenate([w, now * w, field.epipolar_px[..., None]], axis=-1)
 
 
 class _Between:

@@ -15,13 +15,14 @@ from scipy import ndimage
 
 from core.arrays import Bool, Float
 from core.field.region.cuts import Cuts
-from core.field.region.window import connected_points, fit_terms, steps_of, ways_cut, window_offsets
+from core.field.region.window import fit_terms, steps_of, ways_cut, window_offsets
 
-HALVES = (3, 2)
-"""Half widths of the windows that quadratics are fitted to, in points. The wider has the less noise in its curvature,
-which is all that reaches a vector: value and slopes are measured anew. The narrower serves where it does not fit."""
+_WIDTHS = (1.5, 1.0, 0.7)
+"""Half widths of the windows that quadratics are fitted to, in subsets. The wider has the less noise in its curvature,
+which is what reaches a vector: its value is measured anew. The narrower serve where it does not fit."""
+_MIN_HALF = 2  # points; fewer leave nothing to judge a quadratic by
 
-_JUMP_PX, _JUMP_SD = 0.02, 6.0
+_JUMP_PX, _JUMP_SD = 0.01, 6.0
 _BEYOND_PX = 0.1  # by which what neighbours predict beyond the outermost points may differ
 
 
@@ -64,22 +65,29 @@ def predict(xy_px: Float, positions: Float, measured: Bool, cuts: Cuts | None, *
     subset_px
         Width of the subset; the prediction reaches half of it beyond the outermost points.
     """
-    rows, cols, _ = positions.shape
+    rows, cols, m = positions.shape
     spacing = min(steps_of(xy_px))
+    halves = sorted({max(int(np.ceil(width * subset_px / spacing)), _MIN_HALF) for width in _WIDTHS}, reverse=True)
     rim = int(np.ceil((subset_px // 2 + 1) / spacing))
-    coefficients = np.full((rows, cols, 6, positions.shape[2]), np.nan)
-    smooth = np.zeros(measured.shape, bool)
-    for half in HALVES:
-        found, fits = _quadratics(xy_px, positions, measured, cuts, half)
-        new = fits & ~smooth
-        coefficients[new], smooth = found[new], smooth | new
     wide = ((rim, rim), (rim, rim))
-    coefficients = np.pad(coefficients, (*wide, (0, 0), (0, 0)), constant_values=np.nan)
     shown = np.pad(np.where(measured[..., None], positions, np.nan), (*wide, (0, 0)), constant_values=np.nan)
-    known = np.pad(smooth, rim)
-    tolerance = _tolerance(coefficients[:, :, 0] - shown)
-    for _ in range(max(HALVES) + rim):
-        known = _spread(coefficients, known, shown, tolerance)
+    coefficients = np.full((*shown.shape[:2], 6, m), np.nan)
+    known = np.zeros(shown.shape[:2], bool)
+    inside = np.pad(measured, rim)
+    narrow, whole = _quadratics(xy_px, positions, measured, cuts, halves[-1])
+    scatter = _scatter((narrow[:, :, 0] - positions)[whole]) / _share_left(halves[-1], spacing, subset_px)
+    for half in halves:
+        found, whole = (narrow, whole) if half == halves[-1] else _quadratics(xy_px, positions, measured, cuts, half)
+        tolerance = _JUMP_PX + _JUMP_SD * scatter * _share_left(half, spacing, subset_px)
+        with np.errstate(invalid="ignore"):
+            fits = whole & (np.abs(found[:, :, 0] - positions) <= tolerance).all(axis=-1)
+        new = np.pad(fits, rim) & ~known
+        coefficients[new] = found[new[rim : rim + rows, rim : rim + cols]]
+        known |= new
+        for _ in range(half):  # to the rim, where the same quadratic goes on
+            known = _spread(coefficients, known, shown, _JUMP_PX + _JUMP_SD * scatter, inside)
+    for _ in range(rim):
+        known = _spread(coefficients, known, shown, _JUMP_PX + _JUMP_SD * scatter, ~inside)
     c = coefficients
     nodes = np.stack([c[:, :, 0], c[:, :, 1], c[:, :, 2], c[:, :, 4]], axis=-1)
     inner = known[rim : rim + rows, rim : rim + cols] & measured
@@ -94,46 +102,55 @@ def predict(xy_px: Float, positions: Float, measured: Bool, cuts: Cuts | None, *
 def _quadratics(
     xy_px: Float, positions: Float, measured: Bool, cuts: Cuts | None, half: int
 ) -> tuple[Float, Bool]:
-    """Coefficients (r, c, 6, m) of 1, x, y, x^2, x y, y^2 (offsets in points), and where whole windows have them."""
+    """Coefficients (r, c, 6, m) of 1, x, y, x^2, x y, y^2 (offsets in points), and (r, c) where whole windows have them."""
     rows, cols, m = positions.shape
     out = np.full((rows, cols, 6, m), np.nan)
-    fits = np.zeros(measured.shape, bool)
     if min(rows, cols) < 2 * half + 1:
-        return out, fits
+        return out, np.zeros(measured.shape, bool)
     whole = ndimage.minimum_filter(measured, size=2 * half + 1, mode="constant", cval=False)
     crossed = ways_cut(measured, xy_px, cuts, half)
     if crossed is not None:
         whole &= ~crossed.any(axis=-1)
-    r, k = np.nonzero(whole)
-    if len(r) == 0:
-        return out, fits
+    if not whole.any():
+        return out, whole
+    place = np.arange(-half, half + 1) / half
+    middle = np.nanmean(np.where(measured[..., None], positions, np.nan), axis=(0, 1))
+    values = np.where(measured[..., None], positions - middle, 0.0)
+    by_x = [ndimage.correlate1d(values, place**a, axis=1, mode="constant") for a in range(3)]
+    moments = np.stack(
+        [ndimage.correlate1d(by_x[a], place**b, axis=0, mode="constant")[whole]
+         for a, b in ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))], axis=1
+    )  # fmt: skip
+    terms = fit_terms(window_offsets(half)[0], half, 2)
+    scale = np.array([1.0, half, half, half**2, half**2, half**2])[:, None]
+    found = np.einsum("ij,njm->nim", np.linalg.inv(terms.T @ terms) / scale, moments)
+    found[:, 0] += middle
+    out[whole] = found
+    return out, whole
+
+
+def _share_left(half: int, spacing_px: float, subset_px: int) -> float:
+    """What a quadratic leaves of its middle point's noise, as a standard deviation: neighbours share pixels."""
     offsets, _ = window_offsets(half)
-    weights = np.linalg.pinv(fit_terms(offsets, half, 2))
-    weights /= np.array([1.0, half, half, half**2, half**2, half**2])[:, None]
-    values = np.where(measured[..., None], positions, 0.0)
-    total = np.zeros((rows, cols, 6, m))
-    for (dr, dc), weight in zip(offsets, weights.T, strict=True):
-        moved = np.roll(values - 0.0, (-dr, -dc), axis=(0, 1))
-        total += weight[:, None] * moved[:, :, None, :]
-    out[whole] = total[whole]
-    miss = np.abs(out[:, :, 0] - positions)
-    fits = whole & (miss <= _tolerance(out[:, :, 0] - positions)).all(axis=-1)
-    return out, fits
+    lag = np.abs(offsets[:, None, :] - offsets[None, :, :]) * (spacing_px / subset_px)
+    shared = np.maximum(1.0 - lag, 0.0).prod(axis=-1)
+    terms = fit_terms(offsets, half, 2)
+    left = -np.linalg.solve(terms.T @ terms, terms.T)[0]
+    left[0] += 1.0  # the middle comes first
+    return float(np.sqrt(max(left @ shared @ left, 1e-6)))
 
 
-def _tolerance(miss: Float) -> Float:
-    """By how much (m,) px a point may miss what its neighbours predict: a fixed part, and the field's own scatter."""
-    flat = miss.reshape(-1, miss.shape[-1])
-    flat = flat[np.isfinite(flat).all(axis=-1)]
-    scatter = 1.4826 * np.median(np.abs(flat), axis=0) if len(flat) else np.zeros(miss.shape[-1])
-    return np.asarray(_JUMP_PX + _JUMP_SD * scatter)
+def _scatter(values: Float) -> Float:
+    """Robust standard deviation (m,) of values (n, m) about zero."""
+    return np.asarray(1.4826 * np.median(np.abs(values), axis=0)) if len(values) else np.zeros(values.shape[1])
 
 
-def _spread(coefficients: Float, known: Bool, shown: Float, tolerance: Float) -> Bool:
-    """Extend the quadratics, in place, by one point each way; return where there are some."""
+def _spread(coefficients: Float, known: Bool, shown: Float, tolerance: Float, where: Bool) -> Bool:
+    """Extend the quadratics, in place, by one point each way, to points ``where``; return where there are some."""
     rows, cols = known.shape
-    ring = ndimage.binary_dilation(known, np.ones((3, 3))) & ~known
-    r, k = np.nonzero(ring)
+    r, k = np.nonzero(ndimage.binary_dilation(known, np.ones((3, 3))) & ~known & where)
+    if len(r) == 0:
+        return known
     found = np.full((8, len(r), *coefficients.shape[2:]), np.nan)
     steps = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if a or b]
     for one, (dr, dc) in zip(found, steps, strict=True):
@@ -145,7 +162,7 @@ def _spread(coefficients: Float, known: Bool, shown: Float, tolerance: Float) ->
     with np.errstate(invalid="ignore"):
         apart = np.nanmax(found[:, :, 0], axis=0) - np.nanmin(found[:, :, 0], axis=0)
         off = np.abs(mean[:, 0] - shown[r, k])
-        agree = ~(apart > _BEYOND_PX).any(axis=-1) & ~(off > _BEYOND_PX + tolerance).any(axis=-1)
+        agree = ~(apart > _BEYOND_PX).any(axis=-1) & ~(off > tolerance).any(axis=-1)
     coefficients[r[agree], k[agree]] = mean[agree]
     out = known.copy()
     out[r[agree], k[agree]] = True

@@ -79,7 +79,6 @@ def measure_windows(
     step_px: int,
     cuts: Cuts | None,
     white: Bool | None,
-    first_order: bool = True,
 ) -> Windows:
     """Measure the vectors between the points of an ordinary field.
 
@@ -134,7 +133,6 @@ def measure_windows(
         subset=options.subset_px,
         order=setting.order,
         variances=setting.variances,
-        first_order=first_order,
     )
     out = DenseOut(
         values=np.full((rows, cols, 6 if motion else 3), np.nan),

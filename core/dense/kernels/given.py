@@ -49,24 +49,18 @@ class DenseGiven(NamedTuple):
     subset: int
     order: int
     variances: tuple[float, ...]
-    first_order: bool
 
 
 class DenseSpace(NamedTuple):
     """Work space of a thread: rows of pixels in a ring, sums of columns, sums of windows, and small matrices."""
 
     ring: Any
-    place: Any
     values: Any
     tap: Any
     tx: Any
     ty: Any
     sums: Any
-    scratch: Any
     windows: Any
-    gram: Any
-    inverse: Any
-    rhs: Any
     levels: Any
     weights: Any
     normal: Any

@@ -16,14 +16,16 @@ from numba.extending import intrinsic
 from core.matching.kernels.loops import data, lanes, spline
 from core.matching.kernels.vectors import DOUBLE, FLOAT, INT, LANES, LONG, Vec, at, load, spread, store
 
-COUNT, P, F, FF = 0, 1, 2, 3
-GXX, GXY, GYY = 4, 7, 10
-"""Squared gradients: each as it is, times y, and times y^2."""
-GX, GY, FGX, FGY = 13, 15, 17, 19
-"""Each as it is, and times y."""
-FIRST, EACH = 21, 7
-G, GG, FG, GGX, GGY = 0, 1, 2, 3, 5
-"""Of each image, from ``FIRST + EACH k`` on; the last two as they are, and times y."""
+COUNT, P, F, FF, GXX, GXY, GYY, GX, GY, FGX, FGY = range(11)
+"""Sums of a column of pixels: how many count, weights, and weighted products of f and of its gradients."""
+FIRST, EACH = 11, 5
+G, GG, FG, GGX, GGY = range(EACH)
+"""Of each image, from ``FIRST + EACH k`` on: weighted products of its grey levels with 1, themselves, f, gradients."""
+
+
+N_ROWS = 6
+"""Rows of a row of pixels before the images' grey levels: whether a pixel counts (1), its weight, f, the gradients of f
+along x and y times the weight, and one over the weight, zero where a pixel does not count."""
 
 
 def columns_of(images: int) -> int:
@@ -76,16 +78,13 @@ interpolate_cubic, interpolate_quintic = _interpolation(3), _interpolation(5)
 
 
 def _adding(images: int) -> Any:
-    def add_row(_typingctx: Any, row: Any, y: Any, sign: Any, blocks: Any, sums: Any) -> Any:
+    def add_row(_typingctx: Any, row: Any, sign: Any, blocks: Any, sums: Any) -> Any:
         """Add the products of one row of pixels to the sums of their columns.
 
         Parameters
         ----------
         row
-            (6 + images, width) float32: whether a pixel counts (0 or 1), its weight, f, its gradients along x and y
-            times the weight, and each image's grey levels; one spare row.
-        y
-            double, the row's place.
+            (N_ROWS + images, width) float32, see ``N_ROWS``.
         sign
             double, 1 to add and -1 to take off.
         blocks
@@ -93,15 +92,15 @@ def _adding(images: int) -> Any:
         sums
             (columns_of(images), width) double, in place.
         """
-        sig = types.void(row, y, sign, blocks, sums)
+        sig = types.void(row, sign, blocks, sums)
 
         def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
             source = context.make_array(sig.args[0])(context, builder, args[0])
-            target = context.make_array(sig.args[4])(context, builder, args[4])
+            target = context.make_array(sig.args[3])(context, builder, args[3])
             width, wide = (builder.extract_value(a.shape, 1) for a in (source, target))
-            place, sign = spread(builder, args[1]), spread(builder, args[2])
+            sign = spread(builder, args[1])
             kind = ir.VectorType(DOUBLE, LANES)
-            with cgutils.for_range(builder, args[3]) as loop:
+            with cgutils.for_range(builder, args[2]) as loop:
                 offset = builder.mul(builder.sext(loop.index, LONG), LONG(LANES))
 
                 def get(r: int, offset: Any = offset) -> Vec:
@@ -112,36 +111,30 @@ def _adding(images: int) -> Any:
                     there = at(builder, target.data, builder.add(builder.mul(wide, LONG(q)), offset))
                     store(load(builder, there, LANES, DOUBLE) + value, there)
 
-                def moments(q: int, value: Vec, n: int) -> None:
-                    put(q, value)
-                    for i in range(1, n):
-                        value = value * place
-                        put(q + i, value)
-
                 f, gx, gy = get(2), get(3), get(4)
                 weight = get(1) * sign
                 by_x, by_y, wf = gx * sign, gy * sign, weight * f
-                unit = get(5)  # one over the weight, zero where a pixel does not count
+                unit = get(5)
+                xx = gx * unit
                 put(COUNT, get(0) * sign)
                 put(P, weight)
                 put(F, wf)
                 put(FF, wf * f)
-                xx = gx * unit
-                moments(GXX, by_x * xx, 3)
-                moments(GXY, by_y * xx, 3)
-                moments(GYY, by_y * (gy * unit), 3)
-                moments(GX, by_x, 2)
-                moments(GY, by_y, 2)
-                moments(FGX, by_x * f, 2)
-                moments(FGY, by_y * f, 2)
+                put(GXX, by_x * xx)
+                put(GXY, by_y * xx)
+                put(GYY, by_y * (gy * unit))
+                put(GX, by_x)
+                put(GY, by_y)
+                put(FGX, by_x * f)
+                put(FGY, by_y * f)
                 for k in range(images):
-                    g, first = get(6 + k), FIRST + EACH * k
+                    g, first = get(N_ROWS + k), FIRST + EACH * k
                     wg = weight * g
                     put(first + G, wg)
                     put(first + GG, wg * g)
                     put(first + FG, wg * f)
-                    moments(first + GGX, by_x * g, 2)
-                    moments(first + GGY, by_y * g, 2)
+                    put(first + GGX, by_x * g)
+                    put(first + GGY, by_y * g)
             return context.get_dummy_value()
 
         return sig, codegen

@@ -2,8 +2,10 @@
 
 Row by row of pixels, each image is interpolated where the prediction sees it, and the products that the normal
 equations need are added to the sums of columns, which run down the image over a window's height. Along a row of vectors
-these sums run over a window's width. Moments of x and y are taken about the image's corner and moved to each vector,
-all in double precision.
+these sums run over a window's width. All sums are in double precision.
+
+A vector's increment is a shift: the prediction's slopes and curvature stand. Increments with slopes of their own have
+the same bias, and more noise (docs/explanation/decisions/0041-dense-field.md).
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import numpy as np
 from core.dense.kernels import rows as q
 from core.dense.kernels.cameras import factor, invert_lower, positions
 from core.dense.kernels.given import DenseSpace
-from core.dense.kernels.rows import add_row, columns_of, interpolate_cubic, interpolate_quintic
+from core.dense.kernels.rows import N_ROWS, add_row, columns_of, interpolate_cubic, interpolate_quintic
 from core.matching.image import PAD
 from core.matching.kernels.naming import inner, kernel
 from core.matching.kernels.noise import CONTRAST, DENSITY, N_LEVELS, joint_weights
@@ -27,8 +29,6 @@ from core.matching.kernels.warp import undistort
 from core.status import PointStatus
 
 MASKED = int(PointStatus.MASKED)
-N_ROWS = 6
-"""Rows of a row of pixels before the images': counts, weight, f, gradients times weight, one over the weight."""
 _MIN_CONTRAST2 = 1e-6
 
 
@@ -37,14 +37,6 @@ class DenseKernels(NamedTuple):
 
     band: Any
     space: Callable[[int, int, int, int], DenseSpace]
-
-
-def x_moments(images: int) -> tuple[list[int], list[int]]:
-    """Return the sums of columns that are summed over a window times x, and those times x^2 too."""
-    once = [q.GXX, q.GXX + 1, q.GXY, q.GXY + 1, q.GYY, q.GYY + 1, q.GX, q.GY, q.FGX, q.FGY]
-    for k in range(images):
-        once += [q.FIRST + q.EACH * k + q.GGX, q.FIRST + q.EACH * k + q.GGY]
-    return once, [q.GXX, q.GXY, q.GYY]
 
 
 @inner
@@ -163,39 +155,18 @@ def _slide(column, first, wide, step, n, out):
 
 def make_windows(images: int) -> DenseKernels:
     """Compile the kernel for a shape (1 image compared) or a motion (3)."""
-    once, twice = x_moments(images)
-    times_x, times_xx = np.array(once), np.array(twice)
     n_columns = columns_of(images)
-    n_windows = n_columns + len(once) + len(twice)
     add = add_row[images]
-    n_ring_rows = N_ROWS + images
-    unknowns = 5 if images == 3 else 2
-    n_unit = n_columns
-    # places of the moments in x among the sums of windows
-    at_x = {c: n_columns + i for i, c in enumerate(once)}
-    at_xx = {c: n_columns + len(once) + i for i, c in enumerate(twice)}
-    X_XX, X_XXY = at_x[q.GXX], at_x[q.GXX + 1]
-    X_XY, X_XYY = at_x[q.GXY], at_x[q.GXY + 1]
-    X_YY, X_YYY = at_x[q.GYY], at_x[q.GYY + 1]
-    XX_XX, XX_XY, XX_YY = at_xx[q.GXX], at_xx[q.GXY], at_xx[q.GYY]
-    X_GX, X_GY, X_FGX, X_FGY = (at_x[c] for c in (q.GX, q.GY, q.FGX, q.FGY))
-    X_IMAGE = at_x[q.FIRST + q.GGX]
-
     def space(width: int, subset: int, cells: int, vectors: int) -> DenseSpace:
         wide = (width + LANES - 1) // LANES * LANES
         return DenseSpace(
-            ring=np.zeros((subset, n_ring_rows, wide), np.float32),
-            place=np.zeros(subset),
+            ring=np.zeros((subset, N_ROWS + images, wide), np.float32),
             values=np.zeros((4, cells + 1)),
             tap=np.zeros(wide, np.int32),
             tx=np.zeros(wide, np.float32),
             ty=np.zeros(wide, np.float32),
             sums=np.zeros((n_columns, wide)),
-            scratch=np.zeros(wide),
-            windows=np.zeros((n_windows, vectors)),
-            gram=np.zeros((3, 6, 6)),
-            inverse=np.zeros((6, 6)),
-            rhs=np.zeros((images + 2, 6)),
+            windows=np.zeros((n_columns, vectors)),
             levels=np.zeros((images, N_LEVELS)),
             weights=np.zeros((images, images)),
             normal=np.zeros((2, 5, 5)),
@@ -203,74 +174,27 @@ def make_windows(images: int) -> DenseKernels:
         )
 
     @kernel(f"{images}")
-    def set_up_gram(s, i, x, y, p, f2, gram, sum_g, sum_fg):
-        """Sums about the vector, with gain and offset taken out."""
-        # columns gx, gx X, gx Y, gy, gy X, gy Y with X, Y px from the vector
-        for a in range(2):
-            g, xg, f, xf = (q.GX, X_GX, q.FGX, X_FGX) if a == 0 else (q.GY, X_GY, q.FGY, X_FGY)
-            mean = s[q.F, i] / p
-            sum_g[3 * a] = s[g, i]
-            sum_g[3 * a + 1] = s[xg, i] - x * s[g, i]
-            sum_g[3 * a + 2] = s[g + 1, i] - y * s[g, i]
-            sum_fg[3 * a] = s[f, i] - mean * sum_g[3 * a]
-            sum_fg[3 * a + 1] = s[xf, i] - x * s[f, i] - mean * sum_g[3 * a + 1]
-            sum_fg[3 * a + 2] = s[f + 1, i] - y * s[f, i] - mean * sum_g[3 * a + 2]
-        for b in range(3):
-            if b == 0:
-                c, xc, xyc, xxc = q.GXX, X_XX, X_XXY, XX_XX
-            elif b == 1:
-                c, xc, xyc, xxc = q.GXY, X_XY, X_XYY, XX_XY
-            else:
-                c, xc, xyc, xxc = q.GYY, X_YY, X_YYY, XX_YY
-            m = s[c, i]
-            mx, my = s[xc, i] - x * m, s[c + 1, i] - y * m
-            mxx = s[xxc, i] - x * (s[xc, i] + mx)
-            myy = s[c + 2, i] - y * (s[c + 1, i] + my)
-            mxy = s[xyc, i] - x * s[c + 1, i] - y * mx
-            r, k = (0, 0) if b == 0 else ((0, 3) if b == 1 else (3, 3))
-            gram[r, k] = m
-            gram[r + 1, k + 1], gram[r + 2, k + 2] = mxx, myy
-            gram[r + 1, k] = gram[r, k + 1] = mx
-            gram[r + 2, k] = gram[r, k + 2] = my
-            gram[r + 1, k + 2] = gram[r + 2, k + 1] = mxy
-        for r in range(3):
-            for k in range(3):
-                gram[3 + k, r] = gram[r, 3 + k]
-        for r in range(6):
-            a, b = sum_g[r] / p, sum_fg[r] / f2
-            for k in range(6):
-                gram[r, k] -= a * sum_g[k] + b * sum_fg[k]
-
-    @kernel(f"{images}")
-    def vector(s, i, at, ray_lens, given, shown, nodes, state, space_parts, first_order, out, r, c):
+    def vector(s, i, at, spacing, given, nodes, state, parts, out, r, c):
         """One vector; status."""
         lens1, lens2, R, t, to_sys, variances = given
-        gram, inverse, rhs, levels, weights, normal, small = space_parts
-        x_px, y_px, x, y, cell_r, cell_c, u, v = at
+        levels, weights, normal, small = parts
+        x_px, y_px, cell_r, cell_c, u, v = at
         values, covariance, epipolar, zncc, misfit, moved, sigma, _ = out
         p = s[q.P, i]
         f2 = s[q.FF, i] - s[q.F, i] * s[q.F, i] / p
         if not f2 > 1e-3 * p:
             return LOW_TEXTURE
-        sum_g, sum_fg = rhs[images], rhs[images + 1]
-        set_up_gram(s, i, x, y, p, f2, gram[0], sum_g, sum_fg)
-        n = 6
-        if not first_order:
-            gram[0, 0, 1] = gram[0, 1, 0] = gram[0, 0, 3]
-            gram[0, 1, 1] = gram[0, 3, 3]
-            n = 2
-        if not factor(gram[0], n):
+        level = s[q.F, i] / p
+        sum_gx, sum_gy = s[q.GX, i], s[q.GY, i]
+        sum_fgx, sum_fgy = s[q.FGX, i] - level * sum_gx, s[q.FGY, i] - level * sum_gy
+        # gain and offset taken out
+        xx = s[q.GXX, i] - sum_gx * sum_gx / p - sum_fgx * sum_fgx / f2
+        xy = s[q.GXY, i] - sum_gx * sum_gy / p - sum_fgx * sum_fgy / f2
+        yy = s[q.GYY, i] - sum_gy * sum_gy / p - sum_fgy * sum_fgy / f2
+        det = xx * yy - xy * xy
+        if not (det > 1e-9 * (xx + yy) * (xx + yy) and xx > 0.0):
             return LOW_TEXTURE
-        # displacement's own covariance: two columns of the inverse
-        second = 3 if first_order else 1
-        invert_lower(gram[0], n, inverse)
-        c00, c01, c11 = 0.0, 0.0, 0.0
-        for k in range(n):
-            a = inverse[k, 0]
-            b = inverse[k, second] if k >= second else 0.0
-            c00 += a * a
-            c01 += a * b
-            c11 += b * b
+        c00, c01, c11 = yy / det, -xy / det, xx / det
         measured, predicted, turn = small[0], small[1], small[2]
         for k in range(images):
             base = q.FIRST + q.EACH * k
@@ -281,26 +205,10 @@ def make_windows(images: int) -> DenseKernels:
             contrast = math.sqrt(g2 / f2)
             correlation = (s[base + q.FG, i] - mean * s[q.F, i]) / math.sqrt(f2 * g2)
             levels[k, CONTRAST] = contrast
-            b = rhs[k]
-            for a in range(2):
-                g, xg = base + q.GGX + 2 * a, X_IMAGE + 2 * k + a
-                b[3 * a] = s[g, i]
-                b[3 * a + 1] = s[xg, i] - x * s[g, i]
-                b[3 * a + 2] = s[g + 1, i] - y * s[g, i]
-            for j in range(6):
-                b[j] = (b[j] - mean * sum_g[j]) / contrast - sum_fg[j]
-            if not first_order:
-                b[1] = b[3]
-            left = 2.0 * f2 * (1.0 - correlation)
-            sx, sy = 0.0, 0.0
-            for row in range(n):
-                z = 0.0
-                for j in range(row + 1):
-                    z += inverse[row, j] * b[j]
-                left -= z * z
-                sx -= inverse[row, 0] * z
-                if row >= second:
-                    sy -= inverse[row, second] * z
+            bx = (s[base + q.GGX, i] - mean * sum_gx) / contrast - sum_fgx
+            by = (s[base + q.GGY, i] - mean * sum_gy) / contrast - sum_fgy
+            sx, sy = -(c00 * bx + c01 * by), -(c01 * bx + c11 * by)
+            left = 2.0 * f2 * (1.0 - correlation) + sx * bx + sy * by
             left = max(left, 0.0)
             zncc[r, c, k] = 1.0 - 0.5 * left / f2
             misfit[r, c, k] = left / p
@@ -326,7 +234,7 @@ def make_windows(images: int) -> DenseKernels:
                 )
                 turn[2 * j + 1] = _cubic(small[4, 0], small[4, 2], small[4, 1], small[4, 3], u)
             for j in range(4):
-                turn[j] /= ray_lens
+                turn[j] /= spacing
             measured[2 * k] = predicted[0] + turn[0] * sx + turn[1] * sy
             measured[2 * k + 1] = predicted[1] + turn[2] * sx + turn[3] * sy
             det = turn[0] * turn[3] - turn[1] * turn[2]
@@ -349,8 +257,6 @@ def make_windows(images: int) -> DenseKernels:
             at_state[j] = state[j]
         slopes = small[12:18]
         positions(lens1, lens2, R, t, ray, at_state, shift, images, predicted, slopes)
-        det = c00 * c11 - c01 * c01
-        i00, i01, i11 = c11 / det, -c01 / det, c00 / det
         B = small[18:24]
         last = 5 if images == 3 else 2
         for k in range(images):
@@ -371,7 +277,7 @@ def make_windows(images: int) -> DenseKernels:
         for k in range(images):
             for o in range(images):
                 weight = weights[k, o]
-                w00, w01, w11 = weight * i00, weight * i01, weight * i11
+                w00, w01, w11 = weight * xx, weight * xy, weight * yy
                 for j in range(last):
                     a, b = B[2 * k, j], B[2 * k + 1, j]
                     if a == 0.0 and b == 0.0:
@@ -470,9 +376,8 @@ def make_windows(images: int) -> DenseKernels:
             subset,
             order,
             variances,
-            first_order,
         ) = given
-        ring, place, values, tap, tx, ty, sums, scratch, windows, gram, inverse, rhs, levels, weights, normal, small = space
+        ring, values, tap, tx, ty, sums, windows, levels, weights, normal, small = space
         status = out.status
         cols = reference.pixels.shape[1]
         half = subset // 2
@@ -481,7 +386,7 @@ def make_windows(images: int) -> DenseKernels:
             for x in range(sums.shape[1]):
                 sums[a, x] = 0.0
         cameras = (lens1, lens2, R, t, to_sys, variances)
-        parts = (gram, inverse, rhs, levels, weights, normal, small)
+        parts = (levels, weights, normal, small)
         left = int(math.floor(lattice.x0 + 0.5))
         full = float(subset * subset)
         below = -1  # first row of pixels that is not summed yet
@@ -495,26 +400,15 @@ def make_windows(images: int) -> DenseKernels:
             for y in range(below, top + subset):
                 slot = y % subset
                 if y >= origin + subset:
-                    add(ring[slot], place[slot], -1.0, blocks, sums)
+                    add(ring[slot], -1.0, blocks, sums)
                 _row_of_pixels(
                     y, reference, blocked, shown, lattice, nodes, known, grey, order, images, ring[slot], values, tap, tx, ty
                 )
-                place[slot] = float(y - origin)
-                add(ring[slot], place[slot], 1.0, blocks, sums)
+                add(ring[slot], 1.0, blocks, sums)
             below = top + subset
             start, n = left - half + lattice.first * lattice.step, lattice.last - lattice.first
-            for a in range(n_unit):
+            for a in range(n_columns):
                 _slide(sums[a], start, subset, lattice.step, n, windows[a])
-            for a in range(len(times_x)):
-                c = times_x[a]
-                for x in range(cols):
-                    scratch[x] = x * sums[c, x]
-                _slide(scratch, start, subset, lattice.step, n, windows[n_unit + a])
-            for a in range(len(times_xx)):
-                c = times_xx[a]
-                for x in range(cols):
-                    scratch[x] = x * (x * sums[c, x])
-                _slide(scratch, start, subset, lattice.step, n, windows[n_unit + len(times_x) + a])
             along = r * lattice.step / lattice.spacing
             cell_r = min(int(along), cells.shape[0] - 1)
             v = along - cell_r
@@ -536,9 +430,9 @@ def make_windows(images: int) -> DenseKernels:
                     local[j] = (1.0 - v) * (
                         (1.0 - u) * state[cell_r, cell_c, j] + u * state[cell_r, cell_c + 1, j]
                     ) + v * ((1.0 - u) * state[cell_r + 1, cell_c, j] + u * state[cell_r + 1, cell_c + 1, j])
-                at = (x_px, y_px, x_px, y_px - origin, cell_r + lattice.rim, cell_c + lattice.rim, u, v)
+                at = (x_px, y_px, cell_r + lattice.rim, cell_c + lattice.rim, u, v)
                 status[r, c] = vector(
-                    windows, i, at, lattice.spacing, cameras, shown, nodes, local, parts, first_order, out, r, c
+                    windows, i, at, lattice.spacing, cameras, nodes, local, parts, out, r, c
                 )
 
     return DenseKernels(band, space)
