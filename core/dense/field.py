@@ -123,7 +123,7 @@ def _measure(
     step_px: int,
 ) -> Field:
     ordinary = shape if motion is None else motion
-    _check(ordinary, grid, step_px)
+    _check(grid, step_px)
     prepared = [image.prepared(options.interpolation, noise, options.blur) for image, noise in
                 zip(images, (*options.noise, *options.noise), strict=False)]  # fmt: skip
     state = _state(pair, ordinary)
@@ -155,7 +155,7 @@ def _measure(
     return _field(windows, ordinary, dense, grid, options, step_px)
 
 
-def _check(field: Field, grid: PointGrid, step_px: int) -> None:
+def _check(grid: PointGrid, step_px: int) -> None:
     if not (DENSE_STEP_PX.holds(step_px) and step_px <= grid.spacing_px):
         raise InputError(
             f"the dense step is {step_px} px, it must be {DENSE_STEP_PX} and at most the points' spacing, "

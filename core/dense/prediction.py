@@ -81,11 +81,15 @@ def predict(xy_px: Float, positions: Float, measured: Bool, cuts: Cuts | None, *
         tolerance = _JUMP_PX + _JUMP_SD * scatter * _share_left(half, spacing, subset_px)
         with np.errstate(invalid="ignore"):
             fits = whole & (np.abs(found[:, :, 0] - positions) <= tolerance).all(axis=-1)
-        new = np.pad(fits, rim) & ~known
-        coefficients[new] = found[new[rim : rim + rows, rim : rim + cols]]
-        known |= new
+        layer = np.pad(found, (*wide, (0, 0), (0, 0)), constant_values=np.nan)
+        reached = np.pad(fits, rim)
         for _ in range(half):  # to the rim, where the same quadratic goes on
-            known = _spread(coefficients, known, shown, _JUMP_PX + _JUMP_SD * scatter, inside)
+            reached = _spread(layer, reached, shown, _JUMP_PX + _JUMP_SD * scatter, inside)
+        new = reached & ~known
+        coefficients[new] = layer[new]
+        known |= new
+        if known[inside].all():
+            break
     for _ in range(rim):
         known = _spread(coefficients, known, shown, _JUMP_PX + _JUMP_SD * scatter, ~inside)
     c = coefficients
@@ -99,10 +103,8 @@ def predict(xy_px: Float, positions: Float, measured: Bool, cuts: Cuts | None, *
     )
 
 
-def _quadratics(
-    xy_px: Float, positions: Float, measured: Bool, cuts: Cuts | None, half: int
-) -> tuple[Float, Bool]:
-    """Coefficients (r, c, 6, m) of 1, x, y, x^2, x y, y^2 (offsets in points), and (r, c) where whole windows have them."""
+def _quadratics(xy_px: Float, positions: Float, measured: Bool, cuts: Cuts | None, half: int) -> tuple[Float, Bool]:
+    """Coefficients (r, c, 6, m) of 1, x, y, x^2, x y, y^2, offsets in points, and where whole windows have them."""
     rows, cols, m = positions.shape
     out = np.full((rows, cols, 6, m), np.nan)
     if min(rows, cols) < 2 * half + 1:
@@ -148,7 +150,7 @@ def _scatter(values: Float) -> Float:
 def _spread(coefficients: Float, known: Bool, shown: Float, tolerance: Float, where: Bool) -> Bool:
     """Extend the quadratics, in place, by one point each way, to points ``where``; return where there are some."""
     rows, cols = known.shape
-    r, k = np.nonzero(ndimage.binary_dilation(known, np.ones((3, 3))) & ~known & where)
+    r, k = np.nonzero(ndimage.binary_dilation(known, np.ones((3, 3), bool)) & ~known & where)
     if len(r) == 0:
         return known
     found = np.full((8, len(r), *coefficients.shape[2:]), np.nan)

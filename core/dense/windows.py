@@ -144,9 +144,7 @@ def measure_windows(
         sigma=np.full((rows, cols), np.nan),
         status=np.full((rows, cols), PointStatus.OUTSIDE_IMAGE, np.int8),
     )
-    run, make = (
-        (drivers.motion_rows, drivers.motion_space) if motion else (drivers.shape_rows, drivers.shape_space)
-    )
+    run, make = (drivers.motion_rows, drivers.motion_space) if motion else (drivers.shape_rows, drivers.shape_space)
     local = threading.local()
     cells = prediction.known.shape[1] - 1
 

@@ -113,9 +113,7 @@ class DenseSteps:
             self._shape = shape, dense_shape(self.pair, images[:2], shape, grid, self.options, step_px=self.step_px)
         if not result.has_motion:
             return self._shape[1]
-        return dense_motion(
-            self.pair, images, shape, result, self._shape[1], grid, self.options, step_px=self.step_px
-        )
+        return dense_motion(self.pair, images, shape, result, self._shape[1], grid, self.options, step_px=self.step_px)
 
     def take(self, n: int) -> DenseStep | None:
         """Return the dense field of a step, once; None where none was measured."""

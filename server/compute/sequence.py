@@ -202,8 +202,13 @@ class SequenceMeasurement:
         )
         self._terms[step.n] = self._systematic(result, images)
         if self._dense.wanted:
-            self._dense.measure(step.n, self._field(self.reference.n) if result.has_motion else result, result,
-                                (self.pair.image1, self.pair.image2, *(images or ())), self.grid)
+            self._dense.measure(
+                step.n,
+                self._field(self.reference.n) if result.has_motion else result,
+                result,
+                (self.pair.image1, self.pair.image2, *(images or ())),
+                self.grid,
+            )
         self._fields = {n: f for n, f in self._fields.items() if n == self.reference.n} | {step.n: result}
         return result
 

@@ -10,8 +10,8 @@ from core.matching.kernels.given import ComparedImage, ReferenceImage
 class Lattice(NamedTuple):
     """Points of the ordinary field and vectors between them.
 
-    Column and row of the first point, px; distance of points and of vectors, px; first column of vectors and the one after the last; points
-    beyond the field on each side.
+    Column and row of the first point, px; distance of points and of vectors, px; first column of vectors whose windows
+    lie in the image, and the one after the last; points of the prediction beyond the field on each side.
     """
 
     x0: float
@@ -55,7 +55,7 @@ class DenseSpace(NamedTuple):
     """Work space of a thread: rows of pixels in a ring, sums of columns, sums of windows, and small matrices."""
 
     ring: Any
-    values: Any
+    lines: Any
     tap: Any
     tx: Any
     ty: Any

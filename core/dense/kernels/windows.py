@@ -30,6 +30,7 @@ from core.status import PointStatus
 
 MASKED = int(PointStatus.MASKED)
 _MIN_CONTRAST2 = 1e-6
+_OFF_IMAGE = 1.0 / 4096.0  # how much a pixel that another image does not show counts: the window's sum tells it
 
 
 class DenseKernels(NamedTuple):
@@ -61,75 +62,77 @@ def _cubic(a, b, c, e, u):
 
 
 @inner
-def _row_of_pixels(y, reference, blocked, images, lattice, nodes, known, grey, order, n_images, row, values, tap, tx, ty):
-    """Fill one row of pixels: what is seen, weights, the reference, and the images where the prediction sees them."""
-    pixels, grad_x, grad_y, weights = reference
-    cols = pixels.shape[1]
+def _places(y, lattice, nodes, known, image, shape, lead, lines, row, tap, tx, ty):
+    """First taps and fractions of one image along a row of pixels; ``row[0]`` says which of them count."""
+    _, high, wide, stride = image
+    k, cols = shape
     along = (y - lattice.y0) / lattice.spacing + lattice.rim
-    cell_row = int(math.floor(along))
-    for x in range(cols):
-        row[0, x] = 1.0
-    if y >= pixels.shape[0] or cell_row < 0 or cell_row + 1 >= known.shape[0]:
+    top = math.floor(along)
+    n_cells = known.shape[1] - 1
+    _along_row(nodes, top, along - top, k, n_cells + 1, lines)
+    begin, per_spacing = 0, 1.0 / lattice.spacing
+    for cell in range(n_cells):
+        x_here = lattice.x0 + (cell - lattice.rim) * lattice.spacing
+        last = min(max(math.ceil(x_here + lattice.spacing), begin), cols)
+        first = min(max(math.ceil(x_here), begin), last)
+        whole = known[top, cell] & known[top, cell + 1] & known[top + 1, cell] & known[top + 1, cell + 1]
+        if whole == 0:
+            first = last
+        for x in range(begin, first):
+            tap[x], row[0, x] = 0, 0.0
+        begin = last
+        ax, bx, cx, ex = lines[0, cell], lines[1, cell], lines[0, cell + 1], lines[1, cell + 1]
+        ay, by, cy, ey = lines[2, cell], lines[3, cell], lines[2, cell + 1], lines[3, cell + 1]
+        for x in range(first, last):
+            u = (x - x_here) * per_spacing
+            px, py = _cubic(ax, bx, cx, ex, u), _cubic(ay, by, cy, ey, u)
+            if px >= 0.0 and py >= 0.0 and px <= wide - 1.0 and py <= high - 1.0:
+                ix, iy = int(px), int(py)
+                tap[x] = (iy + PAD - lead) * stride + ix + PAD - lead
+                tx[x], ty[x] = px - ix, py - iy
+            else:
+                tap[x] = 0
+                if row[0, x] == 1.0:
+                    row[0, x] = _OFF_IMAGE
+    for x in range(begin, cols):
+        tap[x], row[0, x] = 0, 0.0
+
+
+@inner
+def _row_of_pixels(y, reference, blocked, images, lattice, nodes, known, grey, order, n_images, row, space):
+    """Fill one row of pixels: what counts, the reference, and the images where the prediction sees them."""
+    pixels, grad_x, grad_y, weights = reference
+    lines, tap, tx, ty = space
+    cols = pixels.shape[1]
+    top = math.floor((y - lattice.y0) / lattice.spacing + lattice.rim)
+    if y >= pixels.shape[0] or top < 0 or top + 1 >= known.shape[0]:
         for r in range(row.shape[0]):
             for x in range(cols):
                 row[r, x] = 0.0
         return
+    for x in range(cols):
+        row[0, x] = 1.0
     lead = 1 if order == 3 else 2
-    n_cells = known.shape[1] - 1
     blocks = np.int64((cols + LANES - 1) // LANES)
     for k in range(n_images):
-        coefficients, high, wide, stride = images[k]
-        _along_row(nodes, cell_row, along - cell_row, k, n_cells + 1, values)
-        begin = 0
-        for cell in range(n_cells):
-            x_here = lattice.x0 + (cell - lattice.rim) * lattice.spacing
-            first = min(max(int(math.ceil(x_here)), begin), cols)
-            last = min(max(int(math.ceil(x_here + lattice.spacing)), first), cols)
-            for x in range(begin, first):
-                tap[x], row[0, x] = 0, 0.0
-            begin = last
-            whole = (
-                known[cell_row, cell] != 0
-                and known[cell_row, cell + 1] != 0
-                and known[cell_row + 1, cell] != 0
-                and known[cell_row + 1, cell + 1] != 0
-            )
-            if not whole:
-                for x in range(first, last):
-                    tap[x], row[0, x] = 0, 0.0
-                continue
-            ax, bx, cx, ex = values[0, cell], values[1, cell], values[0, cell + 1], values[1, cell + 1]
-            ay, by, cy, ey = values[2, cell], values[3, cell], values[2, cell + 1], values[3, cell + 1]
-            for x in range(first, last):
-                u = (x - x_here) / lattice.spacing
-                px, py = _cubic(ax, bx, cx, ex, u), _cubic(ay, by, cy, ey, u)
-                if px >= 0.0 and py >= 0.0 and px <= wide - 1.0 and py <= high - 1.0:
-                    ix, iy = int(px), int(py)
-                    tap[x] = (iy + PAD - lead) * stride + ix + PAD - lead
-                    tx[x], ty[x] = px - ix, py - iy
-                else:
-                    tap[x] = 0
-                    if row[0, x] == 1.0:
-                        row[0, x] = 1.0 / 4096.0  # off an image: told from what is not predicted by the count
-        for x in range(begin, cols):
-            tap[x], row[0, x] = 0, 0.0
+        _places(y, lattice, nodes, known, images[k], (k, cols), lead, lines, row, tap, tx, ty)
+        coefficients, stride, seen = images[k].coefficients, np.int64(images[k].stride), row[N_ROWS + k]
         if order == 3:
-            interpolate_cubic(coefficients, np.int64(stride), tap, tx, ty, blocks, row[N_ROWS + k])
+            interpolate_cubic(coefficients, stride, tap, tx, ty, blocks, seen)
         else:
-            interpolate_quintic(coefficients, np.int64(stride), tap, tx, ty, blocks, row[N_ROWS + k])
+            interpolate_quintic(coefficients, stride, tap, tx, ty, blocks, seen)
         level = np.float32(grey[1 + k])
         for x in range(cols):
-            row[N_ROWS + k, x] -= level
-    level = np.float32(grey[0])
-    masked, weighted = blocked.shape[0] > 0, weights.shape[0] > 0
+            seen[x] -= level
+    if blocked.shape[0] > 0:
+        for x in range(cols):
+            if blocked[y, x] != 0:
+                row[0, x] = 0.0
+    level, weighted = np.float32(grey[0]), weights.shape[0] > 0
     for x in range(cols):
-        if masked and blocked[y, x] != 0:
-            row[0, x] = 0.0
-        one = np.float32(1.0)
+        one = np.float32(1.0) if row[0, x] == 1.0 else np.float32(0.0)
         if weighted:
-            one = weights[y, x]
-        if row[0, x] != 1.0:
-            one = np.float32(0.0)
+            one *= weights[y, x]
         row[1, x] = one
         row[2, x] = pixels[y, x] - level
         row[3, x] = one * grad_x[y, x]
@@ -157,11 +160,12 @@ def make_windows(images: int) -> DenseKernels:
     """Compile the kernel for a shape (1 image compared) or a motion (3)."""
     n_columns = columns_of(images)
     add = add_row[images]
+
     def space(width: int, subset: int, cells: int, vectors: int) -> DenseSpace:
         wide = (width + LANES - 1) // LANES * LANES
         return DenseSpace(
             ring=np.zeros((subset, N_ROWS + images, wide), np.float32),
-            values=np.zeros((4, cells + 1)),
+            lines=np.zeros((4, cells + 1)),
             tap=np.zeros(wide, np.int32),
             tx=np.zeros(wide, np.float32),
             ty=np.zeros(wide, np.float32),
@@ -220,17 +224,23 @@ def make_windows(images: int) -> DenseKernels:
                     corner[m] = _cubic(top[0], top[2], low[0], low[2], v)
                     corner[2 + m] = _cubic(top[1], top[3], low[1], low[3], v)
                     d = low[0] - top[0]
-                    small[4, m] = top[2] + v * (6.0 * d - 4.0 * top[2] - 2.0 * low[2]) + v * v * (
-                        3.0 * (top[2] + low[2]) - 6.0 * d
+                    small[4, m] = (
+                        top[2]
+                        + v * (6.0 * d - 4.0 * top[2] - 2.0 * low[2])
+                        + v * v * (3.0 * (top[2] + low[2]) - 6.0 * d)
                     )
                     d = low[1] - top[1]
-                    small[4, 2 + m] = top[3] + v * (6.0 * d - 4.0 * top[3] - 2.0 * low[3]) + v * v * (
-                        3.0 * (top[3] + low[3]) - 6.0 * d
+                    small[4, 2 + m] = (
+                        top[3]
+                        + v * (6.0 * d - 4.0 * top[3] - 2.0 * low[3])
+                        + v * v * (3.0 * (top[3] + low[3]) - 6.0 * d)
                     )
                 d = corner[1] - corner[0]
                 predicted[j] = _cubic(corner[0], corner[2], corner[1], corner[3], u)
-                turn[2 * j] = corner[2] + u * (6.0 * d - 4.0 * corner[2] - 2.0 * corner[3]) + u * u * (
-                    3.0 * (corner[2] + corner[3]) - 6.0 * d
+                turn[2 * j] = (
+                    corner[2]
+                    + u * (6.0 * d - 4.0 * corner[2] - 2.0 * corner[3])
+                    + u * u * (3.0 * (corner[2] + corner[3]) - 6.0 * d)
                 )
                 turn[2 * j + 1] = _cubic(small[4, 0], small[4, 2], small[4, 1], small[4, 3], u)
             for j in range(4):
@@ -245,7 +255,7 @@ def make_windows(images: int) -> DenseKernels:
             into[0], into[1], into[2], into[3] = turn[3] / det, -turn[1] / det, -turn[2] / det, turn[0] / det
             moved[r, c, k] = math.sqrt(sx * sx + sy * sy)
         joint_weights(levels, variances, images, weights)
-        # from pixels to the unknowns: B_k = (d patch px / d image px) (d image px / d unknown), C the patch's covariance
+        # from pixels to the unknowns: B_k = (d reference px / d image px) (d image px / d unknown)
         xc, yc = undistort(lens1, x_px, y_px)
         ray, shift, at_state = small[8], small[9], small[10]
         ray[0], ray[1] = xc, yc
@@ -377,7 +387,7 @@ def make_windows(images: int) -> DenseKernels:
             order,
             variances,
         ) = given
-        ring, values, tap, tx, ty, sums, windows, levels, weights, normal, small = space
+        ring, lines, tap, tx, ty, sums, windows, levels, weights, normal, small = space
         status = out.status
         cols = reference.pixels.shape[1]
         half = subset // 2
@@ -386,14 +396,14 @@ def make_windows(images: int) -> DenseKernels:
             for x in range(sums.shape[1]):
                 sums[a, x] = 0.0
         cameras = (lens1, lens2, R, t, to_sys, variances)
-        parts = (levels, weights, normal, small)
-        left = int(math.floor(lattice.x0 + 0.5))
+        parts, of_row = (levels, weights, normal, small), (lines, tap, tx, ty)
+        left = math.floor(lattice.x0 + 0.5)
         full = float(subset * subset)
         below = -1  # first row of pixels that is not summed yet
         local = np.zeros(5)
         for r in range(first, last):
             y_px = lattice.y0 + r * lattice.step
-            top = int(math.floor(y_px + 0.5)) - half
+            top = math.floor(y_px + 0.5) - half
             if below < 0:
                 below = top
                 origin = top
@@ -402,7 +412,7 @@ def make_windows(images: int) -> DenseKernels:
                 if y >= origin + subset:
                     add(ring[slot], -1.0, blocks, sums)
                 _row_of_pixels(
-                    y, reference, blocked, shown, lattice, nodes, known, grey, order, images, ring[slot], values, tap, tx, ty
+                    y, reference, blocked, shown, lattice, nodes, known, grey, order, images, ring[slot], of_row
                 )
                 add(ring[slot], 1.0, blocks, sums)
             below = top + subset
@@ -431,8 +441,6 @@ def make_windows(images: int) -> DenseKernels:
                         (1.0 - u) * state[cell_r, cell_c, j] + u * state[cell_r, cell_c + 1, j]
                     ) + v * ((1.0 - u) * state[cell_r + 1, cell_c, j] + u * state[cell_r + 1, cell_c + 1, j])
                 at = (x_px, y_px, cell_r + lattice.rim, cell_c + lattice.rim, u, v)
-                status[r, c] = vector(
-                    windows, i, at, lattice.spacing, cameras, nodes, local, parts, out, r, c
-                )
+                status[r, c] = vector(windows, i, at, lattice.spacing, cameras, nodes, local, parts, out, r, c)
 
     return DenseKernels(band, space)

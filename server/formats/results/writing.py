@@ -170,11 +170,7 @@ def fill(dataset: Any, result: Field, provenance: Provenance, strain: StrainFiel
             dataset.strain_note = "strain of smoothed displacements: gauge_px and gauge_mm hold the smoothing's window"
     if result.dense is not None:
         dataset.setncatts(
-            {
-                "method": METHOD,
-                "dense": json.dumps(result.dense.document(), sort_keys=True),
-                "neighbours": NEIGHBOURS,
-            }
+            {"method": METHOD, "dense": json.dumps(result.dense.document(), sort_keys=True), "neighbours": NEIGHBOURS}
         )
     if result.patch is not None:
         dataset.setncatts(
