@@ -19,10 +19,12 @@ from core.field.region.window import fit_terms, steps_of, ways_cut, window_offse
 
 _WIDTHS = (1.5, 1.0, 0.7)
 """Half widths of the windows that quadratics are fitted to, in subsets. The wider has the less noise in its curvature,
-which is what reaches a vector: its value is measured anew. The narrower serve where it does not fit."""
+which is all that reaches a vector: its value is measured anew. It is taken if its curvature differs from the narrowest
+one's by less than that one's noise, as the field's rms; and the narrower serve where it does not fit."""
 _MIN_HALF = 2  # points; fewer leave nothing to judge a quadratic by
 
 _JUMP_PX, _JUMP_SD = 0.01, 6.0
+_TINY_PX = 2e-4
 _BEYOND_PX = 0.1  # by which what neighbours predict beyond the outermost points may differ
 
 
@@ -35,16 +37,16 @@ class Prediction:
     nodes
         (r + 2 rim, c + 2 rim, m, 4) of m image coordinates, px: value, slope along columns, along rows, and mixed
         derivative, per spacing.
-    known
-        (r + 2 rim, c + 2 rim) True where there is a prediction.
+    seen
+        (r + 2 rim - 1, c + 2 rim - 1) True between four points with a prediction that continue one another.
     cells
-        (r - 1, c - 1) True between four measured points of one smooth part: vectors lie there alone.
+        (r - 1, c - 1) True where these four are measured points: vectors lie there alone.
     rim
         Points beyond the field on each side.
     """
 
     nodes: Float
-    known: Bool
+    seen: Bool
     cells: Bool
     rim: int
 
@@ -74,10 +76,12 @@ def predict(xy_px: Float, positions: Float, measured: Bool, cuts: Cuts | None, *
     coefficients = np.full((*shown.shape[:2], 6, m), np.nan)
     known = np.zeros(shown.shape[:2], bool)
     inside = np.pad(measured, rim)
-    narrow, whole = _quadratics(xy_px, positions, measured, cuts, halves[-1])
-    scatter = _scatter((narrow[:, :, 0] - positions)[whole]) / _share_left(halves[-1], spacing, subset_px)
+    narrow, fitted = _quadratics(xy_px, positions, measured, cuts, halves[-1])
+    scatter = _scatter((narrow[:, :, 0] - positions)[fitted]) / _share_left(halves[-1], spacing, subset_px)
     for half in halves:
-        found, whole = (narrow, whole) if half == halves[-1] else _quadratics(xy_px, positions, measured, cuts, half)
+        found, whole = (narrow, fitted) if half == halves[-1] else _quadratics(xy_px, positions, measured, cuts, half)
+        if half != halves[-1] and _bends(found, narrow, (half, halves[-1]), scatter, spacing, subset_px):
+            continue
         tolerance = _JUMP_PX + _JUMP_SD * scatter * _share_left(half, spacing, subset_px)
         with np.errstate(invalid="ignore"):
             fits = whole & (np.abs(found[:, :, 0] - positions) <= tolerance).all(axis=-1)
@@ -94,13 +98,35 @@ def predict(xy_px: Float, positions: Float, measured: Bool, cuts: Cuts | None, *
         known = _spread(coefficients, known, shown, _JUMP_PX + _JUMP_SD * scatter, ~inside)
     c = coefficients
     nodes = np.stack([c[:, :, 0], c[:, :, 1], c[:, :, 2], c[:, :, 4]], axis=-1)
-    inner = known[rim : rim + rows, rim : rim + cols] & measured
+    tolerance = _JUMP_PX + _JUMP_SD * scatter
+    seen = _continuous(c, known, np.maximum(tolerance, _BEYOND_PX))
+    within = known & inside
+    cells = seen & _continuous(c, within, tolerance)
     return Prediction(
         nodes=np.ascontiguousarray(np.where(known[..., None, None], nodes, 0.0)),
-        known=known,
-        cells=inner[1:, 1:] & inner[1:, :-1] & inner[:-1, 1:] & inner[:-1, :-1],
+        seen=seen & ~(_all_four(within) & ~cells),
+        cells=cells[rim : rim + rows - 1, rim : rim + cols - 1],
         rim=rim,
     )
+
+
+def _all_four(points: Bool) -> Bool:
+    """Cells (r - 1, c - 1) with all four corners."""
+    return np.asarray(points[1:, 1:] & points[1:, :-1] & points[:-1, 1:] & points[:-1, :-1])
+
+
+def _continuous(c: Float, known: Bool, tolerance: Float) -> Bool:
+    """Cells (r - 1, c - 1) with all four corners, over whose sides each corner's quadratic meets the next one's value."""
+
+    def meet(a: Float, b: Float, x: float, y: float) -> Bool:
+        with np.errstate(invalid="ignore"):
+            there = np.abs(_moved(a, x, y)[..., 0, :] - b[..., 0, :]) <= tolerance
+            back = np.abs(_moved(b, -x, -y)[..., 0, :] - a[..., 0, :]) <= tolerance
+        return np.asarray((there & back).all(axis=-1))
+
+    along = meet(c[:, :-1], c[:, 1:], 1.0, 0.0)
+    down = meet(c[:-1], c[1:], 0.0, 1.0)
+    return _all_four(known) & along[1:] & along[:-1] & down[:, 1:] & down[:, :-1]
 
 
 def _quadratics(xy_px: Float, positions: Float, measured: Bool, cuts: Cuts | None, half: int) -> tuple[Float, Bool]:
@@ -133,13 +159,43 @@ def _quadratics(xy_px: Float, positions: Float, measured: Bool, cuts: Cuts | Non
 
 def _share_left(half: int, spacing_px: float, subset_px: int) -> float:
     """What a quadratic leaves of its middle point's noise, as a standard deviation: neighbours share pixels."""
+    left = -_weights(half)[0]
+    left[0] += 1.0  # the middle comes first
+    return _noise_of(left, half, spacing_px, subset_px)
+
+
+def _weights(half: int) -> Float:
+    """Weights (6, n) of a whole window's points in its coefficients, offsets in half widths."""
+    terms = fit_terms(window_offsets(half)[0], half, 2)
+    return np.asarray(np.linalg.solve(terms.T @ terms, terms.T))
+
+
+def _noise_of(weights: Float, half: int, spacing_px: float, subset_px: int) -> float:
+    """Standard deviation of a weighted sum over a window's points, of standard deviation 1, that share pixels."""
     offsets, _ = window_offsets(half)
     lag = np.abs(offsets[:, None, :] - offsets[None, :, :]) * (spacing_px / subset_px)
     shared = np.maximum(1.0 - lag, 0.0).prod(axis=-1)
-    terms = fit_terms(offsets, half, 2)
-    left = -np.linalg.solve(terms.T @ terms, terms.T)[0]
-    left[0] += 1.0  # the middle comes first
-    return float(np.sqrt(max(left @ shared @ left, 1e-6)))
+    return float(np.sqrt(max(weights @ shared @ weights, 1e-6)))
+
+
+def _bends(
+    wide: Float, narrow: Float, halves: tuple[int, int], scatter: Float, spacing_px: float, subset_px: int
+) -> bool:
+    """Return True if the curvature of wide windows misses more than the noise of narrow ones' adds to a vector.
+
+    What reaches a vector is the mean of the quadratic's second-order terms over its window. The field's scatter is the
+    noise of one point.
+    """
+    moment = (subset_px / spacing_px) ** 2 / 12.0
+    apart = moment * (wide[:, :, (3, 5)] - narrow[:, :, (3, 5)]).sum(axis=2)
+    apart = apart[np.isfinite(apart).all(axis=-1)]
+    if len(apart) == 0:
+        return False
+    weights = [_weights(half)[[3, 5]].sum(axis=0) * moment / half**2 for half in halves]
+    both = weights[0].copy()
+    both[: len(weights[1])] -= weights[1]  # a window's inner rings come first
+    noise = [_noise_of(w, half, spacing_px, subset_px) for w, half in ((both, halves[0]), (weights[1], halves[1]))]
+    return bool((np.mean(apart**2, axis=0) > (noise[0] ** 2 + noise[1] ** 2) * scatter**2 + _TINY_PX**2).any())
 
 
 def _scatter(values: Float) -> Float:
@@ -172,9 +228,10 @@ def _spread(coefficients: Float, known: Bool, shown: Float, tolerance: Float, wh
 
 
 def _moved(c: Float, x: float, y: float) -> Float:
-    """Coefficients (n, 6, m) of the same quadratics about a place ``x, y`` further on."""
+    """Coefficients (..., 6, m) of the same quadratics about a place ``x, y`` further on."""
     out = c.copy()
-    out[:, 0] = c[:, 0] + x * c[:, 1] + y * c[:, 2] + x * x * c[:, 3] + x * y * c[:, 4] + y * y * c[:, 5]
-    out[:, 1] = c[:, 1] + 2.0 * x * c[:, 3] + y * c[:, 4]
-    out[:, 2] = c[:, 2] + x * c[:, 4] + 2.0 * y * c[:, 5]
+    one, by_x, by_y, xx, xy, yy = np.moveaxis(c, -2, 0)
+    out[..., 0, :] = one + x * by_x + y * by_y + x * x * xx + x * y * xy + y * y * yy
+    out[..., 1, :] = by_x + 2.0 * x * xx + y * xy
+    out[..., 2, :] = by_y + x * xy + 2.0 * y * yy
     return out

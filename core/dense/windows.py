@@ -126,7 +126,7 @@ def measure_windows(
         to_sys=own(np.concatenate([to_sys.rotation, to_sys.translation_mm[:, None]], axis=1)),
         lattice=Lattice(x0, y0, spacing, int(step_px), first, last, prediction.rim),
         nodes=own(prediction.nodes),
-        known=prediction.known.astype(np.uint8),
+        seen=prediction.seen.astype(np.uint8),
         cells=prediction.cells.astype(np.uint8),
         state=own(state),
         levels=levels,
@@ -146,7 +146,7 @@ def measure_windows(
     )
     run, make = (drivers.motion_rows, drivers.motion_space) if motion else (drivers.shape_rows, drivers.shape_space)
     local = threading.local()
-    cells = prediction.known.shape[1] - 1
+    cells = prediction.seen.shape[1]
 
     def work(begin: int, end: int) -> None:
         if not hasattr(local, "space"):

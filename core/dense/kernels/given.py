@@ -26,7 +26,7 @@ class Lattice(NamedTuple):
 class DenseGiven(NamedTuple):
     """Images, cameras, prediction and settings.
 
-    ``blocked`` (rows, cols) uint8 of camera 1's image, 1 where a pixel does not count, or empty. ``nodes``, ``known``,
+    ``blocked`` (rows, cols) uint8 of camera 1's image, 1 where a pixel does not count, or empty. ``nodes``, ``seen``,
     ``cells``: see :class:`core.dense.prediction.Prediction`. ``state`` (r, c, 5) w0, G00, G10, G20 and the epipolar
     offset at the points. ``levels`` (1 + images,) grey levels that are taken off the images, so that sums keep their
     digits. ``variances``: of the images' noise at weight 1, or all one.
@@ -42,7 +42,7 @@ class DenseGiven(NamedTuple):
     to_sys: Any
     lattice: Lattice
     nodes: Any
-    known: Any
+    seen: Any
     cells: Any
     state: Any
     levels: Any

@@ -62,21 +62,20 @@ def _cubic(a, b, c, e, u):
 
 
 @inner
-def _places(y, lattice, nodes, known, image, shape, lead, lines, row, tap, tx, ty):
+def _places(y, lattice, nodes, seen, image, size, lead, lines, row, tap, tx, ty):
     """First taps and fractions of one image along a row of pixels; ``row[0]`` says which of them count."""
     _, high, wide, stride = image
-    k, cols = shape
+    k, cols = size
     along = (y - lattice.y0) / lattice.spacing + lattice.rim
     top = math.floor(along)
-    n_cells = known.shape[1] - 1
+    n_cells = seen.shape[1]
     _along_row(nodes, top, along - top, k, n_cells + 1, lines)
     begin, per_spacing = 0, 1.0 / lattice.spacing
     for cell in range(n_cells):
         x_here = lattice.x0 + (cell - lattice.rim) * lattice.spacing
         last = min(max(math.ceil(x_here + lattice.spacing), begin), cols)
         first = min(max(math.ceil(x_here), begin), last)
-        whole = known[top, cell] & known[top, cell + 1] & known[top + 1, cell] & known[top + 1, cell + 1]
-        if whole == 0:
+        if seen[top, cell] == 0:
             first = last
         for x in range(begin, first):
             tap[x], row[0, x] = 0, 0.0
@@ -99,13 +98,13 @@ def _places(y, lattice, nodes, known, image, shape, lead, lines, row, tap, tx, t
 
 
 @inner
-def _row_of_pixels(y, reference, blocked, images, lattice, nodes, known, grey, order, n_images, row, space):
+def _row_of_pixels(y, reference, blocked, images, lattice, nodes, seen, grey, order, n_images, row, space):
     """Fill one row of pixels: what counts, the reference, and the images where the prediction sees them."""
     pixels, grad_x, grad_y, weights = reference
     lines, tap, tx, ty = space
     cols = pixels.shape[1]
     top = math.floor((y - lattice.y0) / lattice.spacing + lattice.rim)
-    if y >= pixels.shape[0] or top < 0 or top + 1 >= known.shape[0]:
+    if y >= pixels.shape[0] or top < 0 or top >= seen.shape[0]:
         for r in range(row.shape[0]):
             for x in range(cols):
                 row[r, x] = 0.0
@@ -115,15 +114,15 @@ def _row_of_pixels(y, reference, blocked, images, lattice, nodes, known, grey, o
     lead = 1 if order == 3 else 2
     blocks = np.int64((cols + LANES - 1) // LANES)
     for k in range(n_images):
-        _places(y, lattice, nodes, known, images[k], (k, cols), lead, lines, row, tap, tx, ty)
-        coefficients, stride, seen = images[k].coefficients, np.int64(images[k].stride), row[N_ROWS + k]
+        _places(y, lattice, nodes, seen, images[k], (k, cols), lead, lines, row, tap, tx, ty)
+        coefficients, stride, grey_row = images[k].coefficients, np.int64(images[k].stride), row[N_ROWS + k]
         if order == 3:
-            interpolate_cubic(coefficients, stride, tap, tx, ty, blocks, seen)
+            interpolate_cubic(coefficients, stride, tap, tx, ty, blocks, grey_row)
         else:
-            interpolate_quintic(coefficients, stride, tap, tx, ty, blocks, seen)
+            interpolate_quintic(coefficients, stride, tap, tx, ty, blocks, grey_row)
         level = np.float32(grey[1 + k])
         for x in range(cols):
-            seen[x] -= level
+            grey_row[x] -= level
     if blocked.shape[0] > 0:
         for x in range(cols):
             if blocked[y, x] != 0:
@@ -379,7 +378,7 @@ def make_windows(images: int) -> DenseKernels:
             to_sys,
             lattice,
             nodes,
-            known,
+            seen,
             cells,
             state,
             grey,
@@ -412,7 +411,7 @@ def make_windows(images: int) -> DenseKernels:
                 if y >= origin + subset:
                     add(ring[slot], -1.0, blocks, sums)
                 _row_of_pixels(
-                    y, reference, blocked, shown, lattice, nodes, known, grey, order, images, ring[slot], of_row
+                    y, reference, blocked, shown, lattice, nodes, seen, grey, order, images, ring[slot], of_row
                 )
                 add(ring[slot], 1.0, blocks, sums)
             below = top + subset
