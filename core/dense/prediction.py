@@ -116,7 +116,7 @@ def _all_four(points: Bool) -> Bool:
 
 
 def _continuous(c: Float, known: Bool, tolerance: Float) -> Bool:
-    """Cells (r - 1, c - 1) with all four corners, over whose sides each corner's quadratic meets the next one's value."""
+    """Cells (r - 1, c - 1) with all four corners, along whose sides each quadratic meets the next point's value."""
 
     def meet(a: Float, b: Float, x: float, y: float) -> Bool:
         with np.errstate(invalid="ignore"):
