@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.dense.kernels import drivers
+from core.dense.kernels.finish import AtPoints, Limits, Shape
 from core.dense.kernels.given import DenseGiven, DenseOut, Lattice
 from core.dense.prediction import Prediction
 from core.field.region.cuts import Cuts
@@ -28,17 +30,18 @@ _MIN_ROWS = 32
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """Sums of a field's windows, solved: arrays over (r, c) vectors, see ``DenseOut``."""
+    """A field's windows, solved.
+
+    Attributes
+    ----------
+    xy_px
+        (r, c, 2) the vectors, in camera 1's reference image.
+    found
+        What was found at each.
+    """
 
     xy_px: Float
-    values: Float
-    covariance: Float
-    epipolar_px: Float
-    zncc: Float
-    misfit: Float
-    moved_px: Float
-    sigma_px: Float
-    status: NDArray[np.int8]
+    found: DenseOut
 
 
 def node_positions(pair: StereoPair, xy_px: Float, state: Float, *, motion: bool) -> Float:
@@ -134,14 +137,18 @@ def measure_windows(
         order=setting.order,
         variances=setting.variances,
     )
+
+    def empty(*tail: int, dtype: type = np.float32) -> NDArray[Any]:
+        return np.full((rows, cols, *tail), np.nan, dtype)
+
     out = DenseOut(
-        values=np.full((rows, cols, 6 if motion else 3), np.nan),
-        covariance=np.full((rows, cols, 21 if motion else 6), np.nan),
-        epipolar=np.full((rows, cols), np.nan),
-        zncc=np.full((rows, cols, n), np.nan),
-        misfit=np.full((rows, cols, n), np.nan),
-        moved=np.full((rows, cols, n), np.nan),
-        sigma=np.full((rows, cols), np.nan),
+        values=empty(6 if motion else 3, dtype=np.float64),
+        covariance=empty(21 if motion else 6),
+        epipolar=empty(dtype=np.float64),
+        zncc=empty(n, dtype=np.float64),
+        misfit=empty(n),
+        moved=empty(n),
+        sigma=empty(),
         status=np.full((rows, cols), PointStatus.OUTSIDE_IMAGE, np.int8),
     )
     run, make = (drivers.motion_rows, drivers.motion_space) if motion else (drivers.shape_rows, drivers.shape_space)
@@ -158,7 +165,7 @@ def measure_windows(
         size = min(_ROWS_AT_ONCE * max(1, options.subset_px // (16 * step_px)), -(-count // threads()))
         run_ranges(work, count, max(size, _MIN_ROWS))
     x, y = np.meshgrid(x0 + step_px * np.arange(cols), y0 + step_px * np.arange(rows))
-    return Windows(np.stack([x, y], axis=-1), *out)
+    return Windows(np.stack([x, y], axis=-1), out)
 
 
 def _inside(start: float, step: int, count: int, half: int, size: int) -> tuple[int, int]:
@@ -176,3 +183,15 @@ def _blocked(shape: tuple[int, int], cuts: Cuts | None, white: Bool | None) -> N
     for line in cuts.lines_px if cuts else ():
         cv2.polylines(out, [np.rint(line).astype(np.int32)], False, 1, _CUT_WIDTH_PX)
     return out
+
+
+def finish_windows(windows: Windows, points: AtPoints, limits: Limits, shape: Shape) -> tuple[Float, Float]:
+    """Check the vectors, in place, and return their covariance (r, c, n, n) mm^2 and noise (r, c) grey levels."""
+    rows, cols, n = windows.found.values.shape
+    covariance, noise = np.empty((rows, cols, n, n)), np.empty((rows, cols))
+
+    def work(begin: int, end: int) -> None:
+        drivers.finish_rows(begin, end, windows.found, points, limits, shape, covariance, noise)
+
+    run_ranges(work, rows, _MIN_ROWS)
+    return covariance, noise

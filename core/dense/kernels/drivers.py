@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from core.dense.kernels.cameras import positions
+from core.dense.kernels.finish import finish
 from core.dense.kernels.windows import make_windows
 from core.matching.kernels.drivers import kernel_sources
 from core.matching.kernels.naming import entry, stamp_of
@@ -44,8 +45,14 @@ def _entries(stamp: int):  # type: ignore[no-untyped-def]
             shift[0], shift[1], _ = epipolar_shift(lens2, R, t, rays[i, 0], rays[i, 1], state[i, 0])
             positions(lens1, lens2, R, t, rays[i], state[i], shift, images, out[i], slopes)
 
-    return shape_rows, motion_rows, project
+    @entry
+    def finish_rows(first, last, found, points, limits, shape, covariance, noise):
+        if stamp < 0:
+            return
+        finish(first, last, found, points, limits, shape, covariance, noise)
+
+    return shape_rows, motion_rows, project, finish_rows
 
 
-shape_rows, motion_rows, project = _entries(_STAMP)
-"""See :func:`core.dense.kernels.windows.make_windows` and :func:`core.dense.kernels.cameras.positions`."""
+shape_rows, motion_rows, project, finish_rows = _entries(_STAMP)
+"""See :mod:`core.dense.kernels.windows`, :func:`core.dense.kernels.cameras.positions`, :func:`.finish.finish`."""

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from core.dense.prediction import Prediction, predict
 from core.dense.windows import Windows, measure_windows, node_positions
@@ -28,6 +31,22 @@ from tests.support.matching_scene import (
 PAIRS = {"seidel": lambda: paper_pair(kappa=2e-8), "opencv": opencv_pair, "rational": rational_pair}
 AFTER = Plane(np.array([0.02, -0.01, 0.015]), np.array([[1.01, 0.02], [-0.015, 0.995], [0.03, -0.02]]))
 SUBSET, SPACING = 17, 8
+
+
+class Found(NamedTuple):
+    """The windows' arrays under short names."""
+
+    xy_px: NDArray
+    values: NDArray
+    covariance: NDArray
+    epipolar_px: NDArray
+    zncc: NDArray
+    status: NDArray
+
+    @staticmethod
+    def of(windows: Windows) -> Found:
+        f = windows.found
+        return Found(windows.xy_px, f.values, f.covariance, f.epipolar, f.zncc, f.status)
 
 
 class Scene:
@@ -70,13 +89,13 @@ class Scene:
             rim,
         )
 
-    def measured(self, images: int, interpolation: str, step: int = 2, **more: object) -> Windows:
+    def measured(self, images: int, interpolation: str, step: int = 2, **more: object) -> Found:
         options = MatchOptions(subset_px=SUBSET, interpolation=interpolation)  # type: ignore[arg-type]
         shown = [prepare(image, interpolation) for image in self.images[: images + 1]]  # type: ignore[arg-type]
         given = {"cuts": None, "white": None} | more
-        return measure_windows(
+        return Found.of(measure_windows(
             self.pair, shown, self.xy, self.state, self.prediction(images), options, step_px=step, **given
-        )  # type: ignore[arg-type]
+        ))  # type: ignore[arg-type]  # fmt: skip
 
 
 @pytest.fixture(scope="module", params=PAIRS)
@@ -145,8 +164,10 @@ def test_a_louder_image_weighs_less(scene: Scene) -> None:
     options = MatchOptions(subset_px=SUBSET)
     models = [NoiseModel(coefficients=(v, 0.0, 0.0)) for v in (4.0, 4.0, 4.0, 400.0)]
     shown = [prepare(image, noise=model) for image, model in zip(scene.images, models, strict=True)]
-    loud = measure_windows(
-        scene.pair, shown, scene.xy, scene.state, scene.prediction(3), options, step_px=4, cuts=None, white=None
+    loud = Found.of(
+        measure_windows(
+            scene.pair, shown, scene.xy, scene.state, scene.prediction(3), options, step_px=4, cuts=None, white=None
+        )
     )
     # variances are for noise of variance 1 without a model, in (grey levels)^2 with one
     along = [0, 6, 11, 15, 18, 20]
