@@ -120,8 +120,8 @@ def _continuous(c: Float, known: Bool, tolerance: Float) -> Bool:
 
     def meet(a: Float, b: Float, x: float, y: float) -> Bool:
         with np.errstate(invalid="ignore"):
-            there = np.abs(_moved(a, x, y)[..., 0, :] - b[..., 0, :]) <= tolerance
-            back = np.abs(_moved(b, -x, -y)[..., 0, :] - a[..., 0, :]) <= tolerance
+            there = np.abs(_value(a, x, y) - b[..., 0, :]) <= tolerance
+            back = np.abs(_value(b, -x, -y) - a[..., 0, :]) <= tolerance
         return np.asarray((there & back).all(axis=-1))
 
     along = meet(c[:, :-1], c[:, 1:], 1.0, 0.0)
@@ -146,12 +146,14 @@ def _quadratics(xy_px: Float, positions: Float, measured: Bool, cuts: Cuts | Non
     values = np.where(measured[..., None], positions - middle, 0.0)
     by_x = [ndimage.correlate1d(values, place**a, axis=1, mode="constant") for a in range(3)]
     moments = np.stack(
-        [ndimage.correlate1d(by_x[a], place**b, axis=0, mode="constant")[whole]
-         for a, b in ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))], axis=1
-    )  # fmt: skip
+        [
+            ndimage.correlate1d(by_x[a], place**b, axis=0, mode="constant")[whole]
+            for a, b in ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+        ]
+    )
     terms = fit_terms(window_offsets(half)[0], half, 2)
     scale = np.array([1.0, half, half, half**2, half**2, half**2])[:, None]
-    found = np.einsum("ij,njm->nim", np.linalg.inv(terms.T @ terms) / scale, moments)
+    found = np.moveaxis(np.tensordot(np.linalg.inv(terms.T @ terms) / scale, moments, axes=1), 0, 1)
     found[:, 0] += middle
     out[whole] = found
     return out, whole
@@ -227,11 +229,16 @@ def _spread(coefficients: Float, known: Bool, shown: Float, tolerance: Float, wh
     return out
 
 
+def _value(c: Float, x: float, y: float) -> Float:
+    """Values (..., m) of quadratics (..., 6, m) at a place ``x, y`` further on."""
+    terms = np.array([1.0, x, y, x * x, x * y, y * y])
+    return np.asarray(sum(c[..., i, :] * terms[i] for i in np.flatnonzero(terms)))
+
+
 def _moved(c: Float, x: float, y: float) -> Float:
     """Coefficients (..., 6, m) of the same quadratics about a place ``x, y`` further on."""
     out = c.copy()
-    one, by_x, by_y, xx, xy, yy = np.moveaxis(c, -2, 0)
-    out[..., 0, :] = one + x * by_x + y * by_y + x * x * xx + x * y * xy + y * y * yy
-    out[..., 1, :] = by_x + 2.0 * x * xx + y * xy
-    out[..., 2, :] = by_y + x * xy + 2.0 * y * yy
+    out[..., 0, :] = _value(c, x, y)
+    out[..., 1, :] += 2.0 * x * c[..., 3, :] + y * c[..., 4, :]
+    out[..., 2, :] += x * c[..., 4, :] + 2.0 * y * c[..., 5, :]
     return out
