@@ -153,7 +153,10 @@ def _quadratics(xy_px: Float, positions: Float, measured: Bool, cuts: Cuts | Non
     )
     terms = fit_terms(window_offsets(half)[0], half, 2)
     scale = np.array([1.0, half, half, half**2, half**2, half**2])[:, None]
-    found = np.moveaxis(np.tensordot(np.linalg.inv(terms.T @ terms) / scale, moments, axes=1), 0, 1)
+    solution = np.linalg.inv(terms.T @ terms) / scale
+    found = np.empty((len(moments[0]), 6, m))
+    for i, row in enumerate(solution):  # half of it is zero: even and odd terms do not mix
+        found[:, i] = sum(row[j] * moments[j] for j in np.flatnonzero(np.abs(row) > 1e-12 * np.abs(row).max()))
     found[:, 0] += middle
     out[whole] = found
     return out, whole

@@ -58,17 +58,21 @@ def node_positions(pair: StereoPair, xy_px: Float, state: Float, *, motion: bool
     motion
         False: of camera 2's reference alone; True: of camera 1's and camera 2's current image besides.
     """
+    return _projected(pair, xy_px, state, 3 if motion else 1)[..., : 6 if motion else 2]
+
+
+def _projected(pair: StereoPair, xy_px: Float, state: Float, images: int) -> Float:
+    """(r, c, 9) of the points: image coordinates, then camera 2's shift across the epipolar line (``DenseGiven``)."""
     rows, cols = xy_px.shape[:2]
-    out = np.full((rows * cols, 6), np.nan)
+    out = np.full((rows * cols, 9), np.nan)
     pose = pair.cam2_from_cam1
     rays = own(pair.cam1.rays_cam(xy_px.reshape(-1, 2)).xyz_mm)
     given = own(np.nan_to_num(state.reshape(-1, 5), nan=1.0))
     drivers.project(
-        lens_of(pair.cam1), lens_of(pair.cam2), own(pose.rotation), own(pose.translation_mm), rays, given,
-        3 if motion else 1, out,
-    )  # fmt: skip
+        lens_of(pair.cam1), lens_of(pair.cam2), own(pose.rotation), own(pose.translation_mm), rays, given, images, out
+    )
     out[~np.isfinite(state).all(axis=2).ravel()] = np.nan
-    return out[:, : 6 if motion else 2].reshape(rows, cols, -1)
+    return out.reshape(rows, cols, 9)
 
 
 def measure_windows(
@@ -131,7 +135,7 @@ def measure_windows(
         nodes=own(prediction.nodes),
         seen=prediction.seen.astype(np.uint8),
         cells=prediction.cells.astype(np.uint8),
-        state=own(state),
+        state=own(np.concatenate([state, _projected(pair, xy_px, state, n)[..., 6:]], axis=-1)),
         levels=levels,
         subset=options.subset_px,
         order=setting.order,

@@ -42,7 +42,8 @@ def _entries(stamp: int):  # type: ignore[no-untyped-def]
             return
         shift, slopes = np.zeros(2), np.zeros((6, 6))
         for i in range(rays.shape[0]):
-            shift[0], shift[1], _ = epipolar_shift(lens2, R, t, rays[i, 0], rays[i, 1], state[i, 0])
+            shift[0], shift[1], along = epipolar_shift(lens2, R, t, rays[i, 0], rays[i, 1], state[i, 0])
+            out[i, 6], out[i, 7], out[i, 8] = shift[0], shift[1], along
             positions(lens1, lens2, R, t, rays[i], state[i], shift, images, out[i], slopes)
 
     @entry

@@ -23,7 +23,7 @@ from core.dense.kernels.rows import N_ROWS, add_row, columns_of, interpolate_cub
 from core.matching.image import PAD
 from core.matching.kernels.naming import inner, kernel
 from core.matching.kernels.noise import CONTRAST, DENSITY, N_LEVELS, joint_weights
-from core.matching.kernels.point import LOW_TEXTURE, OK, OUTSIDE_IMAGE, SINGULAR, epipolar_shift
+from core.matching.kernels.point import LOW_TEXTURE, OK, OUTSIDE_IMAGE, SINGULAR
 from core.matching.kernels.vectors import LANES
 from core.matching.kernels.warp import undistort
 from core.status import PointStatus
@@ -173,11 +173,11 @@ def make_windows(images: int) -> DenseKernels:
             levels=np.zeros((images, N_LEVELS)),
             weights=np.zeros((images, images)),
             normal=np.zeros((2, 5, 5)),
-            small=np.zeros((24, 6)),
+            small=np.zeros((26, 6)),
         )
 
     @kernel(f"{images}")
-    def vector(s, i, at, spacing, given, nodes, state, parts, out, r, c):
+    def vector(s, i, at, per_px, given, nodes, state, parts, out, r, c):
         """One vector; status."""
         lens1, lens2, R, t, to_sys, variances = given
         levels, weights, normal, small = parts
@@ -206,10 +206,11 @@ def make_windows(images: int) -> DenseKernels:
             if not g2 > _MIN_CONTRAST2 * f2:
                 return LOW_TEXTURE
             contrast = math.sqrt(g2 / f2)
-            correlation = (s[base + q.FG, i] - mean * s[q.F, i]) / math.sqrt(f2 * g2)
+            per_contrast = 1.0 / contrast
+            correlation = (s[base + q.FG, i] - mean * s[q.F, i]) * per_contrast / f2
             levels[k, CONTRAST] = contrast
-            bx = (s[base + q.GGX, i] - mean * sum_gx) / contrast - sum_fgx
-            by = (s[base + q.GGY, i] - mean * sum_gy) / contrast - sum_fgy
+            bx = (s[base + q.GGX, i] - mean * sum_gx) * per_contrast - sum_fgx
+            by = (s[base + q.GGY, i] - mean * sum_gy) * per_contrast - sum_fgy
             sx, sy = -(c00 * bx + c01 * by), -(c01 * bx + c11 * by)
             left = 2.0 * f2 * (1.0 - correlation) + sx * bx + sy * by
             left = max(left, 0.0)
@@ -243,7 +244,7 @@ def make_windows(images: int) -> DenseKernels:
                 )
                 turn[2 * j + 1] = _cubic(small[4, 0], small[4, 2], small[4, 1], small[4, 3], u)
             for j in range(4):
-                turn[j] /= spacing
+                turn[j] *= per_px
             measured[2 * k] = predicted[0] + turn[0] * sx + turn[1] * sy
             measured[2 * k + 1] = predicted[1] + turn[2] * sx + turn[3] * sy
             det = turn[0] * turn[3] - turn[1] * turn[2]
@@ -251,22 +252,22 @@ def make_windows(images: int) -> DenseKernels:
                 return SINGULAR
             levels[k, DENSITY] = min(max(abs(det), 0.01), 100.0)
             into = small[5 + k]
-            into[0], into[1], into[2], into[3] = turn[3] / det, -turn[1] / det, -turn[2] / det, turn[0] / det
+            over = 1.0 / det
+            into[0], into[1], into[2], into[3] = turn[3] * over, -turn[1] * over, -turn[2] * over, turn[0] * over
             moved[r, c, k] = math.sqrt(sx * sx + sy * sy)
         joint_weights(levels, variances, images, weights)
         # from pixels to the unknowns: B_k = (d reference px / d image px) (d image px / d unknown)
         xc, yc = undistort(lens1, x_px, y_px)
         ray, shift, at_state = small[8], small[9], small[10]
         ray[0], ray[1] = xc, yc
-        nu_x, nu_y, along = epipolar_shift(lens2, R, t, xc, yc, state[0])
+        shift[0], shift[1], along = state[5], state[6], state[7]
         if not along > 0.0:
             return SINGULAR
-        shift[0], shift[1] = nu_x, nu_y
         for j in range(5):
             at_state[j] = state[j]
         slopes = small[12:18]
         positions(lens1, lens2, R, t, ray, at_state, shift, images, predicted, slopes)
-        B = small[18:24]
+        B, weighted = small[18:24], small[24:26]
         last = 5 if images == 3 else 2
         for k in range(images):
             into = small[5 + k]
@@ -278,23 +279,28 @@ def make_windows(images: int) -> DenseKernels:
                 a, b = slopes[2 * k, from_j], slopes[2 * k + 1, from_j]
                 B[2 * k, j] = into[0] * a + into[1] * b
                 B[2 * k + 1, j] = into[2] * a + into[3] * b
-        N, pull = normal[0], small[3]
+        N, pull, D = normal[0], small[3], weighted
         for j in range(last):
             pull[j] = 0.0
-            for m in range(last):
+            for m in range(j + 1):
                 N[j, m] = 0.0
         for k in range(images):
+            tx, ty = 0.0, 0.0
             for o in range(images):
-                weight = weights[k, o]
-                w00, w01, w11 = weight * xx, weight * xy, weight * yy
-                for j in range(last):
-                    a, b = B[2 * k, j], B[2 * k + 1, j]
-                    if a == 0.0 and b == 0.0:
-                        continue
-                    ca, cb = w00 * a + w01 * b, w01 * a + w11 * b
-                    pull[j] += ca * measured[2 * o] + cb * measured[2 * o + 1]
-                    for m in range(j + 1):
-                        N[j, m] += ca * B[2 * o, m] + cb * B[2 * o + 1, m]
+                tx += weights[k, o] * measured[2 * o]
+                ty += weights[k, o] * measured[2 * o + 1]
+            tx, ty = xx * tx + xy * ty, xy * tx + yy * ty
+            for m in range(last):
+                a, b = 0.0, 0.0
+                for o in range(images):
+                    a += weights[k, o] * B[2 * o, m]
+                    b += weights[k, o] * B[2 * o + 1, m]
+                D[0, m], D[1, m] = xx * a + xy * b, xy * a + yy * b
+            for j in range(last):
+                a, b = B[2 * k, j], B[2 * k + 1, j]
+                pull[j] += a * tx + b * ty
+                for m in range(j + 1):
+                    N[j, m] += a * D[0, m] + b * D[1, m]
         if not factor(N, last):
             return SINGULAR
         L = normal[1]
@@ -399,7 +405,8 @@ def make_windows(images: int) -> DenseKernels:
         left = math.floor(lattice.x0 + 0.5)
         full = float(subset * subset)
         below = -1  # first row of pixels that is not summed yet
-        local = np.zeros(5)
+        local = np.zeros(8)
+        per_px = 1.0 / lattice.spacing
         for r in range(first, last):
             y_px = lattice.y0 + r * lattice.step
             top = math.floor(y_px + 0.5) - half
@@ -435,11 +442,11 @@ def make_windows(images: int) -> DenseKernels:
                     status[r, c] = OUTSIDE_IMAGE if missing - math.floor(missing) > 1e-6 else MASKED
                     continue
                 x_px = lattice.x0 + c * lattice.step
-                for j in range(5):
+                for j in range(8):
                     local[j] = (1.0 - v) * (
                         (1.0 - u) * state[cell_r, cell_c, j] + u * state[cell_r, cell_c + 1, j]
                     ) + v * ((1.0 - u) * state[cell_r + 1, cell_c, j] + u * state[cell_r + 1, cell_c + 1, j])
                 at = (x_px, y_px, cell_r + lattice.rim, cell_c + lattice.rim, u, v)
-                status[r, c] = vector(windows, i, at, lattice.spacing, cameras, nodes, local, parts, out, r, c)
+                status[r, c] = vector(windows, i, at, per_px, cameras, nodes, local, parts, out, r, c)
 
     return DenseKernels(band, space)
