@@ -18,6 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from server.formats.results.folder import DENSE
 from server.worker import process as worker_process
 from server.worker.process import TaskChannel
 from server.worker.tasks import StepTask
@@ -128,7 +129,8 @@ def run_with_files(
     moved = task.moved(folder, there)
     answer = run(name, topic, threads, function, moved)
     written = {}
-    for file in (f"starts_{task.step.n:04d}.npz", f"step_{task.step.n:04d}.nc"):  # the result last
+    result = f"step_{task.step.n:04d}.nc"
+    for file in (f"{DENSE}/{result}", f"starts_{task.step.n:04d}.npz", result):  # the result last
         if (folder / file).is_file():
             written[file] = (folder / file).read_bytes()
     with contextlib.suppress(OSError):  # read once

@@ -20,6 +20,11 @@ def dense_result(path: Path) -> Path:
     return path.parent / DENSE / path.name
 
 
+def home_of(path: Path) -> Path:
+    """Return the folder of the ordinary results that a result file, dense or not, belongs to."""
+    return path.parent.parent if path.parent.name == DENSE else path.parent
+
+
 def results_in(folder: Path) -> list[Path]:
     """Return a folder's result files, by step."""
     return sorted(p for p in folder.glob("step_*.nc") if _RESULT.fullmatch(p.name))
