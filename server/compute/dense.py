@@ -104,7 +104,7 @@ class DenseSteps:
         try:
             found = self._of(shape, result, images, grid)
         except InputError as error:
-            reason = str(error)
+            reason = error.cause
         self._done[n] = DenseStep(field=found, reason=reason, seconds=round(time.perf_counter() - began, 3))
 
     def _of(self, shape: Field, result: Field, images: Sequence[MeasureImage], grid: PointGrid) -> Field:
