@@ -58,6 +58,8 @@ SPACING_PX = Range(1, 1000, False, 10)
 STRAIN_WINDOW = Range(3, 101, True, 9)
 #: no default window: displacements are smoothed only on request
 SMOOTHING_WINDOW = Range(3, 51, True, 5)
+#: no default in a measurement: a dense field is made only on request; beyond 20 px it is no denser than a usual grid
+DENSE_STEP_PX = Range(1, 20, False, 2)
 #: a wider Gaussian would leave a handful of independent pixels in the subset
 PREFILTER_OF_SUBSET = 0.25
 #: beyond it a match is as likely one speckle off
@@ -264,6 +266,12 @@ class AnalysisSettings(Settings):
         "gauges then take its value. null: as measured.",
         json_schema_extra=ODD,
     )
+    dense_step_px: Annotated[Whole, Field(ge=DENSE_STEP_PX.low, le=DENSE_STEP_PX.high)] | None = Field(
+        None,
+        description="Distance of the vectors of a dense field, px, at most spacing_px: beside each step a field of "
+        "vectors in one step from the ordinary field, each over the whole subset about it; neighbours correlate by the "
+        "pixels they share. null: none.",
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -289,6 +297,10 @@ class AnalysisSettings(Settings):
             raise disagreement(f"seeds_cam2 has {len(self.seeds_cam2)} positions for {len(self.seeds or [])} seeds")
         if self.prefilter_px > PREFILTER_OF_SUBSET * self.subset_px:
             raise disagreement(f"prefilter_px must be at most a quarter of subset_px, {self.subset_px}")
+        if self.dense_step_px is not None and self.dense_step_px > self.spacing_px:
+            raise disagreement(
+                f"dense_step_px is {self.dense_step_px}; it must be at most spacing_px, {self.spacing_px}"
+            )
         return self
 
 

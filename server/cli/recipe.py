@@ -27,6 +27,7 @@ _PLAIN = {
     "max_sigma": "max_sigma_px",
     "reference_update": "reference_update",
     "smooth": "smoothing_window",
+    "dense": "dense_step_px",
 }
 MASK_FILE = "recipe_mask.png"
 """The recipe's mask, in the output folder."""

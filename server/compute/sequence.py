@@ -10,7 +10,7 @@ import json
 import time
 import weakref
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,14 +34,16 @@ from core.strain import StrainOptions
 from core.systematic.interpolation import SmoothSlopes
 from core.systematic.terms import Systematic, terms_of, with_strain
 from server.compute.camera_watch import CameraWatch
+from server.compute.dense import DenseStep, DenseSteps
 from server.compute.strain import smoothed_step, strain_of_step, summarise_strain
 from server.formats.calibrations.native import covariance_in
 from server.formats.calibrations.recognise import LoadedCalibration
 from server.formats.calibrations.volume import own_px_of, parameter_covariance, rbe_of, volume_of
-from server.formats.files import sha256_of, write_bytes
+from server.formats.files import make_folder, sha256_of, write_bytes
 from server.formats.images import read_image
 from server.formats.noise_json import LoadedNoise
 from server.formats.results.camera_motion import CameraMotion
+from server.formats.results.folder import dense_result
 from server.formats.results.reading import read_measured
 from server.formats.results.starts import starts_file, with_starts, write_starts
 from server.formats.results.summary import summarise, to_json
@@ -110,6 +112,7 @@ class SequenceMeasurement:
         self._models = (None, None) if self.noise is None else self.noise.models
         self._volume = volume_of(self.calibration)
         self._common = CommonParts(self.calibration.pair, parameter_covariance(self.calibration))
+        self._dense_common = CommonParts(self.calibration.pair, self._common.source)
         self._rbe_px = rbe_of(self.calibration)
         self._fields: dict[Path, Field] = {}  # by the file that has it, or will have it
         self._previous: int | None = None
@@ -119,6 +122,7 @@ class SequenceMeasurement:
         self._sequence: Updating | None = None
         self._motions: dict[int, CameraMotion | None] = {}
         self._terms: dict[int, Systematic] = {}
+        self._dense = DenseSteps(self.calibration.pair, self.options, self.settings.dense_step_px)
         self._smooth: SmoothSlopes | None = None
         self._watch = CameraWatch(
             self.calibration.pair,
@@ -220,6 +224,14 @@ class SequenceMeasurement:
         self._terms[step.n] = self._systematic(result, images)
         if from_head and previous is not None:
             self._watch.forget(previous)
+        if self._dense.wanted:
+            self._dense.measure(
+                step.n,
+                self._field(self.reference.n) if result.has_motion else result,
+                result,
+                (self.pair.image1, self.pair.image2, *(images or ())),
+                self.grid,
+            )
         self._keep(self.file_of(step.n), result)
         return result
 
@@ -320,6 +332,9 @@ class SequenceMeasurement:
             ).document(),
             "strain": None if strain is None else summarise_strain(strain, shown).document(),
         }
+        dense = self._dense.take(step.n)
+        if dense is not None:
+            summary["dense"] = self._finish_dense(step, dense, about, systematic, in_service=in_service)
         greys = {cam: made for cam, made in zip(CAMERAS, step.grey_from, strict=True) if made is not None}
         if greys:
             summary["grey_from"] = greys
@@ -333,6 +348,29 @@ class SequenceMeasurement:
         return FinishedStep(
             n=step.n, field=shown, summary={**summary, "write_s": round(time.perf_counter() - began, 3)}
         )
+
+    def _finish_dense(
+        self,
+        step: StepImages,
+        dense: DenseStep,
+        about: Mapping[str, str],
+        systematic: Mapping[str, Any] | None,
+        *,
+        in_service: bool,
+    ) -> dict[str, Any]:
+        """Write the dense field of a step, before the step's own file; return its entry of the summary."""
+        if dense.field is None:
+            return dense.entry(None, None)
+        shown = self._dense_common.of(mark_extrapolated(dense.field, self._volume))
+        path = dense_result(self.file_of(step.n))
+        make_folder(path.parent)
+        # what sharp texture does to a match is the same; the ordinary patches' own terms are not a dense field's
+        terms = {"interpolation": None if systematic is None else systematic.get("interpolation")}
+        more = {**about, "systematic": json.dumps({**terms, "patch_order": None, "strain_window": None})}
+        provenance = self._provenance(step, dense.field, more)
+        settings = {**provenance.settings, "spacing_px": self.settings.dense_step_px, "strain": None}
+        write_field(path, shown, replace(provenance, settings=settings), checksum=in_service)
+        return dense.entry(shown, f"{path.parent.name}/{path.name}")
 
     def file_of(self, n: int, kind: Earlier = "step") -> Path:
         """Return the path of a step's result, or of its head."""

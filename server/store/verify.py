@@ -17,6 +17,7 @@ from core.names import CAMERAS
 from server.formats.calibrations.in_test import LATER
 from server.formats.calibrations.kept_checks import KEPT_CHECKS
 from server.formats.files import recorded_sha256, sha256_of, storage_error
+from server.formats.results.folder import DENSE
 from server.store.durable import read_json
 from server.store.folder import check_format, is_id, is_in_use
 from server.store.tests import number_of
@@ -44,7 +45,7 @@ _KNOWN = {
     "test": r"(test|calibration|watch|workspace|certificate_plan)\.json|calibrations|steps|analyses|exports|models",
     "step": r"step\.json|cam[12]\.tif",
     "analysis": r"(analysis|jobs|noise|summary)\.json|mask\.png|step_\d+\.(nc|nc\.sha256|json)|starts_\d+\.npz|"
-    r"head_\d+\.nc(\.sha256)?|head_starts_\d+\.npz",
+    r"head_\d+\.nc(\.sha256)?|head_starts_\d+\.npz|dense",
 }
 _WRITING_S = 1.0  # longer than a file is under way
 _FOLDERS = frozenset({"calibrations", "tests", "noise", "recipes", "certificates", "trash", ".exports"})
@@ -262,7 +263,7 @@ class _Walk:
         document = self.document(path / "analysis.json")
         if document is not None and (path / "mask.png").exists():
             self.compare(path / "mask.png", document.get("mask_sha256"))
-        for result in sorted(path.glob("step_[0-9]*.nc")):
+        for result in sorted((*path.glob("step_[0-9]*.nc"), *path.glob(f"{DENSE}/step_[0-9]*.nc"))):
             self.compare_beside(result)
         for beside in sorted(path.glob("step_[0-9]*.nc.sha256")):
             result = beside.with_suffix("")

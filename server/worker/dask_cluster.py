@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from core.errors import Cancelled, InputError, MeasurementError
-from server.formats.files import written_temporary
+from server.formats.files import make_folder, written_temporary
 from server.worker import dask_task
 from server.worker.executor import TaskExecutor, TaskFuture, WorkerDiedError
 from server.worker.tasks import StepTask
@@ -229,6 +229,7 @@ def _content(client: Any, path: Path) -> Any:
 def _keep(folder: Path, answer: Any, written: dict[str, bytes]) -> Any:
     """Write what a worker without our disk has made; the result last, with its checksum."""
     for name, content in written.items():
+        make_folder((folder / name).parent)
         with written_temporary(folder / name, checksum=name.endswith(".nc")) as temporary:
             temporary.write_bytes(content)
     return answer

@@ -18,6 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from server.formats.results.folder import DENSE
 from server.worker import process as worker_process
 from server.worker.process import TaskChannel
 from server.worker.tasks import StepTask, files_of
@@ -128,7 +129,10 @@ def run_with_files(
     moved = task.moved(folder, there)
     answer = run(name, topic, threads, function, moved)
     written = {}
-    for file in reversed(files_of(task.step.n, "step" if task.against is None else "head")):  # the result last
+    names = [*reversed(files_of(task.step.n, "step" if task.against is None else "head"))]  # the result last
+    if task.against is None:
+        names.insert(0, f"{DENSE}/{names[-1]}")
+    for file in names:
         if (folder / file).is_file():
             written[file] = (folder / file).read_bytes()
     with contextlib.suppress(OSError):  # read once

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from server.exports.request import ExportRequest
-from server.formats.results.folder import number_of
+from server.formats.results.folder import home_of, number_of
 from server.jobs.job import Job, Phase
 from server.workflows.analysis.framed import result_in, variable_of_frame
 from server.workflows.service import Service
@@ -31,7 +31,7 @@ def start_export(
         folder = service.exports.new_folder()
         try:
             framed = _in_frame(service, job, files, request, frame, folder / "frame")
-            task = service.exports.submit(files[0].parent, framed, request, folder)
+            task = service.exports.submit(home_of(files[0]), framed, request, folder)
             made = service.exports.keep(job.id, Path(result_of(task, job)))
         finally:
             shutil.rmtree(folder, ignore_errors=True)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from core.arrays import Bool, Float, Floats
 from core.common.factor import Causes
+from core.field.points.dense_record import DenseRecord
 from core.field.points.patch import PatchChoice
 from core.field.points.smoothing_record import Smoothing
 from core.field.points.starts import Starts
@@ -123,6 +124,8 @@ class Field:
         apart.
     rejected
         What was measured at rejected points; None unless it was asked for.
+    dense
+        How the vectors of a dense field were made; None in an ordinary field.
     starts
         The matcher's own unknowns, (r, c, ...), from which the next step of a sequence starts; not part of a result
         file, None in a field that was read from one.
@@ -155,6 +158,7 @@ class Field:
     causes: Causes | None = None
     frozen: Float | None = None
     rejected: Rejected | None = None
+    dense: DenseRecord | None = None
     starts: Starts | None = None
     failed_seeds_px: tuple[tuple[float, float], ...] = ()
 

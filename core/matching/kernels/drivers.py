@@ -11,7 +11,6 @@ differs from process to process.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from types import FunctionType
@@ -19,16 +18,15 @@ from typing import Any
 
 from core.matching.kernels.given import FitKernels
 from core.matching.kernels.motion import make_motion
-from core.matching.kernels.naming import entry
+from core.matching.kernels.naming import entry, stamp_of
 from core.matching.kernels.shape import make_shape
 
 
-def _stamp() -> int:
+def kernel_sources() -> list[Path]:
+    """Return the files that the kernels are made of."""
     here = Path(__file__).parent
     # besides the kernels' own: what their constants and the layout of a lens come from
-    sources = [*sorted(here.glob("*.py")), here.parents[1] / "status.py", here.parents[1] / "cameras" / "lens.py"]
-    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).digest()
-    return int.from_bytes(digest[:7], "big")
+    return [*sorted(here.glob("*.py")), here.parents[1] / "status.py", here.parents[1] / "cameras" / "lens.py"]
 
 
 def _entry(name: str, kernel: Any, stamp: int) -> Any:
@@ -68,7 +66,7 @@ def _point(*given: Any) -> tuple[int, int]:
     raise NotImplementedError
 
 
-_STAMP = _stamp()
+_STAMP = stamp_of(kernel_sources())
 _FITS = {"shape": {1: make_shape(1), 2: make_shape(2)}, "motion": {1: make_motion(1), 2: make_motion(2)}}
 
 

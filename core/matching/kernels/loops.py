@@ -92,7 +92,7 @@ def _two_columns(rows: list[Any], first: list[Any], wy: list[Vec]) -> tuple[Vec,
     return join(first_two, last_two, even), join(first_two, last_two, odd)
 
 
-def _spline(order: int, rows: list[Any], first: list[Any], tx: Vec, ty: Vec) -> Vec:
+def spline(order: int, rows: list[Any], first: list[Any], tx: Vec, ty: Vec) -> Vec:
     """36 (cubic) or 14400 (quintic) times the spline's value."""
     weights = _cubic_weights if order == 3 else _quintic_weights
     wx, wy = weights(tx), weights(ty)
@@ -110,7 +110,7 @@ def _position(c: list[Vec], x: Vec, y: Vec) -> Vec:
     return along_x + y * ((c[2] + x * (c[4] + x * c[7])) + y * ((c[5] + x * c[8]) + y * c[9]))
 
 
-def _lanes(builder: Any, indices: Any) -> list[Any]:
+def lanes(builder: Any, indices: Any) -> list[Any]:
     """Eight int32 lanes as 64-bit scalars, two at a time."""
     pairs = builder.bitcast(indices, ir.VectorType(LONG, LANES // 2))
     scalars = []
@@ -195,11 +195,11 @@ def _comparison(order: int, degree: int) -> Any:
                 builder.store((yt - yf).value, ty_next)
 
             def terms(offset: Any) -> list[Vec]:
-                first = _lanes(builder, builder.load(k_next))
+                first = lanes(builder, builder.load(k_next))
                 tx, ty = Vec(builder, builder.load(tx_next)), Vec(builder, builder.load(ty_next))
                 find_position(builder.add(offset, LONG(LANES)))
                 x, y, f, weight, gx, gy = (load(builder, at(builder, row, offset)) for row in ref)
-                d = _spline(order, rows, first, tx, ty) * gain - (warp[21] + f)
+                d = spline(order, rows, first, tx, ty) * gain - (warp[21] + f)
                 a = weight * d
                 bx, by = a * gx, a * gy
                 columns = _powers(x, y, degree)

@@ -129,6 +129,14 @@ def lens_jacobian(lens, u, v):
 
 
 @inner
+def image_of(lens, u, v):
+    """Return the pixel x, y of a normalised point, and d(image px) / d(normalised) there, row by row."""
+    near = _rational_expansion(lens, u, v) if is_rational(lens) else _plain_expansion(lens, u, v)
+    j11, j12, j21, j22 = _slopes(lens, near, u, v)
+    return near.x, near.y, j11, j12, j21, j22
+
+
+@inner
 def _radially_undistorted(lens, xd, yd):
     """Invert the radial factor of a rational lens alone, by bisection on the branch that contains the centre."""
     r_d, r_max = math.sqrt(xd * xd + yd * yd), math.sqrt(lens[11])

@@ -159,6 +159,18 @@ class AnalysisAccepted(Accepted):
     analysis_id: str = Field(description="Id of the analysis.", examples=["a000001-77d0b3"])
 
 
+class DenseFigures(Reply):
+    """A dense field in a few numbers."""
+
+    method: str = Field(description="Name of the method.", examples=["dense, shared windows"])
+    file: str | None = Field(None, description="Its file, in the analysis' folder; null: there is none.")
+    reason: str | None = Field(None, description="Why there is none.")
+    step_px: int | None = Field(None, description="Distance of vectors.")
+    window_px: int | None = Field(None, description="Width of the window of each; neighbours share its pixels.")
+    vectors: int | None = Field(None, description="Number of vectors.")
+    valid: int | None = Field(None, description="Vectors with values.")
+
+
 class StepFigures(Reply):
     """A field in a few numbers; `status`, `strain`, `patch` and further figures as in summary.json."""
 
@@ -174,6 +186,7 @@ class StepFigures(Reply):
     systematic: SystematicTerms | None = Field(
         None, description="What no standard uncertainty holds; null: not estimated, by an earlier version."
     )
+    dense: DenseFigures | None = Field(None, description="Its dense field; null: none was asked for.")
     wall_s: float | None = Field(None, description="Seconds that the step took.")
 
 

@@ -14,6 +14,7 @@ from core.settings import (
     DEFAULT_MAX_SIGMA_PX,
     DEFAULT_PATCH,
     DEFAULT_REFERENCE_UPDATE,
+    DENSE_STEP_PX,
     INTERPOLATIONS,
     MAX_SIGMA_PX,
     PATCH_SETTINGS,
@@ -134,6 +135,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "cut leaves points on one side and the planes' bias there outweighs their noise (auto)",
     )
     add("--strain-tensor", choices=STRAIN_TENSORS, help="strain tensor (green_lagrange)")
+    add(
+        "--dense",
+        metavar="STEP",
+        nargs="?",
+        const=str(DENSE_STEP_PX.default),
+        help=f"also a dense field of each step, a vector every STEP px ({DENSE_STEP_PX.default}), in DIR/dense: shared "
+        "windows, one step from the ordinary field; neighbours correlate",
+    )
     add("--smooth", metavar="WINDOW|off", help="smooth displacements by a quadratic over WINDOW x WINDOW points (off)")
     add(
         "--reference-update",
@@ -165,6 +174,8 @@ def run(args: argparse.Namespace) -> int:
         summary = measure_sequence(job, progress)
         files = [job.out / one["file"] for one in summary["steps"]]
         frame = read_head(files[-1]).frame if asked is None else _put_into(asked, files)
+        if asked is not None and job.settings.dense_step_px is not None:
+            progress.note("note: dense fields stay in the system frame")
         write_bytes(job.out / "summary.json", to_json({**summary, "frame": frame}))
         progress.note(f"frame of the files: {frame}")
     finally:
@@ -205,6 +216,17 @@ def _strain(args: argparse.Namespace) -> dict[str, object] | None:
 
 def _smoothing_window(args: argparse.Namespace) -> int | None:
     return None if args.smooth in (None, "off") else check_whole("--smooth", args.smooth, SMOOTHING_WINDOW)
+
+
+def _dense_step_px(args: argparse.Namespace, spacing_px: int) -> int | None:
+    if args.dense is None:
+        return None
+    step_px = check_whole("--dense", args.dense, DENSE_STEP_PX)
+    if step_px > spacing_px:
+        raise InputError(
+            f"--dense {step_px} is more than --step {spacing_px}: it would be no denser.", code="option_conflict"
+        )
+    return step_px
 
 
 def _max_sigma_px(args: argparse.Namespace) -> float:
@@ -311,6 +333,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
             "seeds": None if seeds is None else [seed.xy_px for seed in seeds],
             "seeds_cam2": None if seeds is None else [seed.xy2_px for seed in seeds],
             "smoothing_window": _smoothing_window(args),
+            "dense_step_px": _dense_step_px(args, step),
             "pattern": "projected" if args.projected else "surface",
             "reference_update": args.reference_update or ("never" if args.projected else DEFAULT_REFERENCE_UPDATE),
             "strain": strain,

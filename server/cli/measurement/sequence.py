@@ -30,6 +30,7 @@ from server.formats.calibrations.recognise import LoadedCalibration
 from server.formats.files import make_folder, sha256_of, write_bytes
 from server.formats.images import encode_png, read_mask
 from server.formats.noise_json import LoadedNoise
+from server.formats.results.folder import DENSE, results_in
 from server.formats.results.summary import SequenceSummary, region_found, to_json
 from server.formats.results.uncertainty import NOT_INCLUDED
 from server.formats.version import software_version
@@ -330,6 +331,7 @@ class _Runner:
             f"step {k} of {self.job.last}: {summary['valid']} of {summary['points']} points, "
             f"{residual}{_camera_offset(summary['camera_motion'])}{_strain_noise(summary['strain'])}{duration(seconds)}"
         )
+        self._note_dense(k, summary.get("dense"))
         self._note_patch(k, finished.field)
         self._note_reference(k, finished.field)
         self._note_smoothing(finished.field, summary["strain"])
@@ -351,6 +353,18 @@ class _Runner:
         self._smoothing_noted = True
         gauge = (None, None) if strain is None else (strain["gauge_px"], strain["window"])
         self._progress.note(f"note: {smoothing_note(result.smoothing, gauge[0], strain_window=gauge[1])}")
+
+    def _note_dense(self, n: int, dense: dict[str, Any] | None) -> None:
+        """Print how many vectors a step's dense field has, or why it has none."""
+        if dense is None:
+            return
+        if dense["file"] is None:
+            self._progress.note(f"step {n}: no dense field: {dense['reason']}")
+            return
+        self._progress.note(
+            f"step {n}: dense field of {dense['valid']} of {dense['vectors']} vectors, {dense['step_px']} px apart: "
+            f"{dense['file']}"
+        )
 
     def _note_patch(self, n: int, result: Field) -> None:
         """Print the reason for the patch: of the shape, of the first step, and where it changes."""
@@ -397,6 +411,6 @@ class _Runner:
 
     def _remove_older(self) -> None:
         """Remove an earlier run's results: more steps than now, or its summary, would pass for this one's."""
-        for path in self.job.out.iterdir():
+        for path in (*self.job.out.iterdir(), *results_in(self.job.out / DENSE)):
             if path.name == "summary.json" or _RESULT.fullmatch(path.name):
                 path.unlink()

@@ -11,6 +11,20 @@ from core.errors import InputError
 _RESULT = re.compile(r"step_\d{4,}\.nc")
 
 
+DENSE = "dense"
+"""Folder of the dense fields, inside that of the ordinary results: files of the same names and contract."""
+
+
+def dense_result(path: Path) -> Path:
+    """Return the path of the dense field that belongs to a step's result file."""
+    return path.parent / DENSE / path.name
+
+
+def home_of(path: Path) -> Path:
+    """Return the folder of the ordinary results that a result file, dense or not, belongs to."""
+    return path.parent.parent if path.parent.name == DENSE else path.parent
+
+
 def results_in(folder: Path) -> list[Path]:
     """Return a folder's result files, by step."""
     return sorted(p for p in folder.glob("step_*.nc") if _RESULT.fullmatch(p.name))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from core.common.factor import Causes
 from core.errors import FileFormatError
+from core.field.points.dense_record import DenseRecord
 from core.field.points.patch import PatchChoice
 from core.field.points.result import Field, References
 from core.field.points.smoothing_record import Smoothing
@@ -72,7 +73,7 @@ def read_field(path: str | Path) -> Field:
             common = np.asarray(variables["common_factor"][...], dtype=np.float64)
             total = total - common @ np.swapaxes(common, -1, -2)
             causes = causes_of(variables, common.shape[-1])
-        choice, smoothing = (getattr(dataset, name, None) for name in ("patch_choice", "smoothing"))
+        choice, smoothing, dense = (getattr(dataset, name, None) for name in ("patch_choice", "smoothing", "dense"))
         return Field(
             **arrays,
             status=np.asarray(variables["status"][...], dtype=np.int8),
@@ -85,6 +86,7 @@ def read_field(path: str | Path) -> Field:
             smoothing=None if smoothing is None else Smoothing.from_document(current_entries(json.loads(smoothing))),
             patch=None if choice is None else PatchChoice.from_document(current_entries(json.loads(choice))),
             cuts=_cuts_of(variables),
+            dense=None if dense is None else DenseRecord.from_document(json.loads(dense)),
             references=_references_of(dataset),
         )
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.common.factor import Causes
+from core.field.points.dense_record import METHOD, NEIGHBOURS
 from core.field.points.result import Field, References, Rejected
 from core.field.region.cuts import Cuts, as_arrays
 from core.field.sequence.propagated import current_covariance
@@ -167,6 +168,10 @@ def fill(dataset: Any, result: Field, provenance: Provenance, strain: StrainFiel
         dataset.smoothing = json.dumps(result.smoothing.document(), sort_keys=True)
         if strain is not None:
             dataset.strain_note = "strain of smoothed displacements: gauge_px and gauge_mm hold the smoothing's window"
+    if result.dense is not None:
+        dataset.setncatts(
+            {"method": METHOD, "dense": json.dumps(result.dense.document(), sort_keys=True), "neighbours": NEIGHBOURS}
+        )
     if result.patch is not None:
         dataset.setncatts(
             {

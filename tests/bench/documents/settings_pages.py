@@ -24,6 +24,7 @@ OPTIONS = {
     "pattern": "`--projected`",
     "strain": "`--strain`, `--strain-order`, `--strain-tensor`",
     "smoothing_window": "`--smooth`",
+    "dense_step_px": "`--dense`",
 }
 _HEAD = """# Analysis settings
 

@@ -17,6 +17,7 @@ import matplotlib as mpl
 mpl.use("Agg")
 
 from core.threads import available_threads, set_threads
+from tests.bench.dense import speed as bench_dense
 from tests.bench.speed import assembly
 from tests.bench.speed import kernel as bench_kernel
 from tests.bench.speed import parts as bench_parts
@@ -26,7 +27,7 @@ from tests.bench.speed.pairs import MODERN, PAPER, BenchScene, make_scene
 from tests.bench.speed.peer import Outcome, Run, peer_python, run_ours, run_peer
 from tests.bench.speed.sequence_page import measure_all
 
-PARTS = ("ceilings", "code", "kernel", "peer", "whole")
+PARTS = ("ceilings", "code", "kernel", "dense", "peer", "whole")
 PEER_SETTINGS: dict[str, dict[str, object]] = {
     "tuned": {"max_displacement": 16},
     "default": {},
@@ -80,6 +81,16 @@ def kernel(report: Report, folder: Path) -> None:
             report.parts.append(bench_parts.measure_parts(scene, kind, subset))
             print(f"  {report.parts[-1]}")
     set_threads(available_threads())
+
+
+def dense(report: Report, folder: Path) -> None:
+    """A vector every 2 px."""
+    del folder
+    rates = bench_dense.measure_dense(2 if report.quick else 5)
+    text = bench_dense.text(rates)
+    report.more.append(("Dense", text))
+    report.rows += bench_dense.rows(rates)
+    print(text)
 
 
 def peer(report: Report, folder: Path) -> None:
@@ -151,7 +162,7 @@ def main() -> int:
     args = parser.parse_args()
     wanted = [name for name in args.only.split(",") if name] or list(PARTS[:-1] if args.quick else PARTS)
     report = Report(quick=args.quick)
-    jobs = {"ceilings": ceilings, "code": code, "kernel": kernel, "peer": peer, "whole": whole}
+    jobs = {"ceilings": ceilings, "code": code, "kernel": kernel, "dense": dense, "peer": peer, "whole": whole}
     with tempfile.TemporaryDirectory(prefix="stereorig_bench_") as folder:
         for name in wanted:
             start = time.perf_counter()

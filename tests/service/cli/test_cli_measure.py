@@ -697,3 +697,57 @@ def test_a_way_of_updating_that_is_none_is_refused(folder: Path, tmp_path: Path)
     with pytest.raises(SystemExit) as caught:
         main([*command(folder, tmp_path / "out"), "--reference-update", "sometimes"])
     assert caught.value.code == 2
+
+
+def test_a_dense_field_lies_beside_each_step_and_is_read_as_any_other(
+    originals: Path, rig: SimRig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "results"
+    assert main(command(originals, out, dense="2")) == 0
+    assert "step 1: dense field of" in capsys.readouterr().err
+    summary = json.loads((out / "summary.json").read_text())
+    for n, load in enumerate(LOADS):
+        path = out / "dense" / f"step_000{n}.nc"
+        entry = summary["steps"][n]["dense"]
+        assert (entry["file"], entry["method"]) == (f"dense/{path.name}", "dense, shared windows")
+        field, ordinary = read_field(path), read_measured(out / path.name)
+        assert field.shape == (56, 66)
+        assert entry["valid"] == field.valid.sum() > 0.95 * field.status.size
+        assert field.dense is not None
+        assert (field.dense.step_px, field.dense.window_px, field.dense.spacing_px) == (2, 21, 10.0)
+        xy = np.stack([field.x_px, field.y_px], axis=-1)
+        truth = truth_at(make_scene(rig, "block"), rig.cam1.camera, xy, now=make_scene(rig, "block", load=load))
+        off = (field.xyz_mm - truth.xyz_mm)[field.valid] / field.sigma_mm[field.valid][:, :3]
+        assert 0.5 < np.sqrt(np.mean(off**2)) < 1.5
+        if n > 0:
+            assert field.uvw_mm is not None
+            off = (field.uvw_mm - truth.uvw_mm)[field.valid] / field.sigma_mm[field.valid][:, 3:]
+            assert 0.5 < np.sqrt(np.mean(off**2)) < 1.5
+        with xr.open_dataset(path) as data:
+            assert data.attrs["method"] == "dense, shared windows"
+            assert "correlate" in data.attrs["neighbours"]
+            assert json.loads(data.attrs["settings"])["spacing_px"] == 2
+        # the ordinary result is what it is without a dense one
+        assert ordinary.dense is None
+    assert main(["export", str(out / "dense"), "--format", "vtu", "--out", str(tmp_path / "vtu")]) == 0
+    assert len(list((tmp_path / "vtu").glob("*.vtu"))) == 3
+    # a later run without one leaves none behind that would pass for its own
+    assert main(command(originals, out)) == 0
+    assert list((out / "dense").iterdir()) == []
+
+
+def test_a_step_matched_against_a_later_reference_says_why_it_has_no_dense_field(
+    originals: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "results"
+    assert main(command(originals, out, dense="4", **{"reference-update": "always"})) == 0
+    assert "step 2: no dense field: the step was matched against a later reference." in capsys.readouterr().err
+    steps = json.loads((out / "summary.json").read_text())["steps"]
+    assert [one["dense"]["file"] for one in steps] == ["dense/step_0000.nc", "dense/step_0001.nc", None]
+
+
+def test_a_dense_step_that_is_no_denser_is_refused(
+    originals: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(command(originals, tmp_path / "results", dense="12")) == 1
+    assert "--dense 12 is more than --step 10" in capsys.readouterr().err

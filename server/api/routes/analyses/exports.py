@@ -21,6 +21,7 @@ from server.api.protocol.problems import errors
 from server.base.errors import NotFoundError
 from server.exports.request import MEDIA_CONTENT, MEDIA_TYPES, ExportFormat, ExportRequest, media_type_of, steps_in
 from server.formats.figures.options import COLOURS, MAX_LEVELS, WIDTHS_PX, FigureStyle
+from server.formats.results.folder import dense_result, home_of
 from server.results.channels import has_more
 from server.worker.executor import TaskFuture
 from server.workflows.analysis import start as analysis_start
@@ -91,6 +92,7 @@ class _Asked:
     request: ExportRequest
     steps: list[int] | None
     frame: str | None
+    dense: bool
 
 
 def _asked(
@@ -123,11 +125,12 @@ def _asked(
         ),
     ] = None,
     frame: FrameText = None,
+    dense: Annotated[bool, Query(description="The dense fields of an analysis with `dense_step_px`.")] = False,
 ) -> _Asked:
     wanted = [step] if step is not None else None if steps is None else steps_in(steps)
     names = None if variables is None else variables.split(",")
     request = ExportRequest(format, None, names, drawn.style, drawn.over_image, drawn.fps, coverage)
-    return _Asked(request, wanted, frame)
+    return _Asked(request, wanted, frame, dense)
 
 
 AskedDep = Annotated[_Asked, Depends(_asked)]
@@ -150,7 +153,7 @@ async def export(
     header X-Stale lists what is gone or was replaced since the analysis. A client that goes away ends its export.
     """
     wanted, frame = asked.request, asked.frame
-    files, headers = await run_in_threadpool(_prepared, service, test_id, analysis_id, asked.steps)
+    files, headers = await run_in_threadpool(_prepared, service, test_id, analysis_id, asked.steps, asked.dense)
     as_stored = wanted.variables is None and wanted.coverage.factor == 1.0 and frame in (None, "system")
     if wanted.format == "nc" and len(files) == 1 and as_stored and not await run_in_threadpool(has_more, files[0]):
         return FileResponse(
@@ -158,7 +161,7 @@ async def export(
         )
     folder = await run_in_threadpool(service.exports.new_folder)
     try:
-        home = files[0].parent
+        home = home_of(files[0])
         framed = functools.partial(results_in_frame, variables=wanted.drawn_variables)
         files = await run_in_threadpool(framed, service, test_id, files, frame, folder / "frame")
         made = Path(await _made(request, service, home, files, wanted, folder))
@@ -177,14 +180,14 @@ def begin_export(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, 
     Meant for films and for many steps. `GET /jobs/{job_id}/file` answers with the file once the job has succeeded; it
     is kept until eight later exports are, or the service ends.
     """
-    files, _ = _prepared(service, test_id, analysis_id, asked.steps)
+    files, _ = _prepared(service, test_id, analysis_id, asked.steps, asked.dense)
     service.require_room()
     job = start_export(service, test_id, analysis_id, files, asked.request, asked.frame)
     return Accepted.model_validate({"job": job.document().plain()})
 
 
 def _prepared(
-    service: Service, test_id: str, analysis_id: str, wanted: list[int] | None
+    service: Service, test_id: str, analysis_id: str, wanted: list[int] | None, dense: bool
 ) -> tuple[list[Path], dict[str, str]]:
     document = service.tests.analysis(test_id, analysis_id)
     there = service.tests.finished_steps(test_id, analysis_id)
@@ -195,6 +198,14 @@ def _prepared(
             code="no_results",
             remedy="Wait for its job, or measure again.",
         )
+    if dense:
+        files = [file for file in map(dense_result, files) if wanted is not None or file.is_file()]
+        if not files or not all(file.is_file() for file in files):
+            raise NotFoundError(
+                f"Analysis {analysis_id} has no dense field of these steps.",
+                code="dense_missing",
+                remedy="Measure with dense_step_px; the summary's `dense` says why a step has none.",
+            )
     stale = analysis_start.stale_reasons(service, test_id, document)
     return files, {"X-Stale": "; ".join(stale)} if stale else {}
 

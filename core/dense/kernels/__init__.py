@@ -1,0 +1,1 @@
+"""Compiled code of the dense field; :mod:`core.dense.windows` is the narrow function before it."""
