@@ -36,7 +36,7 @@ class Before:
     @property
     def valid(self) -> NDArray[np.bool_]:
         """(r, c)."""
-        return self.status == PointStatus.OK
+        return np.asarray(self.status == PointStatus.OK)
 
 
 @dataclass(frozen=True)
