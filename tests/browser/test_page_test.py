@@ -192,7 +192,7 @@ def test_a_verification_procedure_is_followed_with_ticks(page: Watched, client: 
     expect(panel.get_by_role("button", name="Make the certificate")).to_be_visible()
     labels = [step["label"] for step in client.get(f"{API}/tests/{test_id}/steps").json()["steps"]]
     assert labels == ["reference", "static", "moved 0 0 0.4 mm", "turned"]
-    page.sound_beside_captures(404)  # there is no plan at first
+    page.sound_beside_captures()
 
 
 def test_pairs_are_imported_in_the_order_of_their_names(page: Watched, client: httpx.Client, tmp_path: Path) -> None:

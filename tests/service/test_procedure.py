@@ -102,7 +102,7 @@ def test_a_plan_is_carried_out_step_by_step_and_judged(bench: tuple[Path, httpx.
     data, client = bench
     test_id = calibrated_test(client)
     path = f"{API}/tests/{test_id}/certificate-plan"
-    assert client.get(path).json()["code"] == "procedure_missing"
+    assert (client.get(path).json()["plan"], client.get(path).json()["steps"]) == (None, [])
     assert client.post(f"{path}:next").json()["code"] == "procedure_missing"
     before = client.put(path, json={"plan": PLAN, "frames": 4}).json()
     assert (before["next"], {one["state"] for one in before["steps"]}) == (0, {"to_come"})

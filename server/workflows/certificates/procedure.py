@@ -47,7 +47,9 @@ def planned(service: Service, test_id: str) -> PlannedProcedure:
 
 
 def show_procedure(service: Service, test_id: str) -> dict[str, object]:
-    """Return a test's procedure: its plan, its steps with what is taken, and what comes next."""
+    """Return a test's procedure: its plan, its steps with what is taken, and what comes next; no plan where none is."""
+    if not service.tests.procedure(test_id):
+        return {"plan": None, "frames": 1, "steps": [], "next": None}
     asked = planned(service, test_id)
     steps = procedure_of(asked.plan, moves=service.config.calibration.moves)
     number = service.tests.next_number(test_id)

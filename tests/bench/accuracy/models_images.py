@@ -186,7 +186,8 @@ def _draw(shown: list[tuple[str, list[Comparison], list[Comparison]]], path: Pat
     axes[0].legend()
     for ax, (name, _, wrong), component in zip(axes[1:], shown, (2, 0), strict=True):
         image = ax.imshow(wrong[0].displacement.z[..., component], cmap="RdBu_r", vmin=-4, vmax=4)
-        ax.set(title=f"{name}: z of {'uvw'[component]}, 2 % too stiff", xticks=[], yticks=[])
+        ax.set(xticks=[], yticks=[])
+        ax.set_title(f"{name}: z of {'uvw'[component]}, 2 % too stiff", fontsize=9)
         fig.colorbar(image, ax=ax)
     fig.tight_layout()
     fig.savefig(path, dpi=110)

@@ -36,7 +36,9 @@ class ProcedureStepReply(Reply):
 class ProcedureReply(Reply):
     """A test's verification procedure."""
 
-    plan: CertificatePlan = Field(description="The plan, as `POST /certificates` takes it once all steps are measured.")
+    plan: CertificatePlan | None = Field(
+        description="The plan, as `POST /certificates` takes it once all steps are measured; null: none was put."
+    )
     frames: int = Field(description="Frames averaged at each step.")
     steps: list[ProcedureStepReply] = Field(description="Its steps, in order.")
     next: int | None = Field(description="Number of the next step; null once all are taken.")

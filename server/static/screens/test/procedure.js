@@ -26,8 +26,7 @@ export function procedurePanel(id, ends) {
     try {
       draw(await api.get(`/tests/${id}/certificate-plan`));
     } catch (error) {
-      if (error instanceof api.Problem && error.code === "procedure_missing") ask(EXAMPLE, 1);
-      else replace(body, problemText(error));
+      replace(body, problemText(error));
     }
   }
 
@@ -54,16 +53,18 @@ export function procedurePanel(id, ends) {
 
   /** @param {Procedure} now */
   function draw(now) {
+    const { plan } = now;
+    if (!plan) return ask(EXAMPLE, 1);
     const next = now.steps.find((one) => one.n === now.next);
     const taken = now.steps.filter((one) => one.state === "taken").length;
     replace(body,
       h("p", { role: "status", "data-role": "procedure-next" }, next ? h("strong", `Step ${next.n}: ${next.what}`) : "All steps are taken.", ` ${taken} of ${now.steps.length} taken.`),
-      next ? takeButton(next) : certify(now),
+      next ? takeButton(next) : certify(plan),
       table([
         ["", (/** @type {Step} */ one) => h("span", { title: SAID[one.state], "aria-label": SAID[one.state] }, one.n === now.next ? "▸" : MARK[one.state])],
         ["Step", (one) => one.n], ["For", (one) => one.kind], ["Who", (one) => BY[one.by]], ["What", (one) => one.what],
       ], now.steps, { caption: "Steps of the procedure" }),
-      taken ? null : h("p", action("Change the plan", async () => ask(now.plan, now.frames))));
+      taken ? null : h("p", action("Change the plan", async () => ask(plan, now.frames))));
   }
 
   /** @param {Step} step */
@@ -77,14 +78,14 @@ export function procedurePanel(id, ends) {
     }, { kind: "primary" }));
   }
 
-  /** @param {Procedure} now */
-  function certify(now) {
+  /** @param {NonNullable<Procedure["plan"]>} plan */
+  function certify(plan) {
     return h("div", h("p", "Measure all steps with strain (below), then make the certificate from the newest analysis."),
       action("Make the certificate", async () => {
         const { analyses } = await api.get(`/tests/${id}`);
         const newest = (analyses ?? []).at(-1);
         if (!newest) return void notify("There is no analysis yet: measure the steps first.", "warn");
-        const { job } = await api.post("/certificates", { test_id: id, analysis_id: newest.id, plan: now.plan });
+        const { job } = await api.post("/certificates", { test_id: id, analysis_id: newest.id, plan });
         const ended = await api.finished(job.id);
         if (ended.state !== "succeeded") throw api.jobProblem(ended);
         const made = String(ended.result?.certificate_id);
