@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -41,20 +42,24 @@ def results(host: Host, url: str) -> list[dict[str, Any]]:
 
 def measured(host: Host, **changes: Any) -> str:
     url, job = begin(host.client, URL, **{**BODY, **changes})
-    done = wait_for_job(host.client, job)
+    done = wait_for_job(host.client, job, seconds=900.0)
     assert done["state"] == "succeeded", done["problem"]
     assert host.client.get(url).json()["steps_finished"] == list(range(STEPS))
     return url
 
 
 @pytest.fixture(scope="module")
-def chain(data: Path) -> list[dict[str, Any]]:
+def host(data: Path) -> Iterator[Host]:
+    """A service with two processes of its own for analyses."""
+    made = Host(data, POOL)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def chain(host: Host) -> list[dict[str, Any]]:
     """What one step after another gives."""
-    host = Host(data, "")
-    try:
-        return results(host, measured(host))
-    finally:
-        host.close()
+    return results(host, measured(host, side_by_side="never"))
 
 
 @pytest.fixture
@@ -97,17 +102,13 @@ def test_a_reference_is_left_once_in_the_sequence(chain: list[dict[str, Any]]) -
 
 
 def test_processes_of_one_machine_find_what_one_after_another_finds(
-    data: Path, chain: list[dict[str, Any]], asked: list[str]
+    host: Host, chain: list[dict[str, Any]], asked: list[str]
 ) -> None:
-    host = Host(data, POOL)
-    try:
-        url = measured(host)
-        assert_as_chain(results(host, url), chain)
-        assert {"head", "joint"} <= set(asked)
-        left = {path.name for path in folder_of(host, url).iterdir() if path.name.startswith(("head", "starts"))}
-        assert left == set()
-    finally:
-        host.close()
+    url = measured(host)
+    assert_as_chain(results(host, url), chain)
+    assert {"head", "joint"} <= set(asked)
+    left = {path.name for path in folder_of(host, url).iterdir() if path.name.startswith(("head", "starts"))}
+    assert left == set()
 
 
 @pytest.mark.deep
@@ -127,36 +128,28 @@ def test_a_cluster_finds_what_one_after_another_finds(
 
 @pytest.mark.deep
 def test_what_was_cancelled_goes_on_where_it_was_and_comes_to_the_same(
-    data: Path, chain: list[dict[str, Any]], asked: list[str]
+    host: Host, chain: list[dict[str, Any]], asked: list[str]
 ) -> None:
-    host = Host(data, POOL)
-    try:
-        url, job = begin(host.client, URL, **BODY)
-        wait_for_steps(host.client, url, 4)
-        assert host.client.post(f"{API}/jobs/{job['id']}/cancel").status_code == 202
-        assert wait_for_job(host.client, job)["state"] == "cancelled"
-        there = {path.name for path in folder_of(host, url).glob("step_*.nc")}
-        before = len(asked)
-        rest = host.client.post(f"{url}:continue").json()["job"]
-        done = wait_for_job(host.client, rest)
-        assert done["state"] == "succeeded", done["problem"]
-        assert_as_chain(results(host, url), chain)
-        again = [kind for kind in asked[before:] if kind != "head"]
-        assert len(again) <= STEPS - len(there) + 4  # a joint and what it throws away, no more
-    finally:
-        host.close()
+    url, job = begin(host.client, URL, **BODY)
+    wait_for_steps(host.client, url, 4)
+    assert host.client.post(f"{API}/jobs/{job['id']}/cancel").status_code == 202
+    assert wait_for_job(host.client, job)["state"] == "cancelled"
+    there = {path.name for path in folder_of(host, url).glob("step_*.nc")}
+    before = len(asked)
+    rest = host.client.post(f"{url}:continue").json()["job"]
+    done = wait_for_job(host.client, rest, seconds=900.0)
+    assert done["state"] == "succeeded", done["problem"]
+    assert_as_chain(results(host, url), chain)
+    again = [kind for kind in asked[before:] if kind != "head"]
+    assert len(again) <= STEPS - len(there) + 4  # a joint and what it throws away, no more
 
 
-@pytest.mark.parametrize("changes", [{"side_by_side": "never"}, {"reference_update": "always"}])
+@pytest.mark.parametrize("changes", [{"reference_update": "always"}])
 def test_one_after_another_is_what_the_settings_can_ask_for(
-    data: Path, asked: list[str], changes: dict[str, str]
+    host: Host, asked: list[str], changes: dict[str, str]
 ) -> None:
-    host = Host(data, POOL)
-    try:
-        url, job = begin(host.client, URL, **{**BODY, **changes}, steps=list(range(1, 9)))
-        done = wait_for_job(host.client, job)
-        assert done["state"] == "succeeded", done["problem"]
-        assert asked == []
-        assert host.client.get(url).json()["steps_finished"] == list(range(9))
-    finally:
-        host.close()
+    url, job = begin(host.client, URL, **{**BODY, **changes}, steps=list(range(1, 9)))
+    done = wait_for_job(host.client, job, seconds=900.0)
+    assert done["state"] == "succeeded", done["problem"]
+    assert asked == []
+    assert host.client.get(url).json()["steps_finished"] == list(range(9))

@@ -64,6 +64,13 @@ class Run:
     steps: int
     points: int = 0
 
+    @property
+    def within(self) -> float:
+        """How many times faster the run was than its own work without heads on one worker, by processor time."""
+        all_s = sum(sum(found) for found in self.tasks.values())
+        heads = sum(self.tasks.get("head", [])) / all_s if all_s > 0.0 else 0.0
+        return sum(self.busy_s) * (1.0 - heads) / max(self.busy_s)
+
 
 @dataclass
 class Figures:
