@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import NullFormatter
 
 from tests.bench.documents.prose import wrapped
 
@@ -89,6 +90,7 @@ def _draw(main: Run, runs: list[Run]) -> None:
     for q, asked in ASKED.items():
         left.plot(asked, 1.0 - q / 100.0, "kv", ms=6, label="asked" if q == 50.0 else None)
     left.set(xlabel="latency, ms", ylabel="share of values that took longer", title=f"{main.points:,} points")
+    left.xaxis.set_minor_formatter(NullFormatter())
     left.legend()
     middle.semilogx([run.points for run in runs], [run.rate_hz for run in runs], "o-")
     middle.axhline(RATE_HZ, color="gray", lw=0.8, ls="--")
