@@ -156,9 +156,9 @@ def measure(client: httpx.Client, test_id: str, points: int, seconds: float, *, 
     ours, theirs = multiprocessing.Pipe()
     context = multiprocessing.get_context("spawn")
     reader = context.Process(target=read_values, args=(port, f"{API}/tests/{test_id}/live/ws", theirs, seconds))
-    before, began = live["account"], time.monotonic()
     reader.start()
     run = Run(points, seconds)
+    before, began = client.get(f"{API}/tests/{test_id}/live").json()["account"], time.monotonic()
     loads, busy_before = [], _busy_s(worker)
     while time.monotonic() < began + seconds + 0.5:
         if captures:
@@ -167,11 +167,11 @@ def measure(client: httpx.Client, test_id: str, points: int, seconds: float, *, 
         run.memory_mib.append((held[0], held[1]))
         loads.append(os.getloadavg()[0])
         time.sleep(max(0.0, 1.0 - (time.monotonic() - began) % 1.0))
-    busy_s = _busy_s(worker) - busy_before
+    busy_s, after = _busy_s(worker) - busy_before, client.get(f"{API}/tests/{test_id}/live").json()["account"]
     run.load = float(np.mean(loads))
     run.latency_ms = ours.recv()
     reader.join()
-    after = client.post(f"{API}/tests/{test_id}/live:stop").json()["account"]
+    client.post(f"{API}/tests/{test_id}/live:stop").raise_for_status()
     names = ("frames", "measured", "followed", "step", "skipped", "refused")
     run.account = {name: after[name] - before[name] for name in names}
     run.busy_ms = 1e3 * busy_s / max(run.account["measured"], 1)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import NullFormatter
 
 from tests.bench.documents.prose import wrapped
 
@@ -85,10 +86,11 @@ def write_page(main: Run, runs: list[Run]) -> None:
 def _draw(main: Run, runs: list[Run]) -> None:
     figure, (left, middle, right) = plt.subplots(1, 3, figsize=(12.0, 3.6), constrained_layout=True)
     latency = np.sort(main.latency_ms)
-    left.semilogy(latency, 1.0 - np.arange(len(latency)) / max(len(latency), 1), label="measured")
+    left.loglog(latency, 1.0 - np.arange(len(latency)) / max(len(latency), 1), label="measured")
     for q, asked in ASKED.items():
         left.plot(asked, 1.0 - q / 100.0, "kv", ms=6, label="asked" if q == 50.0 else None)
     left.set(xlabel="latency, ms", ylabel="share of values that took longer", title=f"{main.points:,} points")
+    left.xaxis.set_minor_formatter(NullFormatter())
     left.legend()
     middle.semilogx([run.points for run in runs], [run.rate_hz for run in runs], "o-")
     middle.axhline(RATE_HZ, color="gray", lw=0.8, ls="--")
@@ -98,7 +100,8 @@ def _draw(main: Run, runs: list[Run]) -> None:
     memory = np.array(main.memory_mib)
     for k, name in enumerate(("service", "computation")):
         right.plot(np.arange(len(memory)) / 60.0, memory[:, k], label=name)
-    right.set(xlabel="minutes", ylabel="resident memory, MiB", ylim=(0.0, None), title="Memory")
+    right.set(xlabel="minutes", ylabel="resident memory, MiB", title="Memory")
+    right.set_ylim(0.0)
     right.legend()
     figure.savefig(FIGURE, dpi=110)
     plt.close(figure)
