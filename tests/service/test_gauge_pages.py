@@ -20,7 +20,7 @@ from tests.support.strain_fields import make_field
 
 API = "/api/v1"
 TEST, ANALYSIS = "t000004-abcdef", "a000004-abcdef"
-STEPS = 230
+STEPS = 115
 PATH = f"{API}/tests/{TEST}/analyses/{ANALYSIS}"
 BEGAN = datetime(2026, 3, 1, 12, tzinfo=UTC)
 MADE = BEGAN.isoformat()
@@ -37,7 +37,7 @@ def drift_mm(n: int) -> float:
 
 @pytest.fixture(scope="module")
 def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """A service on a drawn analysis of 230 steps: a plane that moves by 1 um along Z at each, and carries a channel."""
+    """A service on a drawn analysis of 115 steps: a plane that moves by 1 um along Z at each, and carries a channel."""
     data = tmp_path_factory.mktemp("pages") / "data"
     home = data / "tests" / TEST
     results = home / "analyses" / ANALYSIS
@@ -82,7 +82,7 @@ def pages(client: httpx.Client, body: dict[str, Any], **asked: Any) -> list[dict
 
 def test_an_answer_holds_a_hundred_steps_and_leads_to_the_next(client: httpx.Client) -> None:
     found = pages(client, GAUGES)
-    assert [len(page["steps"]) for page in found] == [100, 100, STEPS - 200]
+    assert [len(page["steps"]) for page in found] == [100, STEPS - 100]
     steps = [step for page in found for step in page["steps"]]
     assert [step["n"] for step in steps] == list(range(1, STEPS + 1))
     w = [step["points"][0]["values"]["w_mm"]["value"] for step in steps]
@@ -115,7 +115,7 @@ def test_a_table_is_a_file_with_all_steps(client: httpx.Client) -> None:
 
 
 def test_the_client_puts_the_pages_together(client: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stereorig.client.operations._GAUGE_STEPS", 60)
+    monkeypatch.setattr("stereorig.client.operations._GAUGE_STEPS", 40)
     with stereorig.Client(str(client.base_url)) as lab:
         found = lab.test(TEST).analysis(ANALYSIS).gauges(**GAUGES)
     assert isinstance(found, GaugesReply)
@@ -126,9 +126,9 @@ def test_the_client_puts_the_pages_together(client: httpx.Client, monkeypatch: p
 
 def test_a_history_is_columns_with_what_the_probe_says(client: httpx.Client) -> None:
     where = {"x_px": 121.0, "y_px": 99.0}
-    first = client.get(f"{PATH}/history/w_mm", params={**where, "limit": 200}).json()
+    first = client.get(f"{PATH}/history/w_mm", params={**where, "limit": 90}).json()
     second = client.get(f"{PATH}/history/w_mm", params={**where, "cursor": first["next_cursor"]}).json()
-    assert (len(first["n"]), len(second["n"]), second["next_cursor"]) == (200, STEPS - 200, None)
+    assert (len(first["n"]), len(second["n"]), second["next_cursor"]) == (90, STEPS - 90, None)
     np.testing.assert_allclose(first["value"], [drift_mm(n) for n in first["n"]], atol=1e-6)
     for name in ("w_mm", "d_mm", "zncc_max"):
         history = client.get(f"{PATH}/history/{name}", params={**where, "limit": 3})
@@ -153,15 +153,15 @@ def test_the_channels_of_many_steps_come_with_their_list(client: httpx.Client) -
 
 
 def test_a_record_for_many_steps_is_summed_up(client: httpx.Client) -> None:
-    rows = [f"{(BEGAN + timedelta(seconds=n)).isoformat()},{n}" for n in range(200)]
+    rows = [f"{(BEGAN + timedelta(seconds=n)).isoformat()},{n}" for n in range(110)]
     content = "\n".join(["Time,Force (kN)", *rows]).encode()
     answer = client.post(f"{API}/tests/{TEST}/channels:import", files={"file": ("f.csv", content)})
     assert answer.is_success, answer.text
     found = answer.json()
-    assert (found["n_steps"], found["n_aligned"]) == (STEPS + 1, 200)
-    assert found["reasons"] == {"it lies outside the record": STEPS + 1 - 200}
+    assert (found["n_steps"], found["n_aligned"]) == (STEPS + 1, 110)
+    assert found["reasons"] == {"it lies outside the record": STEPS + 1 - 110}
     assert [one["n"] for one in found["steps"]] == list(range(100))
     further = {"cursor": found["steps_next_cursor"], "channels": True}
     others = client.get(f"{API}/tests/{TEST}/steps", params=further).json()["steps"]
     assert [one["n"] for one in others] == list(range(100, STEPS + 1))
-    assert [one["n"] for one in others if "force_kn" in one["channels"]] == list(range(100, 200))
+    assert [one["n"] for one in others if "force_kn" in one["channels"]] == list(range(100, 110))
