@@ -53,18 +53,13 @@ def dense() -> None:
     xy = np.stack(np.meshgrid([28.0, 36.0], [28.0, 36.0]), axis=-1)
     pair, options = paper_pair(size=64), MatchOptions(subset_px=9)
     for images in (1, 3):
-        state = np.concatenate(
-            [pair.cam1.rays_cam(xy.reshape(-1, 2)).xyz_mm.reshape(2, 2, 3) * 0.0 + 0.0025] * 2, axis=-1
-        )
-        node_positions(pair, xy, state[..., :5], motion=images == 3)
+        state, one = np.full((2, 2, 5), 0.0025), np.ones((2, 2, 1))
+        node_positions(pair, xy, state, motion=images == 3)
         nothing = Prediction(np.zeros((4, 4, 2 * images, 4)), np.ones((3, 3), bool), np.ones((1, 1), bool), 1)
         found = measure_windows(
             pair, [picture] * (images + 1), xy, state, nothing, options, step_px=2, cuts=None, white=None
         )
-        of = np.ones((2, 2, 2))
-        points = AtPoints(
-            of[..., : 1 + images // 3].copy(), np.ones((2, 2, images)), of[..., :1].copy(), of[..., :1].copy(), 0.25
-        )
+        points = AtPoints(np.ones((2, 2, 1 + images // 3)), np.ones((2, 2, images)), one, one, 0.25)
         none = np.empty((0, 0))
         shape = Shape(np.empty((0, 0), np.int8), none[..., None], none[..., None, None])
         finish_windows(found, points, Limits(0.6, 0.1, 0.1, 0.1, np.ones(images)), shape)
