@@ -34,7 +34,7 @@ from core.strain import StrainOptions
 from core.systematic.interpolation import SmoothSlopes
 from core.systematic.terms import Systematic, terms_of, with_strain
 from server.compute.camera_watch import CameraWatch
-from server.compute.dense import DenseStep, DenseSteps
+from server.compute.dense.steps import DenseStep, DenseSteps
 from server.compute.strain import smoothed_step, strain_of_step, summarise_strain
 from server.formats.calibrations.native import covariance_in
 from server.formats.calibrations.recognise import LoadedCalibration

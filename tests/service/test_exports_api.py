@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import shutil
 import threading
 import time
 import zipfile
@@ -85,6 +86,25 @@ def test_files_hold_what_was_asked_for(client: httpx.Client, url: str) -> None:
     stored = client.get(url, params={"step": 1})
     assert stored.headers["content-type"] == "application/x-netcdf"
     assert stored.content[:4] == b"\x89HDF"
+
+
+def test_dense_fields_are_exported_on_request(client: httpx.Client, service: Service) -> None:
+    test = service.tests.create({"name": "Dense", "specimen": "", "notes": ""}, None)
+    document = {"kind": "displacement", "steps": [0, 1, 2], "settings": {}, "inputs": {"steps": {"0": {}}}}
+    analysis = service.tests.create_analysis(test.id, document)
+    folder = service.tests.analysis_path(test.id, analysis.id)
+    write_results(folder)
+    url = f"/api/v1/tests/{test.id}/analyses/{analysis.id}/export"
+    none = client.get(url, params={"format": "csv", "dense": "true"})
+    assert (none.status_code, none.json()["code"]) == (404, "dense_missing")
+    (folder / "dense").mkdir()
+    for n in (0, 1):
+        shutil.copy(folder / f"step_000{n}.nc", folder / "dense" / f"step_000{n}.nc")
+    every = client.get(url, params={"format": "csv", "dense": "true"})
+    assert sorted(name[-13:] for name in _content(every.content)) == ["step_0000.csv", "step_0001.csv"]
+    one = client.get(url, params={"format": "nc", "step": 1, "dense": "true"})
+    assert one.content == (folder / "dense" / "step_0001.nc").read_bytes()
+    assert client.get(url, params={"step": 2, "dense": "true"}).json()["code"] == "dense_missing"
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,31 @@ def curved() -> None:
         fit_shape(paper_pair(size=64), picture, picture, [[32.0, 32.0]], [[np.nan] * 3], options)
 
 
+def dense() -> None:
+    """The windows of dense fields, over one cell of a prediction that moves nothing."""
+    from core.dense.kernels.finish import AtPoints, Limits, Shape
+    from core.dense.prediction import Prediction
+    from core.dense.windows import finish_windows, measure_windows, node_positions
+    from core.matching.image import prepare
+    from core.matching.options import MatchOptions
+    from tests.support.matching_scene import paper_pair
+
+    picture = prepare(np.random.default_rng(1).normal(128.0, 20.0, (64, 64)))
+    xy = np.stack(np.meshgrid([28.0, 36.0], [28.0, 36.0]), axis=-1)
+    pair, options = paper_pair(size=64), MatchOptions(subset_px=9)
+    for images in (1, 3):
+        state, one = np.full((2, 2, 5), 0.0025), np.ones((2, 2, 1))
+        node_positions(pair, xy, state, motion=images == 3)
+        nothing = Prediction(np.zeros((4, 4, 2 * images, 4)), np.ones((3, 3), bool), np.ones((1, 1), bool), 1)
+        found = measure_windows(
+            pair, [picture] * (images + 1), xy, state, nothing, options, step_px=2, cuts=None, white=None
+        )
+        points = AtPoints(np.ones((2, 2, 1 + images // 3)), np.ones((2, 2, images)), one, one, 0.25)
+        none = np.empty((0, 0))
+        shape = Shape(np.empty((0, 0), np.int8), none[..., None], none[..., None, None])
+        finish_windows(found, points, Limits(0.6, 0.1, 0.1, 0.1, np.ones(images)), shape)
+
+
 def targets() -> None:
     """Line grids and boards, drawn by the tests' own renderers."""
     from core.boards import BoardTarget, detect_board
@@ -71,7 +96,7 @@ def scenes() -> None:
         world.expose("cam1", exposure_ms=10.0, gain_db=0.0, rng=np.random.default_rng(1))
 
 
-GROUPS: dict[str, Callable[[], None]] = {f.__name__: f for f in (measure, curved, targets, scenes)}
+GROUPS: dict[str, Callable[[], None]] = {f.__name__: f for f in (measure, curved, dense, targets, scenes)}
 
 
 def main() -> int:

@@ -216,7 +216,8 @@ def pages() -> dict[str, str]:
         "Smoothed displacements replace `u_mm`, `v_mm`, `w_mm`; `measured_*` hold them as measured, only where that differs. Attributes of",
         "the file: `kind` (`shape` or `displacement`), `step`, `reference_step`, `frame`, `settings` (JSON), `inputs_sha256`, `patch`,",
         "`patch_reason`, `systematic` (as in `summary.json`, JSON), `software_version`, `environment` (versions, hash of the "
-        "code, processor, JSON), `created`, `format_version`.",
+        "code, processor, JSON), `created`, `format_version`. A [dense field](../how_to/fields/dense_fields.md) has `method`, `dense`",
+        "(JSON) and `neighbours` besides.",
         "",
         "## Point status",
         "",

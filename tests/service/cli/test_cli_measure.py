@@ -736,6 +736,7 @@ def test_a_dense_field_lies_beside_each_step_and_is_read_as_any_other(
     assert list((out / "dense").iterdir()) == []
 
 
+@pytest.mark.deep
 def test_a_step_matched_against_a_later_reference_says_why_it_has_no_dense_field(
     originals: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,0 +1,1 @@
+"""Dense fields of the steps of a sequence."""
