@@ -335,7 +335,7 @@ def measure_step(task: StepTask) -> Plain:
 
 def fit_calibration(task: FitTask) -> Plain:
     """Find the grid in every view and fit both cameras; ``calibration.json`` is there when this returns."""
-    summary: Plain = _heavy("server.compute.calibration_fit").fit_calibration(task)
+    summary: Plain = _heavy("server.compute.calibration.fit").fit_calibration(task)
     return summary
 
 
@@ -347,7 +347,7 @@ def repair_calibration(task: RepairTask) -> Plain:
 
 def find_in_pair(task: LookTask) -> dict[str, int]:
     """Find the target in both images; raises as the fit would. Returns the number of points found by camera."""
-    found: dict[str, int] = _heavy("server.compute.guide_session").find_in_pair(task)
+    found: dict[str, int] = _heavy("server.compute.calibration.guide_session").find_in_pair(task)
     return found
 
 
@@ -371,13 +371,13 @@ def measure_live(pixels: tuple[Any, Any], time_s: float) -> Plain:
 
 def look_at_pair(task: GuideTask, pixels: Plain, serial: int) -> Plain:
     """Find the target coarsely in a live pair, and say whether it is at rest and new."""
-    seen: Plain = _heavy("server.compute.guide_session").look_at_pair(task, pixels, serial)
+    seen: Plain = _heavy("server.compute.calibration.guide_session").look_at_pair(task, pixels, serial)
     return seen
 
 
 def guide_views(task: GuideTask, views: list[Plain]) -> Plain:
     """Take up the views that are new, and say what all cover and which view comes next."""
-    guidance: Plain = _heavy("server.compute.guide_session").guide_views(task, views)
+    guidance: Plain = _heavy("server.compute.calibration.guide_session").guide_views(task, views)
     return guidance
 
 

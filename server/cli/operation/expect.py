@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Predict and print; 1 where such a calibration would be refused."""
-    from server.compute.expectation import PlannedCalibration, expectation_document, rig_as_planned
+    from server.compute.calibration.expectation import PlannedCalibration, expectation_document, rig_as_planned
     from server.formats.results.summary import to_json
     from server.workflows.calibration.sequence import CalibrationPlan, check_plan
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 from core.errors import StateError
 from core.plan.settings import PlannedMeasurement, PlannedRig
-from server.compute.expectation import PlannedCalibration, expectation_document, rig_as_planned
+from server.compute.calibration.expectation import PlannedCalibration, expectation_document, rig_as_planned
 from server.store.folder import now_utc
 from server.store.indexing.entries import calibration_entry
 from server.workflows.calibration.sequence import CalibrationPlan, check_plan, rig_metadata, targets_of

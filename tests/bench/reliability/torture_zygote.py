@@ -33,7 +33,7 @@ def load() -> None:
 
     import server.api.app
     import server.cli.operation.serve
-    import server.compute.calibration_fit
+    import server.compute.calibration.fit
     import server.compute.measurement
     import server.compute.noise_fit
 

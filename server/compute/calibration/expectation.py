@@ -18,7 +18,7 @@ from core.names import CAMERAS
 from core.plan.quantities import planned_quantities
 from core.plan.settings import PlannedMeasurement, PlannedRig
 from core.plan.texture import correlation_px, match_variance_px2
-from server.compute.calibration_inputs import nominals_of, options_of, target_of
+from server.compute.calibration.inputs import nominals_of, options_of, target_of
 
 Localiser = Literal["profile", "paper"]
 _CORNERS = tuple(f"{z} {y} {x}" for z in ("back", "front") for y in ("-Y", "+Y") for x in ("-X", "+X"))

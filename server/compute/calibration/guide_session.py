@@ -25,7 +25,7 @@ from core.names import CAMERAS
 from core.target import GridTarget
 from server.base.json_values import without_nan
 from server.base.problem import problem_of
-from server.compute.calibration_inputs import nominals_of, options_of, target_of
+from server.compute.calibration.inputs import nominals_of, options_of, target_of
 from server.compute.grid_kernels import await_grid_kernels
 from server.formats.images import GrayImage, read_image
 from server.worker.tasks import GuideTask, LookTask

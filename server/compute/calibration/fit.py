@@ -17,7 +17,7 @@ from core.calibration.from_images import ImageOfTarget, calibrate_views
 from core.errors import CalibrationError, CalibrationInputError
 from core.grid import GridOptions, GridView
 from core.names import CAMERAS
-from server.compute.calibration_inputs import nominals_of, options_of, target_of
+from server.compute.calibration.inputs import nominals_of, options_of, target_of
 from server.compute.grid_kernels import await_grid_kernels
 from server.formats.calibrations.native import calibration_content, view_record
 from server.formats.images import GrayImage, read_image

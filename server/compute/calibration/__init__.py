@@ -1,0 +1,1 @@
+"""Calibrations as a service makes them: expected, guided, fitted from images."""
