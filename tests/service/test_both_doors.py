@@ -17,6 +17,7 @@ from core.names import CAMERAS
 from core.status import PointStatus
 from server.cli import main
 from server.config.rig_file import parse_config
+from server.formats.files import recorded_sha256
 from server.formats.images import encode_tiff
 from server.formats.results.settings import current_summary
 from server.workflows.service import Service
@@ -167,3 +168,22 @@ def test_smoothing_changes_nothing_that_later_references_go_on_from(data: Path, 
                         assert np.array_equal(measured.astype(expected.dtype), expected, equal_nan=True), (folder, n)
                         smoothed = max(smoothed, float(np.nanmax(np.abs(found[f"{axis}_mm"].values - expected))))
     assert smoothed > 1e-5  # mm: the smoothing itself does something here
+
+
+def test_dense_fields_are_the_same_through_both_doors(data: Path, tmp_path: Path) -> None:
+    settings = {"subset_px": 25, "spacing_px": 12, "patch": "affine", "reference_update": "never", "strain": None}
+    one = by_the_service(data, {**settings, "region": {"rectangle": ROI}, "dense_step_px": 3})
+    command = ["measure", str(data / "tests" / "t000001-abcdef"), "--out", str(tmp_path), "--strain", "off"]
+    command += ["--roi", ",".join(map(str, ROI)), "--subset", "25", "--step", "12", "--patch", "affine"]
+    assert main([*command, "--reference-update", "never", "--dense", "3"]) == 0
+    for n in range(STEPS):
+        name = f"dense/step_{n:04d}.nc"
+        assert recorded_sha256(one / name) == hashlib.sha256((one / name).read_bytes()).hexdigest()
+        with netCDF4.Dataset(one / name) as a, netCDF4.Dataset(tmp_path / name) as b:
+            assert a.method == b.method == "dense, shared windows"
+            assert a["status"].shape[0] == 49
+            assert (a["status"][...] == PointStatus.OK).mean() + (
+                a["status"][...] == PointStatus.EXTRAPOLATED
+            ).mean() > 0.8
+            for variable in a.variables:
+                assert np.asarray(a[variable][...]).tobytes() == np.asarray(b[variable][...]).tobytes(), (n, variable)
