@@ -170,6 +170,7 @@ class SettingsRecord(Record):
     reference: int = 0
     subset_px: float | None = None
     spacing_px: float | None = None
+    dense_step_px: float | None = None
     prefilter_px: float | None = None
     max_sigma_px: float | None = None
     interpolation: str | None = None

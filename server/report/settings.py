@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from core.field.points.dense_record import METHOD
 from server.formats.version import software_version
 from server.report.geometry import Geometry
 from server.report.items import MEASURED, SETTINGS, Item, Value, one
@@ -51,6 +52,7 @@ def analysis(source: Source, measured: Measured, found: Geometry | None) -> list
         one("prefilter", "Image filtering", _prefilter(settings), needs),
         one("subset", "Subset size", length(settings.subset_px), needs, "width of the square subset"),
         one("step", "Step size", length(settings.spacing_px), needs, "distance of the points"),
+        *_dense(settings, length(settings.dense_step_px, f", {METHOD}")),
         one("shape_function", "Subset shape function", _shape_function(measured, settings), needs),
         one("criterion", "Matching criterion", Value(_CRITERION, None, "of this program")),
         one(
@@ -73,6 +75,13 @@ def analysis(source: Source, measured: Measured, found: Geometry | None) -> list
         one("points", "Points", Value(_points(measured), float(measured.steps[0].summary.points), MEASURED)),
         one("region", "Region", _region(settings), needs),
     ]
+
+
+def _dense(settings: SettingsRecord, distance: Value | None) -> list[Item]:
+    if settings.dense_step_px is None:
+        return []
+    comment = "distance of its vectors, which share most of their pixels; its files lie in the folder dense"
+    return [one("dense", "Dense field", distance, comment=comment)]
 
 
 def _prefilter(settings: SettingsRecord) -> Value | None:

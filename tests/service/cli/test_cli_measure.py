@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -731,6 +732,10 @@ def test_a_dense_field_lies_beside_each_step_and_is_read_as_any_other(
         assert ordinary.dense is None
     assert main(["export", str(out / "dense"), "--format", "vtu", "--out", str(tmp_path / "vtu")]) == 0
     assert len(list((tmp_path / "vtu").glob("*.vtu"))) == 3
+    page = tmp_path / "report.html"
+    assert main(["report", str(out), "--out", str(page)]) == 0
+    words = re.sub(r"<[^>]+>|\s", " ", page.read_text(encoding="utf-8")).split()
+    assert re.search(r"Dense field 2 px = [0-9.]+ mm, dense, shared windows", " ".join(words))
     # a later run without one leaves none behind that would pass for its own
     assert main(command(originals, out)) == 0
     assert list((out / "dense").iterdir()) == []
