@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -116,9 +117,10 @@ def test_processes_of_one_machine_find_what_one_after_another_finds(
 def test_a_cluster_finds_what_one_after_another_finds(
     data: Path, chain: list[dict[str, Any]], asked: list[str], tmp_path: Path, images: str
 ) -> None:
+    shutil.copytree(data / "tests", tmp_path / "data" / "tests", ignore=shutil.ignore_patterns("a0*"))
     with cluster_of(2, tmp_path) as cluster:
         cluster.await_workers(2)
-        host = Host(data, f'[compute]\nscheduler = "{cluster.address}"\nimages = "{images}"')
+        host = Host(tmp_path / "data", f'[compute]\nscheduler = "{cluster.address}"\nimages = "{images}"')
         try:
             assert_as_chain(results(host, measured(host)), chain)
             assert {"head", "joint"} <= set(asked)

@@ -72,9 +72,7 @@ def write_page(figures: Figures, times: dict[str, float]) -> None:
         wrapped(
             f"Asked: {ASKED[2]:g} times with two workers; by processor time of both runs {own[1]:.2f} "
             f"({_held(own[1] >= ASKED[2])}), within the run {alone[1]:.2f} ({_held(alone[1] >= ASKED[2])}), by the clock "
-            f"{one.wall_s / two.wall_s:.2f}. Largest difference "
-            f"of a displacement between both runs: {figures.worst_sigma:.1e} of its standard deviation; points with "
-            f"another status: {figures.status_changed}."
+            f"{one.wall_s / two.wall_s:.2f}.{_compared(figures)}"
         ),
         "## Simulated",
         wrapped(
@@ -85,8 +83,8 @@ def write_page(figures: Figures, times: dict[str, float]) -> None:
             f"{1e3 * figures.overhead.serial_s:.1f} ms of "
             f"Dask's scheduler and client with {1e3 * figures.overhead.latency_s:.0f} ms of latency, measured on a real "
             f"scheduler with {figures.overhead.workers} workers in one process whose {figures.overhead.tasks} tasks "
-            f"sleep as long as a step takes and carry {figures.bytes_a_task / 2**20:.1f} MiB, what a step's images and "
-            "result weigh."
+            f"sleep as long as a step takes and carry {figures.overhead.bytes / 1e3:.0f} kB, a task and its summary; "
+            f"images and results{_weight(figures)} go by the shared disk."
         ),
         "| workers | steps | changes of the reference | times faster | heads, joints, repeats | idle | service and "
         "scheduler busy |\n| --- | --- | --- | --- | --- | --- | --- |\n"
@@ -100,6 +98,19 @@ def write_page(figures: Figures, times: dict[str, float]) -> None:
         ),
     ]
     PAGE.write_text("\n\n".join(sections) + "\n", encoding="utf-8")
+
+
+def _compared(figures: Figures) -> str:
+    if figures.worst_sigma is None:
+        return " The results of both runs were not compared here; a test does."
+    return (
+        f" Largest difference of a displacement between both runs: {figures.worst_sigma:.1e} of its standard deviation; "
+        f"points with another status: {figures.status_changed}."
+    )
+
+
+def _weight(figures: Figures) -> str:
+    return "" if figures.bytes_a_task is None else f", {figures.bytes_a_task / 1e6:.1f} MB a step,"
 
 
 def _held(yes: bool) -> str:

@@ -67,9 +67,18 @@ def _sleep(seconds: float, content: bytes) -> bytes:
 
 def dask_overhead(workers: int, task_s: float, size: int) -> Overhead:
     """Run tasks that sleep as long as a step takes and carry as many bytes, one after another on each of the workers."""
+    import dask
     import distributed
 
     count = workers * _TASKS_A_WORKER
+    # what each worker does for itself, many times a second, would be the work of as many machines
+    dask.config.set(
+        {
+            "distributed.worker.profile.enabled": False,
+            "distributed.admin.tick.interval": "10s",
+            "distributed.admin.system-monitor.interval": "10s",
+        }
+    )
     cluster = distributed.LocalCluster(
         n_workers=workers, threads_per_worker=1, processes=False, dashboard_address=None, silence_logs=50
     )
