@@ -446,7 +446,7 @@ def _live(session: Session, test: str) -> None:
     client.post(f"{API}/tests/{test}/live/channels", json={"readings": readings}).raise_for_status()
     asked = {"channel": "pressure_kpa", "gauge": "p1", "quantity": "w_mm"}
     call("align_channel", test, summary="By the ramp that both have seen", body=asked)
-    for operation in ("get_live", "live_history", "live_field", "live_events", "stop_live"):
+    for operation in ("get_live", "live_history", "live_field", "live_field_events", "live_events", "stop_live"):
         call(operation, test)
     client.put(f"{API}/sim/scene", json={"scene": "plate", "load": 20.0}).raise_for_status()
 
