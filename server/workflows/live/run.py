@@ -97,6 +97,7 @@ class LiveRun:
         self._changed = threading.Condition()
         self._slot: Pair | None = None
         self._fault: str | None = None
+        self._gone: str | None = None  # why no pairs come; None where they do
         self._number = 0
         self._clock = _HostClock()
         self._threads = [
@@ -161,6 +162,8 @@ class LiveRun:
                 return
             except StereorigError as error:
                 self.account.without_frame(error.code)
+                with self._changed:
+                    self._gone = error.code
                 self._lost(error.code)
                 self._ending.wait(_PAUSE_S)
                 continue
@@ -173,7 +176,7 @@ class LiveRun:
             with self._changed:
                 if self._slot is not None:
                     self.account.skipped(1)
-                self._slot, self._fault = pair, None
+                self._slot, self._fault, self._gone = pair, None, None
                 self._changed.notify_all()
 
     def _await_empty(self) -> None:
@@ -291,6 +294,8 @@ class LiveRun:
 
     def _publish(self, values: Plain) -> None:
         with self._changed:
+            if self._gone is not None and values["valid"]:  # a frame of before is measured only now
+                values = _invalid(values, self._gone)
             self._newest, self._spoke = values, time.monotonic()
         self.hub.publish("values", values)
 
