@@ -7,7 +7,7 @@ import socket
 from typing import Any
 
 from wsproto import ConnectionType, WSConnection
-from wsproto.events import AcceptConnection, CloseConnection, RejectConnection, Request, TextMessage
+from wsproto.events import AcceptConnection, CloseConnection, Ping, RejectConnection, Request, TextMessage
 
 
 class ValueSocket:
@@ -54,6 +54,8 @@ class ValueSocket:
                     if event.message_finished:
                         found: dict[str, Any] = json.loads(text)
                         return found
+                if isinstance(event, Ping):  # unanswered, the server ends the connection after a while
+                    self._link.sendall(self._protocol.send(event.response()))
                 if isinstance(event, CloseConnection):
                     return None
             try:
