@@ -13,24 +13,7 @@ from core.status import PointStatus
 from server.base.errors import NotFoundError
 from server.formats.results.derived import derived_names
 from server.formats.results.netcdf import opened
-from server.results.reader import derived_variable
-
-
-@dataclass(frozen=True)
-class Place:
-    """A point of the grid.
-
-    Attributes
-    ----------
-    row, col
-        Of the point.
-    distance_px
-        From the pixel that was asked for, in camera 1's reference image.
-    """
-
-    row: int
-    col: int
-    distance_px: float
+from server.results.reader import Place, derived_variable, nearest_place
 
 
 @dataclass
@@ -46,9 +29,8 @@ class PointHistory:
 def nearest_point(path: Path, x_px: float, y_px: float) -> Place:
     """Return the point of a result file nearest to a pixel; the grid is the same in all steps of an analysis."""
     with opened(path) as data:
-        distance = np.hypot(data.variables["x_px"][...] - x_px, data.variables["y_px"][...] - y_px)
-    row, col = (int(i) for i in np.unravel_index(int(np.nanargmin(distance)), distance.shape))
-    return Place(row, col, float(distance[row, col]))
+        x, y = (data.variables[name][...] for name in ("x_px", "y_px"))
+    return nearest_place(x, y, (x_px, y_px))
 
 
 def point_history(files: Sequence[Path], name: str, place: Place) -> PointHistory:

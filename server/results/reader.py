@@ -204,6 +204,30 @@ class ProbeValue:
 
 
 @dataclass(frozen=True)
+class Place:
+    """A point of the grid.
+
+    Attributes
+    ----------
+    row, col
+        Of the point.
+    distance_px
+        From the pixel that was asked for, in camera 1's reference image.
+    """
+
+    row: int
+    col: int
+    distance_px: float
+
+
+def nearest_place(x_px: NDArray[Any], y_px: NDArray[Any], at_px: tuple[float, float]) -> Place:
+    """Return the point nearest to a pixel of the points (r, c) of a grid."""
+    distance = np.hypot(x_px - at_px[0], y_px - at_px[1])
+    row, col = (int(i) for i in np.unravel_index(int(np.nanargmin(distance)), distance.shape))
+    return Place(row, col, float(distance[row, col]))
+
+
+@dataclass(frozen=True)
 class Probe:
     """A measurement point with all that is known of it.
 
@@ -229,8 +253,8 @@ def probe_result(path: Path, x_px: float, y_px: float, asked: CoverageFields) ->
         statement = Statement(Included.of(data), asked)
         variables = {name: Variable.of(v) for name, v in data.variables.items() if v.dimensions[:2] == _GRID}
         variables |= {name: derived_variable(data.variables, name) for name in derived_names(data.variables)}
-    distance = np.hypot(variables["x_px"].values - x_px, variables["y_px"].values - y_px)
-    row, col = (int(i) for i in np.unravel_index(int(np.nanargmin(distance)), distance.shape))
+    place = nearest_place(variables["x_px"].values, variables["y_px"].values, (x_px, y_px))
+    row, col = place.row, place.col
     budgets = _budgets_at(path, row, col)
 
     def number(name: str, variable: Variable) -> ProbeValue:
@@ -247,7 +271,7 @@ def probe_result(path: Path, x_px: float, y_px: float, asked: CoverageFields) ->
     return Probe(
         row=row,
         col=col,
-        distance_px=float(distance[row, col]),
+        distance_px=place.distance_px,
         status=PointStatus(int(variables["status"].values[row, col])).name.lower(),
         values={n: number(n, v) for n, v in variables.items() if v.values.ndim <= 3 and not n.endswith("covariance")},
         uncertainty=statement.document(),
