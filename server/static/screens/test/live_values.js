@@ -113,6 +113,8 @@ export async function liveValuesPanel(testId, ends) {
     source?.close();
     source = null;
     clearInterval(asking);
+    clearTimeout(later); // a value that came before the end must not draw over it
+    later = 0;
   }
   function follow() {
     moments = [];
