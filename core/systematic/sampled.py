@@ -12,91 +12,147 @@ from core.arrays import Float, Float32
 from core.matching.image import PAD
 from core.matching.kernels.naming import entry, inner
 
+_SIXTH = 1.0 / 6.0
+
 
 @inner
-def _weights(t, order, w):
-    """B-spline weights of the ``order + 1`` taps about a fraction ``t``."""
+def _cubic(t):
+    """Cubic B-spline weights of the four taps about a fraction ``t``."""
     s = 1.0 - t
-    if order == 3:
-        w[0], w[3] = s * s * s / 6.0, t * t * t / 6.0
-        w[1] = (4.0 + t * t * (3.0 * t - 6.0)) / 6.0
-        w[2] = 1.0 - (w[0] + w[1] + w[3])
-        return
+    first, last = s * s * s * _SIXTH, t * t * t * _SIXTH
+    second = (4.0 + t * t * (3.0 * t - 6.0)) * _SIXTH
+    return first, second, 1.0 - (first + second + last), last
+
+
+@inner
+def _quintic(t):
+    """Quintic B-spline weights of the six taps about a fraction ``t``."""
+    s = 1.0 - t
     tt, ss = t * t, s * s
-    w[0], w[5] = ss * ss * s / 120.0, tt * tt * t / 120.0
-    w[2] = (66.0 + tt * (-60.0 + tt * (30.0 - 10.0 * t))) / 120.0
-    w[3] = (66.0 + ss * (-60.0 + ss * (30.0 - 10.0 * s))) / 120.0
-    w[1] = (1.0 + s * (5.0 + s * (10.0 + s * (10.0 + s * (5.0 - 5.0 * s))))) / 120.0
-    w[4] = 1.0 - (w[0] + w[1] + w[2] + w[3] + w[5])
+    first, last = ss * ss * s / 120.0, tt * tt * t / 120.0
+    third = (66.0 + tt * (-60.0 + tt * (30.0 - 10.0 * t))) / 120.0
+    fourth = (66.0 + ss * (-60.0 + ss * (30.0 - 10.0 * s))) / 120.0
+    second = (1.0 + s * (5.0 + s * (10.0 + s * (10.0 + s * (5.0 - 5.0 * s))))) / 120.0
+    return first, second, third, fourth, 1.0 - (first + second + third + fourth + last), last
 
 
 @inner
-def _value(coefficients, order, x, y, wx, wy):
-    """Spline value; NaN where a tap lies outside the padded image."""
-    lead, taps = order // 2, order + 1
-    ix, iy = int(np.floor(x)), int(np.floor(y))
-    x0, y0 = ix - lead, iy - lead
-    if x0 < 0 or y0 < 0 or x0 + taps > coefficients.shape[1] or y0 + taps > coefficients.shape[0]:
-        return np.nan
-    _weights(x - ix, order, wx)
-    _weights(y - iy, order, wy)
-    total = 0.0
-    if order == 5:
-        for i in range(6):
-            row = coefficients[y0 + i]
-            total += wy[i] * (
-                wx[0] * row[x0]
-                + wx[1] * row[x0 + 1]
-                + wx[2] * row[x0 + 2]
-                + wx[3] * row[x0 + 3]
-                + wx[4] * row[x0 + 4]
-                + wx[5] * row[x0 + 5]
-            )
+def _cubic_value(c, width, x, y):
+    """Spline value at a place of a flat image of rows of ``width``; all its taps lie inside."""
+    ix, iy = int(x), int(y)
+    w0, w1, w2, w3 = _cubic(x - ix)
+    v0, v1, v2, v3 = _cubic(y - iy)
+    a = (iy - 1) * width + ix - 1
+    b, d, e = a + width, a + 2 * width, a + 3 * width
+    return (
+        v0 * (w0 * c[a] + w1 * c[a + 1] + w2 * c[a + 2] + w3 * c[a + 3])
+        + v1 * (w0 * c[b] + w1 * c[b + 1] + w2 * c[b + 2] + w3 * c[b + 3])
+        + v2 * (w0 * c[d] + w1 * c[d + 1] + w2 * c[d + 2] + w3 * c[d + 3])
+        + v3 * (w0 * c[e] + w1 * c[e + 1] + w2 * c[e + 2] + w3 * c[e + 3])
+    )
+
+
+@inner
+def _row_of_six(c, a, w0, w1, w2, w3, w4, w5):
+    return w0 * c[a] + w1 * c[a + 1] + w2 * c[a + 2] + w3 * c[a + 3] + w4 * c[a + 4] + w5 * c[a + 5]
+
+
+@inner
+def _quintic_value(c, width, x, y):
+    """As :func:`_cubic_value`."""
+    ix, iy = int(x), int(y)
+    w0, w1, w2, w3, w4, w5 = _quintic(x - ix)
+    v0, v1, v2, v3, v4, v5 = _quintic(y - iy)
+    a = (iy - 2) * width + ix - 2
+    return (
+        v0 * _row_of_six(c, a, w0, w1, w2, w3, w4, w5)
+        + v1 * _row_of_six(c, a + width, w0, w1, w2, w3, w4, w5)
+        + v2 * _row_of_six(c, a + 2 * width, w0, w1, w2, w3, w4, w5)
+        + v3 * _row_of_six(c, a + 3 * width, w0, w1, w2, w3, w4, w5)
+        + v4 * _row_of_six(c, a + 4 * width, w0, w1, w2, w3, w4, w5)
+        + v5 * _row_of_six(c, a + 5 * width, w0, w1, w2, w3, w4, w5)
+    )
+
+
+@inner
+def _sample(flat, width, order, x, y, map_, half, current):
+    """Sample the other image over a subset about its place there; all taps lie inside."""
+    side = 2 * half + 1
+    xx, xy, yx, yy = map_[0, 0], map_[0, 1], map_[1, 0], map_[1, 1]
+    if order == 3:  # outside the loops: a choice of splines a pixel costs as much as a spline
+        for i in range(side):
+            for j in range(side):
+                dx, dy = j - half, i - half
+                current[i, j] = _cubic_value(flat, width, x + xx * dx + xy * dy, y + yx * dx + yy * dy)
     else:
-        for i in range(4):
-            row = coefficients[y0 + i]
-            total += wy[i] * (wx[0] * row[x0] + wx[1] * row[x0 + 1] + wx[2] * row[x0 + 2] + wx[3] * row[x0 + 3])
-    return total
+        for i in range(side):
+            for j in range(side):
+                dx, dy = j - half, i - half
+                current[i, j] = _quintic_value(flat, width, x + xx * dx + xy * dy, y + yx * dx + yy * dy)
 
 
 @inner
-def _shift(pixels, current, gx, gy, ax, ay, left, top, x0, y0, half, gain, mean_r, mean_c):
-    """Shift x, y that residuals show through the gradients ``ax, ay``, the subset's from ``left, top`` on."""
-    a00 = a01 = a10 = a11 = b0 = b1 = 0.0
-    for i in range(2 * half + 1):
-        for j in range(2 * half + 1):
-            y, x = y0 - half + i, x0 - half + j
-            rest = gain * (current[i, j] - mean_c) - (pixels[y, x] - mean_r)
-            u, v, g, h = ax[top + i, left + j], ay[top + i, left + j], gx[y, x], gy[y, x]
-            a00 += u * g
-            a01 += u * h
-            a10 += v * g
-            a11 += v * h
-            b0 += u * rest
-            b1 += v * rest
+def _inside(rows, cols, order, x, y, map_, half):
+    """True if all taps of a subset lie in the padded image; of an affine map its corners are the extremes."""
+    lead = order // 2
+    wide = half * (abs(map_[0, 0]) + abs(map_[0, 1]))
+    high = half * (abs(map_[1, 0]) + abs(map_[1, 1]))
+    return x - wide >= lead and y - high >= lead and x + wide < cols - 1 - lead and y + high < rows - 1 - lead
+
+
+@inner
+def _solved(a00, a01, a10, a11, b0, b1):
+    """Shift x, y of two equations."""
     det = a00 * a11 - a01 * a10
     return -(a11 * b0 - a01 * b1) / det, -(a00 * b1 - a10 * b0) / det
 
 
+@inner
+def _shifts(subset, current, gx, gy, lx, ly, gain, mean_r, mean_c, out):
+    """Shifts x, y that residuals of a subset show through its gradients ``gx, gy``, and through ``lx, ly``."""
+    a00 = a01 = a11 = b0 = b1 = 0.0
+    c00 = c01 = c10 = c11 = d0 = d1 = 0.0
+    for i in range(subset.shape[0]):
+        for j in range(subset.shape[1]):
+            rest = gain * (current[i, j] - mean_c) - (subset[i, j] - mean_r)
+            g, h, u, v = gx[i, j], gy[i, j], lx[i, j], ly[i, j]
+            a00 += g * g
+            a01 += g * h
+            a11 += h * h
+            b0 += g * rest
+            b1 += h * rest
+            c00 += u * g
+            c01 += u * h
+            c10 += v * g
+            c11 += v * h
+            d0 += u * rest
+            d1 += v * rest
+    out[0], out[1] = _solved(a00, a01, a01, a11, b0, b1)
+    out[2], out[3] = _solved(c00, c01, c10, c11, d0, d1)
+
+
 @entry
 def _residual_shifts(pixels, gx, gy, lx, ly, coefficients, order, centres, images, maps, half, pad, out):
-    wx, wy = np.empty(6), np.empty(6)
     side = 2 * half + 1
     current = np.empty((side, side))
     n = side * side
+    rows, width = coefficients.shape
+    flat = coefficients.ravel()
     for k in range(len(centres)):
         x0, y0 = centres[k]
         out[k, :] = np.nan
         if x0 < half or y0 < half or x0 + half >= pixels.shape[1] or y0 + half >= pixels.shape[0]:
             continue
+        x, y, map_ = images[k, 0] + pad, images[k, 1] + pad, maps[k]
+        if not _inside(rows, width, order, x, y, map_, half):
+            continue
+        _sample(flat, width, order, x, y, map_, half, current)
+        down, along = slice(y0 - half, y0 + half + 1), slice(x0 - half, x0 + half + 1)
+        subset = pixels[down, along]
         s_r = s_c = s_rc = s_cc = 0.0
         for i in range(side):
             for j in range(side):
-                dx, dy = j - half, i - half
-                x = images[k, 0] + maps[k, 0, 0] * dx + maps[k, 0, 1] * dy + pad
-                y = images[k, 1] + maps[k, 1, 0] * dx + maps[k, 1, 1] * dy + pad
-                c, r = _value(coefficients, order, x, y, wx, wy), pixels[y0 + dy, x0 + dx]
-                current[i, j] = c
+                c, r = current[i, j], subset[i, j]
                 s_r += r
                 s_c += c
                 s_rc += r * c
@@ -105,9 +161,7 @@ def _residual_shifts(pixels, gx, gy, lx, ly, coefficients, order, centres, image
         if not contrast > 0.0:
             continue
         gain = (s_rc - s_r * s_c / n) / contrast
-        known = gain, s_r / n, s_c / n
-        out[k, 0], out[k, 1] = _shift(pixels, current, gx, gy, gx, gy, x0 - half, y0 - half, x0, y0, half, *known)
-        out[k, 2], out[k, 3] = _shift(pixels, current, gx, gy, lx[k], ly[k], 0, 0, x0, y0, half, *known)
+        _shifts(subset, current, gx[down, along], gy[down, along], lx[k], ly[k], gain, s_r / n, s_c / n, out[k])
 
 
 def residual_shifts(
