@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
+from core.field.points.kept_reference import KeptReference
 from core.field.points.starts import depth_per_px, faces_both_cameras
 from core.field.region.visibility import Visibility
 from core.matching.fit import fit_motion, fit_shape
@@ -138,6 +139,8 @@ class Fitter:
         Keep the numbers of points that a check rejects.
     visibility
         The points' visibility; None: all of every subset.
+    kept
+        What a sequence keeps of the reference pair; None: nothing.
     """
 
     pair: StereoPair
@@ -149,6 +152,7 @@ class Fitter:
     min_zncc: float
     visibility: Visibility | None = None
     keep_rejected: bool = False
+    kept: KeptReference | None = None
 
     @property
     def comparisons(self) -> int:
@@ -171,7 +175,7 @@ class Fitter:
 
     def curved(self) -> Fitter:
         """Return the same matcher with curved patches."""
-        return replace(self, options=replace(self.options, patch="quadratic"))
+        return replace(self, options=replace(self.options, patch="quadratic"), kept=None)
 
     def converging(self, rate: Float) -> Fitter:
         """Return the same matcher for points that converge as a sample (m,) of them did.
@@ -205,7 +209,9 @@ class Fitter:
                 np.full(n, np.nan),
             )
         else:
-            m = fit_motion(self.pair, self.ref1, self.ref2, self.cur1, self.cur2, xy_px, w, G, self.options, visible)
+            kept = None if self.kept is None else self.kept.at(xy_px)
+            images = self.ref1, self.ref2, self.cur1, self.cur2
+            m = fit_motion(self.pair, *images, xy_px, w, G, self.options, visible, kept)
             fits = PointFits(
                 m.w,
                 m.G,

@@ -19,6 +19,7 @@ from core.field.growth.field import assemble_field, motion_field
 from core.field.growth.seed import Seeds
 from core.field.growth.state import FieldInputs, prepare
 from core.field.points.images import MeasureImage
+from core.field.points.kept_reference import KeptReference
 from core.field.points.result import Field, References
 from core.field.region.find_visible import with_visibility
 from core.field.region.region import PointGrid
@@ -95,6 +96,7 @@ class Updating:
         self._mode, self._first = mode, first
         self._images_of, self._field_of = images_of, field_of
         self._segments: OrderedDict[int, Segment] = OrderedDict()
+        self._kept: tuple[KeptReference | None] | None = None
 
     def measure(
         self,
@@ -197,10 +199,26 @@ class Updating:
     def _total(self, step: _Step) -> Field:
         inputs = self._inputs(self._reference, self._grid, step, step.progress)
         previous = None if step.previous is None else step.previous.field
+        if previous is not None:  # of a single step it would cost more than it saves
+            inputs = replace(inputs, matcher=replace(inputs.matcher, kept=self._kept_of(inputs)))
         return motion_field(inputs, self._shape, previous, step.seeds)
 
     def _inputs(self, reference: Pair, grid: PointGrid, step: _Step, progress: Progress | None = None) -> FieldInputs:
         return prepare(self._pair, reference, step.images, grid, self._options, progress=progress, cancel=step.cancel)
+
+    def _kept_of(self, inputs: FieldInputs) -> KeptReference | None:
+        """Return what the steps after the first one keep of the first reference, made once.
+
+        It follows from images and shape alone, so that steps measured in another process are the same.
+        """
+        if self._kept is None:
+            matcher, grid = inputs.matcher, inputs.grid
+            reference = matcher.ref1, matcher.ref2
+            made = KeptReference.of(
+                self._pair, reference, self._shape, grid.spacing_px, matcher.options, grid.visibility
+            )
+            self._kept = (made,)
+        return self._kept[0]
 
     def _segment(self, step: int) -> Segment:
         """Return the segment that begins at a step; the latest ones are kept."""
