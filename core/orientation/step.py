@@ -17,6 +17,7 @@ from core.field.points.images import MeasureImage
 from core.field.points.result import Field
 from core.field.settings import MeasureOptions
 from core.matching.fit import fit_shape
+from core.matching.slopes import SlopeFilter
 from core.orientation.matched import MatchedPoints, seen_by_camera2
 from core.robust import spread_indices
 from core.status import PointStatus
@@ -26,7 +27,12 @@ _LARGE_PIXELS = 8_000_000  # from here on an image's gradients are made for this
 
 
 def step_points(
-    pair: StereoPair, field: Field, image1: MeasureImage, image2: MeasureImage, options: MeasureOptions
+    pair: StereoPair,
+    field: Field,
+    image1: MeasureImage,
+    image2: MeasureImage,
+    options: MeasureOptions,
+    slopes: SlopeFilter | None = None,
 ) -> MatchedPoints | None:
     """Match a step's two images at a sample of its field's points.
 
@@ -40,6 +46,9 @@ def step_points(
         Both cameras' images of the step.
     options
         Of the measurement.
+    slopes
+        The reference's, which serve a step of the same camera as well as its own: they are the larger part of what an
+        image's gradients cost. Its own when left out.
 
     Returns
     -------
@@ -63,8 +72,11 @@ def step_points(
     if len(xy) == 0:
         return None
     images = [image.prepared(options.interpolation, None, options.blur) for image in (image1, image2)]
-    if images[0].raw.size > _LARGE_PIXELS:
+    own = "gradients" not in vars(images[0])  # another match has made them else
+    if own and (slopes is not None or images[0].raw.size > _LARGE_PIXELS):
         images[0] = copy.copy(images[0])
+        if slopes is not None:
+            vars(images[0])["slopes"] = slopes
     fit = fit_shape(pair, images[0], images[1], xy, start, options.match_options())
     good = (fit.status == PointStatus.OK) & (fit.zncc.min(axis=1) >= options.min_zncc) & np.isfinite(fit.epipolar_px)
     if not good.any():

@@ -12,7 +12,7 @@ from core.strain.result import StrainField
 from core.strain.tensors import strain_covariance
 
 
-def reference_share(field: Field, strain: StrainField) -> Float | None:
+def reference_share(field: Field, strain: StrainField, points: Bool | None = None) -> Float | None:
     """Return the reference pair's share (r, c, 3) of the own variance of exx, eyy, exy.
 
     Parameters
@@ -21,11 +21,13 @@ def reference_share(field: Field, strain: StrainField) -> Float | None:
         What the strain was made of.
     strain
         Of the same points.
+    points
+        (r, c) True at the points that are asked for; all of them when left out.
 
     Returns
     -------
     Float
-        NaN where there is no strain; None where the reference's noise is not told apart.
+        NaN where there is no strain, or it is not asked for; None where the reference's noise is not told apart.
 
     Notes
     -----
@@ -36,6 +38,8 @@ def reference_share(field: Field, strain: StrainField) -> Float | None:
     if frozen is None or not field.has_motion:
         return None
     good = strain.valid & field.valid
+    if points is not None:
+        good &= points
     frame = tangent_frames(field.normal_sys[good])[..., :2]
     gradient = _moved(field, good, frame) - frame
     per_mm = np.linalg.inv(np.swapaxes(frame, -1, -2) @ _grid_tangents(field)[good])

@@ -15,6 +15,7 @@ from core.errors import SeedError
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field
 from core.field.settings import MeasureOptions
+from core.matching.slopes import SlopeFilter
 from core.orientation import judge_offsets
 from core.orientation.change import Ends, ends_of
 from core.orientation.coarse import features_off_px
@@ -45,6 +46,8 @@ class CameraWatch:
         The calibration's own offset at most, where it is known.
     imported
         True for another program's calibration.
+    slopes
+        Returns the derivative that suits camera 1's reference image, for all steps; None: each step's own is found.
     """
 
     pair: StereoPair
@@ -53,6 +56,7 @@ class CameraWatch:
     covariance: tuple[tuple[str, ...], NDArray[np.float64]] | None
     own_px: float | None
     imported: bool
+    slopes: Callable[[], SlopeFilter | None] | None = None
     _steps: dict[int, StepOffsets | None] = field(default_factory=dict)
 
     @cached_property
@@ -141,7 +145,7 @@ class CameraWatch:
             points = (
                 matched_points(self.pair, result, at_most=SAMPLE)
                 if n == self.reference
-                else step_points(self.pair, result, *images, self.options)
+                else step_points(self.pair, result, *images, self.options, self.slopes and self.slopes())
             )
             names = COVARIANCE_NAMES if self.covariance is None else self.covariance[0]
             self._steps[n] = None if points is None else StepOffsets(self.pair, points, names, ends=self._ends)

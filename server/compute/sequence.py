@@ -26,6 +26,7 @@ from core.field.region.lay_points import make_grid
 from core.field.seeding.seeds import seeds_of
 from core.field.sequence.joint import agree
 from core.field.settings import MeasureOptions
+from core.matching.slopes import SlopeFilter
 from core.measure import PreviousStep, ReferencePair, Updating
 from core.names import CAMERAS
 from core.progress import CancelToken, Progress
@@ -131,6 +132,8 @@ class SequenceMeasurement:
             covariance_in(self.calibration.details, name="calibration.json", pair=self.calibration.pair),
             own_px_of(self.calibration),
             self.calibration.imported,
+            # where each step becomes the next one's reference, its own are needed anyhow
+            None if self.settings.reference_update == "always" else self._reference_slopes,
         )
         images = self.read(self.reference)
         sizes = (self.calibration.image_size1_px, self.calibration.image_size2_px)
@@ -258,6 +261,9 @@ class SequenceMeasurement:
         """Return True if steps that were measured from what is there of a step stand, see :func:`agree`."""
         path = self.file_of(step.n, earlier)
         return path.exists() and agree(result, read_measured(path))
+
+    def _reference_slopes(self) -> SlopeFilter | None:
+        return self.pair.image1.prepared(self.options.interpolation, None, self.options.blur).slopes
 
     def _systematic(self, result: Field, images: Pair | None) -> Systematic:
         """Systematic terms of a step's field; ``images`` are the step's, which the reference itself needs none of."""

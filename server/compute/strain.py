@@ -14,7 +14,7 @@ from core.field.points.smoothing_record import Smoothing
 from core.field.smoothed import smoothed_displacement
 from core.settings import StrainOrder
 from core.strain import StrainField, StrainOptions, StrainStatus, surface_strain
-from server.formats.results.budgets import strain_budgets
+from server.formats.results.budgets import spread_points, strain_budgets
 
 _NAMES = ("exx", "eyy", "exy")
 
@@ -110,7 +110,7 @@ class StrainSummary:
 def summarise_strain(strain: StrainField, field: Field) -> StrainSummary:
     """Summarise one step's strain, and the field that it was made of."""
     valid, patch = strain.valid, None
-    budgets = strain_budgets(field, strain, valid)
+    budgets = strain_budgets(field, strain, spread_points(valid))
     if strain.patch is not None:
         both = valid & np.isfinite(strain.patch).all(axis=-1)
         difference = strain.patch[both] - strain.strain[both]

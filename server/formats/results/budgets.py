@@ -11,11 +11,13 @@ from core.arrays import Bool, Float, Floats
 from core.common.factor import Causes
 from core.field.points.result import Field
 from core.names import BUDGET, BudgetName, Cause
+from core.robust import spread_indices
 from core.strain import StrainField
 from core.strain.reference import reference_share
 from server.formats.results.layout import COVARIANCE_NAMES
 
 STRAIN_NAMES = ("exx", "eyy", "exy")
+_MEDIANS_OF = 2000  # points: a median of a tenth's scatter is known to a few thousandths from them
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +49,16 @@ class PointBudget:
         return {name: float(part[k]) if np.isfinite(part[k]) else None for name, part in self.parts.items()}
 
 
+def spread_points(points: Bool) -> Bool:
+    """Return (r, c) True at some of the points, spread over all: enough for the medians of their budgets."""
+    index = np.flatnonzero(points)
+    if len(index) <= _MEDIANS_OF:
+        return points
+    out = np.zeros(points.shape, bool)
+    out.ravel()[index[spread_indices(len(index), _MEDIANS_OF)]] = True
+    return out
+
+
 def field_budgets(field: Field, points: Bool) -> dict[str, PointBudget]:
     """Return the budgets of positions and displacements.
 
@@ -68,12 +80,12 @@ def field_budgets(field: Field, points: Bool) -> dict[str, PointBudget]:
         frozen = own  # a position's noise is the reference pair's
     elif field.frozen is not None:
         frozen = np.concatenate([own[:, :3], _diagonal(field.frozen)[points]], axis=1)
-    squares = _squares(field.common, field.causes)
+    squares = _squares(field.common, field.causes, points)
     return {
         name: _budget(
             own[:, k],
             None if frozen is None else frozen[:, k],
-            {cause: square[..., k][points] for cause, square in squares.items()},
+            {cause: square[:, k] for cause, square in squares.items()},
         )
         for k, name in enumerate(COVARIANCE_NAMES[: own.shape[-1]])
     }
@@ -92,13 +104,13 @@ def strain_budgets(field: Field, strain: StrainField, points: Bool) -> dict[str,
         (r, c) True at the points that are asked for.
     """
     own = _diagonal(strain.covariance)[points]
-    share = reference_share(field, strain)
-    squares = _squares(strain.common, field.causes)
+    share = reference_share(field, strain, points)
+    squares = _squares(strain.common, field.causes, points)
     return {
         name: _budget(
             own[:, k],
             None if share is None else share[points][:, k] * own[:, k],
-            {cause: square[..., k][points] for cause, square in squares.items()},
+            {cause: square[:, k] for cause, square in squares.items()},
         )
         for k, name in enumerate(STRAIN_NAMES)
     }
@@ -108,11 +120,11 @@ def _diagonal(covariance: Float) -> Float:
     return np.asarray(np.diagonal(covariance, axis1=-2, axis2=-1))
 
 
-def _squares(common: Floats | None, causes: Causes | None) -> Mapping[Cause, Float]:
-    """Variances (r, c, m) by cause; none where the common factor (r, c, m, k) is not known."""
+def _squares(common: Floats | None, causes: Causes | None, points: Bool) -> Mapping[Cause, Float]:
+    """Variances (n, m) by cause at points (r, c); none where the common factor (r, c, m, k) is not known."""
     if common is None:
         return {}
-    return (Causes.untold(common.shape[-1]) if causes is None else causes).squares(common)
+    return (Causes.untold(common.shape[-1]) if causes is None else causes).squares(common[points])
 
 
 def _budget(own: Float, frozen: Float | None, common: Mapping[Cause, Float]) -> PointBudget:

@@ -16,7 +16,7 @@ from core.field.points.patch import PatchChoice
 from core.field.points.result import Field
 from core.field.points.smoothing_record import Smoothing
 from core.status import PointStatus
-from server.formats.results.budgets import field_budgets
+from server.formats.results.budgets import field_budgets, spread_points
 from server.formats.results.camera_motion import CameraMotion
 from server.formats.results.layout import COMPARISONS, FORMAT_VERSION
 from server.formats.results.uncertainty import Included
@@ -74,7 +74,7 @@ class StepSummary:
     sigma_calibration_median_mm
         The calibration's part of it; None where it is not known, and then not included.
     budget_median_mm
-        By coordinate, the medians of the parts of the standard uncertainty: `matching`, `reference` (noise of the
+        By coordinate, the medians, over 2,000 points or all, of the parts of the standard uncertainty: `matching`, `reference` (noise of the
         reference pair, common to all steps), `calibration`, `stage`, `target`. A part that is not told apart is left
         out, and in the one before it.
     uncertainty_includes
@@ -165,7 +165,10 @@ def summarise(
     epipolar = result.epipolar_px[valid]
     names = ("x_mm", "y_mm", "z_mm", "u_mm", "v_mm", "w_mm")[: result.covariance.shape[-1]]
     sigma = result.sigma_mm[valid]
-    common = None if result.common is None else np.einsum("...nk,...nk->...n", result.common, result.common)[valid]
+    common = None
+    if result.common is not None:
+        some = result.common[valid]
+        common = np.einsum("...nk,...nk->...n", some, some)
     summary = StepSummary(
         kind="displacement" if result.has_motion else "shape",
         points=points,
@@ -186,7 +189,7 @@ def summarise(
         sigma_calibration_median_mm=None
         if common is None
         else {name: float(np.median(np.sqrt(common[:, k]))) if n else None for k, name in enumerate(names)},
-        budget_median_mm={name: one.median for name, one in field_budgets(result, valid).items()},
+        budget_median_mm={name: one.median for name, one in field_budgets(result, spread_points(valid)).items()},
         uncertainty_includes=Included.of_field(result).text,
         smoothing=result.smoothing,
         patch=result.patch,
