@@ -87,22 +87,18 @@ def missed_slope(slope: Float, second: Float, moments: Float) -> Float:
     moments
         (n, 2, 4) of :func:`third_moments`.
     """
-    normal = np.cross(slope[..., 0], slope[..., 1])
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    ss, st, tt = np.moveaxis(np.einsum("na,nab->nb", normal, second), -1, 0)
-    # the third derivatives along x_s and x_t: (n, 4, 2)
-    along = -np.stack(
-        [
-            np.stack([ss * ss, ss * st], -1),
-            np.stack([ss * st, st * st], -1),
-            np.stack([st * st, tt * st], -1),
-            np.stack([tt * st, tt * tt], -1),
-        ],
-        axis=1,
-    )
-    metric = np.swapaxes(slope, -1, -2) @ slope
-    (aa, ab), (_, bb) = np.moveaxis(metric[:, :, :, None], 0, 2)  # (n, 1): two by two, its inverse is written out
-    one, two = along[..., 0], along[..., 1]
-    raised = np.stack([bb * one - ab * two, aa * two - ab * one], axis=-1) / (aa * bb - ab * ab)[..., None]
-    third = raised @ np.swapaxes(slope, -1, -2)  # (n, 4, 3)
-    return np.swapaxes(moments @ third, -1, -2)
+    (x, y, z), (p, q, r) = np.moveaxis(slope, (2, 1), (0, 1))  # (n,) each: one array operation a number
+    u, v, w = y * r - z * q, z * p - x * r, x * q - y * p
+    aa, ab, bb = x * x + y * y + z * z, x * p + y * q + z * r, p * p + q * q + r * r
+    per = 1.0 / (u * u + v * v + w * w)  # the metric's determinant, and the normal's square
+    ss, st, tt = (np.sqrt(per) * (u * c[0] + v * c[1] + w * c[2]) for c in np.moveaxis(second, (2, 1), (0, 1)))
+    # the third derivatives along x_s and x_t
+    third = ((ss * ss, ss * st), (ss * st, st * st), (st * st, tt * st), (tt * st, tt * tt))
+    raised = [((ab * two - bb * one) * per, (ab * one - aa * two) * per) for one, two in third]
+    out = np.empty(slope.shape)
+    for k in range(2):
+        m = [moments[:, k, i] for i in range(4)]
+        along, across = (sum(m[i] * raised[i][j] for i in range(4)) for j in range(2))
+        for i in range(3):
+            out[:, i, k] = along * slope[:, i, 0] + across * slope[:, i, 1]
+    return out

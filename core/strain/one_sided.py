@@ -14,13 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from core.arrays import Bool, Float
-from core.field.region.window import window_offsets
+from core.field.region.window import distinct_windows
 from core.settings import StrainTensor
+from core.strain.reduced import window_sums
 from core.strain.result import StrainStatus
 from core.strain.tensors import as_tensor, strain_covariance
 from core.strain.window import Slopes
-
-_VALUES_AT_ONCE = 4_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,17 +130,11 @@ def _around(
     known = good & (trace > 0.0)
     weight = np.where(known, 1.0 / np.where(known, trace, 1.0), 0.0)
     flat = (*good.shape, -1)
-    both = np.concatenate([np.ones((*flat[:2], 1)), bending.reshape(flat), noise.reshape(flat)], axis=-1)
-    both = np.pad(both * weight[..., None], ((half, half), (half, half), (0, 0)))
-    width, depth = both.shape[1:]
-    both = both.reshape(-1, depth)
-    reach = window_offsets(half)[0] @ np.array([width, 1])
-    here = (rows + half) * width + cols + half
-    out = np.empty((len(rows), depth))
-    step = max(_VALUES_AT_ONCE // (seen.shape[1] * depth), 1)
-    for first in range(0, len(rows), step):
-        part = slice(first, first + step)
-        out[part] = np.einsum("mn,mnq->mq", seen[part].astype(np.float64), both[here[part, None] + reach])
+    both = np.concatenate([np.ones((*good.shape, 1)), bending.reshape(flat), noise.reshape(flat)], axis=-1)
+    both *= weight[..., None]
+    kinds, which = distinct_windows(seen)
+    counted = kinds[:, None].astype(np.float64)
+    out = window_sums(both, rows, cols, which, counted, half, from_centre=False)[:, 0]
     out /= np.where(out[:, :1] > 0.0, out[:, :1], 1.0)
     return out[:, 1:7].reshape(-1, 2, 3), out[:, 7:].reshape(-1, 3, 3)
 

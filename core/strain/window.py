@@ -8,7 +8,6 @@ of the surface.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 from scipy import ndimage
@@ -19,6 +18,7 @@ from core.field.region.cuts import Cuts
 from core.field.region.window import connected_points, distinct_windows, fit_terms, steps_of, ways_cut, window_offsets
 from core.strain.arcs import reduced_moments, second_moments, second_weights, third_moments, whole_second_derivatives
 from core.strain.options import StrainOptions
+from core.strain.reduced import window_sums
 from core.strain.result import StrainStatus
 
 _AT_ONCE = 1024
@@ -103,34 +103,26 @@ class ReducedWindows:
     correlation: Correlation
     options: StrainOptions
 
-    @cached_property
-    def _padded(self) -> Float:
-        half = self.options.window // 2
-        held = np.where(self.valid[..., None], self.values, 0.0)
-        return np.pad(held, ((half, half), (half, half), (0, 0))).reshape(-1, 6)
+    def sums(self, rows: np.ndarray, cols: np.ndarray, which: np.ndarray, weights: Float) -> Float:
+        """Weighted sums (m, a, 6) of the values about points (m,), see :func:`core.strain.reduced.window_sums`."""
+        return window_sums(self.values, rows, cols, which, weights, self.options.window // 2, from_centre=True)
 
-    def data(self, rows: np.ndarray, cols: np.ndarray) -> Float:
-        """Values (m, n, 6) of the windows about points (m,), from the centre's on, so that no digits are lost."""
-        half = self.options.window // 2
-        width = self.valid.shape[1] + 2 * half
-        here = (rows + half) * width + cols + half
-        reach = window_offsets(half)[0] @ np.array([width, 1])
-        around = self._padded.take(here[:, None] + reach, axis=0)
-        return np.asarray(around - self.values[rows, cols][:, None, :])
+    def fitted(
+        self, rows: np.ndarray, cols: np.ndarray, kinds: Bool, which: np.ndarray, order: int
+    ) -> tuple[np.ndarray, Float, Float, Float, Float]:
+        """Status, slope, spread, third moments and weights of windows' fits, as in :class:`Slopes`.
 
-    def fitted(self, seen: Bool, data: Float, order: int) -> tuple[np.ndarray, Float, Float, Float, Float]:
-        """Status, slope, spread, third moments and weights of windows' fits, as in :class:`Slopes`."""
+        ``kinds`` and ``which`` are :func:`distinct_windows` of those about points (m,).
+        """
         half = self.options.window // 2
-        kinds, which = distinct_windows(seen)
         found, by_kind = _weights(kinds, half, order, self.options)
         spread, moments = self.correlation.spread(by_kind), reduced_moments(by_kind, kinds, half, order)
-        weights = by_kind[which]
-        slope = np.einsum("man,mnb->mba", weights, data)
-        return found[which], slope, spread[which], moments[which], weights
+        slope = np.swapaxes(self.sums(rows, cols, which, by_kind), 1, 2)
+        return found[which], slope, spread[which], moments[which], by_kind[which]
 
     def quadratics(self, rows: np.ndarray, cols: np.ndarray, seen: Bool, planes: Float) -> Quadratics:
         """Return the quadratics of windows with these connected points (m, n) and weights (m, 2, n) of planes."""
-        raised = self.fitted(seen, self.data(rows, cols), 2)
+        raised = self.fitted(rows, cols, *distinct_windows(seen), 2)
         return Quadratics(*raised, second_moments(planes, self.options.window // 2))
 
 
@@ -224,13 +216,13 @@ def window_slopes(
         r, k = rows[first : first + at_once], cols[first : first + at_once]
         here = (r + half) * there.shape[1] + k + half
         seen = connected_points(there, here, None if crossed is None else crossed[r, k], half)
-        data = windows.data(r, k)
-        there_now = np.concatenate([data[..., :3], data[..., :3] + data[..., 3:]], axis=-1)
         kinds, which = distinct_windows(seen)
         bending = second_weights(kinds, half)
-        second[r, k] = np.einsum("man,mnb->mba", bending[which], there_now)
+        bent = np.swapaxes(windows.sums(r, k, which, bending), 1, 2)
+        bent[:, 3:] += bent[:, :3]  # of the displacement, then of the deformed position
+        second[r, k] = bent
         status[r, k], slope[r, k], spread[r, k], moments[r, k], weights = windows.fitted(
-            seen, data, 2 if options.order == 2 else 1
+            r, k, kinds, which, 2 if options.order == 2 else 1
         )
         reduced.append((r, k, weights))
         if second_spread is not None:

@@ -1,0 +1,66 @@
+"""Weighted sums over windows that edges, holes or cuts have reduced, compiled: no window's points are gathered."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arrays import Float
+from core.field.region.window import window_offsets
+from core.matching.kernels.naming import entry
+
+Index = NDArray[Any]
+
+
+@entry
+def _sums(values, from_centre, at_rows, at_cols, which, weights, offsets, out):
+    """Sums ``out`` (m, a, q) of values (r, c, q) over windows, with the weights ``which`` (m,) of (k, a, n)."""
+    count = values.shape[2]
+    for w in range(len(at_rows)):
+        r, c, kind = at_rows[w], at_cols[w], which[w]
+        centre = values[r, c]
+        for a in range(weights.shape[1]):
+            total = out[w, a]
+            for j in range(count):
+                total[j] = 0.0
+            for p in range(len(offsets)):
+                weight = weights[kind, a, p]
+                if weight == 0.0:  # no point there, or none that counts
+                    continue
+                point = values[r + offsets[p, 0], c + offsets[p, 1]]
+                if from_centre:
+                    for j in range(count):
+                        total[j] += weight * (point[j] - centre[j])
+                else:
+                    for j in range(count):
+                        total[j] += weight * point[j]
+
+
+def window_sums(
+    values: Float, rows: Index, cols: Index, which: Index, weights: Float, half: int, *, from_centre: bool
+) -> Float:
+    """Return weighted sums (m, a, q) over windows.
+
+    Parameters
+    ----------
+    values
+        (r, c, q) on the grid.
+    rows, cols
+        (m,) the windows' middles.
+    which, weights
+        (m,) number of each window's weights among (k, a, n) of the points of ``window_offsets``; zero where a window
+        has no point. What a weight of zero stands at is not looked at.
+    half
+        Points to each side of a middle.
+    from_centre
+        Take the middle's values off the others', so that no digits are lost.
+    """
+    out = np.empty((len(rows), weights.shape[1], values.shape[2]))
+    at = [np.ascontiguousarray(index, dtype=np.int64) for index in (rows, cols, which)]
+    offsets = np.ascontiguousarray(window_offsets(half)[0], dtype=np.int64)
+    held = (np.ascontiguousarray(a, dtype=np.float64) for a in (values, weights))
+    given, by_kind = held
+    _sums(given, from_centre, *at, by_kind, offsets, out)
+    return out
