@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from core.arrays import Bool, Float
 from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
+from core.common.estimates import estimates
 from core.names import CAMERAS
 
 #: of the comparisons camera 2 at t0, camera 1 and camera 2 at t: the inverse of noise I plus the reference's in all
 WEIGHTS = np.eye(3) - 0.25
-_MATCH_WEIGHTS = np.kron(WEIGHTS, np.eye(2))
 _AT_ONCE = 1024
 _FIRM = 1e-12  # of the variance
 Index = slice | Bool | NDArray[np.int64]
@@ -97,13 +97,13 @@ class ReferenceView:
 
     def keep(self) -> None:
         """Make what all steps need of the points, once; parts of them have it then too."""
-        _ = self.by_image, self.by_parameters, self._by_normalised
+        _ = self.by_image, self.by_parameters, self.across_normalised
 
     def at(self, some: Index) -> ReferenceView:
         """Return that of some of the points, with what is known of them."""
         names = ("ray", "by_point1", "by_point2", "along", "across", "px_per_mm")
         part = ReferenceView(self.pair, self.points_mm[some], *(getattr(self, name)[some] for name in names))
-        for name in ("beside", "seen", "by_image", "_by_normalised"):
+        for name in ("beside", "seen", "by_image", "across_normalised"):
             if name in self.__dict__:
                 part.__dict__[name] = self.__dict__[name][some]
         if "by_parameters" in self.__dict__:
@@ -138,16 +138,20 @@ class ReferenceView:
         return self.pair.cam1.parameter_jacobian(self.points_mm), self.pair.cam2.parameter_jacobian(self.points_mm)
 
     @cached_property
-    def _by_normalised(self) -> Float:
-        return _by_normalised(self.pair.cam2, self.points_mm)
+    def across_normalised(self) -> Float:
+        """(n, 2) the unit offset across the epipolar line as a shift of camera 2's normalised image."""
+        p = self.pair.cam2.cam_from_sys.apply(self.points_mm)
+        by_normalised = self.pair.cam2.lens.image_jacobian(p[:, :2] / p[:, 2:])
+        return np.asarray(np.linalg.solve(by_normalised, self.across[..., None])[..., 0])
 
     def carried(self, displaced_mm: Float) -> Float:
         """Return (n, 2) the unit offset across the epipolar line as the same shift of camera 2's normalised image.
 
         In px at the current positions (n, 3).
         """
-        normalised = np.linalg.solve(self._by_normalised, self.across[..., None])
-        return np.asarray((_by_normalised(self.pair.cam2, displaced_mm) @ normalised)[..., 0])
+        p = self.pair.cam2.cam_from_sys.apply(displaced_mm)
+        by_normalised = self.pair.cam2.lens.image_jacobian(p[:, :2] / p[:, 2:])
+        return np.asarray((by_normalised @ self.across_normalised[..., None])[..., 0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,12 +169,15 @@ class Estimator:
         x, y of camera 1 and 2 at the reference, then now. mm/px.
     by_match
         (n, 3, 6) of U, V, W over the shifts that the three comparisons find, mm/px; None of a shape.
+    by_parameters
+        (n, 2, p) of either camera's current images over its parameters; empty of a shape.
     """
 
     reference: ReferenceView
     displaced_mm: Float | None
     by_image: Float
     by_match: Float | None
+    by_parameters: tuple[Float, ...]
 
     @staticmethod
     def at(
@@ -178,23 +185,20 @@ class Estimator:
     ) -> Estimator:
         """Return the estimator at points; ``reference`` is theirs, if it is known."""
         seen = ReferenceView.of(pair, points_mm) if reference is None else reference
-        n = len(points_mm)
         if displaced_mm is None:
-            return Estimator(seen, None, seen.by_image, None)
-        # unknowns depth along camera 1's ray, offset, current X Y Z; comparisons camera 2 at t0, camera 1 and 2 at t
-        A = np.zeros((n, 6, 5))
-        A[:, :2, 0], A[:, :2, 1] = seen.along * seen.px_per_mm[:, None], seen.across
-        A[:, 2:4, 2:], A[:, 4:, 2:] = pair.cam1.point_jacobian(displaced_mm), pair.cam2.point_jacobian(displaced_mm)
-        A[:, 4:, 1] = seen.carried(displaced_mm)
-        At = np.swapaxes(A, 1, 2) @ _MATCH_WEIGHTS
-        gain = np.linalg.solve(At @ A, At)
-        by_match = np.asarray(gain[:, 2:] - seen.ray[..., None] * gain[:, :1], dtype=np.float64)
-        whole = np.zeros((n, 6, 8))
-        whole[:, :3, :4] = seen.by_image
-        whole[:, 3:, :4] = -by_match[:, :, :2] @ seen.seen
-        whole[:, 3:, :2] -= seen.beside
-        whole[:, 3:, 4:] = -by_match[:, :, 2:]
-        return Estimator(seen, displaced_mm, whole, by_match)
+            return Estimator(seen, None, seen.by_image, None, ())
+        now = pair.cam1.parameter_jacobian(displaced_mm), pair.cam2.parameter_jacobian(displaced_mm)
+        ray = displaced_mm - pair.cam1.centre_sys_mm
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        by_match, by_image = estimates(
+            (seen.ray, seen.along, seen.across, seen.px_per_mm),
+            (seen.beside, seen.seen, seen.by_image, seen.across_normalised),
+            now,
+            (pair.cam1.cam_from_sys.rotation, pair.cam2.cam_from_sys.rotation),
+            ray,
+            pair.cam2.cam_from_sys.apply(displaced_mm)[:, 2],
+        )
+        return Estimator(seen, displaced_mm, by_image, by_match, now)
 
     def through(self, names: Sequence[str], directions: Float, some: slice = slice(None)) -> Float:
         """Return derivatives (n, 3 or 6, k) along directions (len(names), k) of the parameters by name.
@@ -202,7 +206,7 @@ class Estimator:
         ``some`` takes a part of the points.
         """
         by_image = self.by_image[some]
-        now = None if self.displaced_mm is None else self.displaced_mm[some]
+        now = [by_parameters[some] for by_parameters in self.by_parameters]
         n, m, _ = by_image.shape
         cameras = (self.reference.pair.cam1, self.reference.pair.cam2)
         own = np.concatenate(
@@ -213,10 +217,10 @@ class Estimator:
         for first in range(0, n, _AT_ONCE):  # what stays in the processor's cache
             part = slice(first, first + _AT_ONCE)
             rows, parts = by_image[part], []
-            for c, camera in enumerate(cameras):
+            for c in range(2):
                 by_own = rows[:, :, 2 * c : 2 * c + 2] @ before[c][part]
-                if now is not None:
-                    by_own += rows[:, :, 4 + 2 * c : 6 + 2 * c] @ camera.parameter_jacobian(now[part])
+                if now:
+                    by_own += rows[:, :, 4 + 2 * c : 6 + 2 * c] @ now[c][part]
                 parts.append(by_own)
             np.matmul(np.concatenate(parts, axis=2), own, out=out[part])
         return out
@@ -269,11 +273,6 @@ def _own_part(camera: Camera, prefix: str, names: Sequence[str], directions: Flo
         if name.startswith(f"{prefix}."):
             own[known.index(name.removeprefix(f"{prefix}."))] += directions[k]
     return own
-
-
-def _by_normalised(camera: Camera, points_mm: Float) -> Float:
-    p = camera.cam_from_sys.apply(points_mm)
-    return camera.lens.image_jacobian(p[:, :2] / p[:, 2:])
 
 
 def _pseudoinverse(A: Float) -> Float:

@@ -270,9 +270,9 @@ class FactorColumns:
 
     def at(self, estimator: Estimator) -> Float32:
         """Return the factor (n, 3 or 6, k) at an estimator's points."""
-        factor = estimator.through(self.names, self.directions)
+        factor = estimator.through(self.names, self.directions).astype(np.float32)
         _to_step(factor, self.step)
-        return factor.astype(np.float32)
+        return factor
 
 
 def sample_of(count: int) -> slice:
@@ -341,7 +341,7 @@ def _rounding(some: Floats, own: Float | None, fine: float) -> Float:
 def _to_step(factor: Floats, step: Float) -> None:
     """Round a factor (..., m, k) in place to steps (m,): exact in either precision, but for steps that hold nothing."""
     by: Any = step[:, None].astype(factor.dtype)
-    np.divide(factor, np.where(by > 0.0, by, 1.0), out=factor)
+    np.multiply(factor, 1.0 / np.where(by > 0.0, by, 1.0), out=factor)  # of a power of two exact
     np.rint(factor, out=factor)
     np.multiply(factor, by, out=factor)
 
