@@ -301,9 +301,7 @@ def keep_reference(
     shape, offset = starts_of("w", w, (n,), terms), np.array(epipolar_px, dtype=np.float64)
     shape[~np.isfinite(offset)] = np.nan
     kept, unused = np.zeros((n, kept_width(terms))), np.empty((n, n_shape_out(terms)))
-    given = given_to_kernels(
-        pair, [ref1, ref2], xy, shape, options, visible, epipolar_px=offset, kept=kept, keep=True
-    )
+    given = given_to_kernels(pair, [ref1, ref2], xy, shape, options, visible, epipolar_px=offset, kept=kept, keep=True)
     run_kernel(run_points["shape"][degree], work_space["shape"][degree], given, unused)
     return kept
 

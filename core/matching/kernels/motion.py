@@ -75,7 +75,9 @@ def make_motion(degree: int) -> FitKernels:
         return OK
 
     @kernel(f"{degree}")
-    def freeze(R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, chain, rigid, ready):
+    def freeze(
+        R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, chain, rigid, ready
+    ):
         """Set up and factor the normal equations; status. ``ready``: their columns are."""
         weights, block, columns, half, _, normal = equations
         joint_weights(levels, variances, 3, weights)
@@ -153,9 +155,7 @@ def make_motion(degree: int) -> FitKernels:
             near, ready = False, False
             if not compared:
                 if moved > REFREEZE_PX:
-                    ready = jacobian(
-                        R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, equations.block, columns
-                    )
+                    ready = jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, equations.block, columns)
                 if ready or not moved > REFREEZE_PX:
                     near = read_form(kept, few, 4, columns[0], w, e, gram, f2, moves[0], rhs[0], levels[0])
             result = compare_all(
@@ -168,7 +168,21 @@ def make_motion(degree: int) -> FitKernels:
                 if few == 3 and rigid:
                     rigid_chain(xc, yc, w, rotation, G, chain)
                 result = freeze(
-                    R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, chain, rigid, ready
+                    R,
+                    t,
+                    e,
+                    nu_x,
+                    nu_y,
+                    M,
+                    slopes,
+                    levels,
+                    variances,
+                    of_reference,
+                    inverse,
+                    equations,
+                    chain,
+                    rigid,
+                    ready,
                 )
                 if result != OK:
                     return result, iterations
@@ -205,9 +219,7 @@ def make_motion(degree: int) -> FitKernels:
             predict(moves, rhs, gram, f2, levels)
         else:
             image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M)
-            near = not compared and read_form(
-                kept, few, 4, columns[0], w, e, gram, f2, moves[0], rhs[0], levels[0]
-            )
+            near = not compared and read_form(kept, few, 4, columns[0], w, e, gram, f2, moves[0], rhs[0], levels[0])
             result = compare_all(
                 images, lenses, M, order, ref, known, of_reference, warp_space, levels, rhs, 1 if near else 0
             )

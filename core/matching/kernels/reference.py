@@ -44,9 +44,7 @@ def subset_array(subset: int) -> np.ndarray:
 
 
 @intrinsic
-def _copy_square(
-    _typingctx: Any, image: Any, top: Any, left: Any, subset: Any, ref: Any, row: Any, less: Any
-) -> Any:
+def _copy_square(_typingctx: Any, image: Any, top: Any, left: Any, subset: Any, ref: Any, row: Any, less: Any) -> Any:
     """Copy a square of an image, 8 px or more wide, less a number, into one row of the reference subset's array."""
     sig = types.void(image, top, left, subset, ref, row, less)
 

@@ -54,7 +54,9 @@ def make_shape(degree: int) -> FitKernels:
     n = few + 1  # unknowns: w1, w2, ..., w0, e
 
     @kernel(f"{degree}")
-    def freeze(R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, _chain, _rigid, _ready):
+    def freeze(
+        R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, _chain, _rigid, _ready
+    ):
         """Set up and factor the normal equations; status."""
         weights, block, columns, _, _, normal = equations
         joint_weights(levels, variances, 1, weights)
@@ -64,7 +66,9 @@ def make_shape(degree: int) -> FitKernels:
         return OK if factor(normal, n) else LOW_TEXTURE
 
     @kernel(f"{degree}", inline="always")
-    def shape_point(reference, patches, which, images, lens1, lens2, R, t, xy, start, _G, at_e, setting, kept, space, out):
+    def shape_point(
+        reference, patches, which, images, lens1, lens2, R, t, xy, start, _G, at_e, setting, kept, space, out
+    ):
         """Fit one point, ``out`` as in ``n_shape_out``. Returns status and iterations."""
         order, tolerance, variances = setting.order, setting.tolerance, setting.variances
         ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, rotation, _, work = space
@@ -109,21 +113,27 @@ def make_shape(degree: int) -> FitKernels:
             if keep:
                 if which < 0:
                     write_sums(
-                        kept,
-                        p,
-                        offset,
-                        f2,
-                        seen.white,
-                        seen.mean,
-                        of_reference.sum_g,
-                        of_reference.sum_fg,
-                        gram,
+                        kept, p, offset, f2, seen.white, seen.mean, of_reference.sum_g, of_reference.sum_fg, gram
                     )
                     write_form(kept, rhs[0], levels[0], w, e, few)
                 return OK, iterations
             if moved > REFREEZE_PX:
                 result = freeze(
-                    R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, rotation, False, False
+                    R,
+                    t,
+                    e,
+                    nu_x,
+                    nu_y,
+                    M,
+                    slopes,
+                    levels,
+                    variances,
+                    of_reference,
+                    inverse,
+                    equations,
+                    rotation,
+                    False,
+                    False,
                 )
                 if result != OK:
                     return result, iterations

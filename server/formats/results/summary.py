@@ -74,9 +74,9 @@ class StepSummary:
     sigma_calibration_median_mm
         The calibration's part of it; None where it is not known, and then not included.
     budget_median_mm
-        By coordinate, the medians, over 2,000 points or all, of the parts of the standard uncertainty: `matching`, `reference` (noise of the
-        reference pair, common to all steps), `calibration`, `stage`, `target`. A part that is not told apart is left
-        out, and in the one before it.
+        By coordinate, the medians of the parts of the standard uncertainty (of large fields over 2,000 points):
+        `matching`, `reference` (noise of the reference pair, common to all steps), `calibration`, `stage`, `target`. A
+        part that is not told apart is left out, and in the one before it.
     uncertainty_includes
         In words; ``calibration not included`` where that is so.
     smoothing
