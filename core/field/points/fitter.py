@@ -213,7 +213,7 @@ class Fitter:
     def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
         """Refine points from start values and reject those that fail the checks of a single point."""
         n = len(xy_px)
-        visible = self._visible(xy_px)
+        visible = self.visible(xy_px)
         w, G = self._terms_of(w), None if G is None else self._terms_of(G)
         if self.cur1 is None or self.cur2 is None:
             s = fit_shape(self.pair, self.ref1, self.ref2, xy_px, w, self.options, visible)
@@ -254,7 +254,8 @@ class Fitter:
         fits.reject(_mask(n, ok[~self._plausible(xy_px[ok], fits.w[ok], fits.G[ok])]), PointStatus.NOT_CONVERGED)
         return fits
 
-    def _visible(self, xy_px: Float) -> VisiblePixels | None:
+    def visible(self, xy_px: Float) -> VisiblePixels | None:
+        """Return the visible pixels of points; None: all of them."""
         return None if self.visibility is None else self.visibility.at(xy_px)
 
     def far_from_start(self, xy_px: Float, fits: PointFits, w: Float, G: Float | None, limit_px: float) -> Bool:

@@ -64,10 +64,10 @@ class TileSetting:
 class _TileFitter(Fitter):
     """A matcher of points whose visible pixels are given."""
 
-    visible: VisiblePixels | None = None
+    given: VisiblePixels | None = None
 
-    def _visible(self, xy_px: Float) -> VisiblePixels | None:  # noqa: ARG002
-        return self.visible
+    def visible(self, xy_px: Float) -> VisiblePixels | None:  # noqa: ARG002
+        return self.given
 
 
 class TileFits:
@@ -112,7 +112,7 @@ class TileFits:
                 options=s.options,
                 min_zncc=s.min_zncc,
                 keep_rejected=s.keep_rejected,
-                visible=some,
+                given=some,
             )
             out = fitter.empty(len(points)) if out is None else out
             fits = fit_part(fitter, points.at(part))
