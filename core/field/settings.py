@@ -14,6 +14,7 @@ from core.noise import NoiseModel
 from core.settings import (
     DEFAULT_INTERPOLATION,
     DEFAULT_PATCH,
+    DEFAULT_SPLIT_STEP,
     PATCH_SETTINGS,
     SPLIT_STEP_FROM,
     SUBSET_PX,
@@ -63,7 +64,7 @@ class MeasureOptions:
     prefilter_px: float = 0.0
     noise: tuple[NoiseModel | None, NoiseModel | None] = (None, None)
     keep_rejected: bool = False
-    split_from: float = SPLIT_STEP_FROM["auto"]
+    split_from: float = SPLIT_STEP_FROM[DEFAULT_SPLIT_STEP]
 
     def __post_init__(self) -> None:
         check_subset(self.subset_px)

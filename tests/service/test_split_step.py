@@ -62,7 +62,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def worker() -> Iterator[ComputeWorker]:
     """A worker that helps."""
-    made = ComputeWorker(threads=1)
+    made = ComputeWorker(threads=1, lowered=False)
     made.start()
     yield made
     made.shutdown()
@@ -174,7 +174,7 @@ def test_in_one_piece_the_points_are_the_same_and_the_values_within_their_uncert
 
 
 def test_tiles_of_a_worker_that_dies_are_taken_again(data: Path, tmp_path: Path, alone: list[Field]) -> None:
-    dying = ComputeWorker(threads=1)
+    dying = ComputeWorker(threads=1, lowered=False)
     dying.start()
     futures = []
 

@@ -80,8 +80,19 @@ def _from_nearest(inputs: FieldInputs, state: GrowthState, index: Index) -> None
     offset = inputs.rays[todo, :2] - inputs.rays[parent, :2]
     w = move_w(points.w[parent], offset)
     G = move_matrix(points.G[parent], offset) if state.fitter.comparisons == 3 else None
-    fitter = state.fitter
-    fit_in_batches(fitter, points, todo, xy, w, G, far_px=SAMPLE_FAR_PX, shared=True, cancel=inputs.cancel)
+    valid, total = int(points.ok.sum()), int(inputs.usable.sum())
+    fit_in_batches(
+        state.fitter,
+        points,
+        todo,
+        xy,
+        w,
+        G,
+        far_px=SAMPLE_FAR_PX,
+        shared=True,
+        report=lambda done: inputs.progress("grow", min(valid + done, total), total),
+        cancel=inputs.cancel,
+    )
 
 
 def _parents(inputs: FieldInputs, sources: Index, todo: Index) -> tuple[Index, Index]:

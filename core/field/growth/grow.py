@@ -6,6 +6,7 @@ neighbours. No value is interpolated: a point that does not match stays empty.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,18 +38,22 @@ def fit_in_batches(
     *,
     far_px: float,
     shared: bool = False,
+    report: Callable[[int], None] | None = None,
     cancel: CancelToken | None = None,
 ) -> Bool:
     """Fit the points ``index`` from starts and store the results; return (m,) True for the valid ones.
 
     A fit that ends further than ``far_px`` from its start has left the basin it was started in. Points that are
-    ``shared`` may be fitted by others.
+    ``shared`` may be fitted by others. ``report`` is called with the number of points fitted so far.
     """
-    good = np.zeros(len(index), bool)
+    good, done = np.zeros(len(index), bool), 0
     fit = fit_shared if shared else fit_here
     for part, fits in fit(fitter, ToFit(xy_px[index], w, G, far_px), cancel):
         points.put(index[part], fits)
         good[part] = fits.ok
+        if report is not None:
+            done += len(fits.status)
+            report(min(done, len(index)))
     return good
 
 
