@@ -35,7 +35,7 @@ def grow_coarse_first(inputs: FieldInputs, state: GrowthState) -> None:
     lattice = np.arange(rows * cols).reshape(rows, cols)[every // 2 :: every, every // 2 :: every]
     coarse = lattice.ravel()
     inputs.progress("grow", 0, int(inputs.usable.sum()))
-    _from_nearest(inputs, state, coarse)
+    _from_nearest(inputs, state, coarse, shared=False)
     part = points.take(coarse)
     grow(
         state.fitter,
@@ -48,7 +48,7 @@ def grow_coarse_first(inputs: FieldInputs, state: GrowthState) -> None:
     )
     points.put(coarse, part)
     raise_if_cancelled(inputs.cancel)
-    _from_nearest(inputs, state, np.arange(len(inputs.xy_px)))
+    _from_nearest(inputs, state, np.arange(len(inputs.xy_px)), shared=True)
 
 
 def _every(inputs: FieldInputs) -> int:
@@ -68,7 +68,7 @@ def _coarse_attempts(inputs: FieldInputs, lattice: Index) -> Attempts:
     return attempts
 
 
-def _from_nearest(inputs: FieldInputs, state: GrowthState, index: Index) -> None:
+def _from_nearest(inputs: FieldInputs, state: GrowthState, index: Index, *, shared: bool) -> None:
     """Fit those of the points ``index`` that are not valid, each from the nearest valid one in reach."""
     points, xy = state.points, inputs.xy_px
     quality = points.quality
@@ -89,7 +89,7 @@ def _from_nearest(inputs: FieldInputs, state: GrowthState, index: Index) -> None
         w,
         G,
         far_px=SAMPLE_FAR_PX,
-        shared=True,
+        shared=shared,
         report=lambda done: inputs.progress("grow", min(valid + done, total), total),
         cancel=inputs.cancel,
     )
