@@ -16,6 +16,7 @@ from core.errors import InputError
 from core.field.growth.field import motion_field, shape_field
 from core.field.growth.seed import Seeds
 from core.field.growth.state import Image, prepare
+from core.field.points.crew import Crew
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field
 from core.field.region.region import PointGrid
@@ -103,6 +104,7 @@ def measure_shape(
     seeds: Seeds | None = None,
     progress: Progress | None = None,
     cancel: CancelToken | None = None,
+    crew: Crew | None = None,
 ) -> Field:
     """Measure the shape of the surface, section 4.1.
 
@@ -120,6 +122,8 @@ def measure_shape(
         Seed points, (x, y) in camera 1 or ``Seed``; found from feature matches when left out.
     progress, cancel
         Receiver of reports (phase, points done, points in all), and the means to stop.
+    crew
+        Those who may fit tiles of many points; None: nobody.
 
     Returns
     -------
@@ -137,7 +141,8 @@ def measure_shape(
     Cancelled
         If the token is set.
     """
-    return shape_field(prepare(pair, (image1, image2), None, grid, options, progress=progress, cancel=cancel), seeds)
+    inputs = prepare(pair, (image1, image2), None, grid, options, progress=progress, cancel=cancel, crew=crew)
+    return shape_field(inputs, seeds)
 
 
 def measure_motion(
@@ -154,6 +159,7 @@ def measure_motion(
     seeds: Seeds | None = None,
     progress: Progress | None = None,
     cancel: CancelToken | None = None,
+    crew: Crew | None = None,
 ) -> Field:
     """Measure the displacement since the reference, section 4.2: three comparisons at once.
 
@@ -171,7 +177,7 @@ def measure_motion(
         The reference's shape on the same grid; measured first when left out. Only its valid points are measured.
     previous
         An earlier step's field on the same grid, to start from.
-    seeds, progress, cancel
+    seeds, progress, cancel, crew
         As in :func:`measure_shape`.
 
     Returns
@@ -192,10 +198,10 @@ def measure_motion(
     )
     if shape is None:
         shape = measure_shape(
-            pair, reference1, reference2, grid, options, seeds=seeds, progress=progress, cancel=cancel
+            pair, reference1, reference2, grid, options, seeds=seeds, progress=progress, cancel=cancel, crew=crew
         )
     images = (reference1, reference2), (cur1, cur2)
-    inputs = prepare(pair, *images, grid, options, progress=progress, cancel=cancel)
+    inputs = prepare(pair, *images, grid, options, progress=progress, cancel=cancel, crew=crew)
     for name, other in (("shape", shape), ("previous", previous)):
         if other is not None and (other.shape != grid.shape or not np.allclose(other.x_px, grid.x_px)):
             raise InputError(

@@ -14,7 +14,9 @@ from core.noise import NoiseModel
 from core.settings import (
     DEFAULT_INTERPOLATION,
     DEFAULT_PATCH,
+    DEFAULT_SPLIT_STEP,
     PATCH_SETTINGS,
+    SPLIT_STEP_FROM,
     SUBSET_PX,
     AnalysisSettings,
     Interpolation,
@@ -49,6 +51,9 @@ class MeasureOptions:
         covariances. None: noise from the residuals of each match, all pixels alike.
     keep_rejected
         Keep, apart, the numbers of points that a check rejects.
+    split_from
+        Usable points from which a field is grown in two passes, see :mod:`core.field.growth.coarse_first`, and its
+        points may be shared out.
     """
 
     subset_px: int = SUBSET_PX.default
@@ -59,6 +64,7 @@ class MeasureOptions:
     prefilter_px: float = 0.0
     noise: tuple[NoiseModel | None, NoiseModel | None] = (None, None)
     keep_rejected: bool = False
+    split_from: float = SPLIT_STEP_FROM[DEFAULT_SPLIT_STEP]
 
     def __post_init__(self) -> None:
         check_subset(self.subset_px)
@@ -84,6 +90,7 @@ class MeasureOptions:
             noise=noise,
             validity=ValidityOptions(max_sigma_px=settings.max_sigma_px),
             keep_rejected=settings.keep_rejected,
+            split_from=SPLIT_STEP_FROM[settings.split_step],
         )
 
     @property

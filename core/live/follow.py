@@ -20,7 +20,7 @@ from core.field.growth.state import SAMPLE_FAR_PX, prepare
 from core.field.points.fitter import PointFits
 from core.field.points.images import MeasureImage, refuse_stale, same_size
 from core.field.points.result import Field
-from core.field.points.starts import Starts
+from core.field.points.starts import Starts, image_positions
 from core.field.region.region import PointGrid
 from core.field.settings import MeasureOptions
 from core.live.converted import Constant, convert
@@ -292,7 +292,10 @@ class Follower:
             self._around = previous.patch, self._reach_px(w, G)
         boxes = []
         for positions, reach, image in zip(
-            self._positions(w, G[:, :, 0]), self._around[1], (self._inputs.ref1, self._inputs.ref2), strict=True
+            image_positions(self._pair, w, G[:, :, 0]),
+            self._around[1],
+            (self._inputs.ref1, self._inputs.ref2),
+            strict=True,
         ):
             rows, cols = image.shape
             with np.errstate(invalid="ignore"):
@@ -302,26 +305,17 @@ class Follower:
             boxes.append((int(x0), int(y0), int(x1), int(y1)))
         return boxes[0], boxes[1]
 
-    def _positions(self, w: Float, column: Float) -> tuple[Float, Float]:
-        """Positions (m, 2) in both cameras' images, px."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            one = column[:, :2] / column[:, 2:]
-            point = self._pair.cam2_from_cam1.apply(column / w[:, :1])
-            two = point[:, :2] / point[:, 2:]
-        lenses = self._pair.cam1.lens, self._pair.cam2.lens
-        return lenses[0].image_from_normalised(one).xy, lenses[1].image_from_normalised(two).xy
-
     def _reach_px(self, w: Float, G: Float) -> tuple[float, float]:
         """Distance from a point to the corners of its subset in both images, the way of a fit and its taps."""
         half = 0.5 * self._options.subset_px / self._constant.scale
-        middle = self._positions(w, G[:, :, 0])
+        middle = image_positions(self._pair, w, G[:, :, 0])
         reach = [0.0, 0.0]
         for across in (-1.0, 1.0):
             for down in (-1.0, 1.0):
                 shift = np.stack([across * half, down * half], axis=1)
                 corner = G[:, :, 0] + np.einsum("mij,mj->mi", G[:, :, 1:3], shift)
                 depth = w[:, :1] + (w[:, 1:3] * shift).sum(axis=1, keepdims=True)
-                for k, there in enumerate(self._positions(depth, corner)):
+                for k, there in enumerate(image_positions(self._pair, depth, corner)):
                     reach[k] = max(reach[k], float(np.nanmax(np.abs(there - middle[k]))))
         return reach[0] + SAMPLE_FAR_PX + _AROUND_PX, reach[1] + SAMPLE_FAR_PX + _AROUND_PX
 

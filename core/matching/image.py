@@ -223,7 +223,7 @@ def prepare_part(pixels: NDArray[Any], order: int, noise: NoiseModel | None, box
     correlate(part, taps, taps, found)
     inner = padded[PAD:-PAD, PAD:-PAD]
     inner[y0:y1, x0:x1] = found[y0 - top : y1 - top, x0 - left : x1 - left]
-    _mirror(padded)
+    mirror_padding(padded, 0, rows)
     return ImageData(padded, pixels, order, noise)
 
 
@@ -232,14 +232,15 @@ def _coefficients(pixels: NDArray[Any], order: int) -> Float32:
     padded = np.empty((rows + 2 * PAD, cols + 2 * PAD), np.float32)
     taps = prefilter(order)
     correlate(pixels, taps, taps, padded[PAD:-PAD, PAD:-PAD])
-    _mirror(padded)
+    mirror_padding(padded, 0, rows)
     return padded
 
 
-def _mirror(padded: Float32) -> None:
-    """Fill the padding."""
-    inner = padded[PAD:-PAD, PAD:-PAD]
-    padded[PAD:-PAD, :PAD] = inner[:, PAD:0:-1]
-    padded[PAD:-PAD, -PAD:] = inner[:, -2 : -PAD - 2 : -1]
+def mirror_padding(padded: Float32, first: int, last: int) -> None:
+    """Fill the padding beside the image's rows ``first`` to ``last``, and above and below it."""
+    beside = padded[PAD + first : PAD + last]
+    inner = beside[:, PAD:-PAD]
+    beside[:, :PAD] = inner[:, PAD:0:-1]
+    beside[:, -PAD:] = inner[:, -2 : -PAD - 2 : -1]
     padded[:PAD] = padded[2 * PAD : PAD : -1]
     padded[-PAD:] = padded[-PAD - 2 : -2 * PAD - 2 : -1]

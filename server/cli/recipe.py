@@ -26,6 +26,7 @@ _PLAIN = {
     "prefilter": "prefilter_px",
     "max_sigma": "max_sigma_px",
     "reference_update": "reference_update",
+    "split_step": "split_step",
     "smooth": "smoothing_window",
     "dense": "dense_step_px",
 }

@@ -31,6 +31,7 @@ from server.compute.background_compilation import BackgroundCompilation, Kernels
 from server.compute.grid_kernels import find_drawn_grid, grid_aside
 from server.compute.overlap import Asked, Measure, MeasureAhead, timed
 from server.compute.sequence import Pair, SequenceMeasurement
+from server.compute.tiles.folder_crew import FolderCrew
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import read_mask
 from server.formats.noise_json import load_noise
@@ -113,7 +114,9 @@ def _measuring(kept: _Kept, task: StepTask, step: StepImages, previous: int | No
         if task.following is not None and step != task.following:
             kept.ahead = task.following, _reader.submit(sequence.read, task.following)
         alone: dict[str, Any] = {} if step != task.step else {"from_head": task.from_head, "against": task.against}
-        return sequence.measure(step, images, previous=previous, progress=progress, cancel=cancel, **alone)
+        return sequence.measure(
+            step, images, previous=previous, shares=task.shares, progress=progress, cancel=cancel, **alone
+        )
 
     return measure
 
@@ -142,6 +145,7 @@ def _begin(task: StepTask) -> SequenceMeasurement:
         reference=task.reference,
         folder=task.folder,
         noise=None if task.noise is None else load_noise(task.noise),
+        crew=FolderCrew(task.folder, task.calibration, lambda tiles: current_task().call(tiles)),
     )
 
 

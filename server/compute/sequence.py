@@ -37,6 +37,7 @@ from core.systematic.terms import Systematic, terms_of, with_strain
 from server.compute.camera_watch import CameraWatch
 from server.compute.dense.steps import DenseStep, DenseSteps
 from server.compute.strain import smoothed_step, strain_of_step, summarise_strain
+from server.compute.tiles.folder_crew import FolderCrew
 from server.formats.calibrations.native import covariance_in
 from server.formats.calibrations.recognise import LoadedCalibration
 from server.formats.calibrations.volume import own_px_of, parameter_covariance, rbe_of, volume_of
@@ -90,6 +91,8 @@ class SequenceMeasurement:
         Models of both cameras.
     inputs
         Name and SHA-256 of further files that the result depends on.
+    crew
+        Those who may fit parts of a step; None: nobody.
 
     Raises
     ------
@@ -106,6 +109,7 @@ class SequenceMeasurement:
     folder: Path
     noise: LoadedNoise | None = None
     inputs: Mapping[str, str] = field(default_factory=dict)
+    crew: FolderCrew | None = None
 
     def __post_init__(self) -> None:
         self.options = MeasureOptions.of(self.settings)
@@ -155,8 +159,10 @@ class SequenceMeasurement:
             MeasureImage(read_image(path), str(path), noise=None if model is None else model.averaged(*step.averages))
             for path, model in zip(step.files, self._models, strict=True)
         )
-        for image in (one, two):
-            image.prepared(self.options.interpolation, None, self.options.blur)
+        for image, path in zip((one, two), step.files, strict=True):
+            prepared = image.prepared(self.options.interpolation, None, self.options.blur)
+            if self.crew is not None:
+                self.crew.know(prepared, path)
             image.contrast()
         return one, two
 
@@ -168,6 +174,7 @@ class SequenceMeasurement:
         previous: int | None = None,
         from_head: bool = False,
         against: int | None = None,
+        shares: bool = False,
         progress: Progress | None = None,
         cancel: CancelToken | None = None,
     ) -> Field:
@@ -183,6 +190,8 @@ class SequenceMeasurement:
             Take the previous step's field from its head, see :meth:`keep_head`.
         against
             Reference to match the step against from seeds, without a previous step.
+        shares
+            Let the crew take parts of it.
 
         Raises
         ------
@@ -195,7 +204,7 @@ class SequenceMeasurement:
         Cancelled
             If the token was set.
         """
-        more: dict[str, Any] = {"progress": progress, "cancel": cancel}
+        more: dict[str, Any] = {"progress": progress, "cancel": cancel, "crew": self.crew if shares else None}
         seeds = seeds_of(self.settings)
         if seeds is not None:
             more["seeds"] = seeds

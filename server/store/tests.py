@@ -24,6 +24,7 @@ from server.base.errors import NotFoundError
 from server.formats import disk as _disk
 from server.formats.calibrations.in_test import LATER, calibration_id_in, calibration_in, later_file
 from server.formats.files import fsync_path, known_sha256, recorded_sha256, sha256_of, storage_error
+from server.formats.results.folder import TILES
 from server.formats.results.settings import current_step, current_summary
 from server.store.documents import (
     METADATA_NAMES,
@@ -535,13 +536,15 @@ class TestStore:
         folder = self._analysis_to_change(test_id, analysis_id)
         for path in (*folder.glob("starts_[0-9]*.npz"), *folder.glob("head_*")):
             path.unlink(missing_ok=True)
+        for path in folder.glob(f"{TILES}*"):  # of a worker that died and whose step another one measured
+            shutil.rmtree(path, ignore_errors=True)
 
     def has_heads(self, test_id: str, analysis_id: str) -> bool:
         """Return True if steps of an unfinished analysis were measured in blocks."""
         return next(self.analysis_path(test_id, analysis_id).glob("head_[0-9]*.nc"), None) is not None
 
     def drop_half_written(self, test_id: str, analysis_id: str) -> list[Path]:
-        """Remove the remains of a result of a worker that was ended: half a file, a checksum without its result.
+        """Remove the remains of a result of a worker that was ended: half a file, a checksum without its result, tiles.
 
         Nothing may write into the analysis meanwhile. Returns the removed files.
         """
@@ -550,6 +553,8 @@ class TestStore:
         removed = sorted([*folder.glob(".*.part"), *lone])
         for path in removed:
             path.unlink(missing_ok=True)
+        for path in folder.glob(f"{TILES}*"):
+            shutil.rmtree(path, ignore_errors=True)
         return removed
 
     def put_summary(self, test_id: str, analysis_id: str, document: Mapping[str, object]) -> None:

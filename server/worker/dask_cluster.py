@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import pickle
 import secrets
 import threading
 import time
@@ -122,10 +123,18 @@ class ClusterExecutor(TaskExecutor):
             self._workers = len(self._connected().scheduler_info(n_workers=-1)["workers"])
         return max(self._at_least, self._workers)
 
+    @property
+    def shares_files(self) -> bool:
+        """True if the workers see the service's data folder."""
+        return self._images == "path"
+
     def _on_event(self, event: tuple[Any, dict[str, Any]]) -> None:
         report = event[1]
         future = self._running.get(report["task"])
-        if future is not None and future.on_progress is not None:
+        if future is not None and "call" in report:
+            if future.on_call is not None:
+                future.on_call(pickle.loads(report["call"]))
+        elif future is not None and future.on_progress is not None:
             future.on_progress(report["phase"], int(report["done"]), int(report["total"]))
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> ClusterFuture:

@@ -10,6 +10,7 @@ import contextlib
 import hashlib
 import importlib
 import os
+import pickle
 import tempfile
 import threading
 import time
@@ -50,6 +51,10 @@ class _Channel(TaskChannel):
     @property
     def cancelled(self) -> bool:
         return self._name in _stopped
+
+    def call(self, task: object) -> bool:
+        self._report_progress({"task": self._name, "call": pickle.dumps(task)})
+        return True
 
     def progress(self, phase: str, done: int, total: int) -> None:
         now = time.monotonic()

@@ -252,6 +252,8 @@ class ComputeWorker(TaskExecutor):
             self._note(message)
             if message[0] == "progress" and message[1] == task.id and task.future.on_progress is not None:
                 task.future.on_progress(*message[2:])
+            elif message[0] == "call" and message[1] == task.id and task.future.on_call is not None:
+                task.future.on_call(message[2])
             elif message[0] == "result" and message[1] == task.id:
                 return message[2]
             elif message[0] == "error" and message[1] == task.id:

@@ -28,11 +28,12 @@ class WorkerDiedError(MeasurementError):
 
 
 class TaskFuture(Future[Any]):
-    """A future with progress, and with cancellation of a running task."""
+    """A future with progress, with calls for help, and with cancellation of a running task."""
 
     def __init__(self) -> None:
         super().__init__()
         self.on_progress: Progress | None = None
+        self.on_call: Callable[[Any], None] | None = None
         self.stop_requested = threading.Event()
 
     def request_stop(self) -> None:
@@ -55,6 +56,11 @@ class TaskExecutor(Executor):
     @abstractmethod
     def width(self) -> int:
         """Number of tasks that run at once."""
+
+    @property
+    def shares_files(self) -> bool:
+        """True if the workers see the service's data folder."""
+        return True
 
     @abstractmethod
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> TaskFuture:

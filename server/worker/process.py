@@ -62,6 +62,13 @@ class TaskChannel:
         """Report progress."""
         self._send(("progress", self._task_id, phase, done, total))
 
+    def call(self, task: object) -> bool:
+        """Tell the service of a task that other workers may help with; return False where nobody hears it."""
+        if self._task_id == 0:
+            return False
+        self._send(("call", self._task_id, task))
+        return True
+
 
 def current_task() -> TaskChannel:
     """Return the running task's channel; one that leads nowhere outside the worker (another executor, a test)."""

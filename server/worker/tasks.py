@@ -94,6 +94,8 @@ class StepTask:
         were measured from it stand. None: nothing.
     generation
         Larger once results have been replaced: what a process has kept of them is not theirs any more.
+    shares
+        True if other workers may be called to fit parts of it.
     """
 
     folder: Path
@@ -111,6 +113,7 @@ class StepTask:
     from_head: bool = False
     compared: Earlier | None = None
     generation: int = 0
+    shares: bool = False
 
     def files(self) -> list[Path]:
         """Return every file that the step reads, as far as they are there."""

@@ -10,6 +10,7 @@ from typing import Any, Self
 from core.errors import Cancelled
 from server.jobs.job import Job
 from server.worker.executor import Progress, TaskExecutor, TaskFuture
+from server.workflows.helpers import Helpers
 
 _STOPPING_S = 3.0  # the worker ends a task within a second, by force if need be
 
@@ -18,21 +19,32 @@ def run_task(
     executor: TaskExecutor, job: Job, function: Callable[..., Any], *args: Any, progress: Progress | None = None
 ) -> Any:
     """Run ``function(*args)`` outside; progress goes to the job, the job's cancellation to the task."""
-    return result_of(executor.submit(function, *args), job, progress)
+    helpers = Helpers(executor)
+    future = executor.submit(function, *args)
+    helpers.hear(future)
+    return result_of(future, job, progress, helpers)
 
 
-def result_of(future: TaskFuture, job: Job, progress: Progress | None = None) -> Any:
+def result_of(future: TaskFuture, job: Job, progress: Progress | None = None, helpers: Helpers | None = None) -> Any:
     """Wait for a task that was begun for a job; progress goes to the job, the job's cancellation to the task."""
     future.on_progress = progress or job.progress
-    with job.waiting(future.request_stop):
+
+    def stop() -> None:
+        future.request_stop()
+        if helpers is not None:
+            helpers.stop()
+
+    with job.waiting(stop):
         while True:
             if job.cancelled:  # also where it was just before the future was known
-                future.request_stop()
+                stop()
             try:
                 return future.result(timeout=0.05)
             except TimeoutError:
                 if future.done():
                     raise
+                if helpers is not None:
+                    helpers.look(busy=1)
             except CancelledError:
                 raise Cancelled(f"The {job.record.kind} was cancelled.") from None
 
@@ -81,6 +93,7 @@ class SideBySide:
     def __init__(self, executor: TaskExecutor, job: Job, progress: Callable[[int, str, float], None]) -> None:
         self._executor, self._job, self._progress = executor, job, progress
         self.running: dict[TaskFuture, int] = {}
+        self._helpers = Helpers(executor)
         self._waiting = contextlib.ExitStack()
 
     @property
@@ -95,6 +108,7 @@ class SideBySide:
         future.on_progress = lambda phase, done, of: self._progress(
             number, phase, min(done / of, 1.0) if of > 0 else 0.0
         )
+        self._helpers.hear(future)
         self.running[future] = number
         return future
 
@@ -107,6 +121,7 @@ class SideBySide:
             The job is to stop.
         """
         self._job.check()
+        self._helpers.look(busy=len(self.running))
         finished, _ = wait(list(self.running), timeout=0.05, return_when=FIRST_COMPLETED)
         for one in finished:
             self._job.check()
@@ -116,6 +131,7 @@ class SideBySide:
     def _stop(self) -> None:
         for future in list(self.running):
             future.request_stop()
+        self._helpers.stop()
 
     def __enter__(self) -> Self:
         self._waiting.enter_context(self._job.waiting(self._stop))

@@ -221,7 +221,7 @@ def _robust(fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: F
         points.G[index] if len(images) == 4 else None,
         points.epipolar_px[index],
         fitter.options,
-        None if fitter.visibility is None else fitter.visibility.at(xy_px[index]),
+        fitter.visible(xy_px[index]),
     )
     reported = points.covariance[index]
     known: Bool = np.asarray((_diagonal(reported) > 0.0).all(axis=1) & np.isfinite(independent).all(axis=(1, 2)))

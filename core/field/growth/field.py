@@ -7,6 +7,7 @@ from dataclasses import replace
 from core.errors import SeedError
 from core.field.checks.unreached import mark_outside
 from core.field.growth.check import check, check_edges, check_residuals, fill, grow_field
+from core.field.growth.coarse_first import grow_coarse_first, is_large
 from core.field.growth.patch import choose_patch, refit_curved
 from core.field.growth.reach import hidden, reach_further
 from core.field.growth.seed import Seeds, match_seeds, seed_motion, seed_shape
@@ -60,6 +61,8 @@ def fill_field(inputs: FieldInputs, state: GrowthState, *, shape: Field | None =
         raise _no_seed(inputs)
     if state.patch.patch == "quadratic" and state.fitter.terms == 3:
         state = refit_curved(inputs, state)
+    if not state.checked and is_large(inputs):
+        grow_coarse_first(inputs, state)
     state = choose_patch(inputs, fill(inputs, state))
     if not state.checked:  # measured anew
         state = fill(inputs, state)

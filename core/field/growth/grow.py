@@ -6,45 +6,26 @@ neighbours. No value is interpolated: a point that does not match stays empty.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.arrays import Bool, Float
-from core.field.points.fitter import PointFits
+from core.field.points.crew import ToFit, fit_here, fit_shared
+from core.field.points.fitter import FitsPoints, PointFits
 from core.field.points.starts import move_matrix, move_w
 from core.field.region.visibility import Visibility
 from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
 from core.robust import MAD_TO_SIGMA
-from core.status import PointStatus
 
 _OFFSETS = np.array([(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)])  # k and k ^ 2 are opposite
 _ALL_AT_ONCE = 512
-_MAX_BATCH = 4096  # a cancel takes effect within a second even on a slow machine
 _FAR_PX = 3.0
 _COUNT_AGAIN = 1.05
 ATTEMPTS = 4
 """Starts of a point at most, each from another neighbour."""
-
-
-class FitsPoints(Protocol):
-    """The matcher as growth uses it; :class:`core.field.points.fitter.Fitter` is one."""
-
-    @property
-    def comparisons(self) -> int:
-        """1 for a shape, 3 for a motion."""
-
-    @property
-    def terms(self) -> int:
-        """Numbers in a point's ``w``."""
-
-    def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
-        """Refine points from start values."""
-
-    def far_from_start(self, xy_px: Float, fits: PointFits, w: Float, G: Float | None, limit_px: float) -> Bool:
-        """Return (n,) True where a fit ended far from its start."""
 
 
 def fit_in_batches(
@@ -56,22 +37,23 @@ def fit_in_batches(
     G: Float | None,
     *,
     far_px: float,
+    shared: bool = False,
+    report: Callable[[int], None] | None = None,
     cancel: CancelToken | None = None,
 ) -> Bool:
     """Fit the points ``index`` from starts and store the results; return (m,) True for the valid ones.
 
-    A fit that ends further than ``far_px`` from its start has left the basin it was started in.
+    A fit that ends further than ``far_px`` from its start has left the basin it was started in. Points that are
+    ``shared`` may be fitted by others. ``report`` is called with the number of points fitted so far.
     """
-    good = np.zeros(len(index), bool)
-    for start in range(0, len(index), _MAX_BATCH):
-        raise_if_cancelled(cancel)
-        part = slice(start, start + _MAX_BATCH)
-        xy = xy_px[index[part]]
-        part_G = None if G is None else G[part]
-        fits = fitter.fit(xy, w[part], part_G)
-        fits.reject(fits.ok & fitter.far_from_start(xy, fits, w[part], part_G, far_px), PointStatus.NOT_CONVERGED)
+    good, done = np.zeros(len(index), bool), 0
+    fit = fit_shared if shared else fit_here
+    for part, fits in fit(fitter, ToFit(xy_px[index], w, G, far_px), cancel):
         points.put(index[part], fits)
         good[part] = fits.ok
+        if report is not None:
+            done += len(fits.status)
+            report(min(done, len(index)))
     return good
 
 
@@ -161,7 +143,7 @@ def grow(
         raise_if_cancelled(cancel)
         progress(phase, valid, total)
         if valid > _COUNT_AGAIN * counted:  # the field's statistics change with its size
-            min_quality, counted = _min_parent_zncc(quality), valid
+            min_quality, counted = min_parent_zncc(quality), valid
             front = usable & (quality <= 0.0) & (attempts.left > 0)
         todo = np.flatnonzero(front)
         near = attempts.neighbours[todo]
@@ -205,7 +187,7 @@ def grow(
     return added
 
 
-def _min_parent_zncc(quality: Float) -> float:
+def min_parent_zncc(quality: Float) -> float:
     """Smallest correlation of a point whose values start a neighbour: not far below the field's own."""
     valid = quality[quality > 0.0]
     middle = float(np.median(valid))

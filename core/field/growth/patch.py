@@ -29,7 +29,9 @@ def refit_curved(inputs: FieldInputs, state: GrowthState) -> GrowthState:
     points = fitter.empty(len(flat.status))
     points.status[:] = flat.status
     G = None if fitter.comparisons == 1 else flat.G[index]
-    fit_in_batches(fitter, points, index, inputs.xy_px, flat.w[index], G, far_px=SAMPLE_FAR_PX, cancel=inputs.cancel)
+    fit_in_batches(
+        fitter, points, index, inputs.xy_px, flat.w[index], G, far_px=SAMPLE_FAR_PX, shared=True, cancel=inputs.cancel
+    )
     return replace(state, fitter=fitter, points=points, attempts=fresh_attempts(inputs), checked=False)
 
 

@@ -154,7 +154,18 @@ def _go_on(inputs: FieldInputs, state: GrowthState, w: Float, G: Float, tried: N
     index = np.flatnonzero(inputs.usable & known & ~points.ok)
     inputs.progress("previous", 0, len(index))
     fitter = state.fitter.converging(points.rate[sample])
-    fit_in_batches(fitter, points, index, inputs.xy_px, w[index], G[index], far_px=SAMPLE_FAR_PX, cancel=inputs.cancel)
+    fit_in_batches(
+        fitter,
+        points,
+        index,
+        inputs.xy_px,
+        w[index],
+        G[index],
+        far_px=SAMPLE_FAR_PX,
+        shared=True,
+        report=lambda done: inputs.progress("previous", done, len(index)),
+        cancel=inputs.cancel,
+    )
     check(inputs, points)
     return replace(state, checked=True)
 

@@ -12,6 +12,7 @@ from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.field.checks.edges import clear_of_edges
 from core.field.growth.grow import Attempts
+from core.field.points.crew import Crew
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.images import MeasureImage, different, refuse_stale, same_size
 from core.field.points.patch import PatchChoice, UsedPatch, asked_for
@@ -110,8 +111,11 @@ def prepare(
     *,
     progress: Progress | None = None,
     cancel: CancelToken | None = None,
+    crew: Crew | None = None,
 ) -> FieldInputs:
     """Check and prepare the inputs of a field: a shape, or with current images a motion.
+
+    ``crew`` are those who may fit tiles of many points; None: nobody.
 
     Raises
     ------
@@ -158,6 +162,7 @@ def prepare(
         min_zncc=options.min_zncc,
         visibility=grid.visibility,
         keep_rejected=options.keep_rejected,
+        crew=crew if int(usable.sum()) >= options.split_from else None,
     )
     compared = None if blur is None else matcher.ref1
     texture = ref1.subset_variance(xy_px, subset_px, compared)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,14 @@ from core.cameras.stereo import StereoPair
 from core.field.points.kept_reference import KeptReference
 from core.field.points.starts import depth_per_px, faces_both_cameras
 from core.field.region.visibility import Visibility
+from core.matching.arguments import VisiblePixels
 from core.matching.fit import fit_motion, fit_shape
 from core.matching.image import ImageData
 from core.matching.options import MatchOptions
 from core.status import PointStatus
+
+if TYPE_CHECKING:
+    from core.field.points.crew import Crew
 
 MAX_EPIPOLAR_PX = 3.0
 MAX_SHEAR = 4.0
@@ -127,6 +131,24 @@ class PointFits:
             getattr(self, name)[which] = np.nan
 
 
+class FitsPoints(Protocol):
+    """The matcher as growth uses it; :class:`Fitter` is one."""
+
+    @property
+    def comparisons(self) -> int:
+        """1 for a shape, 3 for a motion."""
+
+    @property
+    def terms(self) -> int:
+        """Numbers in a point's ``w``."""
+
+    def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
+        """Refine points from start values."""
+
+    def far_from_start(self, xy_px: Float, fits: PointFits, w: Float, G: Float | None, limit_px: float) -> Bool:
+        """Return (n,) True where a fit ended far from its start."""
+
+
 @dataclass(frozen=True, eq=False)
 class Fitter:
     """Four prepared images (two for a shape), a calibrated pair, options: fits batches of points.
@@ -141,6 +163,8 @@ class Fitter:
         The points' visibility; None: all of every subset.
     kept
         What a sequence keeps of the reference pair; None: nothing.
+    crew
+        Those who may take tiles of many points; None: nobody.
     """
 
     pair: StereoPair
@@ -153,6 +177,7 @@ class Fitter:
     visibility: Visibility | None = None
     keep_rejected: bool = False
     kept: KeptReference | None = None
+    crew: Crew | None = None
 
     @property
     def comparisons(self) -> int:
@@ -192,7 +217,7 @@ class Fitter:
     def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
         """Refine points from start values and reject those that fail the checks of a single point."""
         n = len(xy_px)
-        visible = None if self.visibility is None else self.visibility.at(xy_px)
+        visible = self.visible(xy_px)
         w, G = self._terms_of(w), None if G is None else self._terms_of(G)
         if self.cur1 is None or self.cur2 is None:
             s = fit_shape(self.pair, self.ref1, self.ref2, xy_px, w, self.options, visible)
@@ -209,9 +234,8 @@ class Fitter:
                 np.full(n, np.nan),
             )
         else:
-            kept = None if self.kept is None else self.kept.at(xy_px)
             images = self.ref1, self.ref2, self.cur1, self.cur2
-            m = fit_motion(self.pair, *images, xy_px, w, G, self.options, visible, kept)
+            m = fit_motion(self.pair, *images, xy_px, w, G, self.options, visible, self.kept_at(xy_px))
             fits = PointFits(
                 m.w,
                 m.G,
@@ -234,6 +258,14 @@ class Fitter:
         ok = np.flatnonzero(fits.ok)
         fits.reject(_mask(n, ok[~self._plausible(xy_px[ok], fits.w[ok], fits.G[ok])]), PointStatus.NOT_CONVERGED)
         return fits
+
+    def visible(self, xy_px: Float) -> VisiblePixels | None:
+        """Return the visible pixels of points; None: all of them."""
+        return None if self.visibility is None else self.visibility.at(xy_px)
+
+    def kept_at(self, xy_px: Float) -> Float | None:
+        """Return what a sequence keeps of points, (n, k); None: nothing."""
+        return None if self.kept is None else self.kept.at(xy_px)
 
     def far_from_start(self, xy_px: Float, fits: PointFits, w: Float, G: Float | None, limit_px: float) -> Bool:
         """Return (n,) True where a fit ended further than ``limit_px`` from its start in any image."""

@@ -60,6 +60,18 @@ def current_position(w: Float, G: Float) -> Float:
     return np.asarray(G[..., :, 0] / w[..., :1])
 
 
+def image_positions(pair: StereoPair, w: Float, column: Float) -> tuple[Float, Float]:
+    """Return where both cameras see points (n, 2) px, given ``w`` (n, ...) and a column (n, 3) of ``G``.
+
+    With the first column of ``G`` those of the current images; with the points' rays those of the reference.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        one = column[:, :2] / column[:, 2:]
+        point = pair.cam2_from_cam1.apply(column / w[:, :1])
+        two = point[:, :2] / point[:, 2:]
+    return pair.cam1.lens.image_from_normalised(one).xy, pair.cam2.lens.image_from_normalised(two).xy
+
+
 def image_shift_px(pair: StereoPair, rays: Float, w_a: Float, w_b: Float) -> Float:
     """Return the shift (n,) of camera 2's image, px, when the inverse depth on camera 1's rays changes from a to b."""
     pose = pair.cam2_from_cam1

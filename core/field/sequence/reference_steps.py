@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from core.errors import MeasurementError, SeedError
 from core.field.growth.field import assemble_field, motion_field
 from core.field.growth.seed import Seeds
 from core.field.growth.state import FieldInputs, prepare
+from core.field.points.crew import Crew
 from core.field.points.images import MeasureImage
 from core.field.points.kept_reference import KeptReference
 from core.field.points.result import Field, References
@@ -106,6 +108,7 @@ class Updating:
         seeds: Seeds | None = None,
         progress: Progress | None = None,
         cancel: CancelToken | None = None,
+        crew: Crew | None = None,
     ) -> Field:
         """Measure one step.
 
@@ -115,7 +118,7 @@ class Updating:
             Both cameras' images.
         previous
             The step before; None for the first one after the reference.
-        seeds, progress, cancel
+        seeds, progress, cancel, crew
             As in :func:`core.measure.measure_motion`.
 
         Raises
@@ -123,7 +126,7 @@ class Updating:
         MeasurementError, InputError, Cancelled
             As :func:`core.measure.measure_motion`.
         """
-        step = _Step(images, previous, seeds, progress, cancel)
+        step = _Step(images, previous, seeds, progress, cancel, crew)
         if previous is None or self._mode == "never":
             return self._total(step)
         if self._mode == "always":
@@ -155,6 +158,7 @@ class Updating:
         seeds: Seeds | None = None,
         progress: Progress | None = None,
         cancel: CancelToken | None = None,
+        crew: Crew | None = None,
     ) -> Field:
         """Measure a step against a given reference without the steps between, from seeds that are found.
 
@@ -164,7 +168,7 @@ class Updating:
             Both cameras' images.
         reference
             Number of the first reference, or of an earlier step whose images and field can be had.
-        seeds, progress, cancel
+        seeds, progress, cancel, crew
             As in :meth:`measure`.
 
         Returns
@@ -179,10 +183,10 @@ class Updating:
             As :meth:`measure`, and where the reference does not serve: the chain would have looked for a later one.
         """
         if reference == self._first:
-            field = self._total(_Step(images, None, seeds, progress, cancel))
+            field = self._total(_Step(images, None, seeds, progress, cancel, crew))
         else:
             begun = PreviousStep(reference, self._field_of(reference))
-            field = self._by_segment(reference, _Step(images, begun, seeds, progress, cancel))
+            field = self._by_segment(reference, _Step(images, begun, seeds, progress, cancel, crew))
         held = self._held_by(reference)
         if self._mode == "auto" and _fails(field, held, held):
             raise SeedError(f"the images have changed too much since step {reference} to be matched against it.")
@@ -204,7 +208,8 @@ class Updating:
         return motion_field(inputs, self._shape, previous, step.seeds)
 
     def _inputs(self, reference: Pair, grid: PointGrid, step: _Step, progress: Progress | None = None) -> FieldInputs:
-        return prepare(self._pair, reference, step.images, grid, self._options, progress=progress, cancel=step.cancel)
+        more: Any = {"progress": progress, "cancel": step.cancel, "crew": step.crew}
+        return prepare(self._pair, reference, step.images, grid, self._options, **more)
 
     def _kept_of(self, inputs: FieldInputs) -> KeptReference | None:
         """Return what the steps after the first one keep of the first reference, made once.
@@ -280,6 +285,7 @@ class Updating:
             previous_step=step.previous.step,
             progress=step.progress,
             cancel=step.cancel,
+            crew=step.crew,
         )
         n, subset = len(segment.has), self._options.subset_px
         zncc = np.where(state.points.ok[:, None], state.points.zncc, np.nan)
@@ -329,6 +335,7 @@ class _Step:
     seeds: Seeds | None
     progress: Progress | None
     cancel: CancelToken | None
+    crew: Crew | None
 
 
 def _lost(field: Field, before: Bool) -> Bool:

@@ -20,6 +20,7 @@ from core.field.growth.patch import keep_patch
 from core.field.growth.seed import seed_motion
 from core.field.growth.state import GrowthState, begin, prepare
 from core.field.points.assemble import assemble
+from core.field.points.crew import Crew
 from core.field.points.fitter import PointFits
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field
@@ -248,6 +249,7 @@ def measure_segment(
     previous_step: int,
     progress: Progress | None,
     cancel: CancelToken | None,
+    crew: Crew | None,
 ) -> GrowthState:
     """Match a pair of images against a segment's reference; return the final state, about the segment's pixels.
 
@@ -261,7 +263,7 @@ def measure_segment(
     """
     images = (segment.image1, segment.image2), (cur1, cur2)
     try:
-        inputs = prepare(pair, *images, segment.grid, options, progress=progress, cancel=cancel)
+        inputs = prepare(pair, *images, segment.grid, options, progress=progress, cancel=cancel, crew=crew)
     except RegionError as error:
         raise SeedError(f"no point of step {segment.step} is left to match a later step against.") from error
     start = None if previous_step == segment.step else _started(segment, previous, pair)

@@ -14,6 +14,7 @@ from core.settings import (
     DEFAULT_MAX_SIGMA_PX,
     DEFAULT_PATCH,
     DEFAULT_REFERENCE_UPDATE,
+    DEFAULT_SPLIT_STEP,
     DENSE_STEP_PX,
     INTERPOLATIONS,
     MAX_SIGMA_PX,
@@ -21,6 +22,8 @@ from core.settings import (
     REFERENCE_UPDATES,
     SMOOTHING_WINDOW,
     SPACING_PX,
+    SPLIT_STEP_FROM,
+    SPLIT_STEPS,
     STRAIN_ORDERS,
     STRAIN_TENSORS,
     STRAIN_WINDOW,
@@ -150,6 +153,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="never: match every step against the first (total); always: against the step before (incremental); auto: "
         "against the first, or a later reference where that fails, with a note; displacements are totals in any case "
         f"({DEFAULT_REFERENCE_UPDATE})",
+    )
+    add(
+        "--split-step",
+        choices=SPLIT_STEPS,
+        help=f"auto: fields of {SPLIT_STEP_FROM['auto']:,.0f} usable points and more grow over a coarse part of them "
+        "first; always: all fields; never: every field grows in one piece. A service's workers share the rest of such "
+        f"a step ({DEFAULT_SPLIT_STEP})",
     )
     add(
         "--projected",
@@ -336,6 +346,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
             "dense_step_px": _dense_step_px(args, step),
             "pattern": "projected" if args.projected else "surface",
             "reference_update": args.reference_update or ("never" if args.projected else DEFAULT_REFERENCE_UPDATE),
+            "split_step": args.split_step or DEFAULT_SPLIT_STEP,
             "strain": strain,
             "reference": steps[0].n,
             "noise": None if noise is None else noise.record(),

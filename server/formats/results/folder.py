@@ -13,6 +13,8 @@ _RESULT = re.compile(r"step_\d{4,}\.nc")
 
 DENSE = "dense"
 """Folder of the dense fields, inside that of the ordinary results: files of the same names and contract."""
+TILES = ".tiles_"
+"""What the names of folders begin with in which workers share the fits of a step that is being measured."""
 
 
 def dense_result(path: Path) -> Path:

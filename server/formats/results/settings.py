@@ -18,7 +18,7 @@ from core.settings import StoredSettings, patch_name
 _INPUTS = {"calibration.json": "calibration", "noise.json": "noise", "step_cam1": "cam1", "step_cam2": "cam2"}
 _CUTS_AND_MASK = ("cracks", "holes", "mask")
 #: settings that came later: the values that correspond to earlier measurements
-_BEFORE = {"reference_update": "never", "strain": None}
+_BEFORE = {"reference_update": "never", "split_step": "never", "strain": None}
 
 
 _ENTRIES = {

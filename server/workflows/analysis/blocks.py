@@ -81,6 +81,11 @@ class Blocks:
         return all(b.through and b.joint != "open" and b.running is None for b in self._blocks)
 
     @property
+    def size(self) -> int:
+        """Number of steps."""
+        return sum(len(b.steps) for b in self._blocks)
+
+    @property
     def ahead(self) -> int:
         """Number of steps that are measured, whether or not they stand."""
         return sum(b.at for b in self._blocks)

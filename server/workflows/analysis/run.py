@@ -28,7 +28,7 @@ from server.worker.executor import WorkerDiedError
 from server.worker.tasks import StepTask, measure_step
 from server.workflows.analysis.block import Outcome
 from server.workflows.analysis.blocks import Blocks
-from server.workflows.analysis.side_by_side import goes_in_blocks, is_certain, measure_in_blocks
+from server.workflows.analysis.side_by_side import goes_in_blocks, has_helpers, is_certain, measure_in_blocks
 from server.workflows.analysis.tasks import is_independent, task_of
 from server.workflows.camera_identity import check_same_cameras
 from server.workflows.service import Service
@@ -161,7 +161,8 @@ class AnalysisRun:
         started = time.monotonic()
         try:
             self._check_cameras(n)
-            task = task_of(service.tests, document, n, self._done, steps[index + 1] if index + 1 < len(steps) else None)
+            following = steps[index + 1] if index + 1 < len(steps) else None
+            task = task_of(service.tests, document, n, self._done, following, shares=has_helpers(service, document, 1))
             summary = run_task(service.executor, job, measure_step, task, progress=progress)
         except StereorigError as error:
             self._note_failure(job, n, error)
@@ -217,27 +218,28 @@ class AnalysisRun:
                 self._measure_one(job, 0, steps[0])
             self._next = 1
         open_steps = [n for n in steps[self._next :] if n not in self._summaries]
+        shares = has_helpers(self._service, self._document, len(open_steps))
         began = time.monotonic()
-        shares: dict[int, float] = {}
+        parts: dict[int, float] = {}
 
         def tasks() -> Iterator[tuple[int, Callable[[], StepTask]]]:
             for n in open_steps:
                 try:
                     self._check_cameras(n)
-                    task = task_of(self._service.tests, self._document, n, {}, None)
+                    task = task_of(self._service.tests, self._document, n, {}, None, shares=shares)
                 except StereorigError as error:
                     self._note_failure(job, n, error)
                     continue
                 yield n, lambda task=task: task  # type: ignore[misc]
 
         def progress(n: int, phase: str, share: float) -> None:
-            shares[n] = share
-            done = len(self._summaries) + len(self._failed) + sum(shares.values())
-            text = f"step {n}: {phase}" if len(shares) < 2 else f"{len(shares)} steps at once"
+            parts[n] = share
+            done = len(self._summaries) + len(self._failed) + sum(parts.values())
+            text = f"step {n}: {phase}" if len(parts) < 2 else f"{len(parts)} steps at once"
             job.progress(text, round(1000 * min(done, len(steps))), 1000 * len(steps))
 
         def ended(n: int, future: Future[Any]) -> None:
-            shares.pop(n, None)
+            parts.pop(n, None)
             try:
                 summary = future.result()
             except StereorigError as error:

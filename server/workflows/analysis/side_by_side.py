@@ -41,6 +41,14 @@ def goes_in_blocks(
     return len(open_steps) >= 2 * SHORTEST and service.executor.width > 1
 
 
+def has_helpers(service: Service, document: AnalysisRecord, steps: int) -> bool:
+    """Return True if workers are left to help where so many steps are measured at once."""
+    executor = service.executor
+    if stored_settings(document.settings).split_step == "never" or not executor.shares_files:
+        return False
+    return executor.width > steps
+
+
 def is_certain(summary: StepOutcome | None) -> bool:
     """Return True for a step that was announced: its worker alone does not know that what came before it stands."""
     return summary is not None and summary.wall_s is not None
@@ -69,13 +77,15 @@ def measure_in_blocks(
     progress
         Called with the number of steps measured.
     """
-    shares: dict[int, float] = {}
+    parts: dict[int, float] = {}
+    # a block has at least so many steps: where there are fewer, workers have nothing to do
+    shares = has_helpers(service, document, plan.size // SHORTEST)
     asked: dict[TaskFuture, tuple[Ask, float]] = {}
     certain = 0
 
     def shown(number: int, _phase: str, share: float) -> None:
-        shares[number] = share
-        progress(plan.ahead + sum(shares.values()))
+        parts[number] = share
+        progress(plan.ahead + sum(parts.values()))
 
     def outcome_of(ask: Ask, future: TaskFuture, started: float) -> Outcome:
         try:
@@ -96,23 +106,23 @@ def measure_in_blocks(
             while side.has_room and (ask := plan.ask()) is not None:
                 try:
                     prepare(ask.n)
-                    task = _task_of(service, document, ask)
+                    task = _task_of(service, document, ask, shares=shares)
                 except StereorigError as error:
                     refuse(ask.n, error)
                     ended(ask, error)
                 else:
                     asked[side.submit(ask.n, measure_step, task)] = ask, time.monotonic()
             for n, future in side.ended():
-                shares.pop(n, None)
+                parts.pop(n, None)
                 ask, started = asked.pop(future)
                 ended(ask, outcome_of(ask, future, started))
 
 
-def _task_of(service: Service, document: AnalysisRecord, ask: Ask) -> StepTask:
+def _task_of(service: Service, document: AnalysisRecord, ask: Ask, *, shares: bool) -> StepTask:
     needed = [n for n in ask.references if n != ask.previous] + ([] if ask.previous is None else [ask.previous])
     earlier = {n: service.tests.step(document.test_id, n) for n in needed}
     return replace(
-        task_of(service.tests, document, ask.n, earlier, None),
+        task_of(service.tests, document, ask.n, earlier, None, shares=shares),
         previous=ask.previous,
         against=ask.against,
         from_head=ask.from_head,

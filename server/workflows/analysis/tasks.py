@@ -35,6 +35,8 @@ def task_of(
     done: dict[int, StepFiles],
     following: int | None,
     folder: Path | None = None,
+    *,
+    shares: bool = False,
 ) -> StepTask:
     """Return the task of one step, its inputs compared with those that the analysis was made of.
 
@@ -46,6 +48,8 @@ def task_of(
         Number of the step that will probably be asked for next.
     folder
         Where the results go, and mask and noise models lie; the analysis' own when left out.
+    shares
+        True if workers without a task may fit parts of the step.
 
     Raises
     ------
@@ -89,6 +93,7 @@ def task_of(
         noise=folder / "noise.json" if settings.noise is not None else None,
         earlier={k: images_of(k, step) for k, step in earlier.items()},
         keeps_starts=displacement and (n == reference or not is_independent(document)),
+        shares=shares,
     )
 
 

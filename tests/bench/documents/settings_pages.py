@@ -21,6 +21,7 @@ OPTIONS = {
     "seeds": "`--seed`",
     "seeds_cam2": "`--seed X,Y,X2,Y2`",
     "reference_update": "`--reference-update`",
+    "split_step": "`--split-step`",
     "pattern": "`--projected`",
     "strain": "`--strain`, `--strain-order`, `--strain-tensor`",
     "smoothing_window": "`--smooth`",

@@ -1,0 +1,1 @@
+"""Tiles of a step's points, fitted by workers that share its folder."""
