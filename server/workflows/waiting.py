@@ -35,18 +35,16 @@ def result_of(future: TaskFuture, job: Job, progress: Progress | None = None, he
             helpers.stop()
 
     with job.waiting(stop):
-        while True:
+        while not future.done():
             if job.cancelled:  # also where it was just before the future was known
                 stop()
-            try:
-                return future.result(timeout=0.05)
-            except TimeoutError:
-                if future.done():
-                    raise
-                if helpers is not None:
-                    helpers.look(busy=1)
-            except CancelledError:
-                raise Cancelled(f"The {job.record.kind} was cancelled.") from None
+            wait([future], timeout=0.05)
+            if helpers is not None:
+                helpers.look(busy=1)
+        try:
+            return future.result()
+        except CancelledError:
+            raise Cancelled(f"The {job.record.kind} was cancelled.") from None
 
 
 def run_side_by_side(

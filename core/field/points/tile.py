@@ -92,11 +92,7 @@ class TileFits:
         self._whole: list[ImageData] = []
 
     def fit(
-        self,
-        points: ToFit,
-        visible: VisiblePixels | None,
-        kept: Float | None = None,
-        cancel: CancelToken | None = None,
+        self, points: ToFit, visible: VisiblePixels | None, kept: Float | None = None, cancel: CancelToken | None = None
     ) -> PointFits:
         """Fit a tile's points; ``visible`` are their visible pixels, None: all, ``kept`` what a sequence keeps of them.
 
