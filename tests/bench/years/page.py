@@ -113,9 +113,12 @@ def write_soak(soak: Soak) -> None:
         f"| {g.name} | {g.mean:.1f} | {g.grown:+.2f} ({g.low:+.2f} to {g.high:+.2f}) | {g.allowed:g} | {g.verdict} |"
         for g in verdicts(soak)
     ]
+    quarter = max(len(soak.load) // 4, 1)
+    first, last = np.mean(soak.load[:quarter]), np.mean(soak.load[-quarter:])
     did = ", ".join(f"{n:,} {what}".replace(",", " ") for what, n in soak.done.items())
     text = (
-        f"{soak.seconds / 60:.0f} minutes; {_machine()}; load of the machine {np.mean(soak.load):.1f}. Done: {did}"
+        f"{soak.seconds / 60:.0f} minutes; {_machine()}; load of the machine {np.mean(soak.load):.1f} ({first:.1f} in the first "
+        f"quarter, {last:.1f} in the last). Done: {did}"
         f"{'' if soak.live else '; no live measurement: this version has none'}. Answers that were not as they should be: {len(soak.wrong)}. "
         f"Growth is from minute {soak.warm_s / 60:.0f} to the end."
     )

@@ -271,6 +271,17 @@ def _beside(work: Work, tasks: list[Callable[[httpx.Client], None]]) -> Iterator
             thread.join(timeout=150.0)
 
 
+def _failed(client: httpx.Client) -> list[str]:
+    """Return the jobs that failed."""
+    found: list[str] = []
+    cursor: str | None = ""
+    while cursor is not None:
+        page = client.get(f"{API}/jobs", params={"limit": 100, **({"cursor": cursor} if cursor else {})}).json()
+        found += [f"{job['kind']} {job['id']}: {job['problem']}" for job in page["jobs"] if job["state"] == "failed"]
+        cursor = page["next_cursor"]
+    return found
+
+
 def run(folder: Path, seconds: float, *, page: bool = True) -> Soak:
     """Let a service work for so long."""
     soak = Soak(seconds=seconds)
@@ -286,6 +297,7 @@ def run(folder: Path, seconds: float, *, page: bool = True) -> Soak:
             tasks.append(work.looks)
         with _beside(work, tasks):
             work.watch(process)
+        soak.wrong += _failed(client)
     return soak
 
 
