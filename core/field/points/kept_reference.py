@@ -86,4 +86,4 @@ class KeptReference:
         inside = (index >= 0) & (index < len(self.rows))
         if not inside.all() or np.abs(self.xy_px[index] - xy_px).max(initial=0.0) > 1e-6:
             return None
-        return np.take(self.rows, index, axis=0)
+        return np.asarray(np.take(self.rows, index, axis=0))
