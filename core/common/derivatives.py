@@ -113,7 +113,7 @@ class ReferenceView:
     @cached_property
     def beside(self) -> Float:
         """(n, 3, 2) of the points over camera 1's predicted images: these put them beside the ray."""
-        return -_pseudoinverse(self.by_point1)
+        return -pseudoinverse(self.by_point1)
 
     @cached_property
     def seen(self) -> Float:
@@ -275,8 +275,8 @@ def _own_part(camera: Camera, prefix: str, names: Sequence[str], directions: Flo
     return own
 
 
-def _pseudoinverse(A: Float) -> Float:
-    """(n, 3, 2) of matrices (n, 2, 3) of full rank."""
+def pseudoinverse(A: Float) -> Float:
+    """Return the pseudoinverses (n, 3, 2) of matrices (n, 2, 3) of full rank."""
     At = np.swapaxes(A, 1, 2)
     G = A @ At
     a, b, c = G[:, 0, 0], G[:, 0, 1], G[:, 1, 1]

@@ -285,10 +285,12 @@ def keep_reference(
 
     Parameters
     ----------
-    pair, ref1, ref2, xy_px, options, visible
+    pair, ref1, ref2, xy_px
         As of :func:`fit_shape`.
     w, epipolar_px
         (N, 3 or 6), (N,) the shape's results; nothing is kept where they are not finite.
+    options, visible
+        As of :func:`fit_shape`.
 
     Returns
     -------

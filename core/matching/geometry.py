@@ -153,8 +153,8 @@ def motion_geometry(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, G: ArrayLi
     basis[..., 0, 1] = basis[..., 1, 2] = 1.0
     slopes = w[..., None, 1:] / w[..., None, :1]
     # rows of R^T: tangents in the system frame, (N, 3, 2), both in units of 1 / w0
-    before = np.einsum("ji,njk->nik", R, basis[..., 1:] - basis[..., :1] * slopes)
-    after = np.einsum("ji,njk->nik", R, G[..., 1:] - G[..., :1] * slopes)
+    before = R.T @ (basis[..., 1:] - basis[..., :1] * slopes)
+    after = R.T @ (G[..., 1:] - G[..., :1] * slopes)
     frame = tangent_frames(_plane(ray, w) @ R)
     coordinates = np.swapaxes(frame[..., :2], -1, -2) @ before
     gradient = after @ _inverse2(coordinates)  # (N, 3, 2): tangent coordinates -> deformed tangents

@@ -13,6 +13,7 @@ from core.arrays import Float
 from core.calibration import COVARIANCE_NAMES
 from core.calibration.uncertainty import image_derivatives
 from core.cameras.stereo import StereoPair
+from core.common.derivatives import pseudoinverse
 from core.field.region.trend import smooth_terms
 from core.orientation.change import ChangeSlopes, Ends
 from core.orientation.consequence import Consequences
@@ -30,7 +31,7 @@ def calibration_slopes(pair: StereoPair, points: MatchedPoints, names: Sequence[
     across = across_line(pair, points.xy1_px, points.xy2_px)
     A1, A2 = pair.cam1.point_jacobian(xyz), pair.cam2.point_jacobian(xyz)
     by_parameters = image_derivatives(pair, xyz, names)
-    by_image1 = np.einsum("nj,njk->nk", across, A2 @ np.linalg.pinv(A1))
+    by_image1 = np.einsum("nj,njk->nk", across, A2 @ pseudoinverse(A1))
     return np.asarray(
         np.einsum("nj,njk->nk", by_image1, by_parameters[:, :2]) - np.einsum("nj,njk->nk", across, by_parameters[:, 2:])
     )
