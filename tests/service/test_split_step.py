@@ -254,6 +254,12 @@ def measured(host: Host, **changes: Any) -> list[dict[str, Any]]:
     return [contents(folder / f"step_{n:04d}.nc") for n in range(STEPS)]
 
 
+def copy_of(data: Path, folder: Path) -> Path:
+    """A data folder with the test and without its analyses: a service has its own."""
+    shutil.copytree(data / "tests", folder / "tests", ignore=shutil.ignore_patterns("a0*"))
+    return folder
+
+
 def test_a_service_with_two_workers_writes_what_one_worker_does(
     data: Path, host: Host, calls: list[TileTask], tmp_path: Path
 ) -> None:
@@ -261,7 +267,7 @@ def test_a_service_with_two_workers_writes_what_one_worker_does(
     assert np.isfinite(two[1]["exx"]).any()
     before = len(calls)
     assert before >= STEPS
-    single = Host(data, "")
+    single = Host(copy_of(data, tmp_path / "one"), "")
     try:
         one = measured(single, spacing_px=7)
     finally:
@@ -275,11 +281,10 @@ def test_a_service_with_two_workers_writes_what_one_worker_does(
 
 @pytest.mark.deep
 def test_workers_of_a_cluster_write_what_one_worker_does(data: Path, calls: list[TileTask], tmp_path: Path) -> None:
-    shutil.copytree(data / "tests", tmp_path / "data" / "tests", ignore=shutil.ignore_patterns("a0*"))
     with cluster_of(2, tmp_path) as cluster:
         cluster.await_workers(2)
-        there = Host(tmp_path / "data", f'[compute]\nscheduler = "{cluster.address}"')
-        single = Host(data, "")
+        there = Host(copy_of(data, tmp_path / "two"), f'[compute]\nscheduler = "{cluster.address}"')
+        single = Host(copy_of(data, tmp_path / "one"), "")
         try:
             two, one = measured(there), measured(single)
         finally:
