@@ -10,16 +10,21 @@ import pytest
 from core.errors import Cancelled
 from core.field.points.crew import ToFit, fit_shared
 from core.field.points.fitter import Fitter, PointFits
+from core.field.points.tile import TileFits, TileSetting
+from core.field.region.region import PointGrid
 from core.matching.image import PAD, prepare
 from core.matching.rows import prepare_rows, reference_rows
+from core.measure import MeasureOptions, ReferencePair
+from core.noise import NoiseModel
 from core.progress import Cancel
 from core.status import PointStatus
+from tests.support import sequence_bench as bench
 
 N = 1000
 
 
 class Doubling(Fitter):
-    """Fits whose result is twice the start; those of a part are left to the whole at every hundredth point."""
+    """Fits whose result is twice the start."""
 
     def fit(self, xy_px: Any, w: Any, G: Any) -> PointFits:
         fits = PointFits.empty(len(xy_px), 1)
@@ -31,7 +36,7 @@ class Doubling(Fitter):
 
 
 class Others:
-    """Others who take some tiles and finish some of them after a while."""
+    """Others who take some tiles and finish some of them after a while, but for what left their part of the images."""
 
     def __init__(self, takes: set[int], finishes: set[int], after: int = 0) -> None:
         self.takes, self.finishes, self.after = takes, finishes, after
@@ -125,3 +130,40 @@ def test_some_rows_are_prepared_as_those_of_the_whole_image(
         np.testing.assert_array_equal(own[first:last], expected[first:last])
     np.testing.assert_array_equal(reference.pixels[first:last], whole.pixels[first:last])
     assert (reference.slope_noise, reference.slope_share) == (whole.slope_noise, whole.slope_share)
+
+
+class WithImages:
+    """Others who fit all tiles, with the rows of the images that these need."""
+
+    def __init__(self, pixels: list[np.ndarray]) -> None:
+        self.pixels, self.fitted_tiles = pixels, 0
+
+    def share(self, fitter: Fitter, tiles: list[ToFit]) -> WithImages:
+        setting = TileSetting.of(fitter)
+        assert setting is not None
+        self.fits, self.tiles = TileFits(fitter.pair, self.pixels, setting), tiles
+        return self
+
+    def claim(self, _k: int) -> bool:
+        return False
+
+    def fitted(self, k: int) -> PointFits:
+        self.fitted_tiles += 1
+        return self.fits.fit(self.tiles[k], None)
+
+    def close(self) -> None:
+        pass
+
+
+def test_with_noise_models_too_a_tile_is_that_of_the_whole_images() -> None:
+    images = [bench.capture(bench.plate(0.3 * n), seed=n) for n in range(2)]
+    model = NoiseModel(coefficients=(2.0, 0.01, 0.0))
+    options = MeasureOptions(subset_px=33, split_from=0, noise=(model, model))
+    grid = PointGrid.rectangle(180, 170, 340, 310, spacing_px=8)
+    crew = WithImages([*images[0], *images[1]])
+    reference = ReferencePair(bench.rig().pair, *images[0])
+    shape = reference.shape(grid, options)
+    own, shared = (reference.motion(*images[1], grid, options, shape=shape, crew=one) for one in (None, crew))
+    assert crew.fitted_tiles > 0
+    for name in ("status", "uvw_mm", "zncc", "covariance", "noise_grey"):
+        np.testing.assert_array_equal(getattr(shared, name), getattr(own, name))
