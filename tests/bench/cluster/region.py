@@ -230,6 +230,13 @@ def same_results(one: Path, two: Path) -> bool:
     return True
 
 
+def _printed(path: Path) -> Figures:
+    found: dict[str, Any] = json.loads(path.read_text())
+    spent = {name: [Spent(**one) for one in found[name]] for name in ("whole", "alone", "two")}
+    simulated = {workers: [times_faster(step, workers) for step in spent["two"]] for workers in WORKERS}
+    return Figures(**{**found, **spent, "size_px": tuple(found["size_px"]), "simulated": simulated})
+
+
 def main() -> int:
     """Measure, simulate, write the section."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -237,7 +244,11 @@ def main() -> int:
     parser.add_argument("--spacing", type=int, default=8, help="distance of points, px")
     parser.add_argument("--pictures", type=Path, help="where rendered images are kept")
     parser.add_argument("--dry", action="store_true", help="print the figures, write no page")
+    parser.add_argument("--figures", type=Path, help="write the page from figures that were printed before")
     args = parser.parse_args()
+    if args.figures is not None:
+        write_section(_printed(args.figures), list(STEPS.values()))
+        return 0
     size = (args.size[0], args.size[1])
     region = tuple(round(share * side) for share, side in zip((0.1, 0.125, 0.9, 0.875), size * 2, strict=True))
     with tempfile.TemporaryDirectory() as name:

@@ -63,7 +63,7 @@ def _section(figures: Figures, steps: list[str]) -> str:
                 "the calibration's common part and the files. What it gives away are fits of single points whose starts "
                 "are known: in a step after another one from that; in a shape or a first motion from a coarse part of "
                 "the points, a subset's width apart, over which the field grows first; with curved patches from the "
-                "plane ones. A tile is a run of points in rows, a sixteenth of all. It lies in the analysis' folder with "
+                "plane ones. A tile is a run of points in rows, a sixteenth of all, 16,384 at most. It lies in the analysis' folder with "
                 "its starts; whoever is free takes one, reads the images, filters the rows that the tile needs, and "
                 "puts the fits beside. A fit depends on its start and the images alone, so every number is that of one "
                 "worker, to the last bit, and there is no seam. Nobody waits for a tile: what others have taken and not "
