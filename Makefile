@@ -25,7 +25,7 @@ help:
 	@echo "make serve   start the service on the simulated paper rig (ARGS='--config FILE --port N')"
 	@echo "make check   lint, format check, types, import walls, docstrings; lint and types of the page's scripts"
 	@echo "make bench   time everything on this machine, beside pyvale, and write docs/explanation/performance.md (ARGS=--quick: a few minutes)"
-	@echo "make clusterbench  a long test on one and two workers, and on 64 simulated ones; writes docs/explanation/cluster.md (ARGS='--steps N')"
+	@echo "make clusterbench  a long test on one and two workers, and on 64 simulated ones, and one large step; writes docs/explanation/cluster.md (ARGS='--steps N')"
 	@echo "make load    ten minutes of captures, readers, slow streams, analyses and stops; writes docs/explanation/reliability.md (ARGS='--minutes N')"
 	@echo "make torture  kill the service 1,000 times at work, look each time that nothing is lost, write docs/explanation/reliability.md (ARGS='--kills N')"
 	@echo "make powerloss  open 100,000 states in which a lost power may leave the data folder, write docs/explanation/reliability.md (ARGS='--states N')"
@@ -124,6 +124,7 @@ livebench: $(STAMP)
 
 clusterbench: $(STAMP)
 	$(BIN)/python -m tests.bench.cluster.bench $(ARGS)
+	$(BIN)/python -m tests.bench.cluster.region
 
 accuracy: $(STAMP)
 	$(BIN)/python -m tests.bench.accuracy.accuracy $(ARGS)

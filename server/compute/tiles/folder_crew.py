@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import secrets
 import shutil
+import time
 import weakref
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +21,7 @@ from server.worker.tile_task import TileTask
 _log = logging.getLogger("stereorig.tiles")
 
 Call = Callable[[TileTask], bool]
+FITTED = "%d of %d tiles were fitted by other workers; the rest took %.3f s of processor time here"
 
 
 class FolderCrew:
@@ -49,6 +51,7 @@ class FolderCrew:
         images = tuple(path for path in map(self._files.get, images_of(fitter)) if path is not None)
         if setting is None or len(images) < len(images_of(fitter)):
             return None
+        began = time.process_time()
         folder = self._folder / f"{TILES}{secrets.token_hex(6)}"
         try:
             folder.mkdir(parents=True)
@@ -59,14 +62,14 @@ class FolderCrew:
             shutil.rmtree(folder, ignore_errors=True)
             return None
         task = TileTask(folder=folder, tiles=len(tiles), calibration=self._calibration, images=images, setting=setting)
-        return _SharedFolder(task, self._call)
+        return _SharedFolder(task, self._call, began)
 
 
 class _SharedFolder:
     """Tiles in a folder."""
 
-    def __init__(self, task: TileTask, call: Call) -> None:
-        self._task, self._call = task, call
+    def __init__(self, task: TileTask, call: Call, began: float) -> None:
+        self._task, self._call, self._began = task, call, began
         self._called = call(task)
         self._others = 0
 
@@ -85,4 +88,5 @@ class _SharedFolder:
     def close(self) -> None:
         """Want nothing any more."""
         shutil.rmtree(self._task.folder, ignore_errors=True)
-        _log.info("%d of %d tiles were fitted by other workers", self._others, self._task.tiles)
+        spent = time.process_time() - self._began
+        _log.info(FITTED, self._others, self._task.tiles, spent)

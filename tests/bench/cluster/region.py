@@ -10,6 +10,8 @@ from __future__ import annotations
 import argparse
 import heapq
 import json
+import logging
+import re
 import tempfile
 import time
 from collections.abc import Callable
@@ -23,6 +25,7 @@ import psutil
 
 from core.field.points.fitter import PointFits
 from core.settings import SplitStep, StoredSettings
+from server.compute.tiles.folder_crew import FITTED
 from server.formats.files import sha256_of
 from server.worker.embedded import ComputeWorker
 from server.worker.executor import TaskFuture
@@ -36,6 +39,9 @@ from tests.bench.speed.scene import sequence_files
 STEPS = {0: "shape", 1: "first motion", 2: "further step"}
 WORKERS = (1, 2, 4, 8, 16)
 SUBSET_PX = 33
+_FITTED = re.compile(
+    re.escape(FITTED).replace("%d", "([0-9]+)", 1).replace("%d", "[0-9]+").replace(re.escape("%.3f"), "([0-9.]+)")
+)
 _WARM_UP = "server.compute.measurement:compile_here"
 
 
@@ -48,7 +54,9 @@ class Spent:
     own_s, others_s
         Of the worker that measures it, and of the one that helps.
     tiles, elsewhere
-        How many there were, and how many of them the helper fitted.
+        How many there were, and how many of them the helper fitted in time.
+    tiles_s
+        Of its own, of the worker that measures it, for the tiles: writing them, and fitting those that it took.
     tile_bytes
         Written for a tile, on average.
     """
@@ -57,12 +65,23 @@ class Spent:
     others_s: float = 0.0
     tiles: int = 0
     elsewhere: int = 0
+    tiles_s: float = 0.0
     tile_bytes: float = 0.0
 
     @property
     def busiest_s(self) -> float:
         """Of the busiest worker."""
         return max(self.own_s, self.others_s)
+
+    @property
+    def a_tile_s(self) -> float:
+        """Of the worker that measures it, for a tile that it fits itself."""
+        return self.tiles_s / max(self.tiles - self.elsewhere, 1)
+
+    @property
+    def alone_s(self) -> float:
+        """What it would have taken alone, by the same run."""
+        return self.own_s - self.tiles_s + self.a_tile_s * self.tiles
 
 
 @dataclass
@@ -92,6 +111,7 @@ class Bench:
 
     def __init__(self, workers: int, files: Path) -> None:
         self._files = files
+        logging.getLogger().setLevel(logging.INFO)  # as it is when they start, workers send what they log
         self._workers = [ComputeWorker(threads=1, warm_up=_WARM_UP, lowered=False) for _ in range(workers)]
         self._pool = WorkerPool(self._workers)
         for worker in self._workers:
@@ -99,10 +119,21 @@ class Bench:
         for worker in self._workers:
             if not worker.ready.wait(300):
                 raise RuntimeError("a worker does not start")
+        self._logged: list[re.Match[str]] = []
+        logger = logging.getLogger("stereorig.tiles")
+        logger.setLevel(logging.INFO)
+        logger.addFilter(self._note)
         self._processes = [psutil.Process(worker.pid) for worker in self._workers]
+
+    def _note(self, record: logging.LogRecord) -> bool:
+        found = _FITTED.fullmatch(record.getMessage())
+        if found is not None:
+            self._logged.append(found)
+        return True
 
     def close(self) -> None:
         """End the workers."""
+        logging.getLogger("stereorig.tiles").removeFilter(self._note)
         self._pool.shutdown()
 
     def measure(self, folder: Path, region: tuple[int, ...], spacing_px: int, split: SplitStep) -> list[Spent]:
@@ -133,6 +164,7 @@ class Bench:
             helping.append(submit(function, *args))
             return helping[-1]
 
+        self._logged.clear()
         before = [_busy_s(p) for p in self._processes]
         future = submit(measure_step, task)
         helpers.hear(future)
@@ -153,14 +185,16 @@ class Bench:
         finally:
             self._pool.submit = submit  # type: ignore[method-assign]
         future.result()
-        elsewhere = sum(one.result(timeout=60) for one in helping)
+        for one in helping:
+            one.result(timeout=60)
         time.sleep(0.3)  # a process' clock goes in hundredths
         used = [_busy_s(p) - b for p, b in zip(self._processes, before, strict=True)]
         return Spent(
             used[0],
             max(used[1:], default=0.0),
             sum(tiles.tiles for tiles, _ in called),
-            elsewhere,
+            sum(int(found[1]) for found in self._logged),
+            sum(float(found[2]) for found in self._logged),
             float(np.mean([size for _, size in called])) if called else 0.0,
         )
 
@@ -173,18 +207,16 @@ def _busy_s(process: psutil.Process) -> float:
     return float(sum(process.cpu_times()[:2]))
 
 
-def times_faster(alone: Spent, two: Spent, workers: int) -> float:
-    """Return how many times faster a step is by more workers: their shares as measured, whoever is free takes a tile."""
+def times_faster(two: Spent, workers: int) -> float:
+    """Return how many times faster a step is by more workers: its parts as two took them, whoever is free takes a tile."""
     if two.elsewhere == 0 or workers == 1:
         return 1.0
-    own = max((alone.own_s - two.own_s) / two.elsewhere, 0.0)
-    other = two.others_s / two.elsewhere
-    free = [(0.0, own), *((0.0, other) for _ in range(workers - 1))]
+    free = [(0.0, two.a_tile_s), *((0.0, two.others_s / two.elsewhere) for _ in range(workers - 1))]
     heapq.heapify(free)
     for _ in range(two.tiles):
         at, cost = heapq.heappop(free)
         heapq.heappush(free, (at + cost, cost))
-    return alone.own_s / (alone.own_s - own * two.tiles + max(at for at, _ in free))
+    return two.alone_s / (two.own_s - two.tiles_s + max(at for at, _ in free))
 
 
 def same_results(one: Path, two: Path) -> bool:
@@ -198,6 +230,13 @@ def same_results(one: Path, two: Path) -> bool:
     return True
 
 
+def _printed(path: Path) -> Figures:
+    found: dict[str, Any] = json.loads(path.read_text())
+    spent = {name: [Spent(**one) for one in found[name]] for name in ("whole", "alone", "two")}
+    simulated = {workers: [times_faster(step, workers) for step in spent["two"]] for workers in WORKERS}
+    return Figures(**{**found, **spent, "size_px": tuple(found["size_px"]), "simulated": simulated})
+
+
 def main() -> int:
     """Measure, simulate, write the section."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -205,7 +244,11 @@ def main() -> int:
     parser.add_argument("--spacing", type=int, default=8, help="distance of points, px")
     parser.add_argument("--pictures", type=Path, help="where rendered images are kept")
     parser.add_argument("--dry", action="store_true", help="print the figures, write no page")
+    parser.add_argument("--figures", type=Path, help="write the page from figures that were printed before")
     args = parser.parse_args()
+    if args.figures is not None:
+        write_section(_printed(args.figures), list(STEPS.values()))
+        return 0
     size = (args.size[0], args.size[1])
     region = tuple(round(share * side) for share, side in zip((0.1, 0.125, 0.9, 0.875), size * 2, strict=True))
     with tempfile.TemporaryDirectory() as name:
@@ -233,7 +276,7 @@ def main() -> int:
         two=two,
         same=same,
         fits_bytes=sum(a.nbytes for f in fields(point) if (a := getattr(point, f.name)) is not None),
-        simulated={w: [times_faster(a, b, w) for a, b in zip(one, two, strict=True)] for w in WORKERS},
+        simulated={w: [times_faster(step, w) for step in two] for w in WORKERS},
     )
     print(json.dumps(asdict(figures)), flush=True)
     if not args.dry:

@@ -43,17 +43,14 @@ def _section(figures: Figures, steps: list[str]) -> str:
     rows = zip(steps, figures.whole, figures.alone, figures.two, strict=True)
     measured = "\n".join(
         f"| {name} | {whole.own_s:.2f} | {one.own_s:.2f} | {two.own_s:.2f} | {two.others_s:.2f} | "
-        f"{two.elsewhere} of {two.tiles} | {one.own_s / two.busiest_s:.2f} |"
+        f"{two.elsewhere} of {two.tiles} | {one.own_s / two.busiest_s:.2f} | {two.alone_s / two.busiest_s:.2f} |"
         for name, whole, one, two in rows
     )
     simulated = "\n".join(
         f"| {workers} | " + " | ".join(f"{times:.2f}" for times in found) + " |"
         for workers, found in figures.simulated.items()
     )
-    share = [
-        100.0 * two.tiles * (one.own_s - two.own_s) / two.elsewhere / one.own_s if two.elsewhere else 0.0
-        for one, two in zip(figures.alone, figures.two, strict=True)
-    ]
+    share = [100.0 * two.tiles * two.a_tile_s / two.alone_s for two in figures.two]
     shares = ", ".join(f"{value:.0f} % of {name}" for value, name in zip(share, steps, strict=True))
     tile_bytes = max(two.tile_bytes for two in figures.two)
     return "\n\n".join(
@@ -66,7 +63,7 @@ def _section(figures: Figures, steps: list[str]) -> str:
                 "the calibration's common part and the files. What it gives away are fits of single points whose starts "
                 "are known: in a step after another one from that; in a shape or a first motion from a coarse part of "
                 "the points, a subset's width apart, over which the field grows first; with curved patches from the "
-                "plane ones. A tile is a run of points in rows, a sixteenth of all. It lies in the analysis' folder with "
+                "plane ones. A tile is a run of points in rows, a sixteenth of all, 16,384 at most. It lies in the analysis' folder with "
                 "its starts; whoever is free takes one, reads the images, filters the rows that the tile needs, and "
                 "puts the fits beside. A fit depends on its start and the images alone, so every number is that of one "
                 "worker, to the last bit, and there is no seam. Nobody waits for a tile: what others have taken and not "
@@ -74,19 +71,21 @@ def _section(figures: Figures, steps: list[str]) -> str:
             ),
             wrapped(
                 f'`split_step = "auto"` splits steps of {SPLIT_STEP_FROM["auto"]:,.0f} usable points and more. Such '
-                "fields grow in two passes whether or not anybody helps, which costs no more than growth in one piece "
-                "(`never`) and gives the same valid points, values within 2 % of a standard deviation, rms: a match "
-                "that began elsewhere ends elsewhere by some thousandths of it. With `prefilter_px`, and where workers "
-                "do not see the data folder, a step is not split."
+                "fields grow in two passes whether or not anybody helps. Against growth in one piece (`never`) valid "
+                "points are the same, values within 2 % of a standard deviation, rms: a fit that began elsewhere ends "
+                "elsewhere by some thousandths of it. With `prefilter_px`, and where workers do not see the data folder, "
+                "a step is not split."
             ),
             wrapped(
                 f"Processor time, s, of a pair of {megapixels:.0f} megapixels, {figures.points:,} points of 33 px, strain "
                 f"and files included, on {datetime.now(UTC):%Y-%m-%d}, {platform.machine()}, {os.cpu_count()} cores; "
-                "workers of one thread. The results of one worker and of two are "
+                "workers of one thread. Other programs share the cores, and the same work takes more processor time in one "
+                "run than in the other; the last ratio is of the run of two workers alone: what the busiest one would have "
+                "taken with all tiles as its own ones took it. The results of one worker and of two are "
                 + ("the same to the last bit." if figures.same else "**not the same**.")
             ),
             "| step | one piece, one worker | split, one worker | of two: measures | of two: helps | tiles of the helper | "
-            "times faster |\n| --- | --- | --- | --- | --- | --- | --- |\n" + measured,
+            "times faster | within the run |\n| --- | --- | --- | --- | --- | --- | --- | --- |\n" + measured,
             wrapped(
                 f"Share of the processor time that can be given away: {shares}; the rest is what no number of workers "
                 f"makes shorter. A tile's file is {tile_bytes / 1e6:.1f} MB, its fits {figures.fits_bytes} bytes a point. By "
