@@ -16,7 +16,7 @@ from playwright.sync_api import Locator, expect
 
 from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
-from core.settings import SMOOTHING_WINDOW, SPACING_PX, STRAIN_WINDOW, SUBSET_PX
+from core.settings import DENSE_STEP_PX, SMOOTHING_WINDOW, SPACING_PX, STRAIN_WINDOW, SUBSET_PX
 from server.config.rig_file import parse_config
 from server.workflows.service import Service
 from tests.support.page_bench import Watched
@@ -265,12 +265,13 @@ def test_the_region_that_is_posted_is_the_one_drawn(page: Watched, plate: str, p
             shown.wait_for_timeout(350)
         editor.key("Enter")
     shown.get_by_label("Subset", exact=True).fill("15")
+    shown.get_by_label("Dense field, a vector every", exact=True).fill("3")
     shown.get_by_role("textbox", name="Steps", exact=True).fill("0")
     sent = asked(shown, "/analyses", lambda: shown.get_by_role("button", name="Measure", exact=True).click())
     assert np.abs(np.array(sent["region"]["holes"][0]) - hole).max() <= 1.0
     assert np.abs(np.array(sent["region"]["cracks"][0]) - crack).max() <= 1.0
     assert "rectangle" not in sent["region"]
-    assert sent["subset_px"] == 15
+    assert (sent["subset_px"], sent["dense_step_px"]) == (15, 3)
     progress = shown.locator('[data-role="progress"]')
     cancel: Locator = progress.get_by_role("button", name="Cancel")
     cancel.or_(progress.locator(".badge")).first.wait_for(timeout=SLOW)
@@ -343,6 +344,7 @@ def test_each_field_of_a_measurement_says_its_error_beside_itself_and_nothing_is
         ("Spacing", SPACING_PX),
         ("Window", STRAIN_WINDOW),
         ("Smoothing window", SMOOTHING_WINDOW),
+        ("Dense field, a vector every", DENSE_STEP_PX),
     ):
         control = measure.get_by_label(label, exact=True)
         kept = [control.get_attribute(name) for name in ("min", "max", "step")]
@@ -352,6 +354,7 @@ def test_each_field_of_a_measurement_says_its_error_beside_itself_and_nothing_is
         ("Spacing", "0", "Give 1 to 1000\u00a0px, not 0\u00a0px."),
         ("Window", "", "A window is needed here."),
         ("Smoothing window", "2", "Give 3 to 51\u00a0points, not 2\u00a0points."),
+        ("Dense field, a vector every", "30", "Give 1 to 20\u00a0px, not 30\u00a0px."),
         ("Prefilter, sd", "9", "Give a quarter of the subset at most, 8\u00a0px, not 9\u00a0px."),
         ("Largest sigma of a match", "2", "Give 0.001 to 1\u00a0px, not 2\u00a0px."),
         ("Steps", "0-7", "There is no step 2: the test has steps 0 to 1."),
@@ -373,11 +376,16 @@ def test_each_field_of_a_measurement_says_its_error_beside_itself_and_nothing_is
     expect(beside("Prefilter, sd")).to_have_count(0)  # 9 px is a quarter of it
     for label, text in (
         ("Spacing", "10"),
+        ("Dense field, a vector every", "12"),
         ("Smoothing window", ""),
         ("Largest sigma of a match", "0.1"),
         ("Steps", ""),
     ):
         measure.get_by_label(label, exact=True).fill(text)
+    # no denser than the ordinary field: that hangs on the spacing
+    denser = "Give the spacing at most, 10\u00a0px, not 12\u00a0px: it would be no denser."
+    expect(beside("Dense field, a vector every")).to_have_text(denser)
+    measure.get_by_label("Spacing", exact=True).fill("12")
     expect(measure.get_by_role("alert")).to_have_count(0)
     # a region that is missing is said where it is drawn; what stands beside no field is left behind with its screen
     Editor(shown).key("Control+z")  # the region goes

@@ -206,9 +206,7 @@ def test_the_command_asks_for_what_is_done_by_hand_and_goes_on_to_the_certificat
     plan.write_text(json.dumps(PLAN))
     settings = {"subset_px": 21, "spacing_px": 14, "strain": {"window": 3}}
     region = {"rectangle": [70, 70, 180, 170]}
-    recipe.write_text(
-        json.dumps({"format": "stereorig recipe", "version": 1, "region": region, "settings": settings})
-    )
+    recipe.write_text(json.dumps({"format": "stereorig recipe", "version": 1, "region": region, "settings": settings}))
     command = ["certify", "--run", str(plan), "--test", test_id, "--url", str(client.base_url)]
     command += ["--recipe", str(recipe), "--out", str(out), "--json", "--frames", "4"]
     asked: list[str] = []

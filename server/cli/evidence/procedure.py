@@ -89,7 +89,7 @@ def _document(plan: CertificatePlan) -> dict[str, Any]:
 
 
 def _test(client: ServiceClient, test_id: str | None, plan: CertificatePlan, on: ProgressLine) -> str:
-    """Return the test that the steps are taken in, calibrated: nobody moves a body for steps that cannot be measured."""
+    """Return the test that the steps are taken in; refuse one without calibration before anybody moves a body."""
     if test_id is None:
         body = {"name": plan.title or "verification", "calibration_id": "latest"}
         test_id = str(client.call("POST", "/tests", json=body).json()["id"])

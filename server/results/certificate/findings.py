@@ -7,21 +7,27 @@ from typing import Protocol
 
 
 class Finding(Protocol):
-    """A suspect: its stable name, its figures, what to do."""
+    """A suspect."""
 
     @property
-    def code(self) -> str: ...
+    def code(self) -> str:
+        """Its stable name."""
+
     @property
-    def text(self) -> str: ...
+    def text(self) -> str:
+        """The finding with its figures."""
+
     @property
-    def remedy(self) -> str: ...
+    def remedy(self) -> str:
+        """What to do."""
 
 
 class Reason(Finding, Protocol):
     """Why a verdict is no pass."""
 
     @property
-    def outcome(self) -> str: ...
+    def outcome(self) -> str:
+        """What it makes the verdict at least."""
 
 
 def finding_lines(reasons: Iterable[Reason], suspects: Iterable[Finding]) -> list[str]:

@@ -29,6 +29,9 @@ export function about(screen) {
     return typeof value === "number" ? tick(value) : String(value);
   };
 
+  /** @param {StepSummary} one */
+  const denseText = ({ dense }) => h("span", { title: dense?.reason ?? "" }, dense?.file ? `${count(dense.valid)} of ${count(dense.vectors)}` : dense ? "none" : "–");
+
   function draw() {
     const { analysis } = result;
     const steps = analysis.summary?.steps ?? [];
@@ -36,6 +39,7 @@ export function about(screen) {
     const verdict = (/** @type {StepSummary["epipolar_check"]} */ check) => (check ? h("span", { title: check.reason }, badge(check.level, STATE_KIND[check.level] ?? "warn")) : "–");
     const warned = steps.flatMap((one) => [
       ...(one.epipolar_check && one.epipolar_check.level !== "ok" ? [`Step ${one.n}: ${one.epipolar_check.reason}`] : []),
+      ...(one.dense?.reason ? [`Step ${one.n}: no dense field: ${one.dense.reason}`] : []),
       ...(one.camera_motion?.camera_moved ? [`Step ${one.n}: ${one.camera_motion.text}. ${REMEDY}`] : []),
     ]);
     replace(body,
@@ -56,6 +60,7 @@ export function about(screen) {
         ["σ Z", (one) => quantity(one.sigma_median_mm?.z_mm, "mm", 2), { numeric: true }],
         ["σ W", (one) => quantity(one.sigma_median_mm?.w_mm, "mm", 2), { numeric: true }],
         ["Strain noise floor", (one) => quantity(one.strain?.noise_floor_microstrain?.exx, "µm/m", 3), { numeric: true }],
+        ...(analysis.settings.dense_step_px ? [/** @type {const} */ (["Vectors of the dense field", denseText, { numeric: true }])] : []),
         ["Patch", (one) => h("span", { title: one.patch?.reason ?? "" }, one.patch?.patch ?? "–")],
         ["Time", (one) => quantity(one.wall_s, "s", 3), { numeric: true }],
       ], steps, { caption: `Summary of ${(analysis.n_finished ?? 0) > steps.length ? `the first ${steps.length} steps of ${count(analysis.n_finished)}` : "each step"}; σ are medians of the reported standard uncertainties (k = 1)${steps.some((one) => !one.sigma_calibration_median_mm) ? `, ${NOT_INCLUDED}` : ""}`, empty: "No step is finished yet." }),
