@@ -94,7 +94,9 @@ def test_colours_are_the_values_through_the_map_at_any_zoom(page: Watched, bench
     assert np.abs(np.array(pixel(at, round(x[5, 6] + 5), round(y[5, 6] + 5))[:3]) - viridis(share)).max() < 18
     assert pixel(at, 20, 20)[3] == 0  # outside the region
     # on the screen, the colour lies where the pixel is, at two zooms
+    expect(at.locator('[data-role="opacity"]')).to_have_text("75\u00a0%")
     at.get_by_label("Opacity", exact=True).fill("100")
+    expect(at.locator('[data-role="opacity"]')).to_have_text("100\u00a0%")
     for scale in ("fit", "in"):
         if scale == "in":
             frame = at.locator(".view .frame").first
@@ -548,6 +550,10 @@ def test_settings_checks_and_files(page: Watched, bench: Bench) -> None:
     about = at.locator('[data-role="about"]')
     expect(about.get_by_text("rectangle 60, 60, 180, 170")).to_be_visible()
     expect(about.locator("tbody tr")).to_have_count(3)
+    # lengths below 0.1 mm in micrometres here too
+    of_step = bench.client.get(bench.path()).json()["summary"]["steps"][2]
+    expect(about.locator("tbody tr").nth(2)).to_contain_text(f"{of_step['sigma_median_mm']['w_mm'] * 1e3:.2g}\u00a0µm")
+    expect(about).not_to_contain_text("e−5")
     at.get_by_text("Export and report").click()
     # what is saved is in the axes that are shown, unless others are asked for
     with at.expect_download() as saved:
@@ -862,6 +868,10 @@ def test_a_phone_shows_the_step_and_a_low_bar(chromium: Browser, bench: Bench) -
         assert bar["height"] < 844 / 8
         assert step["x"] + step["width"] <= 390
         expect(at.get_by_role("button", name="STOP")).to_be_in_viewport()
+        # what a narrow table breaks into two lines begins where its column does
+        page.open("#/results")
+        name = at.get_by_role("row", name="plate <b>&").locator("button, a").first
+        assert name.evaluate("node => getComputedStyle(node).textAlign") in ("left", "start")
         page.sound()
 
 

@@ -6,6 +6,7 @@ import itertools
 import json
 import re
 from collections.abc import Iterator
+from datetime import datetime
 from pathlib import Path
 
 import cv2
@@ -225,6 +226,52 @@ def test_pairs_are_imported_in_the_order_of_their_names(page: Watched, client: h
     shown.get_by_role("button", name="Measure", exact=True).click()
     expect(shown.get_by_role("alert").filter(has_text="calibration")).to_be_visible()
     page.sound(409, 422)
+
+
+def test_a_load_frames_record_gives_the_steps_their_channels_by_time(
+    page: Watched, client: httpx.Client, tmp_path: Path
+) -> None:
+    test_id = new_test(client, name="with a record")
+    taken = [
+        datetime.fromisoformat(
+            client.post(f"{API}/tests/{test_id}/steps", json={"label": f"s{n}"}).json()["captured_utc"]
+        )
+        for n in (0, 1)
+    ]
+    later = (taken[1] - taken[0]).total_seconds()
+    # the record's force is 2 kN a second of its own clock; step 0 was taken at its 5 s
+    rows = [f"{t:.3f},{2 * t:.4f}" for t in np.arange(0.0, 5.0 + later + 2.0, 0.1)]
+    record = tmp_path / "machine.csv"
+    record.write_text("\n".join(["Time (s),Force (kN)", *rows]), encoding="utf-8")
+    shown = page.open(f"#/test/{test_id}")
+    panel = shown.locator('[data-role="import-record"]')
+    panel.locator("summary").click()
+    send = panel.get_by_role("button", name="Import the record")
+    send.click()
+    beside = panel.locator(".field", has=shown.get_by_label("File of the record")).get_by_role("alert")
+    expect(beside).to_have_text("Choose the record's file.")
+    panel.get_by_label("File of the record").set_input_files(record)
+    panel.get_by_label("At step").fill("7")
+    panel.get_by_label("Time of the record").fill("5")
+    send.click()
+    expect(panel.get_by_role("alert")).to_have_text("The test has no step 7.")
+    panel.get_by_label("At step").fill("0")
+    panel.get_by_label("Channel of the load").fill("force_kn")
+    shown.locator('[data-step="1"] button').click()
+    send.click()
+    said = panel.locator('[data-role="record"]')
+    expect(said).to_contain_text("2 of 2 steps have values of force_kn (kN) now")
+    step = client.get(f"{API}/tests/{test_id}/steps/1").json()
+    assert step["channels"]["force_kn"] == pytest.approx(2 * (5.0 + later), abs=1e-3)
+    assert step["load_n"] == pytest.approx(2e3 * (5.0 + later), abs=1.0)
+    # what is shown of a step has them at once
+    expect(shown.locator('[data-role="quality"]')).to_contain_text("force_kn")
+    # the same record with another clock is refused in words, and nothing changes
+    panel.get_by_label("Time of the record").fill("6")
+    send.click()
+    expect(said.locator(".problem")).to_contain_text("force_kn")
+    assert client.get(f"{API}/tests/{test_id}/steps/1").json()["channels"] == step["channels"]
+    page.sound_beside_captures(422)
 
 
 @pytest.mark.parametrize("presses", [0, 4])
