@@ -734,6 +734,17 @@ def test_a_plot_is_saved_as_numbers_and_as_pictures_and_starts_at_the_reference(
     page.sound()
 
 
+def bars(at: Page) -> list[tuple[float, bool]]:
+    """Return the bar's height, and whether all lies within the window, at three widths."""
+    found = []
+    for size in ((1440, 900), (1024, 768), (390, 844)):
+        at.set_viewport_size({"width": size[0], "height": size[1]})
+        fits = "document.documentElement.scrollWidth <= document.documentElement.clientWidth"
+        found.append((at.evaluate("document.getElementById('bar').offsetHeight"), at.evaluate(fits)))
+    assert all(fits for _, fits in found)
+    return found
+
+
 def test_a_running_analysis_is_followed_until_it_is_finished(page: Watched, bench: Bench) -> None:
     calibration = bench.client.get(f"{API}/tests/{bench.test_id}").json()["calibration_id"]
     test_id = bench.client.post(f"{API}/tests", json={"name": "followed", "calibration_id": calibration}).json()["id"]
@@ -771,12 +782,19 @@ def test_a_running_analysis_is_followed_until_it_is_finished(page: Watched, benc
     expect(at.locator('canvas[data-role="map"]')).to_have_attribute("data-shown", "0 z_mm reference")
     follow.check()
     drawn(at, "2 w_mm reference")
+    # a job at work moves nothing: the bar is as high as without one, and the buttons are on one line
+    expect(at.locator("#bar-job")).to_be_visible()
+    busy = bars(at)
+    at.reload()  # nothing is said of a job that waits: who comes later asks
+    expect(at.locator("#bar-job")).to_contain_text("analysis")
     # the test's screen says so, too, and either of them finishes it
     page.open(f"#/test/{test_id}")
     expect(at.locator('[data-role="measuring"]')).to_have_text("measuring: waiting for the next step")
     at.locator('[data-role="progress"]').get_by_role("button", name="Finish").click()
     expect(at.locator('[data-role="progress"] .badge')).to_have_text("succeeded")
     expect(at.locator('[data-role="measuring"]')).to_have_text("")
+    expect(at.locator("#bar-job")).to_be_hidden()
+    assert bars(at) == busy
     document = bench.client.get(f"{API}/tests/{test_id}/analyses/{made['analysis_id']}").json()
     assert document["steps_finished"] == [0, 1, 2]
     page.sound()
