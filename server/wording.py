@@ -139,6 +139,8 @@ def _sentence(error: ErrorDetails, candidates: Sequence[object], around: Sequenc
         return _SENTENCES[kind].format_map(_Plain(values))
     if kind.startswith(_TIMES):
         return f"must be a time as in 2026-03-01T12:00:00Z{values['got']}"
+    if kind == "value_error" and "Expected UploadFile" in str(error["msg"]):
+        return f"must be a file that is sent{values['got']}"  # of a form; a path or an address is only text
     if kind == "value_error":
         return str(error["msg"]).removeprefix("Value error, ")
     if must and kind.endswith(("_type", "_attributes_type", "_parsing")):

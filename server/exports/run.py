@@ -21,7 +21,7 @@ from server.exports.table import write_table
 from server.exports.vtu import NEEDS, write_pvd, write_vtu
 from server.formats.files import written_temporary
 from server.formats.images import read_mask
-from server.formats.results.folder import number_of
+from server.formats.results.folder import home_of, number_of
 from server.formats.results.netcdf import add_scalars
 from server.results.channels import has_more, rising
 from server.results.provenance import provenance
@@ -121,8 +121,8 @@ def _as_stored(source: Source, files: Sequence[Path], request: ExportRequest, ou
         copy = _path(out, source, number_of(path), "nc")
         with written_temporary(copy) as temporary:
             shutil.copyfile(path, temporary)
-            if has_more(path):
-                add_scalars(temporary, scalars_of(read_step(path, []).recorded))
+            if has_more(path, source.home or home_of(path)):
+                add_scalars(temporary, scalars_of(read_step(path, [], home=source.home).recorded))
         yield copy
 
 
@@ -132,14 +132,14 @@ def _as_vtu(source: Source, files: Sequence[Path], request: ExportRequest, out: 
     moves = any("u_mm" in names for names in there.values())
     asked = None if request.variables is None else [in_file(name, source.coverage) for name in request.variables]
     require_known(files, asked)
-    heads = [read_step(path, []) for path in files]
+    heads = [read_step(path, [], home=source.home) for path in files]
     times = rising(head.recorded.time_s for head in heads) or [float(head.n) for head in heads]
     written = []
     for path, time in zip(files, times, strict=True):
         names = asked
         if names is not None:
             names = [name for name in (*names, *NEEDS) if name in there[path]]
-        step = with_coverage(read_step(path, names), source)
+        step = with_coverage(read_step(path, names, home=source.home), source)
         target = _path(out, source, step.n, "vtu")
         write_vtu(target, step, source, mask=mask, at_rest=moves and "u_mm" not in there[path], time=time)
         written.append((time, target.name))
@@ -161,7 +161,7 @@ def _drawn(source: Source, files: Sequence[Path], request: ExportRequest, out: P
             path = out / f"{source.name}_{name}.{request.format}"
             drawn = frames(source, request.steps, name, request.style, image)
             if request.format == "gif":
-                first = read_step(files[0], [])
+                first = read_step(files[0], [], home=source.home)
                 comment = json.dumps(provenance(first, source), sort_keys=True)
                 write_gif(path, drawn, request.fps, comment, request.style, over_image=request.over_image)
             else:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from core.errors import InputError
 from server.formats.calibrations.in_test import calibration_id_in
-from server.formats.results.folder import first_results, results_in
+from server.formats.results.folder import first_results, home_of, results_in
 from server.formats.results.reading import read_head
 from server.results.staleness import stale_results
 from server.results.steps import Source, failed_steps
@@ -40,8 +40,11 @@ def find_source(folder: Path, analysis: str | None = None) -> Source:
 
 
 def source_of(folder: Path, files: list[Path]) -> Source:
-    """Return the source of an analysis' folder, or of a folder of ``stereorig measure``."""
+    """Return the source of an analysis' folder, or of a folder of ``stereorig measure``; or of its dense fields."""
     heads = [read_head(path) for path in files]
+    # dense fields lie in a folder of their own, and their copies in another frame elsewhere
+    dense = "_dense" if "dense" in heads[0].attributes else ""
+    folder = home_of(folder / files[0].name)
     stale, mask = stale_results(files, heads, folder), _mask(folder, heads[0].settings)
     about: dict[str, object] = {}
     failed = failed_steps(folder)
@@ -62,13 +65,20 @@ def source_of(folder: Path, files: list[Path]) -> Source:
         if folder.parent.name == "analyses":
             about["analysis_id"] = folder.name
             name = f"{test.name}_{folder.name}"
-        return Source(files, name, title, image, about, mask, stale)
+        return Source(files, name + dense, title, image, about, mask, stale, home=folder)
     image_file = heads[0].image_file("cam1")
     calibration = known_json(folder / "summary.json").get("calibration")
     if isinstance(calibration, dict) and calibration.get("file"):
         about["calibration_file"] = str(calibration["file"])
     return Source(
-        files, folder.name or "results", folder.name, Path(image_file) if image_file else None, about, mask, stale
+        files,
+        (folder.name or "results") + dense,
+        folder.name,
+        Path(image_file) if image_file else None,
+        about,
+        mask,
+        stale,
+        home=folder,
     )
 
 

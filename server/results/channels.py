@@ -32,19 +32,19 @@ class Recorded:
     time_s: float | None = None
 
 
-def recorded_with(result: Path, n: int, reference: int | None) -> Recorded:
-    """Return what was recorded with the step of a result file; nothing for a result of no test.
+def recorded_with(home: Path, n: int, reference: int | None) -> Recorded:
+    """Return what was recorded with a step; nothing for results of no test.
 
     Parameters
     ----------
-    result
-        ``<test>/analyses/<id>/step_<nnnn>.nc``, or one in ``<test>/exports/measure``.
+    home
+        Folder of the results, ``<test>/analyses/<id>`` or ``<test>/exports/measure``.
     n
         Number of the step.
     reference
         Of its reference; None: it is the reference.
     """
-    steps = result.absolute().parents[2] / "steps"
+    steps = home.absolute().parent.parent / "steps"
     one = known_json(steps / f"{n:04d}" / "step.json") if steps.is_dir() else {}
     if not one:
         return Recorded()
@@ -58,10 +58,10 @@ def recorded_with(result: Path, n: int, reference: int | None) -> Recorded:
     )
 
 
-def has_more(result: Path) -> bool:
+def has_more(result: Path, home: Path) -> bool:
     """Return True if a step's record has more than its result file: channels, or a load that came later."""
     head = read_head(result)
-    recorded = recorded_with(result, head.step, head.reference_step)
+    recorded = recorded_with(home, head.step, head.reference_step)
     return bool(recorded.channels) or (recorded.load_n is not None and recorded.load_n != head.load_n)
 
 

@@ -35,10 +35,10 @@ def provenance(step: StepResult, source: Source, *, path: Path | None = None) ->
         **({"stale_reasons": list(source.stale_reasons)} if source.stale_reasons else {}),
         **source.about,
     }
-    for name in ("strain", "smoothing", "patch_choice", "transformation"):
+    for name in ("strain", "smoothing", "patch_choice", "transformation", "dense"):
         if name in recorded:
             document[name] = _json(step, name)
-    for name in ("strain_axes", "strain_note", "patch", "patch_reason", "made_from"):
+    for name in ("strain_axes", "strain_note", "patch", "patch_reason", "made_from", "method", "neighbours"):
         if name in recorded:
             document[name] = recorded[name]
     document["step"] = step.n

@@ -18,7 +18,7 @@ from core.settings import Coverage, CoverageFields
 from core.status import PointStatus
 from server.base.errors import NotFoundError
 from server.formats.results.derived import derived_names
-from server.formats.results.folder import number_of
+from server.formats.results.folder import home_of, number_of
 from server.formats.results.netcdf import opened
 from server.formats.results.reading import causes_of
 from server.formats.results.settings import current_inputs, current_settings
@@ -109,6 +109,8 @@ class Source:
         Inputs that are gone or were replaced since they were measured.
     coverage
         Of the expanded uncertainties that stand beside the standard ones; one standard uncertainty: none do.
+    home
+        Folder of the results as they were measured, beside whose test's records they stand; None: each file's own.
     """
 
     files: Sequence[Path]
@@ -119,6 +121,7 @@ class Source:
     mask: Path | None = None
     stale_reasons: Sequence[str] = ()
     coverage: CoverageFields = field(default_factory=lambda: Coverage.model_validate({}))
+    home: Path | None = None
 
 
 def failed_steps(folder: Path) -> dict[str, dict[str, Any]]:
@@ -156,7 +159,9 @@ def chosen(source: Source, steps: Sequence[int] | None) -> list[Path]:
     return [files[n] for n in sorted(files if steps is None else set(steps))]
 
 
-def read_step(path: Path, names: Sequence[str] | None = None, *, always: Sequence[str] = ALWAYS) -> StepResult:
+def read_step(
+    path: Path, names: Sequence[str] | None = None, *, always: Sequence[str] = ALWAYS, home: Path | None = None
+) -> StepResult:
     """Read a result file, or some of its variables.
 
     Parameters
@@ -167,6 +172,8 @@ def read_step(path: Path, names: Sequence[str] | None = None, *, always: Sequenc
         Variables to read; those of ``always`` are read in any case. None: all over the grid of points.
     always
         Variables that the form needs: positions and status.
+    home
+        Folder of the results as they were measured, where the file is another than was; None: the file's own.
 
     Raises
     ------
@@ -176,10 +183,10 @@ def read_step(path: Path, names: Sequence[str] | None = None, *, always: Sequenc
         ``field_missing``, with the names that there are.
     """
     with opened(path) as data:
-        return _read(path, data, names, always)
+        return _read(path, data, names, always, home_of(path) if home is None else home)
 
 
-def _read(path: Path, data: Any, names: Sequence[str] | None, always: Sequence[str]) -> StepResult:
+def _read(path: Path, data: Any, names: Sequence[str] | None, always: Sequence[str], home: Path) -> StepResult:
     over_grid = [name for name, v in data.variables.items() if tuple(v.dimensions[:2]) == _GRID]
     lacking = [name for name in ALWAYS if name not in over_grid]
     if lacking:
@@ -210,7 +217,7 @@ def _read(path: Path, data: Any, names: Sequence[str] | None, always: Sequence[s
             name: replace(v, parts=causes.columns) for name, v in variables.items() if name.startswith(COMMON_FACTOR)
         }
     reference = attributes.get("reference_step")
-    recorded = recorded_with(path, n, None if reference is None else int(str(reference)))
+    recorded = recorded_with(home, n, None if reference is None else int(str(reference)))
     return StepResult(n, variables, attributes, cuts, Included.of(data), causes, recorded)
 
 
@@ -241,7 +248,7 @@ def each(source: Source, steps: Sequence[int] | None, names: Sequence[str] | Non
     for path in files:
         there = [] if names is None else variables_of(path, derived=True)
         wanted = None if names is None else [name for name in names if name in there]
-        yield with_coverage(read_step(path, wanted), source)
+        yield with_coverage(read_step(path, wanted, home=source.home), source)
 
 
 def with_coverage(step: StepResult, source: Source) -> StepResult:

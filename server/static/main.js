@@ -144,6 +144,7 @@ function showKeys() {
 }
 const keysButton = h("button.plain", { type: "button", onclick: showKeys, "aria-label": "Keys", title: "Keys" }, "⌨");
 
+const ACTIVE = ["queued", "running", "cancelling"];
 /** @type {Map<string, import("#routes").Model<"JobReply">>} */
 const active = new Map();
 function showJobs() {
@@ -156,15 +157,30 @@ function showJobs() {
   const { phase: stage, done, total } = job.progress ?? {};
   const share = total ? ` ${Math.floor((100 * done) / total)} %` : "";
   jobText.hidden = false;
-  replace(jobText, badge(`${job.kind}: ${stage ?? job.state}${share}${jobs.length > 1 ? ` (+${jobs.length - 1})` : ""}`, "busy"));
+  const text = `${job.kind}: ${stage ?? job.state}${share}${jobs.length > 1 ? ` (+${jobs.length - 1})` : ""}`;
+  jobText.title = text; // its end is cut off where there is little room
+  replace(jobText, badge(text, "busy"));
 }
 
+/** @type {Set<string>} */
+let toldSince = new Set(); // jobs of which an event came after the list was asked for: it is the newer word
 events.on("job", (job) => {
-  if (["queued", "running", "cancelling"].includes(job.state)) active.set(job.id, job);
+  toldSince.add(job.id);
+  if (ACTIVE.includes(job.state)) active.set(job.id, job);
   else active.delete(job.id);
   showJobs();
 });
-events.on("open", () => { lost.hidden = true; });
+// one that waits sends no event, and one may have ended while the service did not answer
+events.on("open", async () => {
+  lost.hidden = true;
+  const told = new Set();
+  toldSince = told;
+  const { jobs } = await api.get("/jobs").catch(() => ({ jobs: null }));
+  if (!jobs || told !== toldSince) return;
+  for (const id of active.keys()) if (!told.has(id)) active.delete(id);
+  for (const job of jobs) if (ACTIVE.includes(job.state) && !told.has(job.id)) active.set(job.id, job);
+  showJobs();
+});
 
 async function showStage() {
   if (document.hidden) return;

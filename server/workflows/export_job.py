@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from server.exports.request import ExportRequest
-from server.formats.results.folder import home_of, number_of
+from server.formats.results.folder import home_of
 from server.jobs.job import Job, Phase
-from server.workflows.analysis.framed import result_in, variable_of_frame
+from server.workflows.analysis.framed import file_in, variable_of_frame
 from server.workflows.service import Service
 from server.workflows.waiting import result_of
 
@@ -52,7 +52,7 @@ def _in_frame(
     for k, file in enumerate(files):
         job.check()
         job.progress("reading", k, len(files))
-        there = result_in(service, test_id, analysis_id, number_of(file), frame, name)
+        there = file_in(service, test_id, analysis_id, file, frame, name)
         try:  # the kept ones may go while the export reads
             os.link(there, folder / file.name)
             framed.append(folder / file.name)

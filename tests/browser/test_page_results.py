@@ -94,7 +94,9 @@ def test_colours_are_the_values_through_the_map_at_any_zoom(page: Watched, bench
     assert np.abs(np.array(pixel(at, round(x[5, 6] + 5), round(y[5, 6] + 5))[:3]) - viridis(share)).max() < 18
     assert pixel(at, 20, 20)[3] == 0  # outside the region
     # on the screen, the colour lies where the pixel is, at two zooms
+    expect(at.locator('[data-role="opacity"]')).to_have_text("75\u00a0%")
     at.get_by_label("Opacity", exact=True).fill("100")
+    expect(at.locator('[data-role="opacity"]')).to_have_text("100\u00a0%")
     for scale in ("fit", "in"):
         if scale == "in":
             frame = at.locator(".view .frame").first
@@ -548,6 +550,10 @@ def test_settings_checks_and_files(page: Watched, bench: Bench) -> None:
     about = at.locator('[data-role="about"]')
     expect(about.get_by_text("rectangle 60, 60, 180, 170")).to_be_visible()
     expect(about.locator("tbody tr")).to_have_count(3)
+    # lengths below 0.1 mm in micrometres here too
+    of_step = bench.client.get(bench.path()).json()["summary"]["steps"][2]
+    expect(about.locator("tbody tr").nth(2)).to_contain_text(f"{of_step['sigma_median_mm']['w_mm'] * 1e3:.2g}\u00a0µm")
+    expect(about).not_to_contain_text("e−5")
     at.get_by_text("Export and report").click()
     # what is saved is in the axes that are shown, unless others are asked for
     with at.expect_download() as saved:
@@ -728,6 +734,17 @@ def test_a_plot_is_saved_as_numbers_and_as_pictures_and_starts_at_the_reference(
     page.sound()
 
 
+def bars(at: Page) -> list[tuple[float, bool]]:
+    """Return the bar's height, and whether all lies within the window, at three widths."""
+    found = []
+    for size in ((1440, 900), (1024, 768), (390, 844)):
+        at.set_viewport_size({"width": size[0], "height": size[1]})
+        fits = "document.documentElement.scrollWidth <= document.documentElement.clientWidth"
+        found.append((at.evaluate("document.getElementById('bar').offsetHeight"), at.evaluate(fits)))
+    assert all(fits for _, fits in found)
+    return found
+
+
 def test_a_running_analysis_is_followed_until_it_is_finished(page: Watched, bench: Bench) -> None:
     calibration = bench.client.get(f"{API}/tests/{bench.test_id}").json()["calibration_id"]
     test_id = bench.client.post(f"{API}/tests", json={"name": "followed", "calibration_id": calibration}).json()["id"]
@@ -765,12 +782,19 @@ def test_a_running_analysis_is_followed_until_it_is_finished(page: Watched, benc
     expect(at.locator('canvas[data-role="map"]')).to_have_attribute("data-shown", "0 z_mm reference")
     follow.check()
     drawn(at, "2 w_mm reference")
+    # a job at work moves nothing: the bar is as high as without one, and the buttons are on one line
+    expect(at.locator("#bar-job")).to_be_visible()
+    busy = bars(at)
+    at.reload()  # nothing is said of a job that waits: who comes later asks
+    expect(at.locator("#bar-job")).to_contain_text("analysis")
     # the test's screen says so, too, and either of them finishes it
     page.open(f"#/test/{test_id}")
     expect(at.locator('[data-role="measuring"]')).to_have_text("measuring: waiting for the next step")
     at.locator('[data-role="progress"]').get_by_role("button", name="Finish").click()
     expect(at.locator('[data-role="progress"] .badge')).to_have_text("succeeded")
     expect(at.locator('[data-role="measuring"]')).to_have_text("")
+    expect(at.locator("#bar-job")).to_be_hidden()
+    assert bars(at) == busy
     document = bench.client.get(f"{API}/tests/{test_id}/analyses/{made['analysis_id']}").json()
     assert document["steps_finished"] == [0, 1, 2]
     page.sound()
@@ -862,6 +886,10 @@ def test_a_phone_shows_the_step_and_a_low_bar(chromium: Browser, bench: Bench) -
         assert bar["height"] < 844 / 8
         assert step["x"] + step["width"] <= 390
         expect(at.get_by_role("button", name="STOP")).to_be_in_viewport()
+        # what a narrow table breaks into two lines begins where its column does
+        page.open("#/results")
+        name = at.get_by_role("row", name="plate <b>&").locator("button, a").first
+        assert name.evaluate("node => getComputedStyle(node).textAlign") in ("left", "start")
         page.sound()
 
 

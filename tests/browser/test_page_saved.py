@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import re
 from pathlib import Path
@@ -14,12 +15,14 @@ from playwright.sync_api import Locator, Page, expect
 from tests.support import results_page
 from tests.support.page_bench import Watched
 from tests.support.results_page import API, Bench, shown
+from tests.support.service_rig import wait_for_job
 
 bench, page = results_page.bench, results_page.page  # fixtures
 
 pytestmark = pytest.mark.timeout(600)
 expect.set_options(timeout=30_000)  # the machine may be busy
 
+LIMITS = re.compile(r"from ([\d.-]+) to ([\d.-]+) mm")
 EDGE = 12  # px, white about the picture's frame
 TOP = {False: 40, True: 62}  # px, where the frame begins; with a name above it
 
@@ -28,6 +31,15 @@ def saved(at: Page, press: Locator) -> Path:
     with at.expect_download() as file:
         press.click()
     return Path(file.value.path())
+
+
+def drawn_in(at: Page, picture: Locator) -> np.ndarray:
+    """Return the pixels of a picture on the page, in its own size."""
+    read = """image => { const copy = document.createElement('canvas');
+        [copy.width, copy.height] = [image.naturalWidth, image.naturalHeight];
+        copy.getContext('2d').drawImage(image, 0, 0);
+        return copy.toDataURL('image/png').split(',')[1] }"""
+    return pixels(base64.b64decode(at.evaluate(read, picture.element_handle())))
 
 
 def pixels(data: bytes | Path) -> np.ndarray:
@@ -174,3 +186,48 @@ def test_a_calibrations_plots_are_saved_as_numbers_and_pictures(page: Watched, b
     drawing = saved(at, group.get_by_role("button", name="Save as SVG")).read_text()
     assert len(re.findall("fill-opacity", drawing)) == matrix.size
     page.sound()
+
+
+def test_a_dense_field_is_seen_and_saved_where_one_was_measured(page: Watched, bench: Bench) -> None:
+    at = shown(page, bench)
+    at.get_by_text("Export and report").click()
+    expect(at.get_by_label("the dense field")).to_have_count(0)  # none was asked for
+    path = f"{API}/tests/{bench.test_id}/analyses"
+    asked = {"region": {"rectangle": [70, 70, 150, 150]}, "subset_px": 25, "spacing_px": 10, "dense_step_px": 4}
+    made = bench.client.post(path, json={**asked, "steps": [0, 2]}).json()
+    assert wait_for_job(bench.client, made["job"])["state"] == "succeeded"
+    analysis_id = made["analysis_id"]
+    at = shown(page, bench, analysis_id=analysis_id)
+    at.get_by_text("Settings, checks and warnings").click()
+    (figures,) = [one for one in bench.client.get(f"{path}/{analysis_id}").json()["summary"]["steps"] if one["n"] == 2]
+    assert figures["dense"]["valid"] > 200
+    row = at.locator('[data-role="about"] tbody tr').nth(1)
+    expect(row).to_contain_text(f"{figures['dense']['valid']} of {figures['dense']['vectors']}")
+    at.get_by_text("Export and report").click()
+    at.get_by_label("the dense field").check()
+    expect(at.locator('[data-role="seen"]')).to_contain_text("its dense field, a vector every 4 px")
+    picture = at.locator('[data-role="dense-map"] img')
+    at.wait_for_function("image => image.naturalWidth === 900", arg=picture.element_handle())
+    # the service's own map between the same limits; the ordinary field's is another one
+    seen = drawn_in(at, picture)
+    low, high = (
+        float(text)
+        for text in LIMITS.findall(at.locator('[data-role="seen"]').inner_text().replace("\N{MINUS SIGN}", "-"))[0]
+    )
+    options = {"format": "png", "step": 2, "variables": "w_mm", "frame": "specimen", "over_image": "true"}
+    options |= {"limits": f"{low},{high}", "opacity": "0.75"}
+    dense, ordinary = (
+        pixels(bench.client.get(f"{path}/{analysis_id}/export", params={**options, "dense": which}).content)
+        for which in ("true", "false")
+    )
+    assert np.abs(seen - dense).mean() < 0.1 * np.abs(seen - ordinary).mean()
+    # the numbers
+    at.get_by_label("Points", exact=True).select_option("dense")
+    at.get_by_label("Form", exact=True).select_option("csv")
+    table = saved(at, at.get_by_role("button", name="Save the file")).read_text()
+    assert "# method: dense, shared windows" in table
+    assert len([line for line in table.splitlines() if not line.startswith("#")]) == 1 + figures["dense"]["vectors"]
+    # strain is the ordinary field's alone: said where the map would be
+    at.get_by_label("Field", exact=True).select_option("exx")
+    expect(at.locator('[data-role="dense-map"] .problem')).to_contain_text("exx")
+    page.sound(404)

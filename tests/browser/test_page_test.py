@@ -6,6 +6,7 @@ import itertools
 import json
 import re
 from collections.abc import Iterator
+from datetime import datetime
 from pathlib import Path
 
 import cv2
@@ -16,7 +17,7 @@ from playwright.sync_api import Locator, expect
 
 from core.cameras.camera import Camera
 from core.cameras.stereo import StereoPair
-from core.settings import SMOOTHING_WINDOW, SPACING_PX, STRAIN_WINDOW, SUBSET_PX
+from core.settings import DENSE_STEP_PX, SMOOTHING_WINDOW, SPACING_PX, STRAIN_WINDOW, SUBSET_PX
 from server.config.rig_file import parse_config
 from server.workflows.service import Service
 from tests.support.page_bench import Watched
@@ -227,6 +228,52 @@ def test_pairs_are_imported_in_the_order_of_their_names(page: Watched, client: h
     page.sound(409, 422)
 
 
+def test_a_load_frames_record_gives_the_steps_their_channels_by_time(
+    page: Watched, client: httpx.Client, tmp_path: Path
+) -> None:
+    test_id = new_test(client, name="with a record")
+    taken = [
+        datetime.fromisoformat(
+            client.post(f"{API}/tests/{test_id}/steps", json={"label": f"s{n}"}).json()["captured_utc"]
+        )
+        for n in (0, 1)
+    ]
+    later = (taken[1] - taken[0]).total_seconds()
+    # the record's force is 2 kN a second of its own clock; step 0 was taken at its 5 s
+    rows = [f"{t:.3f},{2 * t:.4f}" for t in np.arange(0.0, 5.0 + later + 2.0, 0.1)]
+    record = tmp_path / "machine.csv"
+    record.write_text("\n".join(["Time (s),Force (kN)", *rows]), encoding="utf-8")
+    shown = page.open(f"#/test/{test_id}")
+    panel = shown.locator('[data-role="import-record"]')
+    panel.locator("summary").click()
+    send = panel.get_by_role("button", name="Import the record")
+    send.click()
+    beside = panel.locator(".field", has=shown.get_by_label("File of the record")).get_by_role("alert")
+    expect(beside).to_have_text("Choose the record's file.")
+    panel.get_by_label("File of the record").set_input_files(record)
+    panel.get_by_label("At step").fill("7")
+    panel.get_by_label("Time of the record").fill("5")
+    send.click()
+    expect(panel.get_by_role("alert")).to_have_text("The test has no step 7.")
+    panel.get_by_label("At step").fill("0")
+    panel.get_by_label("Channel of the load").fill("force_kn")
+    shown.locator('[data-step="1"] button').click()
+    send.click()
+    said = panel.locator('[data-role="record"]')
+    expect(said).to_contain_text("2 of 2 steps have values of force_kn (kN) now")
+    step = client.get(f"{API}/tests/{test_id}/steps/1").json()
+    assert step["channels"]["force_kn"] == pytest.approx(2 * (5.0 + later), abs=1e-3)
+    assert step["load_n"] == pytest.approx(2e3 * (5.0 + later), abs=1.0)
+    # what is shown of a step has them at once
+    expect(shown.locator('[data-role="quality"]')).to_contain_text("force_kn")
+    # the same record with another clock is refused in words, and nothing changes
+    panel.get_by_label("Time of the record").fill("6")
+    send.click()
+    expect(said.locator(".problem")).to_contain_text("force_kn")
+    assert client.get(f"{API}/tests/{test_id}/steps/1").json()["channels"] == step["channels"]
+    page.sound_beside_captures(422)
+
+
 @pytest.mark.parametrize("presses", [0, 4])
 def test_the_region_that_is_posted_is_the_one_drawn(page: Watched, plate: str, presses: int) -> None:
     shown = page.open(f"#/test/{plate}")
@@ -265,12 +312,13 @@ def test_the_region_that_is_posted_is_the_one_drawn(page: Watched, plate: str, p
             shown.wait_for_timeout(350)
         editor.key("Enter")
     shown.get_by_label("Subset", exact=True).fill("15")
+    shown.get_by_label("Dense field, a vector every", exact=True).fill("3")
     shown.get_by_role("textbox", name="Steps", exact=True).fill("0")
     sent = asked(shown, "/analyses", lambda: shown.get_by_role("button", name="Measure", exact=True).click())
     assert np.abs(np.array(sent["region"]["holes"][0]) - hole).max() <= 1.0
     assert np.abs(np.array(sent["region"]["cracks"][0]) - crack).max() <= 1.0
     assert "rectangle" not in sent["region"]
-    assert sent["subset_px"] == 15
+    assert (sent["subset_px"], sent["dense_step_px"]) == (15, 3)
     progress = shown.locator('[data-role="progress"]')
     cancel: Locator = progress.get_by_role("button", name="Cancel")
     cancel.or_(progress.locator(".badge")).first.wait_for(timeout=SLOW)
@@ -343,6 +391,7 @@ def test_each_field_of_a_measurement_says_its_error_beside_itself_and_nothing_is
         ("Spacing", SPACING_PX),
         ("Window", STRAIN_WINDOW),
         ("Smoothing window", SMOOTHING_WINDOW),
+        ("Dense field, a vector every", DENSE_STEP_PX),
     ):
         control = measure.get_by_label(label, exact=True)
         kept = [control.get_attribute(name) for name in ("min", "max", "step")]
@@ -352,6 +401,7 @@ def test_each_field_of_a_measurement_says_its_error_beside_itself_and_nothing_is
         ("Spacing", "0", "Give 1 to 1000\u00a0px, not 0\u00a0px."),
         ("Window", "", "A window is needed here."),
         ("Smoothing window", "2", "Give 3 to 51\u00a0points, not 2\u00a0points."),
+        ("Dense field, a vector every", "30", "Give 1 to 20\u00a0px, not 30\u00a0px."),
         ("Prefilter, sd", "9", "Give a quarter of the subset at most, 8\u00a0px, not 9\u00a0px."),
         ("Largest sigma of a match", "2", "Give 0.001 to 1\u00a0px, not 2\u00a0px."),
         ("Steps", "0-7", "There is no step 2: the test has steps 0 to 1."),
@@ -373,11 +423,16 @@ def test_each_field_of_a_measurement_says_its_error_beside_itself_and_nothing_is
     expect(beside("Prefilter, sd")).to_have_count(0)  # 9 px is a quarter of it
     for label, text in (
         ("Spacing", "10"),
+        ("Dense field, a vector every", "12"),
         ("Smoothing window", ""),
         ("Largest sigma of a match", "0.1"),
         ("Steps", ""),
     ):
         measure.get_by_label(label, exact=True).fill(text)
+    # no denser than the ordinary field: that hangs on the spacing
+    denser = "Give the spacing at most, 10\u00a0px, not 12\u00a0px: it would be no denser."
+    expect(beside("Dense field, a vector every")).to_have_text(denser)
+    measure.get_by_label("Spacing", exact=True).fill("12")
     expect(measure.get_by_role("alert")).to_have_count(0)
     # a region that is missing is said where it is drawn; what stands beside no field is left behind with its screen
     Editor(shown).key("Control+z")  # the region goes

@@ -12,12 +12,15 @@ from pathlib import Path
 
 import h5py
 import httpx
+import netCDF4
 import numpy as np
 import pandas as pd
 import pytest
 import scipy.io
 import xarray
 
+from core.field.points.dense_record import METHOD
+from server.cli.main import main
 from server.exports.request import ExportRequest
 from server.exports.run import export
 from server.exports.source import find_source
@@ -31,6 +34,7 @@ from tests.support.service_rig import new_test
 
 API = "/api/v1"
 STEPS = 3
+DENSE = '{"step_px": 3, "window_px": 21, "spacing_px": 7.0, "variance_ratio": 4.0}'
 TIMES = [f"2026-03-01T12:00:{second:02d}.000000Z" for second in (0, 10, 40)]
 CHANNELS = [{"force_kn": 0.0, 'odd "name" °C/$': 20.0}, {"force_kn": 1.5}, {"force_kn": 3.0, 'odd "name" °C/$': 21.5}]
 
@@ -113,6 +117,33 @@ def test_gauges_have_them_beside_each_reading(test_folder: Path) -> None:
     assert table.loc[table["step"] == 1, 'odd "name" °C/$'].isna().all()
     held = scipy.io.loadmat(io.BytesIO(gauges_mat(readings)), simplify_cells=True)["gauges"]
     assert set(held["force_kn"]) == {0.0, 1.5, 3.0}
+
+
+@pytest.mark.parametrize("dense", [False, True])
+def test_an_export_in_the_specimens_axes_and_one_of_dense_fields_have_them_too(
+    test_folder: Path, tmp_path: Path, dense: bool
+) -> None:
+    folder = test_folder / "analyses" / "a000001-000001"
+    if dense:
+        shutil.copytree(folder, folder / "dense")
+        for path in (folder / "dense").glob("*.nc"):
+            with netCDF4.Dataset(path, "a") as file:
+                file.setncatts({"method": METHOD, "dense": DENSE, "neighbours": "by shared pixels"})
+    for form, asked in (("csv", ["--frame", "specimen"]), ("h5", ["--frame", "specimen"]), ("nc", [])):
+        out = tmp_path / form
+        found = str(folder / "dense" if dense else folder)
+        assert main(["export", found, "--format", form, "--out", str(out), *asked]) == 0
+    (table,) = (tmp_path / "csv").glob("*step_0001*")
+    text = table.read_text(encoding="utf-8")
+    assert '# channels: {"force_kn": 1.5}' in text
+    # a dense field says that it is one, by its name too
+    assert (f"# method: {METHOD}" in text, "a000001-000001_dense_step" in table.name) == (dense, dense)
+    with h5py.File(next((tmp_path / "h5").glob("*.h5"))) as data:
+        np.testing.assert_array_equal(data["channel_force_kn"][...], [0.0, 1.5, 3.0])
+        np.testing.assert_array_equal(data["time_s"][...], [0.0, 10.0, 40.0])
+    (stored,) = (tmp_path / "nc").glob("*step_0002*")
+    with xarray.open_dataset(stored, engine="netcdf4") as one:
+        assert float(one["channel_force_kn"]) == 3.0
 
 
 def test_results_of_no_test_have_none(test_folder: Path, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import h5py
 import httpx
+import netCDF4
 import numpy as np
 import pytest
 import scipy.io
@@ -230,3 +231,34 @@ def test_a_film_as_a_job_has_progress_and_a_file_and_can_be_cancelled(client: ht
     assert client.get(f"/api/v1/jobs/{other['id']}/file").status_code == 404
     refused = client.post(f"{url}s", params={"format": "csv", "step": 9})
     assert (refused.status_code, refused.json()["code"]) == (404, "not_found")
+
+
+@pytest.mark.parametrize("frame", ["system", "plane"])
+def test_dense_fields_come_by_a_job_as_at_once_in_the_axes_of_the_ordinary_field(
+    client: httpx.Client, service: Service, frame: str
+) -> None:
+    test = service.tests.create({"name": "Dense job", "specimen": "", "notes": ""}, None)
+    document = {"kind": "displacement", "steps": [0, 1], "settings": {}, "inputs": {"steps": {"0": {}}}}
+    analysis = service.tests.create_analysis(test.id, document)
+    folder = service.tests.analysis_path(test.id, analysis.id)
+    write_results(folder, 2, reference_step="0")
+    shutil.copytree(folder, folder / "dense")
+    for path in (folder / "dense").glob("step_*.nc"):
+        with netCDF4.Dataset(path, "a") as file:
+            file["z_mm"][...] += 0.5
+    url = f"/api/v1/tests/{test.id}/analyses/{analysis.id}/export"
+    asked = {"format": "h5", "frame": frame if frame == "system" else '{"kind": "plane"}'}
+
+    def z_mm(data: bytes) -> Any:
+        with h5py.File(io.BytesIO(data)) as file:
+            return file["z_mm"][...]
+
+    at_once = z_mm(client.get(url, params={**asked, "dense": "true"}).content)
+    job = client.post(f"{url}s", params={**asked, "dense": "true"}).json()["job"]
+    ended = client.get(f"/api/v1/jobs/{job['id']}", params={"wait": 30}).json()
+    assert ended["state"] == "succeeded", ended
+    by_job = z_mm(client.get(f"/api/v1/jobs/{job['id']}/file").content)
+    np.testing.assert_array_equal(by_job, at_once)
+    # the dense field lies 0.5 mm beyond the ordinary one, whose shape the axes are laid through
+    ordinary = z_mm(client.get(url, params=asked).content)
+    assert np.nanmedian(np.abs(by_job - ordinary)) == pytest.approx(0.5, abs=0.02)

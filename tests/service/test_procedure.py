@@ -182,17 +182,33 @@ def test_the_same_key_takes_one_step(bench: tuple[Path, httpx.Client]) -> None:
     assert client.get(path).json()["next"] == 1
 
 
-def test_the_command_asks_for_what_is_done_by_hand(
+def test_the_command_refuses_before_the_first_step_what_it_could_not_measure(
+    bench: tuple[Path, httpx.Client], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, client = bench
+    test_id = new_test(client)
+    plan = tmp_path / "plan.json"
+    plan.write_text(json.dumps(PLAN))
+    assert main(["certify", "--run", str(plan), "--test", test_id, "--url", str(client.base_url)]) == 1
+    assert "not_calibrated" in capsys.readouterr().err
+    assert client.get(f"{API}/tests/{test_id}/steps").json()["steps"] == []
+
+
+def test_the_command_asks_for_what_is_done_by_hand_and_goes_on_to_the_certificate(
     bench: tuple[Path, httpx.Client],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     _, client = bench
-    test_id = new_test(client)
-    plan = tmp_path / "plan.json"
+    test_id = calibrated_test(client)
+    plan, recipe, out = tmp_path / "plan.json", tmp_path / "recipe.json", tmp_path / "out"
     plan.write_text(json.dumps(PLAN))
+    settings = {"subset_px": 21, "spacing_px": 14, "strain": {"window": 3}}
+    region = {"rectangle": [70, 70, 180, 170]}
+    recipe.write_text(json.dumps({"format": "stereorig recipe", "version": 1, "region": region, "settings": settings}))
     command = ["certify", "--run", str(plan), "--test", test_id, "--url", str(client.base_url)]
+    command += ["--recipe", str(recipe), "--out", str(out), "--json", "--frames", "4"]
     asked: list[str] = []
 
     def nobody(_prompt: str) -> str:
@@ -204,11 +220,55 @@ def test_the_command_asks_for_what_is_done_by_hand(
     monkeypatch.setattr("builtins.input", nobody)
     assert main(command) == 1
     printed = capsys.readouterr()
-    assert "procedure_by_hand" in printed.out + printed.err
-    assert "step 4 of 6" in printed.out
-    monkeypatch.setattr("builtins.input", lambda _: "")
-    assert main(command) == 0  # what is taken stays taken
+    assert "procedure_by_hand" in printed.err
+    assert "step 4 of 6" in printed.err
+    by_hand = iter([scene(), scene(way=(0.0, 0.2, 0.0)), scene(turn=float(np.radians(1.0)))])
+
+    def somebody(_prompt: str) -> str:
+        client.put(f"{API}/sim/scene", json=next(by_hand)).raise_for_status()
+        return ""
+
+    monkeypatch.setattr("builtins.input", somebody)
+    status = main(command)  # what is taken stays taken
     printed = capsys.readouterr()
-    assert "step 3 of 6" not in printed.out
-    assert "step 6 of 6: Turn the body by 1 degrees." in printed.out
-    assert "All 7 steps are taken." in printed.out
+    client.put(f"{API}/sim/scene", json=scene()).raise_for_status()
+    assert "step 3 of 6" not in printed.err
+    assert "step 6 of 6: Turn the body by 1 degrees." in printed.err
+    # measured as the recipe says, and judged: the service's certificate, the files and the exit status say the same
+    kept = client.get(f"{API}/certificates").json()["certificates"][-1]
+    assert kept["test_id"] == test_id
+    analysis = client.get(f"{API}/tests/{test_id}/analyses/{kept['analysis_id']}").json()
+    assert (analysis["settings"]["subset_px"], analysis["steps"]) == (21, [*range(7)])
+    document = json.loads(printed.out)
+    assert document["id"] == kept["id"]
+    assert json.loads((out / "certificate.json").read_text()) == document
+    assert (out / "certificate.html").read_bytes() == client.get(f"{API}/certificates/{kept['id']}/report").content
+    assert status == {"pass": 0, "conditional": 4, "fail": 5}[kept["outcome"]]
+    ways = {one["n"]: one for one in document["comparisons"] if one["group"] == "displacement"}
+    assert ways[3]["known"] == pytest.approx(WAY_MM)
+    # the certificate of what the body went, by hand, as the rig's truth has it
+    assert ways[5]["measured"] == pytest.approx(0.2, abs=3e-3)
+
+
+def test_without_a_recipe_the_specimen_is_found_and_a_target_shown_is_not_measured(
+    bench: tuple[Path, httpx.Client],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    _, client = bench
+    test_id = calibrated_test(client)
+    target = {"kind": "checkerboard", "pitch_mm": 4.0, "size": [9, 6]}
+    asked = {"static_steps": [1], "lengths": [{"name": "board", "n": 2, "target": target}]}
+    plan = tmp_path / "plan.json"
+    plan.write_text(json.dumps(asked))
+    monkeypatch.setattr("builtins.input", lambda _: "")
+    # no board is shown, so there is no certificate; the body was measured all the same, by the region that was found
+    assert main(["certify", "--run", str(plan), "--test", test_id, "--url", str(client.base_url)]) != 0
+    printed = capsys.readouterr()
+    assert "region: " in printed.err
+    analyses = client.get(f"{API}/tests/{test_id}").json()["analyses"]
+    assert len(analyses) == 1
+    analysis = client.get(f"{API}/tests/{test_id}/analyses/{analyses[0]['id']}").json()
+    assert analysis["steps"] == [0, 1]
+    assert analysis["settings"]["strain"] is not None

@@ -15,7 +15,7 @@ from server.formats.calibrations.recognise import load_calibration
 from server.formats.images import encode_tiff
 from server.formats.results.reading import read_head
 from server.workflows.service import Service
-from tests.support.service_rig import served, tiny_config, wait_for_job
+from tests.support.service_rig import new_test, served, tiny_config, wait_for_job
 
 API = "/api/v1"
 OURS = {
@@ -157,3 +157,11 @@ def test_images_of_another_size_than_the_calibrations_are_refused_when_they_come
         refused(client.post(f"{API}/tests/{test_id}/steps:import", files=files), 422, "image_size_mismatch")
     refused(client.post(f"{API}/tests/{test_id}/steps", json={}), 422, "image_size_mismatch")
     assert client.get(f"{API}/tests/{test_id}").json()["steps"] == []
+
+
+def test_an_address_in_place_of_a_file_is_refused_in_words_of_who_sent_it(client: httpx.Client) -> None:
+    form = {"cam1": "s3://bucket/left_0000.tif", "cam2": "s3://bucket/right_0000.tif"}
+    answer = client.post(f"{API}/tests/{new_test(client)}/steps:import", data=form)
+    assert answer.status_code == 422
+    assert "cam1: must be a file that is sent, got 's3://bucket/left_0000.tif'." in answer.json()["detail"]
+    assert "class" not in answer.json()["detail"]

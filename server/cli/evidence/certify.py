@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from core.errors import InputError
 from server.cli.terminal import ProgressLine
 from server.formats.files import make_folder, write_bytes
 from server.formats.results.summary import to_json
+from server.results.certificate.findings import finding_lines
 from server.results.certificate.plan import load_plan
 
 OUTCOME_STATUS = {"pass": 0, "conditional": 4, "fail": 5}
@@ -22,8 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "Judge a measuring system by static pairs, known translations, known lengths, a rotation and a reference "
         "extensometer, as far as a plan names them: noise floor, errors beside their uncertainty, class of the virtual "
         "extensometer, verdict with reasons and what is suspect. Writes certificate.json and certificate.html. Ends "
-        "with 0 for a pass, 4 for a conditional one, 5 for a fail. With --run the plan's steps are taken on a running "
-        "service first: the stage moves where it can, a person is asked where it cannot."
+        "with 0 for a pass, 4 for a conditional one, 5 for a fail. With --run the plan is carried out on a running "
+        "service: its steps are taken (the stage moves where it can, a person is asked where it cannot), measured with "
+        "strain, and judged; the certificate is the service's, and its files are written here too."
     )
     add = parser.add_argument
     add(
@@ -43,19 +46,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--run",
         dest="carry_out",
         action="store_true",
-        help="carry the plan out on a running service's rig: take its steps, one by one",
+        help="carry the plan out on a running service's rig: take its steps one by one, measure them, certify",
     )
     add("--frames", metavar="N", type=int, default=1, help="with --run: frames averaged at each step (1)")
+    add(
+        "--recipe",
+        metavar="FILE",
+        type=Path,
+        help="with --run: region and settings of the analysis; without it those drawn in the test, else the specimen "
+        "as it is found and the settings' defaults",
+    )
     add("--url", default="http://127.0.0.1:8000", help="with --run: address of the service (default: %(default)s)")
     add("--key", metavar="KEY", help="with --run: key of the service, where it asks for one")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, judge, write, print; return the verdict's status. With --run, take the steps that are to be judged."""
+    """Read, judge, write, print; return the verdict's status. With --run, take and measure first what is judged."""
     if args.carry_out:
-        from server.cli.evidence.procedure import carry_out
-
-        return carry_out(args.plan, args.test, frames=args.frames, url=args.url, key=args.key)
+        return _carried_out(args)
     if args.folder is None:
         raise InputError(
             "There is no data folder and there are no results to judge.",
@@ -78,11 +86,36 @@ def run(args: argparse.Namespace) -> int:
         )
     finally:
         progress.close()
+    return _kept(args, made.document, made.page, made.lines, made.outcome)
+
+
+def _carried_out(args: argparse.Namespace) -> int:
+    from server.api.models.evidence.certificates import CertificateReply
+    from server.cli.evidence.procedure import carry_out
+    from server.cli.recipe import load_recipe
+
+    progress = ProgressLine()
+    recipe = None if args.recipe is None else load_recipe(args.recipe)
+    try:
+        carried = carry_out(
+            load_plan(args.plan), args.test, frames=args.frames, url=args.url, key=args.key, recipe=recipe, on=progress
+        )
+    finally:
+        progress.close()
+    shown = CertificateReply.model_validate(carried.document)
+    lines = [*finding_lines(shown.reasons, shown.suspects), f"verdict: {shown.outcome}", f"certificate {shown.id}"]
+    return _kept(args, carried.document, carried.page, lines, shown.outcome)
+
+
+def _kept(
+    args: argparse.Namespace, document: Mapping[str, object], page: bytes, lines: Sequence[str], outcome: str
+) -> int:
+    """Write a certificate's files, say what it found, return the verdict's status."""
     make_folder(args.out.absolute())
-    write_bytes(args.out / "certificate.html", made.page)
-    write_bytes(args.out / "certificate.json", to_json(made.document))
+    write_bytes(args.out / "certificate.html", page)
+    write_bytes(args.out / "certificate.json", to_json(document))
     if args.json:
-        print(json.dumps(made.document, indent=1))
+        print(json.dumps(document, indent=1))
     else:
-        print("\n".join([*made.lines, f"written: {args.out / 'certificate.html'}, {args.out / 'certificate.json'}"]))
-    return OUTCOME_STATUS[made.outcome]
+        print("\n".join([*lines, f"written: {args.out / 'certificate.html'}, {args.out / 'certificate.json'}"]))
+    return OUTCOME_STATUS[outcome]

@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
         files = [Path(path) for path in source.files]
         drawn = request.drawn_variables
         strain = drawn is None or any(part_of(name) == "strain" for name in drawn)
-        framed = in_frame(files, asked_at(args.frame, files[0].parent), Path(folder) / "frame", strain=strain)
+        framed = in_frame(files, asked_at(args.frame, files[0]), Path(folder) / "frame", strain=strain)
         for path in export(replace(source, files=framed), request, args.out):
             print(path)
             count += 1

@@ -128,7 +128,7 @@ def run(args: argparse.Namespace) -> int:
             remedy="Give file.csv, file.json or file.mat.",
         )
     files = first_results(args.folder, (args.folder, args.folder / "exports" / "measure"))
-    asked = asked_at(args.frame, files[0].parent)
+    asked = asked_at(args.frame, files[0])
     request = _request(args, asked)
     fields = None if args.field_out is None else FieldWriter(args.field_out, files[0].parent, request)
     readings = read_gauges(files, request, fields)

@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     )
     with tempfile.TemporaryDirectory() as folder:
         first = source.files[min(source.files)]
-        asked = asked_at(args.frame, first.parent)
+        asked = asked_at(args.frame, first)
         if asked is not None:
             framed = in_frame(list(source.files.values()), asked, Path(folder) / "frame")
             source = source.in_frame(dict(zip(source.files, framed, strict=True)))

@@ -16,6 +16,7 @@ from server.formats.version import software_version
 from server.report.certificate.evidence import Gathered, gather
 from server.report.page import render
 from server.report.source import Source
+from server.results.certificate.findings import finding_lines
 from server.results.certificate.plan import CertificatePlan
 
 FORMAT = 1
@@ -103,8 +104,7 @@ def make_certificate(
 
 def lines_of(verdict: Verdict) -> list[str]:
     """Return a verdict as text, the outcome last."""
-    lines = [f"{one.outcome}: {one.code}: {one.text} Remedy: {one.remedy}" for one in verdict.reasons]
-    lines += [f"suspect: {one.code}: {one.text} Remedy: {one.remedy}" for one in verdict.suspects]
+    lines = finding_lines(verdict.reasons, verdict.suspects)
     largest = verdict.largest("length")
     if largest is not None:
         error, expanded = largest.comparison.error, largest.expanded

@@ -164,7 +164,7 @@ def _result(source: Source, n: int) -> Path:
 
 
 def _time(path: Path, n: int, source: Source) -> float | None:
-    return recorded_with(path, n, source.reference).time_s
+    return recorded_with(path.parent, n, source.reference).time_s
 
 
 def _moved(
@@ -296,7 +296,7 @@ def _extensometer(
                 remedy="Name a channel that ends in _mm or _um.",
             )
         for n in elongations:
-            value = recorded_with(source.files[n], n, source.reference).channels.get(reference.channel)
+            value = recorded_with(source.files[n].parent, n, source.reference).channels.get(reference.channel)
             if value is not None and n not in static:
                 true[n] = factor * value
     if not true:

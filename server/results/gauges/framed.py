@@ -8,6 +8,7 @@ from pathlib import Path
 
 from core.errors import MeasurementError
 from server.formats.files import recorded_sha256, write_bytes
+from server.formats.results.folder import home_of
 from server.formats.results.reading import read_head
 from server.results.gauges.fields import FieldWriter
 from server.results.gauges.frames import frame_asked, frame_of_test
@@ -16,8 +17,10 @@ from server.results.gauges.request import Alignment, GaugeRequest
 from server.store.durable import known_json
 
 
-def write_framed(files: Sequence[Path], asked: Alignment, folder: Path, *, strain: bool = True) -> list[Path]:
-    """Write result files in a frame that is laid through the first of them; return their paths.
+def write_framed(
+    files: Sequence[Path], asked: Alignment, folder: Path, *, strain: bool = True, laid_through: Path | None = None
+) -> list[Path]:
+    """Write result files in a frame that is laid through the first of them, or through another; return their paths.
 
     Raises
     ------
@@ -26,7 +29,7 @@ def write_framed(files: Sequence[Path], asked: Alignment, folder: Path, *, strai
     """
     request = GaugeRequest(align=asked)
     writer = FieldWriter(folder, files[0].parent, request, strain=strain)
-    readings = read_gauges(files, request, writer)
+    readings = read_gauges(files, request, writer, laid_through=laid_through)
     problem = next((s.problem for s in readings.steps if s.problem is not None), None)
     if problem is not None:
         raise MeasurementError(problem.cause, code=problem.code, remedy=problem.remedy)
@@ -47,22 +50,23 @@ def put_into_frame(files: Sequence[Path], asked: Alignment) -> str:
     return read_head(files[-1]).frame
 
 
-def asked_at(text: str | None, folder: Path) -> Alignment | None:
-    """Return the frame that a command names for the results of a folder, None for the system frame.
+def asked_at(text: str | None, result: Path) -> Alignment | None:
+    """Return the frame that a command names for a result file and those beside it, None for the system frame.
 
     Raises
     ------
     InputError
         ``frame_invalid``.
     """
-    kept = known_json(folder.absolute().parent.parent / "test.json").get("frame")
+    kept = known_json(home_of(result.absolute()).parent.parent / "test.json").get("frame")
     return frame_asked(text, frame_of_test(kept if isinstance(kept, dict) else None))
 
 
 def in_frame(files: Sequence[Path], asked: Alignment | None, out: Path, *, strain: bool = True) -> list[Path]:
     """Return result files in a frame, written into a folder; they themselves for the system frame.
 
-    The frame is laid through the reference of the measurement, where its result lies beside them. Without ``strain``
+    The frame is laid through the reference of the measurement, where its result lies beside them: of dense fields that
+    of the ordinary ones. Without ``strain``
     that is not made anew: for who reads none of it.
 
     Raises
@@ -73,6 +77,7 @@ def in_frame(files: Sequence[Path], asked: Alignment | None, out: Path, *, strai
     if asked is None:
         return list(files)
     n = read_head(files[-1]).reference_step
-    reference = None if n is None else files[-1].parent / f"step_{n:04d}.nc"
-    before = [reference] if reference is not None and reference.is_file() and reference not in files else []
-    return write_framed([*before, *files], asked, out, strain=strain)[len(before) :]
+    reference = None if n is None else home_of(files[-1]) / f"step_{n:04d}.nc"
+    if reference is None or reference in files or not reference.is_file():
+        reference = None
+    return write_framed(files, asked, out, strain=strain, laid_through=reference)

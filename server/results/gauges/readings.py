@@ -43,7 +43,7 @@ from server.formats.gauges.readings import (
     StepReadings,
 )
 from server.formats.gauges.stated import stated
-from server.formats.results.folder import number_of
+from server.formats.results.folder import home_of, number_of
 from server.formats.results.layout import COVARIANCE_NAMES
 from server.formats.results.reading import ResultHead, read_field, read_head
 from server.formats.results.uncertainty import Included, Statement, read_included
@@ -79,7 +79,7 @@ class _Step:
 
     def reading(self, **found: Any) -> StepReadings:
         head = self.head
-        recorded = recorded_with(self.path, head.step, head.reference_step)
+        recorded = recorded_with(home_of(self.path), head.step, head.reference_step)
         return StepReadings(
             n=head.step,
             kind=head.kind,
@@ -97,6 +97,7 @@ def read_gauges(
     fields: FieldWriter | None = None,
     *,
     only: Collection[int] | None = None,
+    laid_through: Path | None = None,
 ) -> GaugeReadings:
     """Read a set of gauges in every step.
 
@@ -111,6 +112,8 @@ def read_gauges(
     only
         Steps to be read of those that are asked for, as of a page; None: all. The first of those that are asked for is
         read in any case: a frame is laid through it, and positions in mm are found on it.
+    laid_through
+        Result file that a frame is laid through, where that is none of `files`.
 
     Raises
     ------
@@ -128,6 +131,9 @@ def read_gauges(
         needed = {*only, request.difference_from, number_of(chosen[0])}
         chosen = [path for path in chosen if number_of(path) in needed]
     alignment: Alignment | None = None
+    if request.align is not None and laid_through is not None:
+        base = _read(laid_through)
+        alignment = lay(request.align, base.field, base.shared)
     first: ResultHead | None = None
     grid: tuple[Float, Float] | None = None
     hashes, steps, heads, included = {}, [], [], []

@@ -170,7 +170,7 @@ def _coverage(steps: _Steps) -> list[ResultWarning]:
         f"({100.0 * share[n]:.0f} %){why}."
     )
     remedy = (
-        "See the field `status` for the reasons; draw the region on the specimen alone, or improve pattern and light."
+        "See the field status for the reasons; draw the region on the specimen alone, or improve pattern and light."
     )
     return [ResultWarning("low_coverage", level, text, remedy, tuple(sorted(low)))]
 

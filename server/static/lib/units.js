@@ -1,5 +1,5 @@
 // Units and digits of the numbers that are shown: µm below 0.1 mm, strain in µm/m or %, digits by the standard uncertainty.
-import { num, tick } from "./dom.js";
+import { count, num, tick } from "./dom.js";
 
 const MINUS = "−";
 const SMALL_MM = 0.1;
@@ -96,3 +96,22 @@ export function evenMarks(values) {
  * @param {string | null | undefined} text
  */
 export const inUnits = (text) => (text ?? "").replaceAll("+-", "±").replace(/(?<=\d )um\b/g, "µm").replace(/(?<=\d )microstrain\b/g, "µm/m").replace(/(?<=\d )sigma\b/g, "σ");
+
+/**
+ * A duration in the units that people use: 0.4 s, 12 s, 29 min 31 s, 3 h 5 min, 2 d 4 h.
+ * @param {number | null | undefined} seconds
+ */
+export function duration(seconds) {
+  if (seconds === null || seconds === undefined || !Number.isFinite(seconds)) return "–";
+  if (seconds < 9.95) return `${Number(seconds.toFixed(1))}\u00a0s`;
+  const whole = Math.round(seconds);
+  const parts = /** @type {[number, string][]} */ ([[Math.floor(whole / 86400), "d"], [Math.floor(whole / 3600) % 24, "h"], [Math.floor(whole / 60) % 60, "min"], [whole % 60, "s"]]);
+  const first = parts.findIndex(([n]) => n > 0);
+  return parts.slice(first, first + 2).filter(([n]) => n > 0).map(([n, unit]) => `${n}\u00a0${unit}`).join(" ");
+}
+
+/**
+ * How often something was: once, twice, 12 times.
+ * @param {number | null} n
+ */
+export const times = (n) => (n === null ? "–" : n === 1 ? "once" : n === 2 ? "twice" : `${count(n)} times`);

@@ -3,26 +3,11 @@ import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
 import { certificates } from "./certificates.js";
 import { stateBadge, warningsBox } from "./results/warnings.js";
+import { duration, times } from "../lib/units.js";
 import { h, replace, action, badge, count, definitions, num, quantity, table, when, problemText, STATE_KIND } from "../lib/dom.js";
 
 /** @import { Model } from "#routes" */
 /** @typedef {Model<"JobReply">} Job */
-
-/**
- * A duration in the units that people use: 0.4 s, 12 s, 29 min 31 s, 3 h 5 min, 2 d 4 h.
- * @param {number | null | undefined} seconds
- */
-export function duration(seconds) {
-  if (seconds === null || seconds === undefined || !Number.isFinite(seconds)) return "–";
-  if (seconds < 9.95) return `${Number(seconds.toFixed(1))}\u00a0s`;
-  const whole = Math.round(seconds);
-  const parts = /** @type {[number, string][]} */ ([[Math.floor(whole / 86400), "d"], [Math.floor(whole / 3600) % 24, "h"], [Math.floor(whole / 60) % 60, "min"], [whole % 60, "s"]]);
-  const first = parts.findIndex(([n]) => n > 0);
-  return parts.slice(first, first + 2).filter(([n]) => n > 0).map(([n, unit]) => `${n}\u00a0${unit}`).join(" ");
-}
-
-/** @param {number | null} n */
-const times = (n) => (n === null ? "–" : n === 1 ? "once" : n === 2 ? "twice" : `${count(n)} times`);
 
 /** @param {HTMLElement} root */
 export async function open(root) {

@@ -349,7 +349,11 @@ async function show(root, testId, analysisId, query) {
   fieldChoice.addEventListener("change", () => { state.field = fieldChoice.value; state.chosen = true; display.chosen(); refresh().catch(notify); });
   imageChoice.addEventListener("change", () => { state.image = /** @type {Over} */ (imageChoice.value); refresh().catch(notify); });
   slider.addEventListener("input", () => choose(result.steps[Number(slider.value)]).catch(notify));
-  const fade = () => { map.view.canvas.style.opacity = String(Number(opacity.value) / 100); };
+  const opacityText = h("span", { "data-role": "opacity", "aria-hidden": "true" }); // the slider says its own value
+  const fade = () => {
+    map.view.canvas.style.opacity = String(Number(opacity.value) / 100);
+    opacityText.textContent = `${opacity.value}\u00a0%`;
+  };
   opacity.addEventListener("input", fade);
   fade();
   const move = (/** @type {number} */ by) => choose(result.steps[Math.min(Math.max(result.steps.indexOf(state.step ?? NaN) + by, 0), result.steps.length - 1)]).catch(notify);
@@ -363,7 +367,7 @@ async function show(root, testId, analysisId, query) {
   const following = live(screen, setStep);
   const empty = h("div", { "data-role": "empty" });
   const controls = h("div.row.controls", h("div.field", h("label", { for: "resultfield" }, "Field"), Object.assign(fieldChoice, { id: "resultfield" })),
-    axesField, field("Image", imageChoice), field("Opacity", opacity, "%"),
+    axesField, field("Image", imageChoice), h("div.field", h("label", { for: "opacity" }, "Opacity"), h("span.control", Object.assign(opacity, { id: "opacity" }), opacityText)),
     h("div.field.grow", h("label", { for: "resultstep" }, "Step "), h("span.control",
       h("button", { type: "button", "aria-label": "Step before", onclick: () => move(-1) }, "◂"), Object.assign(slider, { id: "resultstep" }),
       h("button", { type: "button", "aria-label": "Next step", onclick: () => move(1) }, "▸"), play, stepText)));

@@ -35,14 +35,15 @@ class FramedResults:
         self._lock = threading.Lock()
         self._kept: OrderedDict[str, Path] = OrderedDict()
 
-    def file(self, files: Sequence[Path], asked: Alignment, *, strain: bool = True) -> Path:
-        """Return the last of some result files in a frame that is laid through the first of them.
+    def file(self, source: Path, asked: Alignment, laid_through: Path | None, *, strain: bool = True) -> Path:
+        """Return a result file in a frame that is laid through it, or through another.
 
         Raises
         ------
         StereorigError
             As :func:`read_gauges`.
         """
+        files = [source] if laid_through is None else [laid_through, source]
         text = "\n".join([f"{strain}", asked.model_dump_json(), *(known_sha256(path) for path in files)])
         key = hashlib.sha256(text.encode()).hexdigest()
         with self._lock:  # one at a time: several requests ask for one step at once
@@ -50,7 +51,9 @@ class FramedResults:
             if known is not None and known.is_file():
                 self._kept.move_to_end(key)
                 return known
-            made = self._kept[key] = write_framed(files, asked, self._folder / key, strain=strain)[-1]
+            out = self._folder / key
+            made = write_framed([source], asked, out, strain=strain, laid_through=laid_through)[0]
+            self._kept[key] = made
             self._forget()
             return made
 
@@ -80,13 +83,19 @@ def result_in(
         Variable that will be read of it: one that is the same in every frame is read where it is stored, and strain is
         made anew for its own components alone.
     """
-    source = service.tests.result_file(test_id, analysis_id, n)
+    return file_in(service, test_id, analysis_id, service.tests.result_file(test_id, analysis_id, n), frame, name)
+
+
+def file_in(
+    service: Service, test_id: str, analysis_id: str, source: Path, frame: str | None, name: str | None = None
+) -> Path:
+    """Return one of an analysis' result files, dense or not, in a frame; see :func:`result_in`."""
     asked = asked_of(service, test_id, frame)
     part = "strain" if name is None else part_of(name)
     if asked is None or part == "none":
         return source
-    before = _reference(service, test_id, analysis_id, [n])
-    return service.framed.file([*before, source], asked, strain=part == "strain")
+    reference = _reference(service, test_id, analysis_id)
+    return service.framed.file(source, asked, None if reference == source else reference, strain=part == "strain")
 
 
 def results_in_frame(
@@ -118,9 +127,9 @@ def variable_of_frame(variables: Sequence[str] | None) -> str | None:
     return None if variables is None else max(variables, key=lambda name: order.index(part_of(name)))
 
 
-def _reference(service: Service, test_id: str, analysis_id: str, numbers: Sequence[int]) -> list[Path]:
-    """Return the reference's result, through which the frame is laid; none where it is asked for, or not there."""
+def _reference(service: Service, test_id: str, analysis_id: str) -> Path | None:
+    """Return the reference's result, through which a frame is laid; None where it is not there."""
     reference = service.tests.analysis(test_id, analysis_id).steps[0]
-    if reference in numbers or reference not in service.tests.finished_steps(test_id, analysis_id):
-        return []
-    return [service.tests.result_file(test_id, analysis_id, reference)]
+    if reference not in service.tests.finished_steps(test_id, analysis_id):
+        return None
+    return service.tests.result_file(test_id, analysis_id, reference)

@@ -12,7 +12,7 @@ interface Unnamed {
   NoiseReply: { plan: { label?: string } };
   AnalysisReply: {
     label?: string; created_utc: string; software?: string; problem?: Trouble | null; inputs?: { calibration_sha256?: string };
-    settings: { reference?: number };
+    settings: { reference?: number; dense_step_px?: number | null };
     summary?: { steps?: StepSummary[]; steps_failed?: { [n: string]: Trouble } } | null;
   };
   GaugesReply: { steps: GaugeReadings[] };
@@ -31,7 +31,7 @@ export type Trouble = { cause?: string; code?: string; remedy?: string; detail?:
 export type StepSummary = {
   n: number; valid: number; points: number; epipolar_offset_rms_px?: number; wall_s?: number; zncc_median?: { [pair: string]: number };
   epipolar_check?: { level: string; reason: string }; sigma_median_mm?: Numbers; sigma_calibration_median_mm?: Numbers | null; strain?: { noise_floor_microstrain?: Numbers }; patch?: { patch?: string; reason?: string };
-  camera_motion?: Schemas["CameraMotion"] | null;
+  camera_motion?: Schemas["CameraMotion"] | null; dense?: Schemas["DenseFigures"] | null;
 };
 export type PositionsCheck = Check & { positions_mm?: { [cam: string]: number[] }; per_camera?: { [cam: string]: Check } };
 export type TakenView = { index: number; camera: string; dz_mm: number; dz_commanded_mm?: number; role: string; file: string; frames: number };

@@ -1,7 +1,7 @@
 // Numbers as they are shown, against the rules of the GUM and figures worked out by hand.
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { amount, evenMarks, inUnits, shown, uncertain, useStrainUnit } from "../../../server/static/lib/units.js";
+import { amount, duration, evenMarks, inUnits, shown, times, uncertain, useStrainUnit } from "../../../server/static/lib/units.js";
 
 const plain = (text) => text.replaceAll("\u00a0", " ");
 
@@ -52,4 +52,11 @@ test("the service's words get the page's units", () => {
 test("a column has one unit: that of its largest number", () => {
   assert.equal(uncertain(-0.05815, 0.00011, "mm", 0.11643), "−0.05815 ± 0.00011\u00a0mm");
   assert.equal(amount(0.00138, "mm", 3, 0.1134), "0.00138\u00a0mm");
+});
+
+test("durations and how often are as people say them", () => {
+  const said = [[0.04, "0 s"], [0.44, "0.4 s"], [9.96, "10 s"], [59.6, "1 min"], [1771.5, "29 min 32 s"], [3600, "1 h"], [11100, "3 h 5 min"], [187200, "2 d 4 h"]];
+  for (const [seconds, text] of said) assert.equal(plain(duration(seconds)), text);
+  assert.equal(duration(null), "–");
+  assert.deepEqual([1, 2, 3, null].map(times), ["once", "twice", "3 times", "–"]);
 });

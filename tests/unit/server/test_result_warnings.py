@@ -62,6 +62,7 @@ def test_few_points_with_values_warn_or_fail_by_their_share(folder: Path, valid:
     if found:
         assert f"{valid} of 900 ({100 * valid / 900:.0f} %)" in found[0].text
         assert "low correlation" in found[0].text
+        assert "`" not in found[0].text + found[0].remedy  # read by people, on the page and in the terminal
 
 
 def test_failed_checks_come_before_warnings(folder: Path) -> None:

@@ -165,10 +165,10 @@ def test_a_rotation_that_is_none_is_refused(files: list[Path], tmp_path: Path) -
 
 def test_a_step_in_a_frame_is_made_once(files: list[Path], tmp_path: Path) -> None:
     kept = FramedResults(tmp_path / "kept")
-    first = kept.file(files, SPECIMEN)
-    assert kept.file(files, SPECIMEN) == first
+    first = kept.file(files[1], SPECIMEN, files[0])
+    assert kept.file(files[1], SPECIMEN, files[0]) == first
     assert mean_strain(first) == pytest.approx([LATERAL, TENSION, 0.0], abs=TOLERANCE)
-    other = kept.file(files, PlaneAlignment(kind="plane"))
+    other = kept.file(files[1], PlaneAlignment(kind="plane"), files[0])
     assert other != first
 
 

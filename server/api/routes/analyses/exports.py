@@ -155,13 +155,13 @@ async def export(
     wanted, frame = asked.request, asked.frame
     files, headers = await run_in_threadpool(_prepared, service, test_id, analysis_id, asked.steps, asked.dense)
     as_stored = wanted.variables is None and wanted.coverage.factor == 1.0 and frame in (None, "system")
-    if wanted.format == "nc" and len(files) == 1 and as_stored and not await run_in_threadpool(has_more, files[0]):
-        return FileResponse(
-            files[0], media_type=MEDIA_TYPES["nc"], headers=headers, filename=f"{test_id}_{analysis_id}_{files[0].name}"
-        )
+    home = home_of(files[0])
+    as_stored &= wanted.format == "nc" and len(files) == 1
+    if as_stored and not await run_in_threadpool(has_more, files[0], home):
+        name = "_".join([test_id, analysis_id, *files[0].relative_to(home).parts])
+        return FileResponse(files[0], media_type=MEDIA_TYPES["nc"], headers=headers, filename=name)
     folder = await run_in_threadpool(service.exports.new_folder)
     try:
-        home = home_of(files[0])
         framed = functools.partial(results_in_frame, variables=wanted.drawn_variables)
         files = await run_in_threadpool(framed, service, test_id, files, frame, folder / "frame")
         made = Path(await _made(request, service, home, files, wanted, folder))

@@ -3,7 +3,7 @@ import { h, replace, table, badge, definitions, num, tick, count, quantity, when
 
 import { REMEDY, camerasBadge } from "./cameras.js";
 import { NOT_INCLUDED } from "./uncertainty.js";
-import { inUnits } from "../../lib/units.js";
+import { amount, inUnits } from "../../lib/units.js";
 
 /** @import { Viewer } from "../results.js" */
 /** @import { StepSummary } from "#routes" */
@@ -29,13 +29,18 @@ export function about(screen) {
     return typeof value === "number" ? tick(value) : String(value);
   };
 
+  /** @param {StepSummary} one */
+  const denseText = ({ dense }) => h("span", { title: dense?.reason ?? "" }, dense?.file ? `${count(dense.valid)} of ${count(dense.vectors)}` : dense ? "none" : "–");
+
   function draw() {
     const { analysis } = result;
     const steps = analysis.summary?.steps ?? [];
     const failed = Object.entries(analysis.steps_failed ?? {});
     const verdict = (/** @type {StepSummary["epipolar_check"]} */ check) => (check ? h("span", { title: check.reason }, badge(check.level, STATE_KIND[check.level] ?? "warn")) : "–");
+    const largest = (/** @type {string} */ name) => Math.max(0, ...steps.map((one) => one.sigma_median_mm?.[name] ?? 0)); // a column has one unit
     const warned = steps.flatMap((one) => [
       ...(one.epipolar_check && one.epipolar_check.level !== "ok" ? [`Step ${one.n}: ${one.epipolar_check.reason}`] : []),
+      ...(one.dense?.reason ? [`Step ${one.n}: no dense field: ${one.dense.reason}`] : []),
       ...(one.camera_motion?.camera_moved ? [`Step ${one.n}: ${one.camera_motion.text}. ${REMEDY}`] : []),
     ]);
     replace(body,
@@ -53,9 +58,10 @@ export function about(screen) {
         ["Cameras", (one) => camerasBadge(one.camera_motion)],
         ["Epipolar offset", (one) => quantity(one.epipolar_offset_rms_px, "px", 3), { numeric: true }],
         ["Correlation", (one) => num(Math.min(...Object.values(one.zncc_median ?? { none: NaN })), 4), { numeric: true }],
-        ["σ Z", (one) => quantity(one.sigma_median_mm?.z_mm, "mm", 2), { numeric: true }],
-        ["σ W", (one) => quantity(one.sigma_median_mm?.w_mm, "mm", 2), { numeric: true }],
-        ["Strain noise floor", (one) => quantity(one.strain?.noise_floor_microstrain?.exx, "µm/m", 3), { numeric: true }],
+        ["σ Z", (one) => amount(one.sigma_median_mm?.z_mm, "mm", 2, largest("z_mm")), { numeric: true }],
+        ["σ W", (one) => amount(one.sigma_median_mm?.w_mm, "mm", 2, largest("w_mm")), { numeric: true }],
+        ["Strain noise floor", (one) => amount(one.strain?.noise_floor_microstrain?.exx, "µm/m", 3), { numeric: true }],
+        ...(analysis.settings.dense_step_px ? [/** @type {const} */ (["Vectors of the dense field", denseText, { numeric: true }])] : []),
         ["Patch", (one) => h("span", { title: one.patch?.reason ?? "" }, one.patch?.patch ?? "–")],
         ["Time", (one) => quantity(one.wall_s, "s", 3), { numeric: true }],
       ], steps, { caption: `Summary of ${(analysis.n_finished ?? 0) > steps.length ? `the first ${steps.length} steps of ${count(analysis.n_finished)}` : "each step"}; σ are medians of the reported standard uncertainties (k = 1)${steps.some((one) => !one.sigma_calibration_median_mm) ? `, ${NOT_INCLUDED}` : ""}`, empty: "No step is finished yet." }),

@@ -1,6 +1,6 @@
 // Export: the picture as it is shown, a film of it, the numbers for other programs, the report.
 import * as api from "../../lib/api.js";
-import { h, replace, action, badge, field, number, select, notify, tick } from "../../lib/dom.js";
+import { h, replace, action, badge, field, number, select, notify, problemText, tick } from "../../lib/dom.js";
 import { pngOf, saveAs, svgFile } from "../../widgets/saving.js";
 import { shownUnit } from "./analysis.js";
 
@@ -49,23 +49,55 @@ export function files(screen) {
   const form = select(NUMBERS, "nc");
   const which = select([["one", "the step shown"], ["all", "all steps"]], "one");
   const fields_ = select([["all", "all"], ["seen", "the one shown"]], "all");
+  // vectors between the points, where they were measured
+  const densePx = result.analysis.settings.dense_step_px;
+  const denseMap = h("input", { type: "checkbox" });
+  const densePicture = h("img", { alt: "" });
+  const denseShown = h("div.dense", { hidden: true, role: "status", "data-role": "dense-map" });
+  const points = select([["field", "the points of the maps"], ["dense", `the dense field, a vector every ${densePx} px`]], "field");
   const course = h("div", { "data-role": "export-course", role: "status" });
 
   /** Whether only the page has the picture: the deformed image, lines over the colours, the surface in space. */
   const here = () => screen.state.mode !== "image" || screen.state.image !== "reference" || screen.overlay.on;
 
+  /** @type {number | undefined} */
+  let drawing;
+  let denseAsked = "";
+  /** Show the map of the dense field once its choice rests: the service draws it. @param {Asked | null} asked */
+  function showDense(asked) {
+    denseShown.hidden = !(asked && denseMap.checked);
+    const wanted = { ...asked, format: "png", step: screen.step, width_px: 900, dense: true };
+    const mine = denseShown.hidden || !root.open ? "" : JSON.stringify(wanted);
+    if (mine === denseAsked) return;
+    denseAsked = mine;
+    clearTimeout(drawing);
+    if (!mine) return;
+    drawing = setTimeout(async () => {
+      try {
+        const drawn = await (await api.raw(`${result.path}/export`, wanted)).blob();
+        if (mine !== denseAsked) return;
+        URL.revokeObjectURL(densePicture.src);
+        replace(denseShown, Object.assign(densePicture, { src: URL.createObjectURL(drawn), alt: `Dense field: ${what.textContent}` }));
+      } catch (error) {
+        if (mine === denseAsked) replace(denseShown, problemText(error));
+      }
+    }, 400);
+  }
+
   function tell() {
     const { info, scale } = screen;
     const asked = seen(screen, over.checked);
+    showDense(asked);
     if (!asked || !info || screen.step === null) {
       what.textContent = "Choose a field with one number a point to save its picture or film.";
       return;
     }
     const unit = scale.unit ? ` ${scale.unit}` : "";
+    const seen_ = denseMap.checked ? `its dense field, a vector every ${densePx} px, ${over.checked ? "over the reference image" : "without an image"}` : "";
     what.textContent = `${info.text}, ${result.stepText(screen.step)}${scale.flags ? "" : `; ${MAPS[scale.name]} from ${tick(Number(scale.low.toPrecision(4)))} to ${tick(Number(scale.high.toPrecision(4)))}${unit}${Number(scale.levels.value) > 1 ? `, ${asked.levels} levels` : ""}`}; `
-      + `axes of the ${result.frame === "system" ? "calibration" : "specimen"}; ${here() ? `as it is seen, ${screen.state.mode === "surface" ? "in space" : screen.state.mode === "compare" ? "both views side by side" : "its lines and its image included"}; a film of it ${over.checked ? "is over the reference image" : "has no image"}` : over.checked ? "over the reference image" : "without an image"}.`;
+      + `axes of the ${result.frame === "system" ? "calibration" : "specimen"}; ${seen_ ? seen_ : here() ? `as it is seen, ${screen.state.mode === "surface" ? "in space" : screen.state.mode === "compare" ? "both views side by side" : "its lines and its image included"}; a film of it ${over.checked ? "is over the reference image" : "has no image"}` : over.checked ? "over the reference image" : "without an image"}.`;
   }
-  over.addEventListener("change", tell);
+  for (const choice of [over, denseMap]) choice.addEventListener("change", tell);
 
   /** Numbers of the picture, checked before anything is sent. */
   function size() {
@@ -79,6 +111,7 @@ export function files(screen) {
     const asked = seen(screen, over.checked);
     if (!asked || screen.step === null) throw new Error("Choose a field with one number a point: its picture can be saved.");
     const width_px = size();
+    if (denseMap.checked) return direct({ ...asked, format, step: screen.step, width_px, dense: true });
     if (!here()) return direct({ ...asked, format, step: screen.step, width_px });
     const drawn = screen.picture(width_px);
     return saveAs(format === "svg" ? svgFile(drawn) : await pngOf(drawn, 1), `${result.testId}_${result.analysisId}_step${screen.step}_${asked.variables}_as_seen.${format}`);
@@ -122,13 +155,13 @@ export function files(screen) {
     if (!asked) throw new Error("Choose a field with one number a point: a film shows it over the steps.");
     const fps = Number(pace.value);
     if (!(fps >= 0.1 && fps <= 60)) throw new Error("A film shows 0.1 to 60 steps a second; correct Steps a second.");
-    await slowly({ ...asked, format: film.value, fps, width_px: size() });
+    await slowly({ ...asked, format: film.value, fps, width_px: size(), ...(denseMap.checked ? { dense: true } : {}) });
   }
 
   async function saveNumbers() {
     const { factor } = screen.interval;
     /** @type {Asked} */
-    const asked = { format: form.value, frame: result.frame };
+    const asked = { format: form.value, frame: result.frame, ...(points.value === "dense" ? { dense: true } : {}) };
     if (fields_.value === "seen" && screen.info && form.value !== "nc") asked.variables = screen.info.name;
     if (factor !== 1 && form.value !== "nc") asked.coverage = 0.95;
     if (which.value === "one" && screen.step !== null) await direct({ ...asked, step: screen.step });
@@ -155,9 +188,10 @@ export function files(screen) {
   form.addEventListener("change", asStored);
   asStored();
   root.append(h("h3", "The picture that is shown"), what,
-    h("div.row", field("Width", width, "px"), h("label.check", over, "over the reference image"), action("Save as PNG", () => picture("png"), { "data-role": "save-png" }), action("Save as SVG", () => picture("svg"))),
+    h("div.row", field("Width", width, "px"), h("label.check", over, "over the reference image"), densePx ? h("label.check", denseMap, "the dense field") : null, action("Save as PNG", () => picture("png"), { "data-role": "save-png" }), action("Save as SVG", () => picture("svg"))), denseShown,
     h("h3", "A film of it over the steps"), h("div.row", field("Film as", film), field("Steps a second", pace), action("Make the film", makeFilm)), course,
-    h("h3", "Numbers for other programs"), h("div.row", field("Form", form), field("Steps", which), field("Fields", fields_), action("Save the file", saveNumbers, { kind: "primary" })), report());
+    h("h3", "Numbers for other programs"), h("div.row", field("Form", form), field("Steps", which), field("Fields", fields_), densePx ? field("Points", points) : null, action("Save the file", saveNumbers, { kind: "primary" })),
+    densePx ? h("p.hint", "The dense field's files lie in the folder ", h("code", "dense"), ` of the analysis, ${result.analysisId}, in the layout of the ordinary ones; strain, normals and rotation are the ordinary field's alone.`) : "", report());
   for (const name of ["toggle", "seen"]) root.addEventListener(name, tell);
   screen.overlay.changed.add(tell);
   screen.drawn.add(tell);

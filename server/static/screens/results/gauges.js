@@ -443,7 +443,7 @@ export function gauges(screen) {
     extensometer: h("details.panel", h("summary", "Extensometers"), h("p.quiet", "Choose the tool Extensometer and click its two ends, or give them."), extInputs.row, h("div.row", field("Show", what), field("Against", over)), extChart, extTable),
     area: h("details.panel", h("summary", "Area"), h("p.quiet", "Choose the tool Area and drag a rectangle, or give its corners."), h("div.row", areaInputs.row, field("Area against", areaAgainst.choice), clear("area")), areaPlot, areaBox),
   };
-  const root = h("div", h("label.check", rigid, "Gauges without the rigid motion of the whole field"), panels.line, panels.extensometer, panels.area);
+  const root = h("div", h("label.check.apart", rigid, "Gauges without the rigid motion of the whole field"), panels.line, panels.extensometer, panels.area);
 
   let last = "";
   let first = true;

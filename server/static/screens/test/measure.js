@@ -186,6 +186,7 @@ export async function measurePanel(id, test, ends, done) {
     const prefilter = number(0, { min: 0, max: 100.25 });
     const maxSigma = number(0.1, { min: 0.001, max: 1, step: "any" });
     const smoothing = number(null, { min: 3, max: 51, step: 2, placeholder: "none" });
+    const dense = number(null, { min: 1, max: 20, step: 1, placeholder: "none" });
     const strain = h("input", { type: "checkbox", checked: true });
     const window_ = number(9, { min: 3, max: 101, step: 2 });
     const order = select([["auto", "planes or quadratics"], [1, "planes"], [2, "quadratics"]], "auto");
@@ -217,9 +218,10 @@ export async function measurePanel(id, test, ends, done) {
       limited(subset, "A subset", { unit: "px" }), limited(spacing, "A spacing", { unit: "px" }),
       limited(prefilter, "A prefilter", { unit: "px", more: (sd) => (sd > Number(subset.value) / 4 ? `Give a quarter of the subset at most, ${Number(subset.value) / 4}\u00a0px, not ${sd}\u00a0px.` : "") }),
       limited(maxSigma, "A largest sigma", { unit: "px" }), limited(smoothing, "A window", { unit: "points", required: false }),
+      limited(dense, "A distance", { unit: "px", required: false, more: (px) => (px > Number(spacing.value) ? `Give the spacing at most, ${spacing.value}\u00a0px, not ${px}\u00a0px: it would be no denser.` : "") }),
       [window_, rule(window_, (text) => (strain.checked ? windowWrong(text) : ""))], [which, rule(which, stepsWrong)],
     ]);
-    for (const input of [subset, strain, follow_]) input.addEventListener("input", () => again(rules)); // others' limits hang on these
+    for (const input of [subset, spacing, strain, follow_]) input.addEventListener("input", () => again(rules)); // others' limits hang on these
     const windowWrong = numberWithin({ low: Number(window_.min), high: Number(window_.max), unit: "points", whole: true, odd: true, what: "A window" });
     /** @param {string} text of the steps */
     function stepsWrong(text) {
@@ -250,7 +252,10 @@ export async function measurePanel(id, test, ends, done) {
         if (value !== undefined) found[name] = value;
       }
       if ((found.prefilter_px ?? 0) > (found.subset_px ?? 0) / 4) found.prefilter_px = 0; // as one that is being typed
-      found.smoothing_window = smoothing.value === "" ? null : correct(smoothing) ? Number(smoothing.value) : before.smoothing_window ?? null;
+      for (const [name, input] of /** @type {const} */ ([["smoothing_window", smoothing], ["dense_step_px", dense]])) {
+        found[name] = input.value === "" ? null : correct(input) ? Number(input.value) : before[name] ?? null;
+      }
+      if ((found.dense_step_px ?? 0) > (found.spacing_px ?? 0)) found.dense_step_px = null;
       if (strain.checked) found.strain = /** @type {Request["strain"]} */ ({ ...(correct(window_) ? { window: Number(window_.value) } : {}), order: order.value === "auto" ? "auto" : Number(order.value), tensor: tensor.value });
       return found;
     }
@@ -267,7 +272,9 @@ export async function measurePanel(id, test, ends, done) {
       for (const [name, control] of /** @type {const} */ ([["kind", kind], ["patch", patch], ["interpolation", interpolation], ["reference_update", update], ["subset_px", subset], ["spacing_px", spacing], ["prefilter_px", prefilter], ["max_sigma_px", maxSigma]])) {
         if (set[name] !== undefined) control.value = String(set[name]);
       }
-      if (set.smoothing_window !== undefined) smoothing.value = String(set.smoothing_window ?? "");
+      for (const [name, control] of /** @type {const} */ ([["smoothing_window", smoothing], ["dense_step_px", dense]])) {
+        if (set[name] !== undefined) control.value = String(set[name] ?? "");
+      }
       if (set.noise_id !== undefined && [...noiseChoice.options].some((one) => one.value === (set.noise_id ?? ""))) noiseChoice.value = set.noise_id ?? "";
       if (set.strain !== undefined) strain.checked = set.strain !== null;
       if (set.strain?.window) window_.value = String(set.strain.window);
@@ -299,11 +306,7 @@ export async function measurePanel(id, test, ends, done) {
         return;
       }
       /** @type {Request} */
-      const body_ = {
-        kind: /** @type {Request["kind"]} */ (kind.value), region, subset_px: Number(subset.value), spacing_px: Number(spacing.value), patch: /** @type {Request["patch"]} */ (patch.value), interpolation: /** @type {Request["interpolation"]} */ (interpolation.value), prefilter_px: Number(prefilter.value), max_sigma_px: Number(maxSigma.value),
-        reference: Number(reference.value), reference_update: /** @type {Request["reference_update"]} */ (update.value), noise_id: noiseChoice.value || null, label: label.value, ...editor.seeds(),
-        smoothing_window: smoothing.value === "" ? null : Number(smoothing.value), strain: strain.checked ? /** @type {Request["strain"]} */ ({ window: Number(window_.value), order: order.value === "auto" ? "auto" : Number(order.value), tensor: tensor.value }) : null,
-      };
+      const body_ = { ...settings(), region, reference: Number(reference.value), label: label.value };
       const wanted = stepList(which.value);
       if (wanted) body_.steps = wanted;
       if (follow_.checked) body_.follow = true;
@@ -328,7 +331,7 @@ export async function measurePanel(id, test, ends, done) {
         h("div",
           h("fieldset", h("legend", "Correlation"),
             h("div.fields", field("Measure", kind), field("Shape function", patch), field("Interpolation", interpolation), field("Prefilter, sd", prefilter, "px", "0: none"), field("Largest sigma of a match", maxSigma, "px", "points beyond it are rejected"), field("Noise", noiseChoice),
-              field("Reference is updated", update), field("Smoothing window", smoothing, "points", "odd; empty: none"))),
+              field("Reference is updated", update), field("Smoothing window", smoothing, "points", "odd; empty: none"), field("Dense field, a vector every", dense, "px", "beside the ordinary field; empty: none"))),
           h("fieldset", h("legend", "Strain"), h("label.check", strain, "compute strain"), h("div.fields", field("Window", window_, "points", "odd"), field("Fit", order), field("Tensor", tensor)), gauge, gaugeWarning),
           h("div.fields", field("Steps", which, "", "such as 1-5, 8; empty: all"), field("Label", label)), h("label.check", follow_, "continue with each new step"),
           h("div.row", { style: { marginTop: "0.5rem" } }, start), jobs.root)));

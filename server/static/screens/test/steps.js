@@ -1,5 +1,6 @@
 // A test's steps: capture with load and channels, quality of the pair, thumbnails, import of existing pairs.
 import * as api from "../../lib/api.js";
+import { importRecord } from "./channels.js";
 import { livePanel } from "./live.js";
 import { allRight, numberWithin, rule } from "../../lib/fields.js";
 import { backToZero } from "../../widgets/way_back.js";
@@ -96,9 +97,14 @@ export async function stepsPanel(id, test, ends, reread) {
     return (test.steps ?? []).length ? h("p", h("a.button", { href: `#/test/${id}?at=region` }, "Draw the region and measure")) : null;
   }
 
+  async function refreshed() {
+    await refresh();
+    if (chosen !== null) await show(chosen); // its channels are others now
+  }
+
   const live = await livePanel(ends); // before anything is shown: it would push the region away from under a drawing hand
   const root = h("section.panel", { "aria-label": "Steps" }, h("h2", "Steps"),
-    h("div.grid.side", h("div", live.root, part.bar, thumbs, incomplete, detail, importPairs(id, refresh, ends)), capture(id, async (step) => { chosen = step.n; drawDetail(step); await refresh(); }, ends, refresh)));
+    h("div.grid.side", h("div", live.root, part.bar, thumbs, incomplete, detail, importPairs(id, refresh, ends), importRecord(id, () => test, refreshed)), capture(id, async (step) => { chosen = step.n; drawDetail(step); await refresh(); }, ends, refresh)));
   draw();
   return { root, refresh, onchange: (/** @type {typeof changed} */ listener) => { changed = listener; } };
 }

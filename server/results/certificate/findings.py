@@ -1,0 +1,36 @@
+"""What a certificate found, as lines of text: the same for one made here and for one that a service made."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Protocol
+
+
+class Finding(Protocol):
+    """A suspect."""
+
+    @property
+    def code(self) -> str:
+        """Its stable name."""
+
+    @property
+    def text(self) -> str:
+        """The finding with its figures."""
+
+    @property
+    def remedy(self) -> str:
+        """What to do."""
+
+
+class Reason(Finding, Protocol):
+    """Why a verdict is no pass."""
+
+    @property
+    def outcome(self) -> str:
+        """What it makes the verdict at least."""
+
+
+def finding_lines(reasons: Iterable[Reason], suspects: Iterable[Finding]) -> list[str]:
+    """Return reasons and suspects as text, a line each."""
+    lines = [f"{one.outcome}: {one.code}: {one.text} Remedy: {one.remedy}" for one in reasons]
+    return lines + [f"suspect: {one.code}: {one.text} Remedy: {one.remedy}" for one in suspects]
