@@ -33,12 +33,9 @@ def check(inputs: FieldInputs, points: PointFits) -> None:
 
 
 def grow_field(inputs: FieldInputs, state: GrowthState) -> int:
-    """Grow from the valid points over all usable ones; return the number of points added.
-
-    They converge as those that are there did: the seeds', and those of an earlier round.
-    """
+    """Grow from the valid points over all usable ones; return the number of points added."""
     return grow(
-        state.fitter.converging(state.points.rate[state.points.ok]),
+        state.fitter,
         state.points,
         attempts=state.attempts,
         xy_px=inputs.xy_px,
