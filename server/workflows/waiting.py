@@ -10,7 +10,7 @@ from typing import Any, Self
 from core.errors import Cancelled
 from server.jobs.job import Job
 from server.worker.executor import Progress, TaskExecutor, TaskFuture
-from server.workflows.helpers import Helpers
+from server.worker.helpers import Helpers
 
 _STOPPING_S = 3.0  # the worker ends a task within a second, by force if need be
 

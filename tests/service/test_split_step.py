@@ -23,9 +23,9 @@ from server.formats.calibrations.recognise import load_calibration
 from server.formats.files import sha256_of
 from server.worker.embedded import ComputeWorker
 from server.worker.executor import TaskFuture, WorkerDiedError
+from server.worker.helpers import Helpers
 from server.worker.tasks import StepImages
 from server.worker.tile_task import TileTask, fit_tiles
-from server.workflows.helpers import Helpers
 from tests.support import sequence_bench as bench
 from tests.support.copied_tests import write_test_of
 from tests.support.dask_bench import Host, cluster_of

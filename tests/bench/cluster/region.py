@@ -29,10 +29,10 @@ from server.compute.tiles.folder_crew import FITTED
 from server.formats.files import sha256_of
 from server.worker.embedded import ComputeWorker
 from server.worker.executor import TaskFuture
+from server.worker.helpers import Helpers
 from server.worker.pool import WorkerPool
 from server.worker.tasks import StepImages, StepTask, measure_step
 from server.worker.tile_task import TileTask
-from server.workflows.helpers import Helpers
 from tests.bench.cluster.region_page import write_section
 from tests.bench.speed.scene import sequence_files
 
