@@ -88,13 +88,8 @@ def given_to_kernels(
     *,
     G: Float | None = None,
     epipolar_px: Float | None = None,
-    kept: Float | None = None,
-    keep: bool = False,
 ) -> Given:
-    """Return the kernels' arguments for n points with unknowns ``w`` and, for a motion, ``G``.
-
-    ``kept`` (n, k) is what a sequence keeps of the points; with ``keep`` it is to be filled.
-    """
+    """Return the kernels' arguments for n points with unknowns ``w`` and, for a motion, ``G``."""
     n, pose = len(xy), pair.cam2_from_cam1
     patches, which = visible_of(visible, n, options.subset_px)
     return Given(
@@ -110,8 +105,7 @@ def given_to_kernels(
         w=w,
         G=np.zeros((n, 3, w.shape[1])) if G is None else G,
         e=np.zeros(n) if epipolar_px is None else epipolar_px,
-        setting=setting_of(options, images, keep=keep),
-        kept=np.zeros((1, 0)) if kept is None or n == 0 else kept,
+        setting=setting_of(options, images),
     )
 
 
@@ -137,7 +131,7 @@ def run_kernel(
     return status, iterations
 
 
-def setting_of(options: MatchOptions, images: list[ImageData], *, keep: bool = False) -> Setting:
+def setting_of(options: MatchOptions, images: list[ImageData]) -> Setting:
     """Return options and noise: the images' variances, or all one where any is unknown."""
     given = [image.noise_variance for image in images]
     variances = [v for v in given if v is not None and v > 0.0]
@@ -160,7 +154,6 @@ def setting_of(options: MatchOptions, images: list[ImageData], *, keep: bool = F
         variances=tuple(variances) if known else (1.0,) * len(images),
         known_noise=known,
         rigid=options.patch == "rigid",
-        keep=keep,
     )
 
 

@@ -24,7 +24,6 @@ from core.matching.arguments import (
 )
 from core.matching.image import ImageData, prepare
 from core.matching.kernels.drivers import run_points, work_space
-from core.matching.kernels.kept import kept_width
 from core.matching.kernels.motion import n_motion_out
 from core.matching.kernels.shape import n_shape_out
 from core.matching.options import MatchOptions
@@ -192,7 +191,6 @@ def fit_motion(
     start_G: ArrayLike | None = None,
     options: MatchOptions | None = None,
     visible: VisiblePixels | None = None,
-    kept: Float | None = None,
 ) -> MotionFit:
     """Measure shape and motion at points of camera 1 from three comparisons at once.
 
@@ -212,9 +210,6 @@ def fit_motion(
         Defaults to ``MatchOptions()``.
     visible
         Which pixels of the points' subsets count; all of them when left out.
-    kept
-        (N, k) of :func:`keep_reference`, of the same images, points and options. The reference's sums are then taken
-        from there, and camera 2's reference image is compared only where a point moves in it.
 
     Raises
     ------
@@ -242,7 +237,7 @@ def fit_motion(
     w = starts_of("start_w", start_w, (n,), terms)
     G = starts_of("start_G", no_motion(pair, xy) if start_G is None else start_G, (n, 3), terms)
     out = np.full((n, n_motion_out(terms)), np.nan)
-    given = given_to_kernels(pair, images, xy, w, options, visible, G=G, kept=kept)
+    given = given_to_kernels(pair, images, xy, w, options, visible, G=G)
     status, iterations = run_kernel(run_points["motion"][degree], work_space["motion"][degree], given, out)
     failed, at = status != 0, 4 * terms
     out[failed, : at + 1] = np.nan
@@ -269,43 +264,6 @@ def fit_motion(
         return fit_motion(pair, one, two, one_now, two_now, xy, fit.w, fit.G, once, visible)
 
     return _with_blurred_noise(fit, images, xy, options, sharp)
-
-
-def keep_reference(
-    pair: StereoPair,
-    ref1: ImageData,
-    ref2: ImageData,
-    xy_px: ArrayLike,
-    w: ArrayLike,
-    epipolar_px: ArrayLike,
-    options: MatchOptions,
-    visible: VisiblePixels | None = None,
-) -> Float:
-    """Return what a sequence keeps of its reference pair, (N, k): sums, and the comparison at the shape's result.
-
-    Parameters
-    ----------
-    pair, ref1, ref2, xy_px
-        As of :func:`fit_shape`.
-    w, epipolar_px
-        (N, 3 or 6), (N,) the shape's results; nothing is kept where they are not finite.
-    options, visible
-        As of :func:`fit_shape`.
-
-    Returns
-    -------
-    Float
-        See :mod:`core.matching.kernels.kept`; all zero where nothing is kept: outside the images, without texture, and
-        of subsets that are not wholly visible.
-    """
-    xy, n = points_of(xy_px)
-    degree, terms = degree_of(options)
-    shape, offset = starts_of("w", w, (n,), terms), np.array(epipolar_px, dtype=np.float64)
-    shape[~np.isfinite(offset)] = np.nan
-    kept, unused = np.zeros((n, kept_width(terms))), np.empty((n, n_shape_out(terms)))
-    given = given_to_kernels(pair, [ref1, ref2], xy, shape, options, visible, epipolar_px=offset, kept=kept, keep=True)
-    run_kernel(run_points["shape"][degree], work_space["shape"][degree], given, unused)
-    return kept
 
 
 def _check_blur(images: list[ImageData]) -> None:

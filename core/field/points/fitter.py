@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
-from core.field.points.kept_reference import KeptReference
 from core.field.points.starts import depth_per_px, faces_both_cameras
 from core.field.region.visibility import Visibility
 from core.matching.arguments import VisiblePixels
@@ -161,8 +160,6 @@ class Fitter:
         Keep the numbers of points that a check rejects.
     visibility
         The points' visibility; None: all of every subset.
-    kept
-        What a sequence keeps of the reference pair; None: nothing.
     crew
         Those who may take tiles of many points; None: nobody.
     """
@@ -176,7 +173,6 @@ class Fitter:
     min_zncc: float
     visibility: Visibility | None = None
     keep_rejected: bool = False
-    kept: KeptReference | None = None
     crew: Crew | None = None
 
     @property
@@ -200,7 +196,7 @@ class Fitter:
 
     def curved(self) -> Fitter:
         """Return the same matcher with curved patches."""
-        return replace(self, options=replace(self.options, patch="quadratic"), kept=None)
+        return replace(self, options=replace(self.options, patch="quadratic"))
 
     def converging(self, rate: Float) -> Fitter:
         """Return the same matcher for points that converge as a sample (m,) of them did.
@@ -234,8 +230,7 @@ class Fitter:
                 np.full(n, np.nan),
             )
         else:
-            images = self.ref1, self.ref2, self.cur1, self.cur2
-            m = fit_motion(self.pair, *images, xy_px, w, G, self.options, visible, self.kept_at(xy_px))
+            m = fit_motion(self.pair, self.ref1, self.ref2, self.cur1, self.cur2, xy_px, w, G, self.options, visible)
             fits = PointFits(
                 m.w,
                 m.G,
@@ -262,10 +257,6 @@ class Fitter:
     def visible(self, xy_px: Float) -> VisiblePixels | None:
         """Return the visible pixels of points; None: all of them."""
         return None if self.visibility is None else self.visibility.at(xy_px)
-
-    def kept_at(self, xy_px: Float) -> Float | None:
-        """Return what a sequence keeps of points, (n, k); None: nothing."""
-        return None if self.kept is None else self.kept.at(xy_px)
 
     def far_from_start(self, xy_px: Float, fits: PointFits, w: Float, G: Float | None, limit_px: float) -> Bool:
         """Return (n,) True where a fit ended further than ``limit_px`` from its start in any image."""

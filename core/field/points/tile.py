@@ -62,16 +62,12 @@ class TileSetting:
 
 @dataclass(frozen=True, eq=False)
 class _TileFitter(Fitter):
-    """A matcher of points whose visible pixels, and what a sequence keeps of them, are given."""
+    """A matcher of points whose visible pixels are given."""
 
-    given_visible: VisiblePixels | None = None
-    given_kept: Float | None = None
+    given: VisiblePixels | None = None
 
     def visible(self, xy_px: Float) -> VisiblePixels | None:  # noqa: ARG002
-        return self.given_visible
-
-    def kept_at(self, xy_px: Float) -> Float | None:  # noqa: ARG002
-        return self.given_kept
+        return self.given
 
 
 class TileFits:
@@ -91,10 +87,8 @@ class TileFits:
         self._pair, self._pixels, self._setting = pair, pixels, setting
         self._whole: list[ImageData] = []
 
-    def fit(
-        self, points: ToFit, visible: VisiblePixels | None, kept: Float | None = None, cancel: CancelToken | None = None
-    ) -> PointFits:
-        """Fit a tile's points; ``visible`` are their visible pixels, None: all, ``kept`` what a sequence keeps of them.
+    def fit(self, points: ToFit, visible: VisiblePixels | None, cancel: CancelToken | None = None) -> PointFits:
+        """Fit a tile's points; ``visible`` are their visible pixels, None: all.
 
         Raises
         ------
@@ -118,8 +112,7 @@ class TileFits:
                 options=s.options,
                 min_zncc=s.min_zncc,
                 keep_rejected=s.keep_rejected,
-                given_visible=some,
-                given_kept=None if kept is None else kept[part],
+                given=some,
             )
             out = fitter.empty(len(points)) if out is None else out
             fits = fit_part(fitter, points.at(part))

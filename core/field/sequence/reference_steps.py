@@ -21,7 +21,6 @@ from core.field.growth.seed import Seeds
 from core.field.growth.state import FieldInputs, prepare
 from core.field.points.crew import Crew
 from core.field.points.images import MeasureImage
-from core.field.points.kept_reference import KeptReference
 from core.field.points.result import Field, References
 from core.field.region.find_visible import with_visibility
 from core.field.region.region import PointGrid
@@ -80,10 +79,6 @@ class Updating:
         The first reference's number.
     """
 
-    #: off: with it single points of blocks side by side end up to 3 % of a standard deviation from the chain's, 2 % is
-    #: what they may (decision 42)
-    keeps = False
-
     def __init__(
         self,
         pair: StereoPair,
@@ -102,7 +97,6 @@ class Updating:
         self._mode, self._first = mode, first
         self._images_of, self._field_of = images_of, field_of
         self._segments: OrderedDict[int, Segment] = OrderedDict()
-        self._kept: tuple[KeptReference | None] | None = None
 
     def measure(
         self,
@@ -207,27 +201,11 @@ class Updating:
     def _total(self, step: _Step) -> Field:
         inputs = self._inputs(self._reference, self._grid, step, step.progress)
         previous = None if step.previous is None else step.previous.field
-        if self.keeps and previous is not None:  # of a single step it would cost more than it saves
-            inputs = replace(inputs, matcher=replace(inputs.matcher, kept=self._kept_of(inputs)))
         return motion_field(inputs, self._shape, previous, step.seeds)
 
     def _inputs(self, reference: Pair, grid: PointGrid, step: _Step, progress: Progress | None = None) -> FieldInputs:
         more: Any = {"progress": progress, "cancel": step.cancel, "crew": step.crew}
         return prepare(self._pair, reference, step.images, grid, self._options, **more)
-
-    def _kept_of(self, inputs: FieldInputs) -> KeptReference | None:
-        """Return what the steps after the first one keep of the first reference, made once.
-
-        It follows from images and shape alone, so that steps measured in another process are the same.
-        """
-        if self._kept is None:
-            matcher, grid = inputs.matcher, inputs.grid
-            reference = matcher.ref1, matcher.ref2
-            made = KeptReference.of(
-                self._pair, reference, self._shape, grid.spacing_px, matcher.options, grid.visibility
-            )
-            self._kept = (made,)
-        return self._kept[0]
 
     def _segment(self, step: int) -> Segment:
         """Return the segment that begins at a step; the latest ones are kept."""

@@ -123,9 +123,7 @@ def make_cluster_robust(degree: int, images: int, parts: PointKernels, freeze: A
         return total * total / squares
 
     @kernel(f"{degree}_{images}", inline="always")
-    def cluster_robust_point(
-        reference, patches, which, shown, lens1, lens2, R, t, xy, w, g, e, setting, kept, space, out
-    ):
+    def cluster_robust_point(reference, patches, which, shown, lens1, lens2, R, t, xy, w, g, e, setting, space, out):
         """Compute the covariance of a fitted point's last unknowns; return status, and 0.
 
         ``out`` has two of ``last`` squared numbers: with independent blocks, and with neighbouring blocks correlated.
@@ -133,7 +131,7 @@ def make_cluster_robust(degree: int, images: int, parts: PointKernels, freeze: A
         subset, order, variances, rigid = setting.subset, setting.order, setting.variances, setting.rigid
         fit_space, part, scores, pull, z, sums = space
         ref, of_reference, warp_space, rhs, levels, M, equations, _, vectors, inverse, G, rotation, chain, _ = fit_space
-        seen = set_up_reference(reference, patches, which, lens1, xy[0], xy[1], subset, ref, kept, of_reference)
+        seen = set_up_reference(reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference)
         xc, yc, p, offset, f2 = seen.xc, seen.yc, seen.p, seen.offset, seen.f2
         if not seen.inside:
             return OUTSIDE_IMAGE, 0
@@ -177,7 +175,7 @@ def make_cluster_robust(degree: int, images: int, parts: PointKernels, freeze: A
                 return SINGULAR, 0
             rigid_chain(xc, yc, w, rotation, G, chain)
         result = freeze(
-            R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, chain, rigid, False
+            R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, chain, rigid
         )
         if result != OK:
             return result, 0

@@ -36,7 +36,7 @@ def _entry(name: str, kernel: Any, stamp: int) -> Any:
         if stamp < 0:  # never; it makes the stamp part of the function
             return
         # unpacked before the loop: in it numba would count references at each attribute
-        reference, patches, which, images, lens1, lens2, R, t, xy, w, G, e, setting, kept = given
+        reference, patches, which, images, lens1, lens2, R, t, xy, w, G, e, setting = given
         for i in range(first, last):
             status[i], iterations[i] = _point(
                 reference,
@@ -52,7 +52,6 @@ def _entry(name: str, kernel: Any, stamp: int) -> Any:
                 G[i],
                 e[i],
                 setting,
-                kept[i % len(kept)],
                 space,
                 out[i],
             )

@@ -24,10 +24,7 @@ class ComparedImage(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """Options and noise: the images' variances, or all one where any is unknown.
-
-    ``keep``: the fit of a shape fills what a sequence keeps, at the unknowns that are given, and changes nothing.
-    """
+    """Options and noise: the images' variances, or all one where any is unknown."""
 
     subset: int
     order: int
@@ -41,7 +38,6 @@ class Setting(NamedTuple):
     variances: tuple[float, ...]
     known_noise: bool
     rigid: bool
-    keep: bool
 
 
 class Given(NamedTuple):
@@ -50,7 +46,7 @@ class Given(NamedTuple):
     ``patches`` (k, subset, subset) uint8 are zero where a pixel does not count, ``which`` (n,) is the index of a
     point's, -1 = none. Images compared with the reference: camera 2's reference and, for a motion, both cameras'
     current images. ``xy`` (n, 2) px; ``w`` (n, M), ``G`` (n, 3, M) starts, or with ``e`` (n,) px the results whose
-    covariance is computed. ``kept`` (n, k) is what a sequence keeps of the points, see ``kept``, or (1, 0).
+    covariance is computed.
     """
 
     reference: ReferenceImage
@@ -66,7 +62,6 @@ class Given(NamedTuple):
     G: Any
     e: Any
     setting: Setting
-    kept: Any
 
 
 class ReferenceSpace(NamedTuple):
@@ -94,8 +89,7 @@ class Subset(NamedTuple):
     ``inside``: True if it lies in the image and the lens model's domain; the point's ray ``xc, yc``, the weights' sum
     ``p``, the remaining mean of f, the sum of squares of f about it, the differences of neighbours against it (1 for
     white noise), the number of pixels that count, and the grey level that is taken off an image before it is first
-    compared: zero unless the mean is so large against the contrast that the sums would lose it; and the grey level that
-    was taken off the subset.
+    compared: zero unless the mean is so large against the contrast that the sums would lose it.
     """
 
     inside: bool
@@ -107,7 +101,6 @@ class Subset(NamedTuple):
     white: float
     n_pixels: float
     first_shift: float
-    mean: float
 
 
 class WarpSpace(NamedTuple):

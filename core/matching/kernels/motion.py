@@ -11,7 +11,6 @@ import numpy as np
 
 from core.matching.kernels.cluster_robust import make_cluster_robust
 from core.matching.kernels.given import FitKernels
-from core.matching.kernels.kept import has_kept, kept_offset, read_form
 from core.matching.kernels.linear import covariance_of_last, solve
 from core.matching.kernels.naming import kernel
 from core.matching.kernels.noise import (
@@ -63,9 +62,9 @@ def make_motion(degree: int) -> FitKernels:
     unknowns = 4 * few + 1
 
     @kernel(f"{degree}")
-    def compare_all(images, lenses, M, order, ref, known, of_reference, warp_space, levels, rhs, first):
-        """All three comparisons, but for those before the ``first``; status."""
-        for k in range(first, 3):
+    def compare_all(images, lenses, M, order, ref, known, of_reference, warp_space, levels, rhs):
+        """All three comparisons; status."""
+        for k in range(3):
             lens = lenses[0] if k == 1 else lenses[1]
             if not compare(images[k], lens, M[k], order, ref, known, of_reference, warp_space, levels[k], rhs[k]):
                 return OUTSIDE_IMAGE
@@ -75,13 +74,11 @@ def make_motion(degree: int) -> FitKernels:
         return OK
 
     @kernel(f"{degree}")
-    def freeze(
-        R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, chain, rigid, ready
-    ):
-        """Set up and factor the normal equations; status. ``ready``: their columns are."""
+    def freeze(R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, chain, rigid):
+        """Set up and factor the normal equations; status."""
         weights, block, columns, half, _, normal = equations
         joint_weights(levels, variances, 3, weights)
-        if not ready and not jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, block, columns):
+        if not jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, block, columns):
             return SINGULAR
         n = unknowns
         if few == 3 and rigid:
@@ -101,7 +98,7 @@ def make_motion(degree: int) -> FitKernels:
 
     @kernel(f"{degree}", inline="always")
     def motion_point(
-        reference, patches, which, images, lens1, lens2, R, t, xy, start_w, start_g, _e, setting, kept, space, out
+        reference, patches, which, images, lens1, lens2, R, t, xy, start_w, start_g, _e, setting, space, out
     ):
         """Fit one point, ``out`` as in ``n_motion_out``. Returns status and iterations."""
         order, tolerance, variances = setting.order, setting.tolerance, setting.variances
@@ -110,7 +107,7 @@ def make_motion(degree: int) -> FitKernels:
         )
         gram, columns, normal = of_reference.gram, equations.columns, equations.normal
         subset = setting.subset
-        seen = set_up_reference(reference, patches, which, lens1, xy[0], xy[1], subset, ref, kept, of_reference)
+        seen = set_up_reference(reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference)
         xc, yc, p, offset, f2 = seen.xc, seen.yc, seen.p, seen.offset, seen.f2
         if not seen.inside:
             return OUTSIDE_IMAGE, 0
@@ -143,8 +140,7 @@ def make_motion(degree: int) -> FitKernels:
         slopes = lens_jacobian(lens1, xc, yc)
         blocks_of_pixels = np.int64((subset * subset + LANES - 1) // LANES)
         known = (blocks_of_pixels, p, offset, f2)
-        compared = not has_kept(kept) or rigid  # camera 2 at t0: else taken from what is kept
-        e = 0.0 if compared else kept_offset(kept, few)
+        e = 0.0
         for k in range(3):
             levels[k, GAIN], levels[k, SHIFT] = 1.0, seen.first_shift
         moved, previous, last = np.inf, 0.0, np.inf
@@ -152,15 +148,7 @@ def make_motion(degree: int) -> FitKernels:
         iterations = 0
         while iterations < setting.max_iterations:
             image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M)
-            near, ready = False, False
-            if not compared:
-                if moved > REFREEZE_PX:
-                    ready = jacobian(R, t, e, nu_x, nu_y, M, slopes, of_reference, inverse, equations.block, columns)
-                if ready or not moved > REFREEZE_PX:
-                    near = read_form(kept, few, 4, columns[0], w, e, gram, f2, moves[0], rhs[0], levels[0])
-            result = compare_all(
-                images, lenses, M, order, ref, known, of_reference, warp_space, levels, rhs, 1 if near else 0
-            )
+            result = compare_all(images, lenses, M, order, ref, known, of_reference, warp_space, levels, rhs)
             if result != OK:
                 return result, iterations
             iterations += 1
@@ -168,21 +156,7 @@ def make_motion(degree: int) -> FitKernels:
                 if few == 3 and rigid:
                     rigid_chain(xc, yc, w, rotation, G, chain)
                 result = freeze(
-                    R,
-                    t,
-                    e,
-                    nu_x,
-                    nu_y,
-                    M,
-                    slopes,
-                    levels,
-                    variances,
-                    of_reference,
-                    inverse,
-                    equations,
-                    chain,
-                    rigid,
-                    ready,
+                    R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, chain, rigid
                 )
                 if result != OK:
                     return result, iterations
@@ -219,10 +193,7 @@ def make_motion(degree: int) -> FitKernels:
             predict(moves, rhs, gram, f2, levels)
         else:
             image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M)
-            near = not compared and read_form(kept, few, 4, columns[0], w, e, gram, f2, moves[0], rhs[0], levels[0])
-            result = compare_all(
-                images, lenses, M, order, ref, known, of_reference, warp_space, levels, rhs, 1 if near else 0
-            )
+            result = compare_all(images, lenses, M, order, ref, known, of_reference, warp_space, levels, rhs)
             if result != OK:
                 return result, iterations
         if not w[0] > 0.0:  # behind camera 1

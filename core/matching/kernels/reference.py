@@ -21,10 +21,9 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from core.matching.kernels.given import Subset
-from core.matching.kernels.kept import has_kept, read_sums
 from core.matching.kernels.loops import GX, GY, N_ROWS, WEIGHT, F, X, Y, monomials, sum_reference
 from core.matching.kernels.naming import inner, kernel
-from core.matching.kernels.vectors import LANES, LONG, at, load, spread, store
+from core.matching.kernels.vectors import LANES, LONG, at, load, store
 from core.matching.kernels.warp import set_up_nodes, undistort
 
 LARGE_MEAN = 100.0
@@ -44,9 +43,9 @@ def subset_array(subset: int) -> np.ndarray:
 
 
 @intrinsic
-def _copy_square(_typingctx: Any, image: Any, top: Any, left: Any, subset: Any, ref: Any, row: Any, less: Any) -> Any:
-    """Copy a square of an image, 8 px or more wide, less a number, into one row of the reference subset's array."""
-    sig = types.void(image, top, left, subset, ref, row, less)
+def _copy_square(_typingctx: Any, image: Any, top: Any, left: Any, subset: Any, ref: Any, row: Any) -> Any:
+    """Copy a square of an image, 8 px or more wide, into one row of the reference subset's array."""
+    sig = types.void(image, top, left, subset, ref, row)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         array = context.make_array(sig.args[0])(context, builder, args[0])
@@ -54,7 +53,7 @@ def _copy_square(_typingctx: Any, image: Any, top: Any, left: Any, subset: Any, 
         out = context.make_array(sig.args[4])(context, builder, args[4])
         to = at(builder, out.data, builder.mul(args[5], builder.extract_value(out.shape, 1)))
         start = at(builder, array.data, builder.add(builder.mul(args[1], cols), args[2]))
-        subset, less = args[3], spread(builder, args[6])
+        subset = args[3]
         last = builder.sub(subset, LONG(LANES))
         whole = builder.sdiv(subset, LONG(LANES))
         with cgutils.for_range(builder, subset) as line:
@@ -62,22 +61,22 @@ def _copy_square(_typingctx: Any, image: Any, top: Any, left: Any, subset: Any, 
             target = at(builder, to, builder.mul(line.index, subset))
             with cgutils.for_range(builder, whole) as part:
                 offset = builder.mul(part.index, LONG(LANES))
-                store(load(builder, at(builder, source, offset)) - less, at(builder, target, offset))
+                store(load(builder, at(builder, source, offset)), at(builder, target, offset))
             # the rest, overlapping the pixels already copied
-            store(load(builder, at(builder, source, last)) - less, at(builder, target, last))
+            store(load(builder, at(builder, source, last)), at(builder, target, last))
         return context.get_dummy_value()
 
     return sig, codegen
 
 
 @inner
-def _copy(image, top, left, subset, ref, row, less):
+def _copy(image, top, left, subset, ref, row):
     if subset >= LANES:
-        _copy_square(image, np.int64(top), np.int64(left), np.int64(subset), ref, np.int64(row), less)
+        _copy_square(image, np.int64(top), np.int64(left), np.int64(subset), ref, np.int64(row))
         return
     for r in range(subset):
         for c in range(subset):
-            ref[row, r * subset + c] = image[top + r, left + c] - less
+            ref[row, r * subset + c] = image[top + r, left + c]
 
 
 @inner
@@ -116,25 +115,7 @@ def make_reference(degree: int) -> Any:
     sum_all = sum_reference[degree]
 
     @kernel(f"{degree}")
-    def _reduce(raw, offset, f2, sum_g, sum_fg, gram):
-        """Take gain and offset out of the raw sums."""
-        for i in range(n_columns):
-            sum_g[i] = raw[first_g + i]
-            sum_fg[i] = raw[first_fg + i] - offset * raw[first_g + i]
-        for j in range(few):
-            for k in range(few):
-                m = product[j, k]
-                gram[j, k] = raw[first_gg + m]
-                gram[j, few + k] = gram[few + j, k] = raw[first_gg + many + m]
-                gram[few + j, few + k] = raw[first_gg + 2 * many + m]
-        per_weight, per_f2 = 1.0 / raw[0], 1.0 / f2
-        for i in range(n_columns):
-            a, b = sum_g[i] * per_weight, sum_fg[i] * per_f2
-            for j in range(n_columns):
-                gram[i, j] -= a * sum_g[j] + b * sum_fg[j]
-
-    @kernel(f"{degree}")
-    def set_up_reference(reference, patches, which, lens, x_px, y_px, subset, ref, kept, space):
+    def set_up_reference(reference, patches, which, lens, x_px, y_px, subset, ref, space):
         """Copy the subset nearest to (x_px, y_px) and sum it; return a :class:`Subset`.
 
         Parameters
@@ -145,14 +126,12 @@ def make_reference(degree: int) -> Any:
             Camera 1's.
         ref
             The subset's array, see ``loops``.
-        kept
-            What is kept of the point (see ``kept``), or nothing; its sums are then taken from there.
         space
             A :class:`ReferenceSpace`.
         """
         pixels, grad_x, grad_y, weights = reference
         raw, node_work, powers, basis, middle, sum_g, sum_fg, gram = space
-        nothing = Subset(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        nothing = Subset(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         rows, cols = pixels.shape
         half = 0.5 * (subset - 1)
         left, top = int(np.floor(x_px - half + 0.5)), int(np.floor(y_px - half + 0.5))
@@ -164,32 +143,36 @@ def make_reference(degree: int) -> Any:
         middle[0], middle[1], middle[2] = left + half - x_px, top + half - y_px, half
         if not set_up_nodes(lens, middle[0], middle[1], half, xc, yc, node_work, powers):
             return nothing
-        known = has_kept(kept)
-        mean = kept[4] if known else 0.0
-        none = np.float32(0.0)
-        _copy(pixels, top, left, subset, ref, np.int64(F), np.float32(mean))
-        _copy(grad_x, top, left, subset, ref, np.int64(GX), none)
-        _copy(grad_y, top, left, subset, ref, np.int64(GY), none)
+        _copy(pixels, top, left, subset, ref, np.int64(F))
+        _copy(grad_x, top, left, subset, ref, np.int64(GX))
+        _copy(grad_y, top, left, subset, ref, np.int64(GY))
         if weights.shape[0] > 0:
-            _copy(weights, top, left, subset, ref, np.int64(WEIGHT), none)
+            _copy(weights, top, left, subset, ref, np.int64(WEIGHT))
         count = subset * subset
         if patches.shape[0] > 0:
             count = _count_visible(patches, which, subset, weights.shape[0] > 0, ref)
-        last = pixels[top + subset - 1, left + subset - 1] - np.float32(mean)
+        mean = np.float32(0.0)  # of a diagonal: only there to keep the sums small
+        for i in range(subset):
+            mean += pixels[top + i, left + i]
         for i in range(subset * subset, ref.shape[1]):  # the last pixel has no right neighbour: it differs by nothing
-            ref[F, i] = last
-        if known:
-            p, offset, f2, white = read_sums(kept, sum_g, sum_fg, gram)
-        else:
-            diagonal = np.float32(0.0)  # only there to keep the sums small
-            for i in range(subset):
-                diagonal += pixels[top + i, left + i]
-            mean = diagonal / subset
-            sum_all(ref, np.int64((subset * subset + LANES - 1) // LANES), np.float32(mean), raw)
-            p, offset = raw[0], raw[1] / raw[0]
-            f2 = raw[2] - raw[1] * offset
-            white = 0.5 * raw[3] / f2
-            _reduce(raw, offset, f2, sum_g, sum_fg, gram)
+            ref[F, i] = pixels[top + subset - 1, left + subset - 1]
+        sum_all(ref, np.int64((subset * subset + LANES - 1) // LANES), np.float32(mean / subset), raw)
+        p, offset = raw[0], raw[1] / raw[0]
+        f2 = raw[2] - raw[1] * offset
+        for i in range(n_columns):
+            sum_g[i] = raw[first_g + i]
+            sum_fg[i] = raw[first_fg + i] - offset * raw[first_g + i]
+        for j in range(few):
+            for k in range(few):
+                m = product[j, k]
+                gram[j, k] = raw[first_gg + m]
+                gram[j, few + k] = gram[few + j, k] = raw[first_gg + many + m]
+                gram[few + j, few + k] = raw[first_gg + 2 * many + m]
+        per_weight, per_f2 = 1.0 / p, 1.0 / f2
+        for i in range(n_columns):
+            a, b = sum_g[i] * per_weight, sum_fg[i] * per_f2
+            for j in range(n_columns):
+                gram[i, j] -= a * sum_g[j] + b * sum_fg[j]
         # positions -> rays: X = a0 + a1 x + a2 y, Y alike, with the lens's slope at the point
         u, v = basis[1], basis[2]
         u[1], u[2], v[1], v[2] = half * node_work[16], half * node_work[17], half * node_work[18], half * node_work[19]
@@ -198,10 +181,10 @@ def make_reference(degree: int) -> Any:
         if few == 6:
             for row, s, t in ((3, u, u), (4, u, v), (5, v, v)):
                 times(s, t, basis[row])
-        first_shift = float(mean)
+        first_shift = float(mean / subset)
         if first_shift * first_shift * p <= LARGE_MEAN * LARGE_MEAN * f2:
             first_shift = 0.0
-        return Subset(True, xc, yc, p, offset, f2, white, float(count), first_shift, float(mean))
+        return Subset(True, xc, yc, p, offset, f2, 0.5 * raw[3] / f2, float(count), first_shift)
 
     return set_up_reference, n_columns, first_gg + 3 * many
 

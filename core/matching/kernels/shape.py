@@ -8,7 +8,6 @@ import numpy as np
 
 from core.matching.kernels.cluster_robust import make_cluster_robust
 from core.matching.kernels.given import FitKernels
-from core.matching.kernels.kept import write_form, write_sums
 from core.matching.kernels.linear import covariance_of_last, solve
 from core.matching.kernels.naming import kernel
 from core.matching.kernels.noise import (
@@ -54,9 +53,7 @@ def make_shape(degree: int) -> FitKernels:
     n = few + 1  # unknowns: w1, w2, ..., w0, e
 
     @kernel(f"{degree}")
-    def freeze(
-        R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, _chain, _rigid, _ready
-    ):
+    def freeze(R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, _chain, _rigid):
         """Set up and factor the normal equations; status."""
         weights, block, columns, _, _, normal = equations
         joint_weights(levels, variances, 1, weights)
@@ -66,15 +63,13 @@ def make_shape(degree: int) -> FitKernels:
         return OK if factor(normal, n) else LOW_TEXTURE
 
     @kernel(f"{degree}", inline="always")
-    def shape_point(
-        reference, patches, which, images, lens1, lens2, R, t, xy, start, _G, at_e, setting, kept, space, out
-    ):
+    def shape_point(reference, patches, which, images, lens1, lens2, R, t, xy, start, _G, _e, setting, space, out):
         """Fit one point, ``out`` as in ``n_shape_out``. Returns status and iterations."""
         order, tolerance, variances = setting.order, setting.tolerance, setting.variances
         ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, rotation, _, work = space
         gram, columns, normal = of_reference.gram, equations.columns, equations.normal
         subset = setting.subset
-        seen = set_up_reference(reference, patches, which, lens1, xy[0], xy[1], subset, ref, kept, of_reference)
+        seen = set_up_reference(reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference)
         xc, yc, p, offset, f2 = seen.xc, seen.yc, seen.p, seen.offset, seen.f2
         if not seen.inside:
             return OUTSIDE_IMAGE, 0
@@ -97,8 +92,7 @@ def make_shape(degree: int) -> FitKernels:
         slopes = lens_jacobian(lens1, xc, yc)
         blocks_of_pixels = np.int64((subset * subset + LANES - 1) // LANES)
         known = (blocks_of_pixels, p, offset, f2)
-        keep = setting.keep
-        e = at_e if keep else 0.0
+        e = 0.0
         levels[0, GAIN], levels[0, SHIFT] = 1.0, seen.first_shift
         moved, previous, last = np.inf, 0.0, np.inf
         status = NOT_CONVERGED
@@ -110,30 +104,9 @@ def make_shape(degree: int) -> FitKernels:
             iterations += 1
             if levels[0, CONTRAST] == 0.0:
                 return LOW_TEXTURE, iterations
-            if keep:
-                if which < 0:
-                    write_sums(
-                        kept, p, offset, f2, seen.white, seen.mean, of_reference.sum_g, of_reference.sum_fg, gram
-                    )
-                    write_form(kept, rhs[0], levels[0], w, e, few)
-                return OK, iterations
             if moved > REFREEZE_PX:
                 result = freeze(
-                    R,
-                    t,
-                    e,
-                    nu_x,
-                    nu_y,
-                    M,
-                    slopes,
-                    levels,
-                    variances,
-                    of_reference,
-                    inverse,
-                    equations,
-                    rotation,
-                    False,
-                    False,
+                    R, t, e, nu_x, nu_y, M, slopes, levels, variances, of_reference, inverse, equations, rotation, False
                 )
                 if result != OK:
                     return result, iterations

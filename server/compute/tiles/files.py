@@ -16,13 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from core.arrays import Float
 from core.field.points.crew import ToFit
 from core.field.points.fitter import PointFits
 from core.matching.arguments import VisiblePixels
 
 
-def put_tile(folder: Path, k: int, points: ToFit, visible: VisiblePixels | None, kept: Float | None) -> None:
+def put_tile(folder: Path, k: int, points: ToFit, visible: VisiblePixels | None) -> None:
     """Write what is to be fitted.
 
     Raises
@@ -32,8 +31,6 @@ def put_tile(folder: Path, k: int, points: ToFit, visible: VisiblePixels | None,
     arrays: dict[str, Any] = {"xy_px": points.xy_px, "w": points.w, "far_px": np.float64(points.far_px)}
     if points.G is not None:
         arrays["G"] = points.G
-    if kept is not None:
-        arrays["kept"] = kept
     if visible is not None:
         used = np.unique(visible.of_point[visible.of_point >= 0])
         place = np.full(len(visible.patches) + 1, -1, np.int32)  # the last one: all of a subset
@@ -42,7 +39,7 @@ def put_tile(folder: Path, k: int, points: ToFit, visible: VisiblePixels | None,
     _put(folder / f"tile_{k:04d}.npz", arrays)
 
 
-def tile_in(folder: Path, k: int) -> tuple[ToFit, VisiblePixels | None, Float | None]:
+def tile_in(folder: Path, k: int) -> tuple[ToFit, VisiblePixels | None]:
     """Return what is to be fitted.
 
     Raises
@@ -53,8 +50,7 @@ def tile_in(folder: Path, k: int) -> tuple[ToFit, VisiblePixels | None, Float | 
     with np.load(folder / f"tile_{k:04d}.npz", allow_pickle=False) as found:
         points = ToFit(found["xy_px"], found["w"], found.get("G"), float(found["far_px"]))
         visible = VisiblePixels(found["patches"], found["of_point"]) if "patches" in found else None
-        kept = found.get("kept")
-    return points, visible, kept
+    return points, visible
 
 
 def claim(folder: Path, k: int) -> bool:

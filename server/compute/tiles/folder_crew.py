@@ -56,7 +56,7 @@ class FolderCrew:
         try:
             folder.mkdir(parents=True)
             for k, points in enumerate(tiles):
-                files.put_tile(folder, k, points, fitter.visible(points.xy_px), fitter.kept_at(points.xy_px))
+                files.put_tile(folder, k, points, fitter.visible(points.xy_px))
         except OSError as error:
             _log.warning("tiles could not be shared out (%s); they are fitted here", error)
             shutil.rmtree(folder, ignore_errors=True)

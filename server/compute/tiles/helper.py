@@ -52,8 +52,8 @@ def fit_tiles(task: TileTask) -> int:
                 pixels = [_pixels(path, path.stat().st_mtime_ns) for path in task.images]
                 calibration = task.calibration, task.calibration.stat().st_mtime_ns
                 fits = TileFits(_pair(*calibration), pixels, task.setting)
-            points, visible, kept = files.tile_in(task.folder, k)
-            files.put_fits(task.folder, k, fits.fit(points, visible, kept, token))
+            points, visible = files.tile_in(task.folder, k)
+            files.put_fits(task.folder, k, fits.fit(points, visible, token))
         except (OSError, Cancelled):
             if task.wanted:
                 raise

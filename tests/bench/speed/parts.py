@@ -92,13 +92,13 @@ def _timers(order: int) -> dict[str, Any]:
     sums_of, compare = sum_reference[DEGREE], (compare_cubic if order == 3 else compare_quintic)[DEGREE]
     lead = order // 2
 
-    everything, nothing = np.zeros((0, 1, 1), np.uint8), np.zeros(0)
+    everything = np.zeros((0, 1, 1), np.uint8)
 
     @njit(nogil=True, error_model="numpy")
     def reference(n, images, lens, x, y, subset, ref, space):
         total = 0.0
         for _ in range(n):
-            total += set_up_reference(images, everything, -1, lens, x, y, subset, ref, nothing, space).f2
+            total += set_up_reference(images, everything, -1, lens, x, y, subset, ref, space).f2
         return total
 
     @njit(nogil=True, error_model="numpy")
