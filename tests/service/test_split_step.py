@@ -140,6 +140,7 @@ def test_a_shape_a_first_motion_and_a_further_step_are_those_of_one_worker(
         assert future.result(timeout=30) >= 0  # a tile that nobody wanted any more is no failure
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize("changes", [{"patch": "quadratic"}, {"keep_rejected": True}])
 def test_so_they_are_with_other_patches_and_what_was_rejected(
     data: Path, tmp_path: Path, worker: ComputeWorker, changes: dict[str, Any]
