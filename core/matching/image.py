@@ -214,6 +214,14 @@ def prepare_part(pixels: NDArray[Any], order: int, noise: NoiseModel | None, box
     """
     rows, cols = pixels.shape
     padded = np.full((rows + 2 * PAD, cols + 2 * PAD), np.nan, np.float32)
+    x0, y0, x1, y1 = box
+    padded[PAD + y0 : PAD + y1, PAD + x0 : PAD + x1] = coefficients_in(pixels, order, box)
+    mirror_padding(padded, 0, rows)
+    return ImageData(padded, pixels, order, noise)
+
+
+def coefficients_in(pixels: NDArray[Any], order: int, box: Box) -> Float32:
+    """Return the coefficients of a box of an image, those of the whole image to the last bit."""
     taps = prefilter(order)
     reach = len(taps) // 2
     x0, y0, x1, y1 = box
@@ -221,10 +229,7 @@ def prepare_part(pixels: NDArray[Any], order: int, noise: NoiseModel | None, box
     part = pixels[top : y1 + reach, left : x1 + reach]
     found = np.empty(part.shape, np.float32)
     correlate(part, taps, taps, found)
-    inner = padded[PAD:-PAD, PAD:-PAD]
-    inner[y0:y1, x0:x1] = found[y0 - top : y1 - top, x0 - left : x1 - left]
-    mirror_padding(padded, 0, rows)
-    return ImageData(padded, pixels, order, noise)
+    return found[y0 - top : y1 - top, x0 - left : x1 - left]
 
 
 def _coefficients(pixels: NDArray[Any], order: int) -> Float32:

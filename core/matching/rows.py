@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arrays import Float32
-from core.matching.filters import correlate, prefilter
-from core.matching.image import PAD, ImageData, mirror_padding
+from core.matching.image import PAD, ImageData, coefficients_in, mirror_padding
 from core.matching.odd_filters import REACH
 from core.matching.slopes import SlopeFilter
 
@@ -33,15 +32,10 @@ def prepare_rows(pixels: NDArray[Any], order: int, first: int, last: int) -> Ima
         First row, and one past the last one, inside the image.
     """
     rows, cols = pixels.shape
-    taps = prefilter(order)
-    top = max(first - len(taps) // 2, 0)
-    part = pixels[top : last + len(taps) // 2]
-    found = np.empty(part.shape, np.float32)
-    correlate(part, taps, taps, found)
     padded = np.zeros((rows + 2 * PAD, cols + 2 * PAD), np.float32)  # rows that nobody reads take no memory
     inner = padded[PAD:-PAD, PAD:-PAD]
     inner[max(first - _EDGE, 0) : last + _EDGE] = np.nan
-    inner[first:last] = found[first - top : last - top]
+    inner[first:last] = coefficients_in(pixels, order, (0, first, cols, last))
     mirror_padding(padded, max(first - _EDGE, 0), min(last + _EDGE, rows))
     return ImageData(padded, pixels, order)
 

@@ -20,7 +20,6 @@ Index = NDArray[np.intp]
 
 _REACH_SUBSETS = 1.5
 _PARENTS = 4  # the nearest ones; the first that no cut separates counts
-_APART = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 
 def is_large(inputs: FieldInputs) -> bool:

@@ -66,8 +66,7 @@ def in_frame(files: Sequence[Path], asked: Alignment | None, out: Path, *, strai
     """Return result files in a frame, written into a folder; they themselves for the system frame.
 
     The frame is laid through the reference of the measurement, where its result lies beside them: of dense fields that
-    of the ordinary ones. Without ``strain``
-    that is not made anew: for who reads none of it.
+    of the ordinary ones. Without ``strain`` that is not made anew: for who reads none of it.
 
     Raises
     ------
