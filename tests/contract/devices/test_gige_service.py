@@ -161,7 +161,9 @@ def test_fake_cameras_end_in_a_clear_refusal_before_anything_moves(network: Name
             print(rounds)
             assert fault_s < 1.0, rounds
             assert back_s < 3.0, rounds
-            assert client.post(f"{API}/tests/{test_id}/steps", json={}).json()["n"] == 3
+            after = _step_of_a_camera_that_answers(client, test_id)
+            assert after.is_success, after.text
+            assert after.json()["n"] == 3
             pairs = client.get(f"{API}/cameras/cam1/stats").json()["pairs"]
             assert pairs["triggered"] == sum(pairs[name] for name in ("paired", "unpaired", "incomplete", "dropped"))
 
@@ -188,6 +190,15 @@ def _lose_and_find(
     assert shown["settings"]["exposure_ms"] == pytest.approx(7.0)
     assert shown["reconnections"] > before
     return fault_s, back_s, process
+
+
+def _step_of_a_camera_that_answers(client: httpx.Client, test_id: str) -> httpx.Response:
+    """Capture a step; once more where a machine with other work let the camera be silent for the watchdog's 0.4 s."""
+    answer = client.post(f"{API}/tests/{test_id}/steps", json={})
+    if not answer.is_success and answer.json()["code"] == "camera_lost":
+        _until(lambda: client.get(f"{API}/cameras/cam2").json()["fault"] is None, 20.0)
+        answer = client.post(f"{API}/tests/{test_id}/steps", json={})
+    return answer
 
 
 def test_simulated_pictures_behind_the_same_drivers_end_in_a_calibration(network: Namespace, tmp_path: Path) -> None:

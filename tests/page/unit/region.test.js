@@ -39,6 +39,11 @@ test("a hole that reaches over the image's border ends there", () => {
   assert.ok(hole.every(([x, y]) => x >= 0 && y >= 0));
 });
 
+test("nothing is cut at the border of an image that is still on its way", () => {
+  const rectangle = { form: "rectangle", points: [[20, 10], [90, 70]] };
+  assert.deepEqual(regionOf({ ...nothing(), outlines: [rectangle] }, { width: 0, height: 0 }), { rectangle: [20, 10, 90, 70], holes: [], cracks: [] });
+});
+
 test("numbers are read as they are written", () => {
   for (const shape of [CIRCLE, { form: "polygon", points: [[1, 2], [30.5, 4], [5, 60]] }]) assert.deepEqual(pointsFrom(textOf(shape.points, shape.form), shape.form), shape.points);
   assert.equal(textOf(CIRCLE.points, "circle"), "100, 80; 30");

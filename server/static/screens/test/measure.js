@@ -97,6 +97,7 @@ export async function measurePanel(id, test, ends, done) {
     const correct = (/** @type {HTMLInputElement} */ input) => input.value !== "" && input.checkValidity();
     let asked = 0;
     async function rateTexture() {
+      if (!views[0].width) return; // a region is cut at the image's border: it is rated once the image is there
       asked += 1;
       const mine = asked;
       const region = editor.region();
@@ -171,13 +172,16 @@ export async function measurePanel(id, test, ends, done) {
       drawSample();
       drawGauge();
       checkSeeds();
+      rateSoon();
+    }
+    function rateSoon() {
       clearTimeout(timer);
       timer = setTimeout(() => { rateTexture(); if (showTexture.checked) layTexture().catch(notify); }, 300);
     }
     for (const input of [subset, spacing]) input.addEventListener("input", changed);
     showSample.addEventListener("change", drawSample);
     showTexture.addEventListener("change", () => layTexture().catch(notify));
-    views[0].image.addEventListener("load", drawSample);
+    views[0].image.addEventListener("load", () => { drawSample(); rateSoon(); });
 
     // settings
     const kind = select([["displacement", "shape and displacement"], ["profile", "shape only"]], "displacement");

@@ -93,10 +93,11 @@ const inImage = (points, { width, height }) => points.map(([x, y]) => /** @type 
 /**
  * The region as the API takes it; null where nothing is drawn that points may lie in.
  * @param {State} state
- * @param {{ width: number, height: number }} size of camera 1's image
+ * @param {{ width: number, height: number }} image camera 1's; without a size while it is on its way: nothing is cut at a border that is not known
  * @returns {Model<"Region"> | null}
  */
-export function regionOf(state, size) {
+export function regionOf(state, image) {
+  const size = image.width ? image : { width: Infinity, height: Infinity };
   const cuts = { holes: state.holes.map((hole) => inImage(corners(hole), size)), cracks: state.cracks };
   if (state.mask !== null) return { mask_png_base64: state.mask, ...cuts };
   // a circle that reaches over the image's border ends there
