@@ -35,6 +35,7 @@ function draw(screen, answer) {
   /** @typedef {{ name: string, title: string, at: number, group: string, text: string | HTMLElement }} Row */
   /** @type {Row[]} */
   const rows = [];
+  const sizes = sizesOf(answer);
   for (const [name, { value, units, sigma, not_included: lacking, budget }] of Object.entries(answer.values)) {
     if (name.startsWith("sigma_") || name === "status" || name === "strain_status") continue;
     const { unit, factor } = shownUnit(name, units);
@@ -45,7 +46,7 @@ function draw(screen, answer) {
     }
     const shown = value === null || value === undefined ? null : value * factor;
     const u = sigma === null || sigma === undefined || shown === null ? null : sigma * factor;
-    const text = withUncertainty(shown, u, unit, screen.interval.factor);
+    const text = withUncertainty(shown, u, unit, screen.interval.factor, sizes.get(`${groupOf(name).group} ${unit}`));
     rows.push({ ...row, text: u === null ? text : /** @type {string | HTMLElement} */ (withBudget(text, budgetTable(budget, unit, factor, lacking ?? ""))) });
   }
   rows.sort((p, q) => p.at - q.at); // what matters first
@@ -58,6 +59,22 @@ function draw(screen, answer) {
     groups(rows.filter((row) => row.group !== INTERNALS)),
     h("details", { open: kept }, h("summary", "Internals"), h("div", { "data-group": INTERNALS }, table(columns, rows.filter((row) => row.group === INTERNALS)))));
   mark(screen);
+}
+
+/**
+ * Largest number of each group and unit: X, Y and Z stand in one unit, whatever the size of each.
+ * @param {Answer} answer
+ */
+function sizesOf(answer) {
+  /** @type {Map<string, number>} */
+  const sizes = new Map();
+  for (const [name, { value, units }] of Object.entries(answer.values)) {
+    if (typeof value !== "number" || name.startsWith("sigma_")) continue;
+    const { unit, factor } = shownUnit(name, units);
+    const key = `${groupOf(name).group} ${unit}`;
+    sizes.set(key, Math.max(sizes.get(key) ?? 0, Math.abs(value * factor)));
+  }
+  return sizes;
 }
 
 /**

@@ -72,9 +72,10 @@ export function interval(screen) {
  * @param {number | null} sigma standard uncertainty
  * @param {string} unit
  * @param {number} factor
+ * @param {number} [size] of the largest number beside it: they have one unit
  */
-export function withUncertainty(value, sigma, unit, factor) {
-  return uncertain(value, sigma === null ? null : factor * sigma, unit);
+export function withUncertainty(value, sigma, unit, factor, size = 0) {
+  return uncertain(value, sigma === null ? null : factor * sigma, unit, size);
 }
 
 /**
