@@ -85,13 +85,16 @@ def _pool(
         solved, _ = _inverse(J, fit_width, pieces[k, 14], fits[k, 12] ** 2, C)
         if not solved:
             continue
-        taken = np.sum((J @ C) * J, axis=1)
+        propagated = J @ C
         for i in range(len(r)):
             at = floor((distance[i] + _REACH_PX) * _PER_PX + 0.5)
             if 0 <= at < _BINS:
+                taken = 0.0
+                for j in range(N_SHAPE):
+                    taken += propagated[i, j] * J[i, j]
                 share = r[i] / fits[k, 5]
                 count[family[k], at] += 1.0
-                free[family[k], at] += 1.0 - taken[i]
+                free[family[k], at] += 1.0 - taken
                 total[family[k], at] += share
                 squares[family[k], at] += share * share
     return count, free, total, squares

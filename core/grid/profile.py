@@ -157,6 +157,13 @@ def close_normal(N: Float, fit_width: bool, width: float, variance: float) -> fl
 
 
 @njit(cache=True, nogil=True)
+def _copy(source: Float, to: Float) -> None:
+    """Copy (n,) numbers; ``to[:] = source`` would have the text of an error that cannot be compiled, for seconds."""
+    for k in range(source.size):
+        to[k] = source[k]
+
+
+@njit(cache=True, nogil=True)
 def _minimise(
     ts: Float,
     ds: Float,
@@ -207,10 +214,10 @@ def _minimise(
         settled = kept and best - rss < 1e-7 * best
         best = rss
         kept = True
-        par[:] = trial
+        _copy(trial, par)
         prior = close_normal(N, fit_width, width, rss / (count - N_SHAPE))
         g[7] = g[7] + prior * (width - par[7]) if fit_width else 0.0
-        accepted[:] = N
+        _copy(N.ravel(), accepted.ravel())
         if settled or step == _STEPS - 1:
             break
         M = N.copy()
@@ -232,7 +239,7 @@ def _minimise(
             for i in range(N_SHAPE):
                 gain += delta[i] * g[i]
             if gain < _NO_GAIN * best:
-                par[:] = trial
+                _copy(trial, par)
                 break
     return best
 
@@ -287,14 +294,14 @@ def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, ou
     peak, _, _, _ = profile_terms(0.0, width, blur, a, b)
     par[5] = (line / n_line - par[2]) / max(peak, 0.1)
     accepted = np.zeros((N_SHAPE, N_SHAPE))
-    led = False
-    if n > _MANY_PIXELS:
-        start, every = par.copy(), n // _SEARCHED_PIXELS
-        best = _minimise(ts, ds, gs, n, every, a, b, scale, width, fit_width, par, accepted, False)
+    # one call, since numba would compile another for each constant among its arguments
+    led, start, best = False, par.copy(), np.inf
+    for turn in range(0 if n > _MANY_PIXELS else 1, 2):
+        every = n // _SEARCHED_PIXELS if turn == 0 else 1
+        best = _minimise(ts, ds, gs, n, every, a, b, scale, width, fit_width, par, accepted, led)
         led = np.isfinite(best)
         if not led:
-            par[:] = start
-    best = _minimise(ts, ds, gs, n, 1, a, b, scale, width, fit_width, par, accepted, led)
+            _copy(start, par)
     if not np.isfinite(best):
         return
     J, delta, C = np.zeros(N_SHAPE), np.zeros(N_SHAPE), np.zeros((N_SHAPE, N_SHAPE))
@@ -306,7 +313,7 @@ def _fit_piece(image: Float32, piece: Float, guard_blurs: float, sign: float, ou
         J[j] = 1.0
         if not solve_cholesky(M, J, delta):
             return
-        C[:, j] = delta
+        _copy(delta, C[:, j])
     peak, _, _, _ = profile_terms(0.0, par[7], par[6], a, b)
     out[0] = par[0]
     out[1] = par[1] * scale
