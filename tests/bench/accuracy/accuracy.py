@@ -36,6 +36,7 @@ from tests.bench.accuracy import (
 )
 from tests.bench.accuracy import experiments as accuracy_experiments
 from tests.bench.accuracy import faces_before as accuracy_faces_before
+from tests.bench.accuracy import faces_speed as accuracy_faces_speed
 from tests.bench.accuracy import large as accuracy_large
 from tests.bench.accuracy import models as accuracy_models
 from tests.bench.accuracy import models_images as accuracy_models_images
@@ -80,6 +81,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     **accuracy_adversarial_reliefs.SECTIONS,
     **accuracy_reliefs.SECTIONS,
     **accuracy_faces_before.SECTIONS,
+    **accuracy_faces_speed.SECTIONS,
     "noise-random": accuracy_noise.random_error,
     "noise-mean": accuracy_noise.mean_error,
     "noise-model": accuracy_noise.camera_noise,
