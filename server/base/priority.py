@@ -16,8 +16,8 @@ from pathlib import Path
 
 _SERVICE_NICE = -10
 _WORKER_NICE = 5
-BELOW_WORKER = 19
-"""For what the worker itself need not wait for."""
+BELOW_WORKER, LAST = 12, 19
+"""For what the worker need not wait for yet, and for what it needs after that."""
 _SWITCH_S = 0.001
 _PR_SET_PDEATHSIG = 1
 _AUTOGROUP = Path("/proc/self/autogroup")

@@ -1,9 +1,9 @@
 """Compile kernels in processes of their own, beside the work that does not need them yet.
 
 numba compiles one kernel at a time in a process, and keeps it on disk for every other. A displacement's kernels are
-compiled while another process compiles those of a shape, which a measurement needs first. A service has both compiled
-aside when it starts, after those that find a line grid: its worker calibrates meanwhile, and waits only where it is to
-measure.
+compiled while another process compiles those of a shape, which a measurement needs first. A service has all compiled
+aside when it starts, those that find a line grid before a shape's, a shape's before a displacement's: its worker
+calibrates meanwhile, and waits only for those that a task needs.
 """
 
 from __future__ import annotations
@@ -11,16 +11,18 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from types import TracebackType
 from typing import Any, Protocol
 
 import numpy as np
 
-from core.compiling import COMPILING, no_collection
-from server.base.priority import BELOW_WORKER, end_with_parent, lower_worker
+from core.compiling import COMPILING, NotCompiledError, no_collection, refuse_compiling
+from server.base.priority import BELOW_WORKER, LAST, end_with_parent, lower_worker
 
 _MAX_WAIT_S = 300.0
 _POLL_S = 0.05
+_LOOK_AGAIN_S = 0.5
 
 
 class BackgroundCompilation:
@@ -80,7 +82,7 @@ class KernelsAside:
     Parameters
     ----------
     what
-        ``grid``: those that find a line grid. ``all``: those of a first measurement.
+        ``grid``: those that find a line grid. ``shape``, ``motion``: those of a first shape and displacement.
     """
 
     def __init__(self, what: str) -> None:
@@ -90,6 +92,11 @@ class KernelsAside:
     def start(self) -> None:
         """Start; the processes end with this one."""
         self._process = _start(self._what)
+
+    @property
+    def ended(self) -> bool:
+        """True once nobody would have to wait."""
+        return self._process is None or self._process.poll() is not None
 
     def wait(self, task: Task) -> None:
         """Return once the kernels are there, or will have to be compiled here.
@@ -125,11 +132,32 @@ def _start(what: str) -> subprocess.Popen[bytes]:
     )
 
 
-def _compile_all() -> None:
+def _compile_shape() -> None:
     lower_worker(BELOW_WORKER)
-    from server.compute.measurement import compile_here
+    from core.threads import set_threads
+    from server.compute.measurement import measure_small_shape
 
-    compile_here(1)
+    set_threads(1)
+    measure_small_shape()
+
+
+def _compile_after_shape() -> None:
+    """Compile a displacement's fit beside a shape's kernels, and what both are needed for once those are on disk."""
+    lower_worker(LAST)
+    from core.threads import set_threads
+    from server.compute.measurement import measure_small_shape, measure_small_steps
+
+    set_threads(1)
+    _compile_motion("affine")
+    ends = time.monotonic() + _MAX_WAIT_S
+    while time.monotonic() < ends:
+        try:
+            with refuse_compiling():
+                measure_small_shape()
+            break
+        except NotCompiledError:
+            time.sleep(_LOOK_AGAIN_S)
+    measure_small_steps()
 
 
 def _compile_grid() -> None:
@@ -170,12 +198,14 @@ def _compile_motion(patch: Any) -> None:
 
 
 def main() -> int:
-    """Compile a displacement's kernels for plane or quadratic patches, those of a grid, or of a first measurement."""
+    """Compile a displacement's kernels for plane or quadratic patches, or those of a grid, a first shape or motion."""
     end_with_parent()
     what = sys.argv[1]
     with no_collection():
-        if what == "all":
-            _compile_all()
+        if what == "shape":
+            _compile_shape()
+        elif what == "motion":
+            _compile_after_shape()
         elif what == "grid":
             _compile_grid()
         else:

@@ -56,7 +56,7 @@ class _Kept:
 
 
 _kept: OrderedDict[str, _Kept] = OrderedDict()
-_aside = KernelsAside("all")
+_shape_aside, _motion_aside = KernelsAside("shape"), KernelsAside("motion")
 _reader = ThreadPoolExecutor(1, thread_name_prefix="stereorig-read")
 _ahead = MeasureAhead()
 
@@ -86,7 +86,7 @@ def measure_step(task: StepTask) -> dict[str, object]:
             return {"n": task.step.n, "compute_s": measured.seconds}
     elif task.following is not None:
         kept.ahead = task.following, _reader.submit(sequence.read, task.following)
-    if task.following is not None and channel.keeps_going:
+    if task.following is not None and channel.keeps_going and _motion_aside.ended:
         after = Asked(_key_of(task), task.following, task.step.n)
         _ahead.begin(after, _measuring(kept, task, task.following, task.step.n))
     agrees = {}
@@ -155,34 +155,42 @@ def warm_up(threads: int) -> None:
     if available_threads() < 2:  # a single processor has no time to spare
         compile_here(threads)
         return
-    for aside, run in ((grid_aside, find_drawn_grid), (_aside, _run_once)):
+    for asides, run in (((grid_aside,), find_drawn_grid), ((_shape_aside, _motion_aside), measure_small_steps)):
         try:
             with refuse_compiling():
                 run()
         except NotCompiledError:
-            aside.start()
+            for aside in asides:
+                aside.start()
 
 
-def await_kernels() -> None:
-    """Return once the kernels are there that :func:`warm_up` has compiled aside.
+def await_kernels(*, motion: bool = True) -> None:
+    """Return once the kernels are there that :func:`warm_up` has compiled aside; ``motion``: a displacement's too.
 
     Raises
     ------
     Cancelled
         The service asked for it.
     """
-    _aside.wait(current_task())
+    _shape_aside.wait(current_task())
+    if motion:
+        _motion_aside.wait(current_task())
 
 
 def compile_here(threads: int) -> None:
     """Load the kernels of the default settings, or compile them: a displacement's in a process beside this one."""
     set_threads(threads)
     with BackgroundCompilation("affine") as compilation, report_compiling(compilation.start):
-        _run_once(compilation.wait)
+        measure_small_steps(compilation.wait)
 
 
-def _run_once(before_motion: Callable[[], None] = lambda: None) -> None:
-    """Measure a small pair of images, and a displacement of nothing."""
+def measure_small_shape() -> None:
+    """Measure the shape in a small pair of images."""
+    measure_small_steps(motion=False)
+
+
+def measure_small_steps(before_motion: Callable[[], None] = lambda: None, *, motion: bool = True) -> None:
+    """Measure the shape in a small pair of images, and a displacement of nothing where ``motion`` says so."""
     # a plane imaged by two cameras side by side: camera 2's image is camera 1's, shifted by 6 px
     rng = np.random.default_rng(1)
     noise = cv2.GaussianBlur(rng.normal(size=(128, 150)), (0, 0), 1.3)
@@ -207,7 +215,8 @@ def _run_once(before_motion: Callable[[], None] = lambda: None) -> None:
     options = MeasureOptions(subset_px=21, patch="affine")
     reference = ReferencePair(pair, left, right)
     shape = reference.shape(grid, options, seeds=seeds)
-    before_motion()
-    reference.motion(left.copy(), right.copy(), grid, options, shape=shape)
     one, two = (image.prepared(options.interpolation) for image in (reference.image1, reference.image2))
     interpolation_term(shape, pair, SmoothSlopes.of(one), [two], subset_px=options.subset_px)
+    if motion:
+        before_motion()
+        reference.motion(left.copy(), right.copy(), grid, options, shape=shape)

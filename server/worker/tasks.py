@@ -332,7 +332,8 @@ def warm_up(threads: int) -> None:
 
 def measure_step(task: StepTask) -> Plain:
     """Measure one step; its result file is readable when this returns. Returns the step's summary."""
-    summary: Plain = _measuring("server.compute.measurement").measure_step(task)
+    moved = task.step.n != task.reference.n
+    summary: Plain = _measuring("server.compute.measurement", motion=moved).measure_step(task)
     return summary
 
 
@@ -390,9 +391,9 @@ def fit_noise(task: NoiseTask) -> Plain:
     return summary
 
 
-def _measuring(module: str) -> Any:
-    """Return a module that matches images, once the kernels are there."""
-    _heavy("server.compute.measurement").await_kernels()
+def _measuring(module: str, *, motion: bool = True) -> Any:
+    """Return a module that matches images, once the kernels are there; ``motion``: a displacement's too."""
+    _heavy("server.compute.measurement").await_kernels(motion=motion)
     return _heavy(module)
 
 

@@ -70,7 +70,7 @@ def slow(monkeypatch, seconds):
     """Have a process that sleeps in the place of one that compiles."""
 
     def start(what):
-        assert what == "all"
+        assert what == "shape"
         return subprocess.Popen([sys.executable, "-c", f"import time; time.sleep({seconds})"])
 
     monkeypatch.setattr(background_compilation, "_start", start)
@@ -78,7 +78,7 @@ def slow(monkeypatch, seconds):
 
 def test_a_task_waits_for_what_is_compiled_aside_and_says_so_once(monkeypatch):
     slow(monkeypatch, 0.4)
-    aside, task = KernelsAside("all"), Waiting(10**6)
+    aside, task = KernelsAside("shape"), Waiting(10**6)
     aside.start()
     process = aside._process
     aside.wait(task)
@@ -91,7 +91,7 @@ def test_a_task_waits_for_what_is_compiled_aside_and_says_so_once(monkeypatch):
 
 def test_a_task_that_waits_for_kernels_can_be_stopped_and_the_next_waits_again(monkeypatch):
     slow(monkeypatch, 60)
-    aside = KernelsAside("all")
+    aside = KernelsAside("shape")
     aside.start()
     process = aside._process
     assert process is not None
@@ -108,7 +108,7 @@ def test_a_task_that_waits_for_kernels_can_be_stopped_and_the_next_waits_again(m
 
 def test_nothing_started_is_nothing_to_wait_for():
     task = Waiting(0)
-    KernelsAside("all").wait(task)
+    KernelsAside("shape").wait(task)
     assert task.told == []
 
 

@@ -92,5 +92,5 @@ def compiled_while_waiting() -> list[int]:
     compiled: list[int] = []
     with report_compiling(lambda: compiled.append(1)):
         find_drawn_grid()
-        server.compute.measurement._run_once()
+        server.compute.measurement.measure_small_steps()
     return compiled

@@ -64,8 +64,8 @@ def section() -> list[str]:
         "| --- | --- | --- |",
         *rows,
         "",
-        "A service has kernels compiled in processes beside its worker: those that find a grid first, while the stages move; a displacement's beside a",
-        "shape's. A calibration waits for the first, a measurement for the others, and says so. Compiled kernels hold for one Python, one numba and one",
+        "A service has kernels compiled in processes beside its worker: those that find a grid first, while the stages move, a shape's before a",
+        "displacement's. A calibration waits for the first, each step for those that it needs, and says so. Compiled kernels hold for one Python, one numba and one",
         "kind of processor, so the wheel brings none ([why](decisions/0035-kernels-compiled-aside.md)); the container image has them.",
         "",
     ]
