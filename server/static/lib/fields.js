@@ -55,6 +55,12 @@ export function rule(control, wrong) {
 }
 
 /**
+ * Whether a field holds a value within its control's own limits.
+ * @param {HTMLInputElement} input
+ */
+export const correct = (input) => input.value !== "" && input.checkValidity();
+
+/**
  * Check every field; the first that is wrong has the focus.
  * @param {readonly [Entry, Rule][]} rules
  */

@@ -5,11 +5,12 @@ import { greyOf } from "../../widgets/grey.js";
 import { running } from "./running.js";
 import { RegionEditor } from "../../widgets/region_editor.js";
 import { Workspace } from "../../lib/workspace.js";
-import { again, allRight, limited, numberWithin, rule } from "../../lib/fields.js";
+import { again, allRight, correct, limited, numberWithin, rule } from "../../lib/fields.js";
 import { draw } from "./drawing.js";
 import { recipesBar } from "./recipes.js";
+import { textureRating } from "./texture.js";
 import { gaugePx, gaugeText } from "../../widgets/region/gauge.js";
-import { h, replace, svg, field, number, select, action, table, badge, num, count, quantity, notify, problemText } from "../../lib/dom.js";
+import { h, replace, svg, field, number, select, action, notify } from "../../lib/dom.js";
 
 /** @import { Ends } from "#dom" */
 /** @import { Model } from "#routes" */
@@ -19,8 +20,6 @@ import { h, replace, svg, field, number, select, action, table, badge, num, coun
 
 /** A list to choose from is no place for thousands of steps: the first ones can be the reference, or the one that is. */
 const MOST_REFERENCES = 200;
-/** @type {Record<string, string>} */
-const LEVEL = { good: "good", usable: "warn", poor: "bad" };
 
 /**
  * @param {string} id
@@ -59,10 +58,9 @@ export async function measurePanel(id, test, ends, done) {
     const subset = number(33, { min: 9, max: 401, step: 2 });
     const spacing = number(10, { min: 1, max: 1000, step: 1 });
     const showSample = h("input", { type: "checkbox", checked: true });
-    const showTexture = h("input", { type: "checkbox" });
-    const legend = h("span.quiet");
-    const overlays = views.map((view) => { const image = h("img", { alt: "", hidden: true }); view.content.insertBefore(image, view.svg); return image; });
-    const texture = h("div", { role: "status", "data-role": "texture" });
+    const noiseChoice = select([["", "from the residuals"], ...noise.filter((one) => one.state === "complete" || !one.state).map((one) => [one.id, String(one.plan.label || one.id)])], "");
+    const use = (/** @type {number} */ px) => { subset.value = String(px); again(rules); changed(); };
+    const texture = textureRating(id, views, editor, { reference, subset, spacing, noise: noiseChoice }, { use, ends });
 
     /** @type {number | null} */
     let shownStep = null;
@@ -94,31 +92,7 @@ export async function measurePanel(id, test, ends, done) {
       replace(sample, parts);
     }
 
-    const correct = (/** @type {HTMLInputElement} */ input) => input.value !== "" && input.checkValidity();
-    let asked = 0;
-    async function rateTexture() {
-      if (!views[0].width) return; // a region is cut at the image's border: it is rated once the image is there
-      asked += 1;
-      const mine = asked;
-      const region = editor.region();
-      if (!region || ![subset, spacing].every(correct)) {
-        replace(texture, h("p.quiet", region ? "Correct the fields that are marked." : "Draw a region to rate its speckle quality for such subsets."));
-        return;
-      }
-      try {
-        const rated = await api.post(`/tests/${id}/steps/${reference.value}/texture`, { region, subset_px: Number(subset.value), spacing_px: Number(spacing.value), noise_id: noiseChoice.value || null });
-        if (mine !== asked) return;
-        replace(texture,
-          h("p", badge(`${rated.level} speckle quality`, LEVEL[rated.level] ?? ""), ` ${num(100 * rated.good_share, 3)} % of ${count(rated.subsets)} subsets with an expected error below ${rated.good_px} px, ${num(100 * rated.usable_share, 3)} % below ${rated.usable_px} px; median ${quantity(rated.median_error_px, "px", 2)} at a noise of ${num(rated.noise_grey, 3)} grey levels.`),
-          rated.proposed_subset_px && rated.proposed_subset_px !== rated.subset_px ? h("p.row", `Min. subset for this texture: ${rated.proposed_subset_px} px. `, h("button", { type: "button", onclick: () => { subset.value = String(rated.proposed_subset_px); again(rules); changed(); } }, `Use ${rated.proposed_subset_px} px`)) : null,
-          rated.proposed_subset_px ? null : h("p", "No subset up to 91 px is sufficient: the contrast is too low, or the speckles are too coarse."),
-          h("details", h("summary", "Other sizes"), table([["Subset", (row) => quantity(row.subset_px, "px"), { numeric: true }], [`below ${rated.good_px} px`, (row) => quantity(100 * row.good_share, "%", 3), { numeric: true }], [`below ${rated.usable_px} px`, (row) => quantity(100 * row.usable_share, "%", 3), { numeric: true }]], rated.sizes, { caption: "Share of the region's subsets with an expected random error" })));
-      } catch (error) {
-        if (mine === asked) replace(texture, problemText(error));
-      }
-    }
-
-    const found = h("span.quiet", { role: "status", "data-role": "found" });
+      const found = h("span.quiet", { role: "status", "data-role": "found" });
     const missing = h("small.error", { role: "alert", hidden: true }); // what a measurement lacks here
     const find = action("Find the specimen", async () => {
       found.textContent = "";
@@ -128,22 +102,6 @@ export async function measurePanel(id, test, ends, done) {
       editor.change((state) => Object.assign(state, { outlines: [{ form: "polygon", points: region.polygon }], holes: (region.holes ?? []).map((points) => ({ form: "polygon", points })), mask: null }));
       found.textContent = `Found: ${answer.text}. Correct it by its corners.`;
     });
-
-    /** @type {string[]} */
-    let shownMaps = [];
-    async function layTexture() {
-      const on = showTexture.checked;
-      overlays.forEach((image) => { image.hidden = !on; });
-      legend.textContent = "";
-      if (!on || !correct(subset)) return;
-      const answers = await Promise.all(views.map((_, k) => api.raw(`/tests/${id}/steps/${reference.value}/cam${k + 1}/maps/texture`, { subset_px: Number(subset.value) })));
-      legend.textContent = answers[0].headers.get("X-Legend") ?? "";
-      const fresh = await Promise.all(answers.map(async (answer) => URL.createObjectURL(await answer.blob())));
-      overlays.forEach((image, k) => { image.src = fresh[k]; });
-      shownMaps.forEach((url) => URL.revokeObjectURL(url));
-      shownMaps = fresh;
-    }
-    ends.push(() => shownMaps.forEach((url) => URL.revokeObjectURL(url)));
 
     let seedsAsked = "";
     async function checkSeeds() {
@@ -163,25 +121,17 @@ export async function measurePanel(id, test, ends, done) {
       }
     }
 
-    /** @type {number | undefined} */
-    let timer;
-    ends.push(() => clearTimeout(timer));
     function changed() {
       keep();
       missing.hidden ||= editor.region() !== null;
       drawSample();
       drawGauge();
       checkSeeds();
-      rateSoon();
-    }
-    function rateSoon() {
-      clearTimeout(timer);
-      timer = setTimeout(() => { rateTexture(); if (showTexture.checked) layTexture().catch(notify); }, 300);
+      texture.soon();
     }
     for (const input of [subset, spacing]) input.addEventListener("input", changed);
     showSample.addEventListener("change", drawSample);
-    showTexture.addEventListener("change", () => layTexture().catch(notify));
-    views[0].image.addEventListener("load", () => { drawSample(); rateSoon(); });
+    views[0].image.addEventListener("load", () => { drawSample(); texture.soon(); });
 
     // settings
     const kind = select([["displacement", "shape and displacement"], ["profile", "shape only"]], "displacement");
@@ -195,7 +145,6 @@ export async function measurePanel(id, test, ends, done) {
     const window_ = number(9, { min: 3, max: 101, step: 2 });
     const order = select([["auto", "planes or quadratics"], [1, "planes"], [2, "quadratics"]], "auto");
     const tensor = select([["green_lagrange", "Green-Lagrange"], ["infinitesimal", "infinitesimal"], ["hencky", "Hencky (logarithmic)"]], "green_lagrange");
-    const noiseChoice = select([["", "from the residuals"], ...noise.filter((one) => one.state === "complete" || !one.state).map((one) => [one.id, String(one.plan.label || one.id)])], "");
     noiseChoice.addEventListener("change", changed);
     const update = select([["auto", "auto"], ["never", "never (total)"], ["always", "always (incremental)"]], "auto");
     const which = h("input", { type: "text", placeholder: "all", "aria-describedby": "which-hint" });
@@ -331,7 +280,7 @@ export async function measurePanel(id, test, ends, done) {
             h("p.hint", "Seeds are searched for automatically if none are given. On a periodic texture, click three points that are not on one line, each in both views.")),
           h("fieldset", h("legend", "Subsets and texture"),
             h("div.fields", field("Subset", subset, "px", "odd"), field("Spacing", spacing, "px", "distance of neighbouring points")),
-            h("div.row", h("label.check", showSample, "draw them to scale"), h("button", { type: "button", onclick: () => views[0].centreOn(...editor.middle(), 6) }, "Zoom to the subsets"), h("label.check", showTexture, "texture map"), legend), texture)),
+            h("div.row", h("label.check", showSample, "draw them to scale"), h("button", { type: "button", onclick: () => views[0].centreOn(...editor.middle(), 6) }, "Zoom to the subsets"), h("label.check", texture.showMap, "texture map"), texture.legend), texture.rating)),
         h("div",
           h("fieldset", h("legend", "Correlation"),
             h("div.fields", field("Measure", kind), field("Shape function", patch), field("Interpolation", interpolation), field("Prefilter, sd", prefilter, "px", "0: none"), field("Largest sigma of a match", maxSigma, "px", "points beyond it are rejected"), field("Noise", noiseChoice),
