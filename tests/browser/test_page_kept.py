@@ -129,7 +129,7 @@ def test_region_and_settings_outlive_screen_reload_browser_and_service(chromium:
         assert isinstance(settings, dict)
         assert (settings["subset_px"], settings["spacing_px"]) == (21, 9)
         shown.get_by_label("Subset", exact=True).fill("21")
-        page.sound(422)  # the texture of an even subset
+        page.sound_beside_captures(422)  # the texture of an even subset
         served.kill()
         shown.get_by_label("Spacing", exact=True).fill("8")
         expect(shown.locator('[data-role="saved"]')).to_contain_text("Not saved: the service does not answer")
@@ -160,7 +160,7 @@ def test_region_and_settings_outlive_screen_reload_browser_and_service(chromium:
         mine, other = (served.workspace(test_id) for test_id in (TEST, OTHER))
         for name in ("region", "settings", "image_size_px"):
             assert other[name] == mine[name], name
-        page.sound()
+        page.sound_beside_captures()
 
 
 def test_two_windows_do_not_overwrite_each_other(chromium: Browser, served: Served) -> None:
