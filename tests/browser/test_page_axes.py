@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -97,8 +98,11 @@ def test_a_tension_along_the_images_vertical_reads_as_one_and_files_keep_the_sys
 
 def test_axes_are_chosen_by_clicks_and_kept_with_the_test(page: Watched, bench: Bench, strip: str) -> None:
     at = opened(page, bench, strip, "exx")
+    # what the axes are now comes after the first press: it does not stand in the place of what to click
+    at.route("**/frame", lambda route: (time.sleep(1.0), route.continue_()), times=1)
     at.get_by_text("Axes of the specimen", exact=True).click()
     at.get_by_role("button", name="X along a line").click()
+    at.wait_for_timeout(1500)
     state = at.locator('[data-role="frame-state"]')
     expect(state).to_contain_text("where X begins (1 of 2)")
     box = at.locator('canvas[data-role="map"]').bounding_box()

@@ -96,6 +96,7 @@ export function frames(screen, reread) {
   }
   async function tell() {
     const { text, chosen } = await api.get(`/tests/${result.testId}/frame`);
+    if (picking) return; // begun while this was on its way: what to click next stands here
     state.textContent = `${chosen ? "Kept with the test" : "Usual axes"}: ${text.replace(/^aligned by plane/, "best plane of the reference shape").replace(/^aligned by/, "laid by")}.`;
   }
   choice.addEventListener("change", () => choose().catch(notify));
