@@ -135,17 +135,17 @@ def _start(what: str) -> subprocess.Popen[bytes]:
 def _compile_shape() -> None:
     lower_worker(BELOW_WORKER)
     from core.threads import set_threads
-    from server.compute.measurement import measure_small_shape
+    from server.compute.measurement import measure_small_steps
 
     set_threads(1)
-    measure_small_shape()
+    measure_small_steps(motion=False)
 
 
 def _compile_after_shape() -> None:
     """Compile a displacement's fit beside a shape's kernels, and what both are needed for once those are on disk."""
     lower_worker(LAST)
     from core.threads import set_threads
-    from server.compute.measurement import measure_small_shape, measure_small_steps
+    from server.compute.measurement import measure_small_steps
 
     set_threads(1)
     _compile_motion("affine")
@@ -153,7 +153,7 @@ def _compile_after_shape() -> None:
     while time.monotonic() < ends:
         try:
             with refuse_compiling():
-                measure_small_shape()
+                measure_small_steps(motion=False)
             break
         except NotCompiledError:
             time.sleep(_LOOK_AGAIN_S)

@@ -184,11 +184,6 @@ def compile_here(threads: int) -> None:
         measure_small_steps(compilation.wait)
 
 
-def measure_small_shape() -> None:
-    """Measure the shape in a small pair of images."""
-    measure_small_steps(motion=False)
-
-
 def measure_small_steps(before_motion: Callable[[], None] = lambda: None, *, motion: bool = True) -> None:
     """Measure the shape in a small pair of images, and a displacement of nothing where ``motion`` says so."""
     # a plane imaged by two cameras side by side: camera 2's image is camera 1's, shifted by 6 px
