@@ -41,8 +41,7 @@ async def create_model(
     ] = None,
     unit: Annotated[Unit | None, Form(description="Unit of length, where the file states none.")] = None,
     displacement: Annotated[
-        str | None,
-        Form(min_length=1, max_length=_NAME, description="Array of the nodes' displacement, or three: `ux,uy,uz`."),
+        str | None, Form(max_length=_NAME, description="Array of the nodes' displacement, or three: `ux,uy,uz`.")
     ] = None,
     time: Annotated[FormNumber | None, Form(description="Time of the state to take from a series; the last.")] = None,
     align: Annotated[
