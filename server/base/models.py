@@ -175,8 +175,8 @@ def not_both(*names: str) -> JsonDict:
 
 
 def given(name: str) -> JsonDict:
-    """Return the schema's words for: this field is there, and not null."""
-    return {"required": [name], "properties": {name: {"not": {"type": "null"}}}}
+    """Return the schema's words for: this field is there, and neither null nor an empty list."""
+    return {"required": [name], "properties": {name: {"not": {"type": "null"}, "minItems": 1}}}
 
 
 class Listing(BaseModel):
