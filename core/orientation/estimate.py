@@ -10,14 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from core.arrays import Float
 from core.cameras.stereo import StereoPair
 from core.field.region.trend import smooth_terms
 from core.orientation.change import ChangeSlopes, changed, offset_slopes, plausible_bump
 from core.orientation.matched import MatchedPoints
-from core.orientation.noise import blocks_of, effective_variance, robust_weights
+from core.orientation.noise import SharedNoise, effective_variance, robust_weights
 
 #: smallest and largest bump that the prior takes for plausible, rad
 _SMALLEST_RAD, _LARGEST_RAD = 2e-5, 0.1
@@ -70,7 +69,7 @@ def estimate_change(
     bump_rad: float | None = None,
     start: Float | None = None,
     slopes: ChangeSlopes | None = None,
-    blocks: NDArray[np.int64] | None = None,
+    shared: SharedNoise | None = None,
 ) -> OrientationEstimate:
     """Estimate the change of the relative orientation.
 
@@ -86,9 +85,9 @@ def estimate_change(
         Size of the bump, where it is known; else from the offsets.
     start
         (5,) a change to start from; none if left out.
-    slopes, blocks
+    slopes, shared
         Of these points, where they are known already: :class:`core.orientation.change.ChangeSlopes`, without a start;
-        :func:`core.orientation.noise.blocks_of`.
+        :class:`core.orientation.noise.SharedNoise`.
 
     Returns
     -------
@@ -100,7 +99,7 @@ def estimate_change(
     firm = np.linalg.inv(unit)
     terms = smooth_terms(xy1)
     basis = orthonormal(terms)
-    blocks = blocks_of(xy1, points.step) if blocks is None else blocks
+    shared = SharedNoise.of(points) if shared is None else shared
     change = np.zeros(5) if start is None else np.array(start, dtype=np.float64)
     J = offset_slopes(pair, change, xy1, xy2) if slopes is None or start is not None else slopes.offset
 
@@ -114,7 +113,7 @@ def estimate_change(
         if offset_px is None:
             J = offset_slopes(pair, change, xy1, xy2)
         weights, _ = robust_weights(residual - smooth_surface(basis, residual))
-        variance = effective_variance(J, weights, residual, blocks)
+        variance = effective_variance(J, weights, residual, shared)
         information = (J * weights[:, None]).T @ J / variance
         prior = firm / size**2
         posterior = np.linalg.inv(information + prior)
@@ -128,7 +127,7 @@ def estimate_change(
             break
     residual = left_at(change)
     weights, noise = robust_weights(residual)
-    variance = effective_variance(J, weights, residual, blocks)
+    variance = effective_variance(J, weights, residual, shared)
     information = (J * weights[:, None]).T @ J / variance
     prior = firm / size**2
     posterior = np.linalg.inv(information + prior)

@@ -16,7 +16,7 @@ from core.orientation.consequence import Consequence
 from core.orientation.estimate import estimate_change
 from core.orientation.matched import MatchedPoints
 from core.orientation.offsets import StepOffsets
-from core.significance import chi_square_tail, two_sided_sigmas
+from core.significance import f_tail, two_sided_sigmas
 
 Against = Literal["calibration", "reference", "last_step"]
 Pattern = Literal["mean", "slope", "curvature"]
@@ -52,8 +52,8 @@ class OffsetFinding:
     carried_by
         The largest of these.
     chi_square, p_value, sigmas
-        Of the smooth part against what is expected, six terms; the chance of so much; the same in standard deviations
-        of a normal distribution.
+        Of the smooth part against what is expected, six terms; the chance of so much, with what the points themselves
+        tell of their noise (few of them tell little); the same in standard deviations of a normal distribution.
     change_deg, change_sigma_deg
         :data:`core.orientation.change.CHANGE_NAMES` that explain it.
     determined
@@ -145,7 +145,10 @@ def judge_offsets(
         C = C + J @ covariance @ J.T
     c = smooth.coefficients
     chi_square = float(c @ np.linalg.solve(C, c))
-    p_value = chi_square_tail(chi_square, 6)
+    parts_of_noise = [(smooth.covariance, smooth.degrees)]
+    if earlier is not None:
+        parts_of_noise.append((earlier.covariance, earlier.degrees))
+    p_value = f_tail(chi_square / 6, 6, _degrees(C, parts_of_noise))
     expected = float(np.sqrt(np.trace(C)))
     rms = float(np.sqrt(max(c @ c - np.trace(smooth.covariance), 0.0)))
     moved: bool | None = p_value < CHANCE and rms > 3.0 * _FLOOR_PX[against]
@@ -155,7 +158,7 @@ def judge_offsets(
             moved, known = moved and rms > own_px, True
         if imported or not known:
             moved = None
-    estimate = estimate_change(pair, step.points, offset, slopes=step.change_slopes, blocks=step.blocks)
+    estimate = estimate_change(pair, step.points, offset, slopes=step.change_slopes, shared=step.shared)
     cost = step.consequences
     parts = {name: float(np.sqrt(np.sum(c[part] ** 2))) for name, part in _PARTS.items()}
     finding = OffsetFinding(
@@ -183,13 +186,19 @@ def judge_offsets(
 class _Earlier:
     """The smooth part of earlier offsets at the same place of the image.
 
-    ``offset_px`` (n,) at the points; ``covariance`` (6, 6) of its coefficients over the points' terms, and
-    ``projector`` (6, m) that makes them of the earlier offsets.
+    ``offset_px`` (n,) at the points; ``covariance`` (6, 6) of its coefficients over the points' terms, ``projector``
+    (6, m) that makes them of the earlier offsets, and ``degrees`` of freedom behind the covariance.
     """
 
     offset_px: Float
     covariance: Float
     projector: Float
+    degrees: float
+
+
+def _degrees(whole: Float, parts: Sequence[tuple[Float, float]]) -> float:
+    """Degrees of freedom (Welch and Satterthwaite) of a covariance; some parts of it have as many as stand beside."""
+    return float(np.trace(whole)) ** 2 / sum(float(np.trace(part)) ** 2 / degrees for part, degrees in parts)
 
 
 def _earlier(step: StepOffsets, held: StepOffsets) -> _Earlier:
@@ -201,7 +210,7 @@ def _earlier(step: StepOffsets, held: StepOffsets) -> _Earlier:
     turn = np.linalg.lstsq(there, fit.terms, rcond=None)[0]
     terms = here @ turn
     onto = step.terms.T / len(step.offset_px) @ terms
-    return _Earlier(terms @ fit.coefficients, onto @ fit.covariance @ onto.T, onto @ fit.projector)
+    return _Earlier(terms @ fit.coefficients, onto @ fit.covariance @ onto.T, onto @ fit.projector, fit.degrees)
 
 
 _SAYS = {

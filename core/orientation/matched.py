@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,24 +26,34 @@ class MatchedPoints:
         (n, 2) in camera 1 and camera 2.
     step
         (n,) number of the image pair, from 0.
+    subset_px
+        Width of the subsets that were matched; 0 for points that have none, and share no pixels.
     """
 
     xy1_px: Float
     xy2_px: Float
     step: NDArray[np.int32]
+    subset_px: int = 0
 
     @staticmethod
-    def of(xy1_px: Float, xy2_px: Float, step: int = 0) -> MatchedPoints:
+    def of(xy1_px: Float, xy2_px: Float, step: int = 0, *, subset_px: int = 0) -> MatchedPoints:
         """Return the points of one pair of images."""
-        return MatchedPoints(xy1_px, xy2_px, np.full(len(xy1_px), step, np.int32))
+        return MatchedPoints(xy1_px, xy2_px, np.full(len(xy1_px), step, np.int32), subset_px)
 
     @staticmethod
     def joined(parts: Sequence[MatchedPoints]) -> MatchedPoints:
-        """Return the points of several pairs of images."""
-        return MatchedPoints(*(np.concatenate([getattr(p, a) for p in parts]) for a in ("xy1_px", "xy2_px", "step")))
+        """Return the points of several pairs of images, matched with subsets of one width."""
+        xy1, xy2, step = (np.concatenate([getattr(p, a) for p in parts]) for a in ("xy1_px", "xy2_px", "step"))
+        return MatchedPoints(xy1, xy2, step, parts[0].subset_px)
+
+    def at(self, which: NDArray[np.bool_]) -> MatchedPoints:
+        """Return some of the points, (n,) True."""
+        return replace(self, xy1_px=self.xy1_px[which], xy2_px=self.xy2_px[which], step=self.step[which])
 
 
-def matched_points(pair: StereoPair, shape: Field, step: int = 0, *, at_most: int | None = None) -> MatchedPoints:
+def matched_points(
+    pair: StereoPair, shape: Field, subset_px: int, step: int = 0, *, at_most: int | None = None
+) -> MatchedPoints:
     """Return the valid points of a shape as they were matched.
 
     Parameters
@@ -52,6 +62,8 @@ def matched_points(pair: StereoPair, shape: Field, step: int = 0, *, at_most: in
         The cameras that the shape was measured with.
     shape
         Reference positions and epipolar offsets.
+    subset_px
+        Width of its subsets.
     step
         Number of its images.
     at_most
@@ -62,7 +74,7 @@ def matched_points(pair: StereoPair, shape: Field, step: int = 0, *, at_most: in
         ok = ok[np.unique(spread_indices(len(ok), at_most))]
     xy1 = np.stack([shape.x_px.ravel()[ok], shape.y_px.ravel()[ok]], axis=1)
     xyz, offset = shape.xyz_mm.reshape(-1, 3)[ok], shape.epipolar_px.ravel()[ok]
-    return MatchedPoints.of(xy1, seen_by_camera2(pair, xy1, xyz, offset), step)
+    return MatchedPoints.of(xy1, seen_by_camera2(pair, xy1, xyz, offset), step, subset_px=subset_px)
 
 
 def seen_by_camera2(pair: StereoPair, xy1_px: Float, xyz_mm: Float, offset_px: Float) -> Float:

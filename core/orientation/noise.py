@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from core.arrays import Float
-from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight, median
+from core.orientation.matched import MatchedPoints
+from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight, median, spread_indices
 
 _BLOCKS = 8
 _FLOOR_PX = 1e-6
+_PAIRED = 2000  # points among which overlaps are counted: more of them tell no more
 
 
 def robust_weights(residual_px: Float) -> tuple[Float, float]:
@@ -18,34 +23,89 @@ def robust_weights(residual_px: Float) -> tuple[Float, float]:
     return biweight((residual_px / (BIWEIGHT_REACH * sigma)) ** 2), sigma
 
 
-def blocks_of(xy_px: Float, step: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Return (n,) the number of the block that a point lies in: 8 x 8 over each step's points."""
-    low, high = xy_px.min(axis=0), xy_px.max(axis=0)
-    cell = np.minimum((xy_px - low) / np.maximum(high - low, 1e-9) * _BLOCKS, _BLOCKS - 1).astype(np.int64)
-    _, number = np.unique((step.astype(np.int64) * _BLOCKS + cell[:, 0]) * _BLOCKS + cell[:, 1], return_inverse=True)
-    return np.asarray(number.ravel())
+@dataclass(frozen=True, eq=False)
+class SharedNoise:
+    """What the noise of matched points has in common with their neighbours'.
+
+    Two subsets share the part of their pixels by which they overlap, and as much of their noise. Over a field of many
+    subsets, sums over blocks show that and any structure besides; where a block is no wider than a subset they do not,
+    and the overlap alone tells.
+
+    Attributes
+    ----------
+    blocks
+        (n,) number of the block that a point lies in: 8 x 8 over each step's points.
+    pairs, overlap
+        (m, 2) points whose subsets overlap, each pair once, and (m,) by what part of their pixels.
+    one_of
+        How many points one of those looked at stands for.
+    """
+
+    blocks: NDArray[np.int64]
+    pairs: NDArray[np.int64]
+    overlap: Float
+    one_of: float
+
+    @staticmethod
+    def of(points: MatchedPoints) -> SharedNoise:
+        """Look at points of one or several steps."""
+        n, width = len(points.xy1_px), points.subset_px
+        some = np.arange(n) if n <= _PAIRED else np.unique(spread_indices(n, _PAIRED))
+        # subsets of two steps are as far apart as two subsets that do not overlap
+        at = np.column_stack([points.xy1_px[some], points.step[some] * (2.0 * width)])
+        near = cKDTree(at).query_pairs(width, p=np.inf, output_type="ndarray") if width > 0 else np.empty((0, 2), int)
+        pairs = some[near].reshape(-1, 2)
+        apart = np.abs(points.xy1_px[pairs[:, 0]] - points.xy1_px[pairs[:, 1]])
+        overlap = np.prod(1.0 - np.minimum(apart / max(width, 1), 1.0), axis=1)
+        return SharedNoise(_blocks(points), pairs, overlap, (n - 1) / max(len(some) - 1, 1))
+
+    def metric(self, basis: Float) -> Float:
+        """Return (k, k) B' R B of columns (n, k), with the correlation R that the overlaps give the points' noise."""
+        one, two = basis[self.pairs[:, 0]], basis[self.pairs[:, 1]]
+        half = (one * self.overlap[:, None]).T @ two * self.one_of**2
+        return np.asarray(basis.T @ basis + half + half.T)
+
+    def degrees(self, spent: float) -> float:
+        """Degrees of freedom that a variance from all points has, ``spent`` of their squares taken by a fit."""
+        n = len(self.blocks)
+        squares = n + 2.0 * float((self.overlap**2).sum()) * self.one_of**2
+        return max(n - spent, 1.0) ** 2 / squares
 
 
-def effective_variance(design: Float, weights: Float, values: Float, blocks: NDArray[np.int64]) -> float:
+def _blocks(points: MatchedPoints) -> NDArray[np.int64]:
+    low, high = points.xy1_px.min(axis=0), points.xy1_px.max(axis=0)
+    cell = (points.xy1_px - low) / np.maximum(high - low, 1e-9) * _BLOCKS
+    cell = np.minimum(cell, _BLOCKS - 1).astype(np.int64)
+    number = (points.step.astype(np.int64) * _BLOCKS + cell[:, 0]) * _BLOCKS + cell[:, 1]
+    return np.asarray(np.unique(number, return_inverse=True)[1].ravel())
+
+
+def effective_variance(design: Float, weights: Float, values: Float, shared: SharedNoise) -> float:
     """Return the variance that one point has in a fit, px^2: larger than its own where neighbours are not independent.
 
     The scores' sums over blocks hold what neighbouring points have in common, from shared pixels or from a structure
-    that the design does not follow: their mean square in the design's own metric replaces the points' variance.
+    that the design does not follow: their mean square in the design's own metric replaces the points' variance. That
+    is never less than what the overlap of their subsets makes of it.
 
     Parameters
     ----------
     design
         (n, k) derivatives of the values.
-    weights, values, blocks
+    weights, values
         (n,); what the design explains of the values is taken out first.
+    shared
+        Of these points.
     """
     root = np.sqrt(weights)
     u, s, _ = np.linalg.svd(design * root[:, None], full_matrices=False)
     basis = u[:, s > 1e-9 * max(float(s[0]), 1e-300)]
     left = root * values
     left = left - basis @ (basis.T @ left)
-    k, count = basis.shape[1], int(blocks.max()) + 1
-    sums = np.stack([np.bincount(blocks, weights=column, minlength=count) for column in (basis * left[:, None]).T])
-    shared = float((sums**2).sum()) / max(k, 1) * count / max(count - k, 1)
-    own = float(left @ left) / max(float(weights.sum()) - k, 1.0)
-    return float(max(shared, own, _FLOOR_PX**2))
+    k, count = basis.shape[1], int(shared.blocks.max()) + 1
+    sums = np.stack(
+        [np.bincount(shared.blocks, weights=column, minlength=count) for column in (basis * left[:, None]).T]
+    )
+    seen = float((sums**2).sum()) / max(k, 1) * count / max(count - k, 1)
+    spent = float(np.trace(shared.metric(basis)))
+    own = float(left @ left) / max(float(weights.sum()) - spent, 1.0) * spent / max(k, 1)
+    return float(max(seen, own, _FLOOR_PX**2))

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from core.arrays import Float
 from core.calibration import COVARIANCE_NAMES
@@ -18,7 +17,7 @@ from core.field.region.trend import smooth_terms
 from core.orientation.change import ChangeSlopes, Ends
 from core.orientation.consequence import Consequences
 from core.orientation.matched import MatchedPoints, across_line
-from core.orientation.noise import blocks_of, effective_variance, robust_weights
+from core.orientation.noise import SharedNoise, effective_variance, robust_weights
 
 
 def calibration_slopes(pair: StereoPair, points: MatchedPoints, names: Sequence[str] = COVARIANCE_NAMES) -> Float:
@@ -41,13 +40,15 @@ def calibration_slopes(pair: StereoPair, points: MatchedPoints, names: Sequence[
 class SmoothOffsets:
     """Smooth part of offsets: coefficients (6,) over orthonormal terms of the image, and their covariance.
 
-    A coefficient is the root mean square that its term contributes over the points.
+    A coefficient is the root mean square that its term contributes over the points. ``degrees`` of freedom stand
+    behind the covariance's size.
     """
 
     terms: Float
     coefficients: Float
     covariance: Float
     projector: Float
+    degrees: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +86,7 @@ class StepOffsets:
         good = np.isfinite(self.offset_px)
         if good.all():
             return self
-        some = MatchedPoints(self.points.xy1_px[good], self.points.xy2_px[good], self.points.step[good])
-        return StepOffsets(self.pair, some, self.names, self.offset_px[good], self.ends)
+        return StepOffsets(self.pair, self.points.at(good), self.names, self.offset_px[good], self.ends)
 
     @cached_property
     def terms(self) -> Float:
@@ -95,9 +95,9 @@ class StepOffsets:
         return np.asarray(terms * np.sign(terms[0, 0]))
 
     @cached_property
-    def blocks(self) -> NDArray[np.int64]:
-        """(n,) :func:`core.orientation.noise.blocks_of`."""
-        return blocks_of(self.points.xy1_px, self.points.step)
+    def shared(self) -> SharedNoise:
+        """What the points' noise has in common."""
+        return SharedNoise.of(self.points)
 
     @cached_property
     def smooth(self) -> SmoothOffsets:
@@ -112,8 +112,12 @@ class StepOffsets:
             projector = normal @ (terms * weights[:, None]).T
             coefficients = projector @ offset_px
             weights, _ = robust_weights(offset_px - terms @ coefficients)
-        variance = effective_variance(terms, weights, offset_px, self.blocks)
-        return SmoothOffsets(terms, coefficients, np.asarray(normal * variance, dtype=np.float64), projector)
+        variance = effective_variance(terms, weights, offset_px, self.shared)
+        # the variance is the terms' mean one; noise that neighbours share weighs on the mean more than on the curvature
+        covariance = self.shared.metric(projector.T)
+        covariance *= variance * np.trace(normal) / np.trace(covariance)
+        degrees = self.shared.degrees(float(np.trace(self.shared.metric(terms))) / len(terms))
+        return SmoothOffsets(terms, coefficients, covariance, projector, degrees)
 
     @cached_property
     def by_parameters(self) -> Float:

@@ -133,6 +133,7 @@ def repair_orientation(
         for k, (one, two) in enumerate(images)
     ]
     at = grid.xy_px[grid.allowed]
+    subset_px = (options or MeasureOptions()).subset_px
     found = [feature_matches(one, two, box_around(at, 16.0, one.shape), k) for k, (one, two) in enumerate(taken)]
     report("features", 1, 1)
     matches = MatchedPoints.joined([m for m, _ in found])
@@ -140,7 +141,9 @@ def repair_orientation(
     now = changed(pair, change)
     for _ in range(_ROUNDS):
         parts = [
-            matched_points(now, measure_shape(now, one, two, grid, options, progress=progress, cancel=cancel), k)
+            matched_points(
+                now, measure_shape(now, one, two, grid, options, progress=progress, cancel=cancel), subset_px, k
+            )
             for k, (one, two) in enumerate(taken)
         ]
         points = MatchedPoints.joined(parts)

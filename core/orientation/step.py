@@ -83,7 +83,9 @@ def step_points(
         return None
     rays = pair.cam1.rays_cam(xy[good]).xyz_mm
     xyz = pair.cam1.sys_from_cam.apply(rays / fit.w[good, :1])
-    return MatchedPoints.of(xy[good], seen_by_camera2(pair, xy[good], xyz, fit.epipolar_px[good]))
+    return MatchedPoints.of(
+        xy[good], seen_by_camera2(pair, xy[good], xyz, fit.epipolar_px[good]), subset_px=options.subset_px
+    )
 
 
 def current_plane(pair: StereoPair, w: Float, G: Float) -> tuple[Float, Float]:

@@ -7,7 +7,7 @@ import numpy as np
 from core.arrays import Float
 from core.field.region.trend import smooth_terms
 from core.orientation.matched import MatchedPoints
-from core.orientation.noise import blocks_of, effective_variance, robust_weights
+from core.orientation.noise import SharedNoise, effective_variance, robust_weights
 
 
 def structure_left_px(points: MatchedPoints, offset_px: Float, *, order: int) -> float:
@@ -31,8 +31,7 @@ def structure_left_px(points: MatchedPoints, offset_px: Float, *, order: int) ->
                 terms @ np.linalg.lstsq(terms * np.sqrt(weights)[:, None], values * np.sqrt(weights), rcond=1e-9)[0]
             )
             weights, _ = robust_weights(values - smooth)
-        blocks = blocks_of(points.xy1_px[of_step], points.step[of_step])
-        by_noise = effective_variance(terms, weights, values, blocks) * terms.shape[1]
+        by_noise = effective_variance(terms, weights, values, SharedNoise.of(points.at(of_step))) * terms.shape[1]
         square += max(float((smooth**2).sum()) - by_noise, 0.0)
         count += len(values)
     return float(np.sqrt(square / max(count, 1)))

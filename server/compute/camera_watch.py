@@ -143,7 +143,7 @@ class CameraWatch:
         if n not in self._steps:
             result, images = step()
             points = (
-                matched_points(self.pair, result, at_most=SAMPLE)
+                matched_points(self.pair, result, self.options.subset_px, at_most=SAMPLE)
                 if n == self.reference
                 else step_points(self.pair, result, *images, self.options, self.slopes and self.slopes())
             )

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, uniform_filter
 
 from core.cameras.camera import TEN_PARAMETER_NAMES, Camera
 from core.cameras.stereo import StereoPair
@@ -119,6 +119,32 @@ def test_noise_alone_is_not_called_a_motion(correlated: bool) -> None:
         ]
         called += sum(bool(f and f.camera_moved) for f in findings)
     assert called == 0  # 100 tests at a chance of 1e-4 each
+
+
+@pytest.mark.parametrize("spacing_px", [5, 10])
+def test_noise_that_a_few_overlapping_subsets_share_is_not_called_a_motion(spacing_px: int) -> None:
+    """Noise of pixels under random texture, as a least-squares match of each subset would have it."""
+    rng, subset_px = np.random.default_rng(1), 21
+    side = 200 + spacing_px * np.arange(9)
+    xy1 = np.stack([a.ravel() for a in np.meshgrid(side, side)], axis=1).astype(float)
+    xy2, at = CAM2.project(pose_points(CAM1, 0, xy1)), xy1.astype(int) - 170
+    called = 0
+    for _ in range(60):
+        seen = []
+        for _ in range(2):
+            slope = np.gradient(gaussian_filter(rng.normal(size=(160, 160)), 1.5), axis=0)
+            sums = [uniform_filter(a, subset_px) for a in (slope * rng.normal(size=slope.shape), slope**2)]
+            error = (sums[0] / sums[1])[at[:, 1], at[:, 0]]
+            moved = xy2 + np.outer(error * 0.05 / error.std(), [0.0, 1.0])
+            seen.append(MatchedPoints.of(xy1, moved, subset_px=subset_px))
+        now, before = seen
+        offsets = PAIR.epipolar_residual_px(before.xy1_px, before.xy2_px)
+        findings = [
+            judge_offsets(PAIR, now, own_px=0.004),
+            judge_offsets(PAIR, now, before=(before, offsets), against="reference"),
+        ]
+        called += sum(bool(f and f.camera_moved) for f in findings)
+    assert called == 0  # of 120; 103 and 22 before the overlap was counted
 
 
 def test_a_hundredth_of_a_degree_between_two_steps_is_told_with_its_consequence() -> None:
