@@ -3,8 +3,9 @@
 A patch that straddles a step, a ridge or a crack averages both sides, and its correlation need not show it: a part of
 the subset pulls the match. Where the shape or the motion bends or jumps between points a subset apart, beside gaps, and
 where residuals are larger than about them, the match is compared with what it is without each part of the subset. What
-a part changes is the point's error to first order: within the noise's reach it is added to the point's standard
-deviation; a point that is off by more is rejected.
+a part changes is the point's error to first order. Of some forty parts one changes the match by so much by noise alone:
+that is taken off, in squares. What is left is added to the point's standard deviation where it is small; a point that
+is off by more is rejected.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from core.field.points.fitter import Fitter, PointFits
 from core.field.points.starts import depth_per_px
 from core.progress import CancelToken, raise_if_cancelled
 from core.robust import spread_indices
+from core.settings import DEFAULT_MAX_SIGMA_PX
 from core.status import PointStatus
 
 _FEW = 12
@@ -34,7 +36,9 @@ _PART_SIGMAS = 5.0  # of the change without a part; some thirty parts are tried
 _EDGE_SIGMAS = 4.0  # the same where the shape shows an edge, so that a part's pull is to be expected
 _MOST_CORRELATED = 2.0  # variance of a match over that by white residuals, up to which it is no part's doing
 _FAR_SIGMAS = 4.0  # a change beyond what correlated residuals are counted as
-_OFF_SIGMAS, _OFF_PX = 3.0, 0.03  # what a part changes by, over the point's standard deviation and px: rejected
+_OFF_SIGMAS = 3.0  # what a part changes by, over the point's standard deviation, beyond which the point is rejected
+# and over px: less than what is delivered by default is no edge of a shape
+_OFF_SHAPE_PX, _OFF_MOTION_PX = DEFAULT_MAX_SIGMA_PX, 0.03
 _USUAL = 256  # points that tell how much parts change a usual match
 _OF_WHITE, _SCATTER_OF_WHITE = 2.0, 0.26  # median of the largest change's significance, its logarithm's scatter
 _AT_ONCE = 256
@@ -156,6 +160,7 @@ def _pulled(
     unit = _unit_px(fitter, points, index, rays)
     covariance = points.covariance[index]
     bad = np.zeros(len(index), bool)
+    off_px = _OFF_SHAPE_PX if len(pulls) == 1 else _OFF_MOTION_PX
     for unknown, which, direction in _SHAPE if len(pulls) == 1 else _MOTION:
         pull = pulls[which]
         sure = pull.significance[:, direction] / least
@@ -172,8 +177,9 @@ def _pulled(
             before = _pulls(fitter, [SubsetResiduals(*(values[some] for values in found[0]))], visible[some])[0]
             shift[some] -= before.shift_px[np.arange(len(some)), direction, pull.part[some, direction]]
         far = np.abs(shift) > _FAR_SIGMAS * sd
+        shift *= np.sqrt(np.maximum(1.0 - 1.0 / np.maximum(sure, 1.0) ** 2, 0.0))
         counts = (sure > np.sqrt(correlated)) | ((sure > np.sqrt(noise_factor)) & far)
-        bad |= counts & (np.abs(shift) > np.maximum(_OFF_SIGMAS * sd, _OFF_PX))
+        bad |= counts & (np.abs(shift) > np.maximum(_OFF_SIGMAS * sd, off_px))
         # beside a shape's edge a pull is expected: where all residuals are correlated it is doubtful, and is said
         doubtful = edges & (sure > 1.0) & ~counts & (len(pulls) == 1)
         shift = np.where(counts | doubtful, shift, 0.0)
