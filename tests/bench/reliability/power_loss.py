@@ -4,7 +4,7 @@ Days of work are recorded on the service itself, each in another order (tests/su
 day, the states are made that a file system may hold then, and the service starts on each. The instants of a day are
 taken in passes that each go through the whole day, so that a run that is ended by the clock has seen all of its parts.
 
-    python -m tests.bench.reliability.power_loss [--states 100000] [--minutes N] [--seed N] [--write | --add]
+    python -m tests.bench.reliability.power_loss [--states 100000] [--minutes N] [--seed N] [--processes N] [--write | --add]
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 from tests.bench.documents.prose import wrapped
@@ -29,6 +31,7 @@ BEGIN, END = "<!-- power loss: begin -->", "<!-- power loss: end -->"
 _MEMORY = Path("/dev/shm")  # states are made and removed by the ten thousand
 _OF_AN_INSTANT = 200
 _PASSES = 32
+_DAYS_APART = 1000  # seeds of one process's days from the next one's
 
 
 def _states(recording: Recording, seed: int, ends: float) -> Iterator[State]:
@@ -65,6 +68,23 @@ def run(states: int, seed: int, folder: Path, minutes: float = float("inf")) -> 
     return total, size
 
 
+def run_side_by_side(
+    processes: int, states: int, seed: int, folder: Path, minutes: float
+) -> tuple[Verdict, Counter[str]]:
+    """Do as :func:`run` in several processes, each with days of its own."""
+    share = -(-states // processes)
+    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
+        jobs = [
+            pool.submit(run, share, seed + _DAYS_APART * k, folder / f"process{k}", minutes) for k in range(processes)
+        ]
+        found = [job.result() for job in jobs]
+    total, size = Verdict(), Counter[str]()
+    for verdict, of in found:
+        total = Verdict(total.states + verdict.states, total.wrong + verdict.wrong, total.counts + verdict.counts)
+        size.update(of)
+    return total, size
+
+
 def section(found: Verdict, size: Counter[str], wall_s: float) -> str:
     """Write the section of the page."""
     text = (
@@ -91,12 +111,16 @@ def main() -> int:
     parser.add_argument("--states", type=int, default=100_000, help="at least so many (100000)")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="end after so many, wherever it is then")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--processes", type=int, default=1, help="so many side by side, each with days of its own")
     parser.add_argument("--write", action="store_true", help="write the section of docs/explanation/reliability.md")
     parser.add_argument("--add", action="store_true", help="write it before what the section holds")
     asked = parser.parse_args()
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="power-loss-", dir=_MEMORY if _MEMORY.is_dir() else None) as folder:
-        found, size = run(asked.states, asked.seed, Path(folder), asked.minutes)
+        if asked.processes == 1:
+            found, size = run(asked.states, asked.seed, Path(folder), asked.minutes)
+        else:
+            found, size = run_side_by_side(asked.processes, asked.states, asked.seed, Path(folder), asked.minutes)
     text = section(found, size, time.monotonic() - began)
     print(text)
     if asked.write or asked.add:
