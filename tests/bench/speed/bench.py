@@ -23,6 +23,8 @@ from tests.bench.speed import assembly
 from tests.bench.speed import kernel as bench_kernel
 from tests.bench.speed import parts as bench_parts
 from tests.bench.speed.ceilings import measure_ceilings
+from tests.bench.speed.ending import HOW as ENDING_HOW
+from tests.bench.speed.ending import measure_ending
 from tests.bench.speed.layout import of_threads, thousands
 from tests.bench.speed.page import Report, targets, write_page
 from tests.bench.speed.pairs import MODERN, PAPER, BenchScene, make_scene
@@ -78,6 +80,12 @@ def kernel(report: Report, folder: Path) -> None:
             report.parts.append(bench_parts.measure_parts(scene, kind, subset))
             print(f"  {report.parts[-1]}")
     set_threads(available_threads())
+    repeats = 5 if report.quick else 20
+    endings = [measure_ending("cubic", subset, repeats) for subset in (33, 21)]
+    report.rows += [row for ending in endings for row in ending.rows()]
+    report.more.append(("Where a fit ends", ENDING_HOW.format(repeats=repeats)))
+    for ending in endings:
+        print(f"  {ending}")
 
 
 def dense(report: Report, folder: Path) -> None:

@@ -98,7 +98,7 @@ def targets(report: Report) -> list[Row]:
     rows: list[Row] = []
     if report.rates:
         max_threads = max(r.threads for r in report.rates)
-        for fit, subset, min_rate in (("motion", 33, 6e4), ("motion", 21, 1.2e5), ("shape", 33, 2e5)):
+        for fit, subset, min_rate in (("motion", 33, 1.2e5), ("motion", 21, 2e5), ("shape", 33, 2e5)):
             rate = pick_rate(report, fit, "cubic", subset, max_threads)
             rows.append(
                 Row(f"{fit}, cubic, {subset} px, {of_threads(max_threads)}", rate, "points/s", min_rate, at_least=True)

@@ -17,7 +17,7 @@ from tests.bench.speed.layout import of_threads, save, table, thousands
 from tests.bench.speed.sequence import PointCost, SeedFigures, SequenceFigures, Used
 
 PARTS = ("sequence", "fresh", "seeds", "points", "memory")
-RATE, FIRST_S, SEEDS_S, COMPILE_S, LARGE_MB = 60_000.0, 3.0, 1.0, 30.0, 2000.0
+RATE, FIRST_S, STEP_S, SEEDS_S, COMPILE_S, LARGE_MB = 60_000.0, 3.0, 1.5, 1.0, 30.0, 2000.0
 
 
 @dataclass
@@ -44,7 +44,7 @@ class Figures:
         if self.shape is not None:
             out.append(Row("first field of a fresh process: shape", self.shape.wall_s, "s", FIRST_S))
         if self.displacement is not None:
-            out.append(Row("the same and a first displacement", self.displacement.wall_s, "s"))
+            out.append(Row("the same and a first displacement", self.displacement.wall_s, "s", STEP_S))
         for kind, (cold, warm) in self.cold.items():
             what = f"compiling everything a first {kind} measurement needs"
             out.append(Row(what, cold.wall_s - warm.wall_s, "s", COMPILE_S))
