@@ -162,8 +162,8 @@ ALDIC = Peer(
     "interpolates that field at the matched points. Its subsets are as wide as ours, but its nodes are its own: their "
     "distance must be a power of two, 8 px for our 10, and they lie centred in the same region, so points a second "
     "count more and nearer points. Errors are against the truth at its nodes. Subsets move by affine functions through a bicubic "
-    "kernel without a prefilter, and iterations end at a hundredth of a pixel, which shows in its means. Points are lost only to its check of tracks (ZNSSD "
-    "over 1): its quality gate (ZNSSD, reprojection, outliers) is off by default, and off here.",
+    "kernel without a prefilter, whose bias is in its means, and iterations end at a hundredth of a pixel. Points are lost "
+    "only to its check of tracks (ZNSSD over 1): its quality gate (ZNSSD, reprojection, outliers) is off by default, and off here.",
     spacing_px=8,
 )
 PEERS = (PYVALE, ALDIC)
