@@ -138,6 +138,10 @@ def test_a_peer_is_looked_for_where_it_is_said_to_be(monkeypatch: pytest.MonkeyP
     monkeypatch.setenv(FAKE.variable, sys.executable)
     assert FAKE.interpreter() == Path(sys.executable)
     assert FAKE.environment.name == ".venv-bench-fake"
+    built = replace(FAKE, built=True)  # the variable names its program, which this interpreter's script runs
+    assert built.interpreter() == Path(sys.executable)
+    monkeypatch.delenv(FAKE.variable)
+    assert built.interpreter() is None
 
 
 @pytest.mark.parametrize("peer", PEERS, ids=lambda peer: peer.name)

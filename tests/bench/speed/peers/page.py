@@ -7,7 +7,7 @@ import numpy as np
 
 from tests.bench.accuracy.table import Row
 from tests.bench.speed.layout import of_threads, save, table, thousands
-from tests.bench.speed.peers.programs import NOT_MEASURED, PEERS
+from tests.bench.speed.peers.programs import PEERS
 from tests.bench.speed.peers.runs import Beside, Outcome
 
 Ours = dict[str, list[Outcome]]  # by scene
@@ -81,7 +81,8 @@ def further_s(outcomes: list[Outcome], sequence: Outcome) -> float:
 
 def title() -> str:
     """The section's title."""
-    return f"Beside {' and '.join(peer.name for peer in PEERS)}"
+    *names, last = (peer.name for peer in PEERS)
+    return f"Beside {', '.join(names)} and {last}"
 
 
 def text(ours: Ours, besides: list[Beside]) -> list[str]:
@@ -91,12 +92,12 @@ def text(ours: Ours, besides: list[Beside]) -> list[str]:
     found = {beside.peer.name: beside for beside in besides}
     out = [HOW]
     for peer in PEERS:
-        version = found[peer.name].version if peer.name in found else "not installed here"
+        version = found[peer.name].version if peer.name in found else "(not measured in this run)"
         settings = [f"- `{s.name}`: {s.says}." for s in peer.settings]
         compared = f"Ratios compare with `{peer.compared}`. Its settings:"
         out += [f"**{peer.name}** {version}: {peer.about} {compared}", "\n".join(settings)]
     out += [f"{b.peer.name} failed in this run: {'; '.join(b.failed)}." for b in besides if b.failed]
-    out += [NOT_MEASURED, ERRORS_HOW]
+    out.append(ERRORS_HOW)
     for scene, outcomes in ours.items():
         lines = [_line("stereorig", o) for o in outcomes]
         for beside in besides:

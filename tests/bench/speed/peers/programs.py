@@ -59,6 +59,8 @@ class Peer:
         Distance of its own points where it cannot take ours; None: it measures ours.
     asked
         Least ratio of speeds by (scene, kind of run).
+    built
+        Built from sources instead of installed: ``variable`` names its program, and its script runs in our interpreter.
     """
 
     name: str
@@ -73,6 +75,7 @@ class Peer:
     about: str
     spacing_px: int | None = None
     asked: dict[tuple[str, str], float] = field(default_factory=dict)
+    built: bool = False
 
     @property
     def environment(self) -> Path:
@@ -82,11 +85,15 @@ class Peer:
     @property
     def how_to_install(self) -> str:
         """What to do where it is missing."""
+        if self.built:
+            return f"{self.name} is not built here: the head of opencorr_bench.cpp says how; {self.variable} names the program"
         return f"{self.name} is not installed: `make bench` installs {self.package} into {self.environment.name}"
 
     def interpreter(self) -> Path | None:
         """Return the interpreter that has it, or None: the one that ``variable`` names, its environment's, this one."""
         named = os.environ.get(self.variable)
+        if self.built:
+            return Path(sys.executable) if named and Path(named).is_file() else None
         for candidate in [Path(named)] if named else [self.environment / "bin" / "python", Path(sys.executable)]:
             if candidate.exists():
                 with tempfile.TemporaryDirectory() as elsewhere:  # pyvale leaves a log file where it is imported
@@ -166,7 +173,26 @@ ALDIC = Peer(
     "only to its check of tracks (ZNSSD over 1): its quality gate (ZNSSD, reprojection, outliers) is off by default, and off here.",
     spacing_px=8,
 )
-PEERS = (PYVALE, ALDIC)
-NOT_MEASURED = (
-    "OpenCorr is not measured: it is C++ to be built from its source, and no registry (PyPI, Debian, npm) has it."
+OPENCORR = Peer(
+    name="OpenCorr",
+    package="",
+    extra="",
+    module="",
+    script="run_opencorr.py",
+    variable="STEREORIG_BENCH_OPENCORR",
+    settings=(
+        Setting(
+            "guided",
+            {},
+            "starts from SIFT features at the reference and the first step, then from the step before; precision 0.001, at "
+            "most 10 iterations",
+        ),
+    ),
+    compared="guided",
+    owner="OpenCorr's",
+    about="a C++ library that no registry (PyPI, Debian, npm) has: it is measured where somebody has built it from its sources, by a "
+    "program that goes its example of stereo DIC's way, each call a process of its own. Subsets move by second-order functions from camera to camera, "
+    "by affine ones over time; positions are in single precision.",
+    built=True,
 )
+PEERS = (PYVALE, ALDIC, OPENCORR)
