@@ -8,8 +8,9 @@ BIN := $(VENV)/bin
 PROGRAM := $(VENV)/.program
 STAMP := $(VENV)/.installed
 ARAVIS := $(VENV)/.aravis
-PEER := .venv-bench
-PEER_STAMP := $(PEER)/.installed
+# what the bench compares with: extras of pyproject.toml, each in .venv-<extra>
+PEERS := bench bench-aldic
+PEER_STAMPS := $(PEERS:%=.venv-%/.installed)
 ARGS ?=
 # test files side by side, a process each: one more than there are cores, since devices make tests wait; more than four
 # only compile the same kernels again
@@ -25,7 +26,7 @@ help:
 	@echo "make test-all   both, in one session, as CI does"
 	@echo "make serve   start the service on the simulated paper rig (ARGS='--config FILE --port N')"
 	@echo "make check   lint, format check, types, import walls, docstrings; lint and types of the page's scripts"
-	@echo "make bench   time everything on this machine, beside pyvale, and write docs/explanation/performance.md (ARGS=--quick: a few minutes)"
+	@echo "make bench   time everything on this machine, beside pyvale and al-dic-3d, and write docs/explanation/performance.md (ARGS=--quick: a few minutes)"
 	@echo "make clusterbench  a long test on one and two workers, and on 64 simulated ones, and one large step; writes docs/explanation/cluster.md (ARGS='--steps N')"
 	@echo "make load    ten minutes of captures, readers, slow streams, analyses and stops; writes docs/explanation/reliability.md (ARGS='--minutes N')"
 	@echo "make torture  kill the service 1,000 times at work, look each time that nothing is lost, write docs/explanation/reliability.md (ARGS='--kills N')"
@@ -110,16 +111,16 @@ check-page: $(if $(shell command -v npm),$(PAGE))
 	@command -v npm >/dev/null || { echo "The page's scripts are not checked: Node is missing. Install it: apt-get install nodejs npm"; [ "$$CI" != true ]; exit $$?; }; \
 		npm run --prefix tests/page --silent check
 
-# The peer has its own environment, since its pins clash with ours. Without it the rest is measured all the same.
-$(PEER_STAMP): pyproject.toml | $(STAMP)
-	@rm -rf $(PEER)
-	@echo "Setting up $(PEER) (once) ..."
-	@$(PYTHON) -m venv $(PEER)
-	@$(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["bench"], sep="\n")' > $(PEER)/requirements.txt
-	@$(PEER)/bin/python -m pip install --quiet --disable-pip-version-check -r $(PEER)/requirements.txt && touch $@ \
-		|| { echo "pip could not install the peer; its message is above. The bench goes on without it."; rm -rf $(PEER); }
+# Each peer has its own environment, since its pins clash with ours. Without it the rest is measured all the same.
+$(PEER_STAMPS): .venv-%/.installed: pyproject.toml | $(STAMP)
+	@rm -rf $(@D)
+	@echo "Setting up $(@D) (once) ..."
+	@$(PYTHON) -m venv $(@D)
+	@$(BIN)/python -c 'import sys, tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"][sys.argv[1]], sep="\n")' $* > $(@D)/requirements.txt
+	@$(@D)/bin/python -m pip install --quiet --disable-pip-version-check -r $(@D)/requirements.txt && touch $@ \
+		|| { echo "pip could not install the peer of $(@D); its message is above. The bench goes on without it."; rm -rf $(@D); }
 
-bench: $(STAMP) $(PEER_STAMP)
+bench: $(STAMP) $(PEER_STAMPS)
 	$(BIN)/python -m tests.bench.speed.bench $(ARGS)
 
 # a live measurement's latency, ten minutes; ARGS="--minutes 1" for less
@@ -183,5 +184,5 @@ pagepictures: $(STAMP)
 	$(BIN)/python -m tests.bench.page.pictures $(ARGS)
 
 clean:
-	rm -rf $(VENV) $(PEER) tests/page/node_modules build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .cache
+	rm -rf $(VENV) $(PEERS:%=.venv-%) tests/page/node_modules build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import sys
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import llvmlite.binding as llvm
 import numpy as np
 import pytest
 
+from core.arrays import Float
+from tests.bench.speed import layout, worker
 from tests.bench.speed import page as bench_page
-from tests.bench.speed import worker
 from tests.bench.speed.assembly import HERE, count_loop, innermost_loops
 from tests.bench.speed.ceilings import Ceilings, CompiledLoop, fma_ir, gather_ir, load_ir, rows_ir, vector_width
+from tests.bench.speed.ending import measure_ending
 from tests.bench.speed.kernel import KINDS, Costs, Rate, make_kernel_scene
 from tests.bench.speed.page import Report
 from tests.bench.speed.pairs import BenchScene, Errors, Request, compare, make_scene
 from tests.bench.speed.parts import Parts, measure_parts
-from tests.bench.speed.peer import Outcome, Run, peer_python, run_peer
+from tests.bench.speed.peers.plan import WARM, own_runs, peer_runs
+from tests.bench.speed.peers.programs import ALDIC, PEERS, PYVALE, Peer, Setting
+from tests.bench.speed.peers.runs import Beside, Outcome, Run, run_peer
 
+PEERS_FOLDER = Path(layout.__file__).parent / "peers"
 TINY = Request("tiny", "sim_paper", (150, 140), (46, 46, 106, 96), 10, 1)
 
 
@@ -46,7 +52,7 @@ def test_worker_measures_the_scene(scene: BenchScene, tmp_path: Path) -> None:
     out = tmp_path / "out"
     worker.measure(job, run, out)
     fields = worker.read_fields(out, 1)
-    errors = compare(scene, 33, fields["xyz"], fields["uvw"])
+    errors = compare(scene, TINY.points(33), fields["xyz"], fields["uvw"])
     assert errors.lost == 0
     # 33 um a pixel, 1089 px a subset, noise 2: a hundredth of a pixel would be a blunder
     assert (errors.sd_um > 0.0).all()
@@ -55,20 +61,96 @@ def test_worker_measures_the_scene(scene: BenchScene, tmp_path: Path) -> None:
 
 
 def test_judge_counts_lost_points_and_sees_offsets(scene: BenchScene) -> None:
-    xyz, uvw = scene.truth(33, 1)
+    xyz, uvw = scene.truth(TINY.points(33), 1)
     pose = scene.pair.cam1.cam_from_sys
     uvw_cam, xyz_cam = uvw @ pose.rotation.T, pose.apply(xyz + np.array([0.0, 0.0, 0.002]))
     uvw_cam[0, 3] = np.nan
-    errors = compare(scene, 33, xyz_cam, uvw_cam)
+    errors = compare(scene, TINY.points(33), xyz_cam, uvw_cam)
     assert errors.lost == 1
     np.testing.assert_allclose(errors.mean_um, [0.0, 0.0, 0.0, 2.0], atol=1e-9)
 
 
-def test_peer_measures_the_scene(scene: BenchScene, tmp_path: Path) -> None:
-    python = peer_python()
+PLAIN = Setting("plain", {}, "plain")
+FAKE = Peer(
+    "fake", "fake", "bench-fake", "json", "fake.py", "STEREORIG_BENCH_FAKE", (PLAIN,), "plain", "the fake's", ""
+)
+SCRIPT = """
+import sys
+sys.path.insert(0, {folder!r})
+from job import measure_runs, read_job
+import numpy as np
+job = read_job()
+print("a line of its own")
+measure_runs(job, "7", lambda run, out: (out / "seen").touch(), lambda run, out: np.load({fields!r}))
+"""
+
+
+def fake_peer(folder: Path, scene: BenchScene, points: Float, spacing_px: int | None) -> Peer:
+    """A peer that finds the truth at its points, 3 um off in camera 1's X, without the first one's displacement."""
+    xyz, uvw = scene.truth(points, 1)
+    pose = scene.pair.cam1.cam_from_sys
+    moved = uvw @ pose.rotation.T + np.array([0.003, 0.0, 0.0])
+    moved[0, 0] = np.nan
+    fields, script = folder / "known.npz", folder / "fake.py"
+    np.savez(fields, x=points[:, 0], y=points[:, 1], xyz=pose.apply(xyz), uvw=moved)
+    script.write_text(SCRIPT.format(folder=str(PEERS_FOLDER), fields=str(fields)))
+    return replace(FAKE, script=str(script), spacing_px=spacing_px)
+
+
+@pytest.mark.parametrize("spacing_px", [None, 4])
+def test_a_peer_s_fields_are_judged_at_the_points_it_measured(
+    scene: BenchScene, tmp_path: Path, spacing_px: int | None
+) -> None:
+    points = TINY.points(33)
+    if spacing_px is not None:  # nodes of its own, some pixels inside the region
+        x, y = np.meshgrid(np.arange(46, 107, spacing_px), np.arange(47, 97, spacing_px))
+        points = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
+    peer = fake_peer(tmp_path, scene, points, spacing_px)
+    version, (outcome,) = run_peer(peer, Path(sys.executable), scene, [Run("one", 33, 1, repeats=2)], 1, tmp_path)
+    assert version == "7"
+    assert outcome.points == len(points)
+    assert outcome.errors.lost == 1
+    assert outcome.errors.sd3_um < 1e-6
+    assert np.linalg.norm(outcome.errors.mean_um[:3]) == pytest.approx(3.0)
+
+
+def test_a_peer_that_measures_other_points_is_refused(scene: BenchScene, tmp_path: Path) -> None:
+    peer = fake_peer(tmp_path, scene, TINY.points(33) + 1.0, None)
+    with pytest.raises(RuntimeError, match="did not measure the points"):
+        run_peer(peer, Path(sys.executable), scene, [Run("one", 33, 1)], 1, tmp_path)
+
+
+def test_every_program_measures_the_kinds_that_are_compared() -> None:
+    for all_threads in (False, True):
+        own = own_runs("modern", all_threads=all_threads, quick=False)
+        for peer in PEERS:
+            theirs = peer_runs(peer, "modern", all_threads=all_threads, quick=False)
+            assert theirs[0].name.startswith(WARM)
+            compared = {(r.kind, r.subset_px) for r in theirs[1:] if r.setting == peer.compared}
+            assert compared == {(r.kind, r.subset_px) for r in own if not r.name.startswith(WARM)}
+    # what is measured once only is left out of the short form
+    assert {r.setting for r in peer_runs(PYVALE, "paper", all_threads=True, quick=True)[1:]} == {"tuned"}
+
+
+def test_a_peer_is_looked_for_where_it_is_said_to_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(FAKE.variable, "/nowhere/python")
+    assert FAKE.interpreter() is None
+    monkeypatch.setenv(FAKE.variable, sys.executable)
+    assert FAKE.interpreter() == Path(sys.executable)
+    assert FAKE.environment.name == ".venv-bench-fake"
+    built = replace(FAKE, built=True)  # the variable names its program, which this interpreter's script runs
+    assert built.interpreter() == Path(sys.executable)
+    monkeypatch.delenv(FAKE.variable)
+    assert built.interpreter() is None
+
+
+@pytest.mark.parametrize("peer", PEERS, ids=lambda peer: peer.name)
+def test_peer_measures_the_scene(scene: BenchScene, tmp_path: Path, peer: Peer) -> None:
+    python = peer.interpreter()
     if python is None:
-        pytest.skip("the peer is not installed")
-    version, outcomes = run_peer(python, scene, [Run("one", 33, 1, {"max_displacement": 16})], 1, tmp_path)
+        pytest.skip(peer.how_to_install)
+    (setting,) = (s for s in peer.settings if s.name == peer.compared)
+    version, outcomes = run_peer(peer, python, scene, [Run("one", 33, 1, setting.options)], 1, tmp_path)
     assert version
     errors = outcomes[0].errors
     assert errors.lost == 0
@@ -145,6 +227,16 @@ def test_costs_and_parts_split_a_point_s_time() -> None:
     assert sum(split.values()) == pytest.approx(30.0)
 
 
+def test_a_fit_s_ending_is_judged_beside_full_iteration() -> None:
+    ending = measure_ending("cubic", 21, repeats=3, size_px=120)
+    # 3 x 9 points x 3 components: a scatter's own scatter is 8 %; both see the same noise
+    assert ending.over_bound == pytest.approx(1.0, abs=0.3)
+    assert ending.over_bound == pytest.approx(ending.full_over_bound, abs=0.01)
+    assert 0.0 < ending.bias_px < 0.01
+    assert ending.lost == 0
+    assert [row.limit for row in ending.rows()] == [1.03, None, 1e-3, 0]
+
+
 @pytest.mark.deep
 def test_parts_of_a_fit_are_timed() -> None:
     parts = measure_parts(make_kernel_scene(40), "cubic", 9)
@@ -155,8 +247,8 @@ def test_parts_of_a_fit_are_timed() -> None:
 
 
 def test_page_holds_what_was_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench_page, "DOCS", tmp_path)
-    report = Report(quick=False, peer_version="1.2.3")
+    monkeypatch.setattr(layout, "DOCS", tmp_path)
+    report = Report(quick=False, peers=[Beside(PYVALE, "1.2.3"), Beside(ALDIC, "4.5.6")])
     for threads in (1, 2):
         levels = {"L1": 200.0, "L2": 80.0, "L3": 60.0}
         report.ceilings.append(Ceilings(threads, 8, 100.0 * threads, levels, 13.0, 18.0, 9.9, 0.97))
@@ -173,16 +265,28 @@ def test_page_holds_what_was_measured(tmp_path: Path, monkeypatch: pytest.Monkey
     errors = Errors(0, np.array([0.01, 0.02, 0.03, 0.04]), np.array([0.1, 0.1, 0.3, 0.2]))
     worse = Errors(2, errors.mean_um, 2.0 * errors.sd_um)
     for scene in ("modern", "paper"):
-        for what in ("single", "sequence"):
-            run, other = Run(f"cubic {what}, 33 px", 33, 5), Run(f"tuned {what}, 33 px", 33, 5)
-            report.ours.setdefault(scene, []).extend(Outcome(run, t, 9900, 2.0 / t, 2.0, errors) for t in (1, 2))
-            report.peer.setdefault(scene, []).extend(Outcome(other, t, 9900, 24.0 / t, 24.0, worse) for t in (1, 2))
+        for what, steps, took in (("single", 1, 0.4), ("sequence", 5, 2.0)):
+            run = Run(f"cubic {what}, 33 px", 33, steps)
+            report.ours.setdefault(scene, []).extend(Outcome(run, t, 9900, took / t, took, errors) for t in (1, 2))
+            for beside, slower in zip(report.peers, (12, 24), strict=True):
+                other = Run(f"{beside.peer.compared} {what}, 33 px", 33, steps)
+                beside.outcomes.setdefault(scene, []).extend(
+                    Outcome(other, t, 9900, took * slower / t, took * slower, worse) for t in (1, 2)
+                )
     page = bench_page.write_page(report).read_text()
-    assert "| speed over the peer's: cubic sequence, 33 px, 2 threads | 12 |  | at least 10 | yes |" in page
+    assert "| speed over the peer's: cubic single, 33 px, 1 thread | 12 |  |  |  |" in page
+    assert "| speed over the peer's: cubic single, 33 px, 2 threads | 12 |  | at least 10 | yes |" in page
+    assert "| speed over the peer's: cubic sequence, 33 px, 2 threads | 12 |  | at least 30 | **no** |" in page
+    assert "| speed over the peer's: 9,900 points, cubic single, 33 px, 2 threads | 12 |  | at least 5 | yes |" in page
+    assert "| the same, steps after the first alone | 24 |  |  |  |" in page
+    assert "| speed over al-dic-3d's: cubic sequence, 33 px, 2 threads | 24 |  |  |  |" in page
+    assert "| 9,900 points: cubic single, 33 px, 2 threads | 0.2 | s | at most 0.12 | **no** |" in page
     assert "worst of u, v, w: cubic sequence, 33 px, 2 threads | 0.5 |  | at most 1 | yes |" in page
-    assert "| motion, cubic, 33 px, 2 threads | 65,400 | points/s | at least 60,000 | yes |" in page
-    assert "| motion, cubic, 21 px, 2 threads | 65,400 | points/s | at least 120,000 | **no** |" in page
-    assert "| pyvale | tuned sequence, 33 px | 2 | 12.00 | 4,120 | 2 |" in page
+    assert "| motion, cubic, 33 px, 2 threads | 65,400 | points/s | at least 120,000 | **no** |" in page
+    assert "| motion, cubic, 21 px, 2 threads | 65,400 | points/s | at least 200,000 | **no** |" in page
+    assert "| pyvale | tuned sequence, 33 px | 2 | 12.00 | 9,900 | 4,120 | 2 |" in page
+    assert "| al-dic-3d | local sequence, 33 px | 2 | 24.00 | 9,900 | 2,060 | 2 |" in page
+    assert "**al-dic-3d** 4.5.6: " in page
     for name in ("bench_peer_speed", "bench_peer_accuracy", "bench_costs", "bench_iterations", "bench_parts"):
         assert f"figures/{name}.png" in page
         assert (tmp_path / "figures" / f"{name}.png").stat().st_size > 5000

@@ -55,7 +55,7 @@ def test_a_process_of_its_own_is_measured_from_its_start_to_its_end() -> None:
 
 
 def test_figures_become_rows_and_sections(tmp_path: Path, small: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tests.bench.speed.page.DOCS", tmp_path)
+    monkeypatch.setattr("tests.bench.speed.layout.DOCS", tmp_path)
     figures = Figures(
         seeds=bench.measure_seeds(tmp_path, threads=1, runs=1),
         points=bench.measure_points(tmp_path, (20, 40), threads=1, runs=1),

@@ -19,7 +19,8 @@ from core.field.region.region import PointGrid
 from core.measure import MeasureOptions, ReferencePair
 from core.settings import INTERPOLATIONS, Interpolation
 from core.threads import available_threads, set_threads
-from tests.bench.speed.page import Row, table, thousands
+from tests.bench.accuracy.table import Row
+from tests.bench.speed.layout import table, thousands
 from tests.bench.speed.scene import capture, rig_of_size
 
 SIZE_PX = (1024, 1024)

@@ -1,4 +1,4 @@
-"""Measure speed on this machine, beside a peer and beside the machine's own limits: ``make bench``.
+"""Measure speed on this machine, beside peers and beside the machine's own limits: ``make bench``.
 
 Writes ``docs/explanation/performance.md`` with its plots and prints the same figures; nothing here passes or fails. ``--quick`` takes a few minutes: the
 small rig only, no whole measurements. ``--quick`` and ``--only`` (some parts) print and leave the page as it is, unless ``--page`` is given.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import subprocess
 import tempfile
 import time
 from pathlib import Path
@@ -22,19 +23,17 @@ from tests.bench.speed import assembly
 from tests.bench.speed import kernel as bench_kernel
 from tests.bench.speed import parts as bench_parts
 from tests.bench.speed.ceilings import measure_ceilings
-from tests.bench.speed.page import Report, targets, thousands, write_page
+from tests.bench.speed.ending import HOW as ENDING_HOW
+from tests.bench.speed.ending import measure_ending
+from tests.bench.speed.layout import of_threads, thousands
+from tests.bench.speed.page import Report, targets, write_page
 from tests.bench.speed.pairs import MODERN, PAPER, BenchScene, make_scene
-from tests.bench.speed.peer import Outcome, Run, peer_python, run_ours, run_peer
+from tests.bench.speed.peers.plan import WARM, own_runs, peer_runs
+from tests.bench.speed.peers.programs import PEERS
+from tests.bench.speed.peers.runs import Beside, Outcome, run_ours, run_peer
 from tests.bench.speed.sequence_page import measure_all
 
 PARTS = ("ceilings", "code", "kernel", "dense", "peer", "whole")
-PEER_SETTINGS: dict[str, dict[str, object]] = {
-    "tuned": {"max_displacement": 16},
-    "default": {},
-    "loose": {"max_displacement": 16, "precision": 0.01},
-    "unfiltered": {"max_displacement": 16, "image_filter_kernel": 1},
-}
-WARM = "warm-up"
 
 
 def counts() -> list[int]:
@@ -81,6 +80,12 @@ def kernel(report: Report, folder: Path) -> None:
             report.parts.append(bench_parts.measure_parts(scene, kind, subset))
             print(f"  {report.parts[-1]}")
     set_threads(available_threads())
+    repeats = 5 if report.quick else 20
+    endings = [measure_ending("cubic", subset, repeats) for subset in (33, 21)]
+    report.rows += [row for ending in endings for row in ending.rows()]
+    report.more.append(("Where a fit ends", ENDING_HOW.format(repeats=repeats)))
+    for ending in endings:
+        print(f"  {ending}")
 
 
 def dense(report: Report, folder: Path) -> None:
@@ -94,44 +99,31 @@ def dense(report: Report, folder: Path) -> None:
 
 
 def peer(report: Report, folder: Path) -> None:
-    """Ours and the peer on the same files."""
-    python = peer_python()
-    if python is None:
-        print("  pyvale is not installed: `make bench` installs it into .venv-bench")
+    """Ours and the peers on the same files."""
+    pythons = {p.name: p.interpreter() for p in PEERS}
+    for p in PEERS:
+        if pythons[p.name] is None:
+            print(f"  {p.how_to_install}")
+    report.peers = [Beside(p) for p in PEERS if pythons[p.name] is not None]
     for request in (PAPER,) if report.quick else (MODERN, PAPER):
         scene = make_scene(request, folder / request.name)
         name = request.name
-        report.ours[name], report.peer[name] = [], []
+        report.ours[name] = []
         for threads in counts():
-            own, other = _runs(name, threads, report.quick)
-            _, found = run_ours(scene, own, threads, folder)
-            report.ours[name] += _printed(scene, found)
-            if python is not None:
-                report.peer_version, found = run_peer(python, scene, other, threads, folder)
-                report.peer[name] += _printed(scene, found)
-        if python is None:
-            del report.peer[name]
-
-
-def _runs(scene: str, threads: int, quick: bool) -> tuple[list[Run], list[Run]]:
-    """What both programs measure; the first run of each only warms the process up."""
-    large, all_threads = scene == "modern", threads == counts()[-1]
-    steps = 2 if quick else 3 if large and not all_threads else 6
-    own, other = [], []
-    for subset in (33, 21) if all_threads else (33,):
-        for kind in ("cubic", "quintic"):
-            options = {"interpolation": kind}
-            own.append(Run(f"{kind} single, {subset} px", subset, 1, options, repeats=2))
-            own.append(Run(f"{kind} sequence of {steps}, {subset} px", subset, steps, options, repeats=2))
-        settings = ["tuned"] if large or not all_threads or subset == 21 or quick else ["tuned", "loose", "unfiltered"]
-        for setting in settings:
-            if setting == "tuned":
-                other.append(Run(f"tuned single, {subset} px", subset, 1, PEER_SETTINGS["tuned"]))
-            other.append(Run(f"{setting} sequence of {steps}, {subset} px", subset, steps, PEER_SETTINGS[setting]))
-    if large and all_threads:
-        other.append(Run("default single, 33 px", 33, 1, PEER_SETTINGS["default"]))
-    warm = [Run(f"{WARM} {kind}", 33, 1, {"interpolation": kind}) for kind in ("cubic", "quintic")]
-    return [*warm, *own], [Run(WARM, 21, 1, PEER_SETTINGS["tuned"]), *other]
+            all_threads = threads == counts()[-1]
+            runs = own_runs(name, all_threads=all_threads, quick=report.quick)
+            report.ours[name] += _printed("stereorig", scene, run_ours(scene, runs, threads, folder)[1])
+            for beside in report.peers:
+                runs = peer_runs(beside.peer, name, all_threads=all_threads, quick=report.quick)
+                python = pythons[beside.peer.name]
+                assert python is not None
+                try:
+                    beside.version, found = run_peer(beside.peer, python, scene, runs, threads, folder)
+                except (RuntimeError, ValueError, subprocess.TimeoutExpired) as error:  # the rest is worth an hour
+                    print(f"  {beside.peer.name} failed: {error}", flush=True)
+                    beside.failed.append(f"{name}, {of_threads(threads)}")
+                else:
+                    beside.outcomes.setdefault(name, []).extend(_printed(beside.peer.name, scene, found))
 
 
 def whole(report: Report, folder: Path) -> None:
@@ -141,12 +133,12 @@ def whole(report: Report, folder: Path) -> None:
     report.rows += figures.rows()
 
 
-def _printed(scene: BenchScene, outcomes: list[Outcome]) -> list[Outcome]:
+def _printed(program: str, scene: BenchScene, outcomes: list[Outcome]) -> list[Outcome]:
     kept = [o for o in outcomes if not o.run.name.startswith(WARM)]
     for o in kept:
         sd = ", ".join(f"{v:.3f}" for v in o.errors.sd_um)
         print(
-            f"  {scene.request.name:8s}{o.run.name:28s}{o.threads:2d} thread(s){o.wall_s:8.2f} s{thousands(o.rate):>10s} / s"
+            f"  {scene.request.name:8s}{program:11s}{o.run.name:32s}{o.threads:2d} thread(s){o.wall_s:8.2f} s{thousands(o.rate):>10s} / s"
             f"   lost {o.errors.lost}   sd of u, v, w, Z {sd} um",
             flush=True,
         )

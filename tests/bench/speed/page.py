@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from tests.bench.accuracy.table import Row
 from tests.bench.documents.prose import wrapped
+from tests.bench.speed import layout
 from tests.bench.speed.assembly import HERE, LoopCount
 from tests.bench.speed.ceilings import Ceilings
 from tests.bench.speed.kernel import Costs, Rate
+from tests.bench.speed.layout import of_threads, save, table, thousands
 from tests.bench.speed.parts import Parts
-from tests.bench.speed.peer import Outcome
-
-DOCS = Path(__file__).resolve().parents[3] / "docs"
+from tests.bench.speed.peers import page as peers_page
+from tests.bench.speed.peers.runs import Beside, Outcome
 
 
 @dataclass
@@ -37,10 +38,10 @@ class Report:
         See the modules of these names.
     iterations
         Iterations of each point by the fit's name.
-    ours, peer
+    ours
         Outcomes by scene.
-    peer_version
-        None where the peer is not installed.
+    peers
+        Those of each peer that is installed.
     more
         Sections that other scripts measured: title, text.
     rows
@@ -55,8 +56,7 @@ class Report:
     parts: list[Parts] = field(default_factory=list)
     loops: list[LoopCount] = field(default_factory=list)
     ours: dict[str, list[Outcome]] = field(default_factory=dict)
-    peer: dict[str, list[Outcome]] = field(default_factory=dict)
-    peer_version: str | None = None
+    peers: list[Beside] = field(default_factory=list)
     more: list[tuple[str, str]] = field(default_factory=list)
     rows: list[Row] = field(default_factory=list)
 
@@ -80,28 +80,6 @@ def machine() -> list[str]:
     ]
 
 
-def table(head: list[str], rows: list[list[str]]) -> str:
-    """A table in Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def thousands(value: float) -> str:
-    """Three digits that count, with commas."""
-    if not np.isfinite(value):
-        return "-"
-    digits = max(0, int(np.floor(np.log10(abs(value)))) - 2) if value else 0
-    return f"{round(value / 10**digits) * 10**digits:,.0f}"
-
-
-def save(figure: plt.Figure, name: str, caption: str) -> str:
-    """Write a plot and return its line in the page."""
-    (DOCS / "figures").mkdir(exist_ok=True)
-    figure.savefig(DOCS / "figures" / name, dpi=110)
-    plt.close(figure)
-    return f"![{caption}](../figures/{name})"
-
-
 # targets
 
 
@@ -120,16 +98,10 @@ def targets(report: Report) -> list[Row]:
     rows: list[Row] = []
     if report.rates:
         max_threads = max(r.threads for r in report.rates)
-        for fit, subset, min_rate in (("motion", 33, 6e4), ("motion", 21, 1.2e5), ("shape", 33, 2e5)):
+        for fit, subset, min_rate in (("motion", 33, 1.2e5), ("motion", 21, 2e5), ("shape", 33, 2e5)):
             rate = pick_rate(report, fit, "cubic", subset, max_threads)
             rows.append(
-                Row(
-                    f"{fit}, cubic, {subset} px, {max_threads} thread{'s' if max_threads > 1 else ''}",
-                    rate,
-                    "points/s",
-                    min_rate,
-                    at_least=True,
-                )
+                Row(f"{fit}, cubic, {subset} px, {of_threads(max_threads)}", rate, "points/s", min_rate, at_least=True)
             )
         slower = pick_rate(report, "motion", "cubic", 33, 1) / pick_rate(report, "motion", "quintic", 33, 1)
         rows.append(Row("quintic over cubic, motion, 33 px, time", slower, "", 1.8))
@@ -152,7 +124,7 @@ def targets(report: Report) -> list[Row]:
                 3.0 if limit else None,
             )
         )
-    return [*rows, *peer_rows(report), *report.rows]
+    return [*rows, *peers_page.rows(report.ours, report.peers), *report.rows]
 
 
 def target_line(row: Row) -> list[str]:
@@ -164,145 +136,6 @@ def target_line(row: Row) -> list[str]:
     limit = "" if row.limit is None else f"{'at least' if row.at_least else 'at most'} {figure(row.limit)}"
     met = "" if row.limit is None else ("yes" if row.met else "**no**")
     return [row.what, figure(row.measured), row.unit, limit, met]
-
-
-# the peer
-
-
-def find(outcomes: list[Outcome], name: str, threads: int) -> Outcome | None:
-    """The outcome of a run by its name."""
-    return next((o for o in outcomes if o.run.name == name and o.threads == threads), None)
-
-
-def further_s(outcomes: list[Outcome], sequence: Outcome) -> float:
-    """Seconds of a step after the first: a sequence less the single step of the same setting; NaN without one."""
-    setting = sequence.run.name.split(" ", 1)[0]
-    for o in outcomes:
-        same = (o.threads, o.run.subset_px, o.run.steps) == (sequence.threads, sequence.run.subset_px, 1)
-        if same and o.run.name.startswith(setting) and sequence.run.steps > 1:
-            return (sequence.wall_s - o.wall_s) / (sequence.run.steps - 1)
-    return float("nan")
-
-
-def peer_rows(report: Report) -> list[Row]:
-    """Ratios to the peer and errors beside its."""
-    rows = []
-    for scene, outcomes in report.ours.items():
-        for ours in outcomes:
-            if ours.run.subset_px != 33 or "tuned" not in [o.run.name.split()[0] for o in report.peer.get(scene, [])]:
-                continue
-            what = ours.run.name.split(" ", 1)[1]
-            peer = find(report.peer[scene], f"tuned {what}", ours.threads)
-            if peer is None or scene != "modern":
-                continue
-            min_rate = 10.0 if "sequence" in what else 3.0
-            label = f"{ours.run.name}, {ours.threads} thread{'s' if ours.threads > 1 else ''}"
-            rows.append(Row(f"speed over the peer's: {label}", ours.rate / peer.rate, "", min_rate, at_least=True))
-            if "sequence" in what:
-                further = further_s(report.peer[scene], peer) / further_s(outcomes, ours)
-                rows.append(Row("the same, steps after the first alone", further, ""))
-            if "sequence" in what and ours.threads == max(o.threads for o in outcomes):
-                worst = float(np.max(ours.errors.sd_um[:3] / peer.errors.sd_um[:3]))
-                rows.append(Row(f"random error over the peer's, worst of u, v, w: {label}", worst, "", 1.0))
-                rows.append(Row(f"points lost: {label}", ours.errors.lost, "", 0))
-    return rows
-
-
-def _outcome_row(program: str, o: Outcome) -> list[str]:
-    e = o.errors
-    sd, mean = [f"{v:.3f}" for v in e.sd_um], [f"{v:+.3f}" for v in e.mean_um]
-    return [
-        program,
-        o.run.name,
-        str(o.threads),
-        f"{o.wall_s:.2f}",
-        thousands(o.rate),
-        str(e.lost),
-        " / ".join(sd),
-        " / ".join(mean),
-    ]
-
-
-def peer_text(report: Report) -> list[str]:
-    """The section about the peer."""
-    head = [
-        "program",
-        "run",
-        "threads",
-        "s",
-        "points/s",
-        "lost",
-        "sd of u / v / w / Z, um",
-        "mean of u / v / w / Z, um",
-    ]
-    text = [PEER_HOW.format(version=report.peer_version or "not installed here")]
-    for scene, ours in report.ours.items():
-        rows = [_outcome_row("stereorig", o) for o in ours]
-        rows += [_outcome_row("pyvale", o) for o in report.peer.get(scene, [])]
-        text += [f"### {SCENES[scene]}", table(head, rows)]
-    if report.peer:
-        text += [_speed_plot(report), _accuracy_plot(report)]
-    return text
-
-
-def _speed_plot(report: Report) -> str:
-    scene = "modern" if "modern" in report.peer else next(iter(report.peer))
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained", sharey=True)
-    for ax, threads in zip(axes, sorted({o.threads for o in report.ours[scene]}), strict=False):
-        bars = [("stereorig", o) for o in report.ours[scene]] + [("pyvale", o) for o in report.peer[scene]]
-        bars = [(program, o) for program, o in bars if o.threads == threads and o.run.subset_px == 33]
-        names = [o.run.name.removesuffix(", 33 px") for _, o in bars]
-        drawn = ax.barh(names, [o.rate for _, o in bars], color=["C0" if p == "stereorig" else "C1" for p, _ in bars])
-        ax.bar_label(drawn, [thousands(o.rate) for _, o in bars], padding=3, fontsize=8)
-        ax.set(xlabel="points / s", title=f"{threads} thread{'s' if threads > 1 else ''}")
-        ax.margins(x=0.22)
-    axes[0].invert_yaxis()
-    figure.suptitle("Disk to disk, 33 px: stereorig (blue), pyvale (orange)")
-    return save(figure, "bench_peer_speed.png", "Points a second, ours and the peer's")
-
-
-def _accuracy_plot(report: Report) -> str:
-    scenes = list(report.peer)
-    figure, axes = plt.subplots(1, len(scenes), figsize=(4.6 * len(scenes), 3.6), layout="constrained", squeeze=False)
-    for ax, scene in zip(axes[0], scenes, strict=True):
-        max_threads = max(o.threads for o in report.ours[scene])
-        for colour, outcomes in (("C0", report.ours[scene]), ("C1", report.peer[scene])):
-            for k, o in enumerate(o for o in outcomes if o.threads == max_threads and "sequence" in o.run.name):
-                ax.plot(o.rate, o.errors.sd3_um, "o" if o.run.subset_px == 33 else "s", color=colour)
-                label = f"{o.run.name.split()[0]}, {o.run.subset_px} px"
-                ax.annotate(
-                    label,
-                    (o.rate, o.errors.sd3_um),
-                    fontsize=7,
-                    xytext=(4, -10 if k % 2 else 4),
-                    textcoords="offset points",
-                )
-        ax.set(xscale="log", xlabel="points / s", ylabel="random error of the displacement / um", title=SCENES[scene])
-        ax.title.set_fontsize(9)
-        low, high = np.log10(ax.dataLim.intervalx)
-        ax.set_xlim(10 ** np.floor(low), 10 ** np.ceil(high + 0.3))
-        ax.set_ylim(0.0, 1.2 * ax.dataLim.ymax)
-    return save(figure, "bench_peer_accuracy.png", "Random error against speed")
-
-
-SCENES = {
-    "modern": "25 degrees, 1200 x 1100 px, 39 um a pixel, 9,900 points",
-    "paper": "60 degrees, 512 x 480 px, 33 um a pixel, 1,330 points",
-}
-PEER_HOW = """pyvale {version} (`dic.calculate_3d`) and `stereorig measure`, each called in one warm process of its own, on as many cores as
-threads: image files on disk to result files on disk, the same TIFF files (8 bit, noise 2 of 255), the same points (step 10
-px), the same cameras to the last digit (OpenCV's lens with distortion, in both). "single" is the reference and one step, "sequence" the
-reference and several; points a second count the points of the displacement fields, and the time is the whole call's, the reference's own
-work and, for us, the search for seeds included. pyvale is given its seed. Its subsets move by an affine function, which leaves out the second
-order of perspective, ours as planes in space; both weigh all pixels alike. Its settings:
-
-- `tuned`: 16 px as the largest displacement to look for, which makes its first search fast; everything else its default (cubic B-spline,
-  Gaussian filter of 5 px with sd 1, precision 0.001). This is what the ratios compare with.
-- `default`: all its defaults (128 px to look for).
-- `loose`: precision 0.01. `unfiltered`: without its Gaussian filter.
-
-Means and scatters are over points against the simulation's truth, in the system of the specimen (w and Z across its plane); the scatter is pooled over
-steps, the mean is the worst step's."""
 
 
 # the kernel
@@ -524,7 +357,7 @@ def write_page(report: Report) -> Path:
     sections: list[tuple[str, list[str]]] = [
         ("Machine", [*(f"- {line}" for line in machine())]),
         ("Targets", [table(["what", "measured", "unit", "asked", "met"], rows)]),
-        ("Beside pyvale", peer_text(report) if report.ours else []),
+        (peers_page.title(), peers_page.text(report.ours, report.peers) if report.ours else []),
         ("One point", kernel_text(report) if report.rates else []),
         ("The machine's limits", machine_text(report) if report.ceilings else []),
         ("Generated code", assembly_text(report)),
@@ -535,7 +368,7 @@ def write_page(report: Report) -> Path:
         if parts:
             glue = "\n" if title == "Machine" else "\n\n"
             page += [f"## {title}\n", glue.join(parts) + "\n"]
-    path = DOCS / "explanation" / "performance.md"
+    path = layout.DOCS / "explanation" / "performance.md"
     path.parent.mkdir(exist_ok=True)
     path.write_text(wrapped("\n".join(page)).rstrip() + "\n")
     return path

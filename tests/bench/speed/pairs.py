@@ -79,12 +79,12 @@ class BenchScene:
     cam2: list[Path]
     calibration: Path
 
-    def truth(self, subset_px: int, steps: int) -> tuple[Float, Float]:
-        """True positions (N, 3) at the reference and displacements (steps, N, 3), mm, system frame."""
+    def truth(self, points_px: Float, steps: int) -> tuple[Float, Float]:
+        """True positions (N, 3) at the reference and displacements (steps, N, 3) of camera 1's pixels (N, 2), mm, system frame."""
         texture = load_rig(self.request.config).texture(1)  # does not matter for the truth
-        before, xy = plane_scene(texture), self.request.points(subset_px)
+        before = plane_scene(texture)
         pairs = [
-            true_points(before, plane_scene(texture, motion=motion_of(n)), self.pair.cam1, xy)
+            true_points(before, plane_scene(texture, motion=motion_of(n)), self.pair.cam1, points_px)
             for n in range(1, steps + 1)
         ]
         return pairs[0][0], np.array([moved for _, moved in pairs])
@@ -174,9 +174,9 @@ class Errors:
         return float(np.linalg.norm(self.sd_um[:3]))
 
 
-def compare(scene: BenchScene, subset_px: int, xyz_cam1_mm: Float, uvw_cam1_mm: Float) -> Errors:
-    """Compare fields in camera 1's frame, (N, 3) and (steps, N, 3) with NaN where lost, with the truth."""
-    xyz, moved = scene.truth(subset_px, len(uvw_cam1_mm))
+def compare(scene: BenchScene, points_px: Float, xyz_cam1_mm: Float, uvw_cam1_mm: Float) -> Errors:
+    """Compare fields in camera 1's frame, (N, 3) and (steps, N, 3) with NaN where lost, with the truth at its pixels (N, 2)."""
+    xyz, moved = scene.truth(points_px, len(uvw_cam1_mm))
     to_sys = scene.pair.cam1.sys_from_cam
     z = (to_sys.apply(xyz_cam1_mm) - xyz)[:, 2] * 1e3
     error = (uvw_cam1_mm @ to_sys.rotation.T - moved) * 1e3

@@ -13,11 +13,11 @@ import matplotlib.pyplot as plt
 from core.threads import available_threads
 from tests.bench.accuracy.table import Row
 from tests.bench.speed import sequence as bench
-from tests.bench.speed.page import save, table, thousands
+from tests.bench.speed.layout import of_threads, save, table, thousands
 from tests.bench.speed.sequence import PointCost, SeedFigures, SequenceFigures, Used
 
 PARTS = ("sequence", "fresh", "seeds", "points", "memory")
-RATE, FIRST_S, SEEDS_S, COMPILE_S, LARGE_MB = 60_000.0, 3.0, 1.0, 30.0, 2000.0
+RATE, FIRST_S, STEP_S, SEEDS_S, COMPILE_S, LARGE_MB = 60_000.0, 3.0, 1.5, 1.0, 30.0, 2000.0
 
 
 @dataclass
@@ -39,18 +39,18 @@ class Figures:
         max_threads = available_threads()
         for s in self.sequences:
             limit = RATE if (s.threads, s.suffix, s.interpolation) == (max_threads, "tif", "cubic") else None
-            what = f"sequence, disk to disk, {s.interpolation}, {s.suffix}, {_threads(s.threads)}"
+            what = f"sequence, disk to disk, {s.interpolation}, {s.suffix}, {of_threads(s.threads)}"
             out.append(Row(what, s.rate, "points/s", limit, at_least=True))
         if self.shape is not None:
             out.append(Row("first field of a fresh process: shape", self.shape.wall_s, "s", FIRST_S))
         if self.displacement is not None:
-            out.append(Row("the same and a first displacement", self.displacement.wall_s, "s"))
+            out.append(Row("the same and a first displacement", self.displacement.wall_s, "s", STEP_S))
         for kind, (cold, warm) in self.cold.items():
             what = f"compiling everything a first {kind} measurement needs"
             out.append(Row(what, cold.wall_s - warm.wall_s, "s", COMPILE_S))
             out.append(Row(f"{what}, processor time of both processes", cold.cpu_s - warm.cpu_s, "s"))
         for f in self.seeds:
-            what = f"feature seeds on 2448 x 2048 px, {f.what}, {_threads(f.threads)}"
+            what = f"feature seeds on 2448 x 2048 px, {f.what}, {of_threads(f.threads)}"
             out.append(Row(what, f.wall_s, "s", SEEDS_S if f.what == "shape" and f.threads == max_threads else None))
         if len(self.points) > 1:
             few, many = self.points[-2], self.points[-1]
@@ -109,7 +109,7 @@ class Figures:
 
     def _sequence_plot(self) -> str:
         figure, ax = plt.subplots(figsize=(9, 0.9 + 0.5 * len(self.sequences)), layout="constrained")
-        names = [f"{s.interpolation}, {s.suffix}, {_threads(s.threads)}" for s in self.sequences]
+        names = [f"{s.interpolation}, {s.suffix}, {of_threads(s.threads)}" for s in self.sequences]
         left = [0.0] * len(names)
         for k, (stage, _, _) in enumerate(bench.STAGES):
             width = [s.stages[stage][0] for s in self.sequences]
@@ -193,10 +193,6 @@ class Figures:
 
 
 SIZE = f"{bench.SIZE_PX[0]} x {bench.SIZE_PX[1]}"
-
-
-def _threads(n: int) -> str:
-    return "1 thread" if n == 1 else f"{n} threads"
 
 
 def measure_all(folder: Path, *, quick: bool, only: tuple[str, ...] = ()) -> Figures:

@@ -1,21 +1,18 @@
 """Runs the command line's ``measure`` on the files that a job names, in one warm process on a given number of cores.
 
-``python -m tests.bench.speed.worker JOB.json``, the twin of ``bench_peer_pyvale.py``: images on disk to results on disk.
+``python -m tests.bench.speed.worker JOB.json``, the twin of the scripts in ``peers``: images on disk to results on disk.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
-import json
-import os
-import shutil
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from tests.bench.speed.peers.job import measure_runs, read_job
 
 
 def measure(job: dict[str, Any], run: dict[str, Any], out: Path) -> None:
@@ -23,6 +20,7 @@ def measure(job: dict[str, Any], run: dict[str, Any], out: Path) -> None:
     from server.cli.main import main
 
     last = run["steps"] + 1
+    options = {"strain": "off", **run["options"]}  # peers make none
     arguments = [
         "measure",
         "--cam1",
@@ -39,9 +37,7 @@ def measure(job: dict[str, Any], run: dict[str, Any], out: Path) -> None:
         str(job["spacing_px"]),
         "--out",
         str(out),
-        "--strain",
-        "off",
-        *(text for name, value in run["options"].items() for text in (f"--{name}", str(value))),
+        *(text for name, value in options.items() for text in (f"--{name}", str(value))),
     ]
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
@@ -70,23 +66,15 @@ def read_fields(out: Path, steps: int) -> dict[str, Any]:
 
 def main() -> int:
     """Run the job."""
-    job = json.loads(Path(sys.argv[1]).read_text())
-    if hasattr(os, "sched_setaffinity"):  # before anything that counts cores is imported
-        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: job["threads"]])
+    job = read_job()
     from server.formats.version import software_version
 
-    print(json.dumps({"version": software_version()}), flush=True)
-    for run in job["runs"]:
-        out = Path(job["folder"]) / run["name"]
-        wall, cpu = [], []
-        for _ in range(run["repeats"]):
-            shutil.rmtree(out, ignore_errors=True)
-            start = time.perf_counter(), time.process_time()
-            measure(job, run, out)
-            wall.append(time.perf_counter() - start[0])
-            cpu.append(time.process_time() - start[1])
-        np.savez(out.with_suffix(".npz"), **read_fields(out, run["steps"]))
-        print(json.dumps({"name": run["name"], "wall_s": wall, "cpu_s": cpu}), flush=True)
+    measure_runs(
+        job,
+        software_version(),
+        lambda run, out: measure(job, run, out),
+        lambda run, out: read_fields(out, run["steps"]),
+    )
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Ours and the peer on the same files with the same points, cameras and subsets, each in its own process."""
+"""Ours and peers on the same files with the same cameras and subsets, each in a process of its own."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from core.arrays import Float
 from core.cameras.lens import OpenCVLens
 from tests.bench.speed.pairs import BenchScene, Errors, compare
+from tests.bench.speed.peers.programs import Peer
 from tests.support.requirements import ROOT
 
-PEER_PYTHON = ROOT / ".venv-bench" / "bin" / "python"
 MAX_S = 1800.0
 
 
@@ -25,7 +25,8 @@ MAX_S = 1800.0
 class Run:
     """One program, one setting, one number of steps.
 
-    ``options`` go to the program as they are: options of ``stereorig measure``, or arguments of ``calculate_3d``.
+    ``options`` go to the program as they are: options of ``stereorig measure``, arguments of pyvale's ``calculate_3d``, keys of
+    al-dic-3d's table ``matching``.
     """
 
     name: str
@@ -33,6 +34,16 @@ class Run:
     steps: int
     options: dict[str, Any] = field(default_factory=dict)
     repeats: int = 1
+
+    @property
+    def kind(self) -> str:
+        """The reference and one step, or several."""
+        return "single" if self.steps == 1 else "sequence"
+
+    @property
+    def setting(self) -> str:
+        """Name of the setting alone."""
+        return self.name.split(" ", 1)[0]
 
 
 @dataclass(frozen=True)
@@ -62,17 +73,14 @@ class Outcome:
         return self.points * self.run.steps / self.wall_s
 
 
-def peer_python() -> Path | None:
-    """Return the interpreter that has the peer, or None: ``STEREORIG_BENCH_PEER``, ``.venv-bench``, this one."""
-    named = os.environ.get("STEREORIG_BENCH_PEER")
-    for candidate in [Path(named)] if named else [PEER_PYTHON, Path(sys.executable)]:
-        if candidate.exists():
-            with tempfile.TemporaryDirectory() as elsewhere:  # it leaves a log file where it is imported
-                command = [str(candidate), "-c", "import pyvale.dic"]
-                probe = subprocess.run(command, capture_output=True, check=False, cwd=elsewhere)
-            if probe.returncode == 0:
-                return candidate
-    return None
+@dataclass
+class Beside:
+    """What a peer took and what it is worth: outcomes by scene, and where it failed."""
+
+    peer: Peer
+    version: str = ""
+    outcomes: dict[str, list[Outcome]] = field(default_factory=dict)
+    failed: list[str] = field(default_factory=list)
 
 
 def run_ours(scene: BenchScene, runs: list[Run], threads: int, folder: Path) -> tuple[str, list[Outcome]]:
@@ -81,19 +89,24 @@ def run_ours(scene: BenchScene, runs: list[Run], threads: int, folder: Path) -> 
     return _run(command, scene, runs, threads, folder / f"ours_{scene.request.name}_{threads}")
 
 
-def run_peer(python: Path, scene: BenchScene, runs: list[Run], threads: int, folder: Path) -> tuple[str, list[Outcome]]:
+def run_peer(
+    peer: Peer, python: Path, scene: BenchScene, runs: list[Run], threads: int, folder: Path
+) -> tuple[str, list[Outcome]]:
     """Measure with the peer's interpreter; returns the peer's version and outcomes."""
-    command = [str(python), str(Path(__file__).with_name("bench_peer_pyvale.py"))]
-    return _run(command, scene, runs, threads, folder / f"peer_{scene.request.name}_{threads}")
+    command = [str(python), str(Path(__file__).parent / peer.script)]
+    place = folder / f"{peer.name}_{scene.request.name}_{threads}"
+    return _run(command, scene, runs, threads, place, peer.spacing_px)
 
 
 def _run(
-    command: list[str], scene: BenchScene, runs: list[Run], threads: int, folder: Path
+    command: list[str], scene: BenchScene, runs: list[Run], threads: int, folder: Path, spacing_px: int | None = None
 ) -> tuple[str, list[Outcome]]:
     folder.mkdir(parents=True, exist_ok=True)
     job = folder / "job.json"
-    job.write_text(json.dumps(_job(scene, runs, threads, folder)))
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": str(threads)}
+    job.write_text(json.dumps(_job(scene, runs, threads, folder) | ({"spacing_px": spacing_px} if spacing_px else {})))
+    # small matrices: the threads of a linear algebra library would only wait for one another
+    limits = {"OMP_NUM_THREADS": str(threads), "OPENBLAS_NUM_THREADS": "1"}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **limits}
     done = subprocess.run(
         [*command, str(job)], capture_output=True, text=True, check=False, env=environment, timeout=MAX_S, cwd=folder
     )
@@ -103,7 +116,7 @@ def _run(
     lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
     version = str(lines[0]["version"])
     took = {line["name"]: line for line in lines[1:]}
-    return version, [_outcome(scene, run, threads, folder, took[run.name]) for run in runs]
+    return version, [_outcome(scene, run, threads, folder, took[run.name], spacing_px) for run in runs]
 
 
 def _job(scene: BenchScene, runs: list[Run], threads: int, folder: Path) -> dict[str, Any]:
@@ -145,10 +158,22 @@ def _job(scene: BenchScene, runs: list[Run], threads: int, folder: Path) -> dict
     }
 
 
-def _outcome(scene: BenchScene, run: Run, threads: int, folder: Path, took: dict[str, Any]) -> Outcome:
+def _outcome(
+    scene: BenchScene, run: Run, threads: int, folder: Path, took: dict[str, Any], spacing_px: int | None
+) -> Outcome:
     with np.load(folder / f"{run.name}.npz") as fields:
-        wanted = scene.request.points(run.subset_px)
-        if not np.array_equal(np.stack([fields["x"], fields["y"]], axis=1), wanted):
+        points = np.stack([fields["x"], fields["y"]], axis=1).astype(np.float64)
+        if not _as_asked(scene, run, points, spacing_px):
             raise RuntimeError(f"{run.name} did not measure the points that it was asked for.")
-        errors = compare(scene, run.subset_px, fields["xyz"], fields["uvw"])
-    return Outcome(run, threads, len(wanted), min(took["wall_s"]), min(took["cpu_s"]), errors)
+        errors = compare(scene, points, fields["xyz"], fields["uvw"])
+    return Outcome(run, threads, len(points), min(took["wall_s"]), min(took["cpu_s"]), errors)
+
+
+def _as_asked(scene: BenchScene, run: Run, points: Float, spacing_px: int | None) -> bool:
+    """Whether these are the scene's points, or nodes of a program's own that fill the same region at its own distance."""
+    if spacing_px is None:
+        return np.array_equal(points, scene.request.points(run.subset_px))
+    x0, y0, x1, y1 = scene.request.region(run.subset_px)
+    nodes = (1 + (x1 - x0) // spacing_px) * (1 + (y1 - y0) // spacing_px)
+    inside = (points >= (x0, y0)).all() and (points <= (x1, y1)).all()
+    return bool(inside) and len(np.unique(points, axis=0)) == len(points) == nodes

@@ -1,25 +1,19 @@
-"""Runs in the peer's own environment and imports nothing of this project: pyvale on the files that a job names.
+"""Runs in the peer's own environment and imports nothing of this project but ``job.py``: pyvale on the files that a job names.
 
-``python bench_peer_pyvale.py JOB.json``, the twin of ``bench_worker.py``: prints one JSON line of timings a run, and writes
-each run's fields, in camera 1's frame and millimetres, beside the job. Everything is done as pyvale's users do it:
-``dic.calculate_3d`` from image files to result files (binary ones, the faster form).
+``python run_pyvale.py JOB.json``, the twin of ``worker.py``. Everything is done as pyvale's users do it: ``dic.calculate_3d`` from
+image files to result files (binary ones, the faster form).
 """
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
-import sys
-import time
+from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
+from job import measure_runs, read_job
 
-JOB = json.loads(Path(sys.argv[1]).read_text())
-if hasattr(os, "sched_setaffinity"):  # before anything that counts cores is imported
-    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: JOB["threads"]])
+JOB = read_job()
 
+import numpy as np  # noqa: E402
 import pyvale.calib as calib  # noqa: E402
 import pyvale.dic as dic  # noqa: E402
 
@@ -74,7 +68,7 @@ def correlate(run, out):
     )
 
 
-def read_fields(out):
+def read_fields(run, out):
     """Results in the order of the points' rows."""
     found = dic.import_3d(data=str(out / "*.dic3d"), delimiter=",", binary=True, layout="column", print_level=0)
     s = found.stereo
@@ -86,24 +80,5 @@ def read_fields(out):
     return {"x": found.ss_x[order], "y": found.ss_y[order], "xyz": xyz[order], "uvw": uvw[:, order]}
 
 
-def main() -> int:
-    from importlib.metadata import version
-
-    print(json.dumps({"version": version("pyvale")}), flush=True)
-    for run in JOB["runs"]:
-        out = Path(JOB["folder"]) / run["name"]
-        wall, cpu = [], []
-        for _ in range(run["repeats"]):
-            shutil.rmtree(out, ignore_errors=True)
-            out.mkdir(parents=True)
-            start = time.perf_counter(), time.process_time()
-            correlate(run, out)
-            wall.append(time.perf_counter() - start[0])
-            cpu.append(time.process_time() - start[1])
-        np.savez(out.with_suffix(".npz"), **read_fields(out))
-        print(json.dumps({"name": run["name"], "wall_s": wall, "cpu_s": cpu}), flush=True)
-    return 0
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    measure_runs(JOB, version("pyvale"), correlate, read_fields)
