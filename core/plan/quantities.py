@@ -80,6 +80,11 @@ def planned_quantities(
         Covariance of the cameras' parameters, by cause.
     plan
         The measurement.
+
+    Raises
+    ------
+    FloatingPointError
+        Where the pixel beside the target's middle does not see its plane.
     """
     reader = _Reader(pair, sizes, source, plan)
     out = reader.of_shape()
@@ -100,6 +105,8 @@ class _Reader:
         # mm on the surface per px: the mean over both directions
         points = pair.cam1.back_project_to_plane(self.middle_px + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])).xyz_mm
         self.mm_per_px = float(np.sqrt(np.linalg.norm(np.cross(points[1] - points[0], points[2] - points[0]))))
+        if not 0.0 < self.mm_per_px < np.inf:
+            raise FloatingPointError("the target's plane has no size in a pixel about its middle")
 
     def of_shape(self) -> list[PlannedQuantity]:
         field = self._field(laid_about([self.middle_px], self.plan.spacing_px, 1))

@@ -181,3 +181,9 @@ def test_a_noise_whose_square_is_nothing_is_refused(client: httpx.Client) -> Non
         assert answer.status_code == 422, answer.text
         assert answer.json()["fields"][0]["field"] == "noise_px"
     assert client.post("/api/v1/calibrations:expect", json={"noise_px": 1e-6}).status_code == 200
+
+
+def test_cameras_whose_pixels_do_not_see_the_targets_plane_are_refused(client: httpx.Client) -> None:
+    answer = client.post("/api/v1/calibrations:expect", json={"rig": {"phd_px": 0.001}})
+    assert answer.status_code == 422, answer.text
+    assert answer.json()["code"] == "calibration_singular"
