@@ -16,14 +16,14 @@ ARGS ?=
 # only compile the same kernels again
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n > 3 ? 4 : n + 1)))
 
-.PHONY: help wheel demo quick test test-deep test-all serve check check-page kernels bench format accuracy coverage fuzz load years soak openapi reference docs torture powerloss livebench clusterbench pagespeed pagepictures clean
+.PHONY: help wheel demo quick test test-deep serve check check-page kernels bench format accuracy coverage fuzz load years soak openapi reference docs torture powerloss livebench clusterbench pagespeed pagepictures clean
 
 help:
 	@echo "make demo    start the service on the simulated paper rig and run the plate experiment over HTTP"
 	@echo "make quick   the tests that need no service and no device: minutes"
 	@echo "make test    the whole behaviour at normal depth (WORKERS=1: one file at a time)"
 	@echo "make test-deep  the long forms: fuzzing, kills, load, Monte Carlo at full depth"
-	@echo "make test-all   both, in one session, as CI does"
+	@echo "make   both, in one session, as CI does"
 	@echo "make serve   start the service on the simulated paper rig (ARGS='--config FILE --port N')"
 	@echo "make check   lint, format check, types, import walls, docstrings; lint and types of the page's scripts"
 	@echo "make bench   time everything on this machine, beside pyvale and al-dic-3d, and write docs/explanation/performance.md (ARGS=--quick: a few minutes)"
@@ -85,9 +85,6 @@ test: $(KERNELS)
 
 test-deep: $(KERNELS)
 	$(PYTEST) -m deep $(ARGS)
-
-test-all: $(KERNELS)
-	$(PYTEST) -m '' $(ARGS)
 
 serve: $(PROGRAM) $(ARAVIS)
 	$(BIN)/stereorig serve $(ARGS)
