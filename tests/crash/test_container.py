@@ -10,7 +10,7 @@ import pytest
 
 from tests.support.container import Image
 
-pytestmark = [pytest.mark.deep, pytest.mark.container, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.deep, pytest.mark.delivered, pytest.mark.timeout(900)]
 
 
 @pytest.fixture(scope="module")

@@ -59,6 +59,7 @@ def printed(url: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Pa
 
 
 @pytest.mark.deep
+@pytest.mark.delivered
 def test_a_whole_test_in_twenty_lines(printed: tuple[str, Path]) -> None:
     text, folder = printed
     assert re.search(r"^calibration: (good|usable|marginal)$", text, re.MULTILINE), text
@@ -93,6 +94,7 @@ def analysis(rig: Client) -> Analysis:
 
 
 @pytest.mark.deep
+@pytest.mark.delivered
 def test_fields_are_data_arrays_with_units_over_all_steps(analysis: Analysis) -> None:
     w = analysis.field("w_mm")
     assert w.dims == ("step", "row", "col")
@@ -109,6 +111,7 @@ def test_fields_are_data_arrays_with_units_over_all_steps(analysis: Analysis) ->
 
 
 @pytest.mark.deep
+@pytest.mark.delivered
 def test_a_strain_gauge_has_its_channels_beside_it(analysis: Analysis) -> None:
     gauge = analysis.extensometer((60, 120), (195, 120))
     assert list(gauge.pressure_kpa.values) == [0.0, 172.0, 344.0, 517.0, 689.0]
@@ -121,6 +124,7 @@ def test_a_strain_gauge_has_its_channels_beside_it(analysis: Analysis) -> None:
 
 
 @pytest.mark.deep
+@pytest.mark.delivered
 def test_exports_are_written(analysis: Analysis, tmp_path: Path) -> None:
     assert analysis.export(tmp_path / "a" / "last.csv", "csv", step=4).read_bytes().startswith(b"#")
     with pytest.raises(InputError) as refused:
@@ -208,6 +212,7 @@ def test_both_clients_have_the_same_methods_and_parameters() -> None:
 
 
 @pytest.mark.deep
+@pytest.mark.delivered
 def test_the_async_client_reads_what_the_other_reads(url: str, analysis: Analysis) -> None:
     async def read() -> tuple[list[str], np.ndarray, str]:
         async with stereorig.AsyncClient(url, progress=False) as rig:

@@ -18,7 +18,7 @@ import pytest
 
 from tests.support.requirements import ROOT, missing
 
-pytestmark = [pytest.mark.deep, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.deep, pytest.mark.delivered, pytest.mark.timeout(600)]
 _SOURCES = ("core", "drivers", "server", "sim", "stereorig", "config", "pyproject.toml", "README.md", "LICENSE")
 
 
