@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from core.arrays import Float
@@ -35,15 +36,14 @@ class SharedNoise:
     ----------
     blocks
         (n,) number of the block that a point lies in: 8 x 8 over each step's points.
-    pairs, overlap
-        (m, 2) points whose subsets overlap, each pair once, and (m,) by what part of their pixels.
+    overlap
+        (n, n) sparse, by what part of their pixels the subsets of two points overlap; none with itself.
     one_of
         How many points one of those looked at stands for.
     """
 
     blocks: NDArray[np.int64]
-    pairs: NDArray[np.int64]
-    overlap: Float
+    overlap: csr_array
     one_of: float
 
     @staticmethod
@@ -54,21 +54,20 @@ class SharedNoise:
         # subsets of two steps are as far apart as two subsets that do not overlap
         at = np.column_stack([points.xy1_px[some], points.step[some] * (2.0 * width)])
         near = cKDTree(at).query_pairs(width, p=np.inf, output_type="ndarray") if width > 0 else np.empty((0, 2), int)
-        pairs = some[near].reshape(-1, 2)
-        apart = np.abs(points.xy1_px[pairs[:, 0]] - points.xy1_px[pairs[:, 1]])
-        overlap = np.prod(1.0 - np.minimum(apart / max(width, 1), 1.0), axis=1)
-        return SharedNoise(_blocks(points), pairs, overlap, (n - 1) / max(len(some) - 1, 1))
+        one, two = some[near].reshape(-1, 2).T
+        apart = np.abs(points.xy1_px[one] - points.xy1_px[two])
+        share = np.prod(1.0 - np.minimum(apart / max(width, 1), 1.0), axis=1)
+        half = csr_array((share, (one, two)), shape=(n, n))
+        return SharedNoise(_blocks(points), half + half.T, (n - 1) / max(len(some) - 1, 1))
 
     def metric(self, basis: Float) -> Float:
         """Return (k, k) B' R B of columns (n, k), with the correlation R that the overlaps give the points' noise."""
-        one, two = basis[self.pairs[:, 0]], basis[self.pairs[:, 1]]
-        half = (one * self.overlap[:, None]).T @ two * self.one_of**2
-        return np.asarray(basis.T @ basis + half + half.T)
+        return np.asarray(basis.T @ basis + self.one_of**2 * (basis.T @ (self.overlap @ basis)))
 
     def degrees(self, spent: float) -> float:
         """Degrees of freedom that a variance from all points has, ``spent`` of their squares taken by a fit."""
         n = len(self.blocks)
-        squares = n + 2.0 * float((self.overlap**2).sum()) * self.one_of**2
+        squares = n + self.one_of**2 * float((self.overlap.data**2).sum())
         return max(n - spent, 1.0) ** 2 / squares
 
 
