@@ -3,7 +3,7 @@
 A patch that straddles a step, a ridge or a crack averages both sides, and its correlation need not show it: a part of
 the subset pulls the match. Where the shape or the motion bends or jumps between points a subset apart, beside gaps, and
 where residuals are larger than about them, the match is compared with what it is without each part of the subset. What
-a part changes is the point's error to first order. Of some forty parts one changes the match by so much by noise alone:
+a part changes is the point's error to first order. Of some fifty parts one changes the match by so much by noise alone:
 that is taken off, in squares. What is left is added to the point's standard deviation where it is small; a point that
 is off by more is rejected.
 """
@@ -32,7 +32,7 @@ from core.status import PointStatus
 _FEW = 12
 _WIDER = 3
 _LOUDER = 4.5  # robust standard deviations of the residuals' energy about a point
-_PART_SIGMAS = 5.0  # of the change without a part; some thirty parts are tried
+_PART_SIGMAS = 5.0  # of the change without a part; some fifty parts are tried
 _EDGE_SIGMAS = 4.0  # the same where the shape shows an edge, so that a part's pull is to be expected
 _MOST_CORRELATED = 2.0  # variance of a match over that by white residuals, up to which it is no part's doing
 _FAR_SIGMAS = 4.0  # a change beyond what correlated residuals are counted as
