@@ -37,6 +37,9 @@ class ConnectionLimits:
         Time over which the pace is measured.
     unread_s
         How long a client may take nothing of an answer that waits for it.
+    idle_s
+        How long a connection without a request stays. Clients take up an idle one for some seconds (httpx for 5, other
+        programs for up to 60): where the server ends it in that moment, the request is lost. So it waits longer.
     """
 
     max_open: int = 1000
@@ -44,6 +47,7 @@ class ConnectionLimits:
     body_bytes_per_s: float = 1000.0
     body_s: float = 20.0
     unread_s: float = 60.0
+    idle_s: int = 75
 
 
 def _count_nothing(_why: str) -> None:

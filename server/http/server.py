@@ -70,6 +70,7 @@ class OrderlyServer(uvicorn.Server):
                 log_config=None,  # its lines go where all go
                 access_log=False,
                 server_header=False,
+                timeout_keep_alive=self._keeper.limits.idle_s,
                 timeout_graceful_shutdown=_GRACE_S,
                 lifespan="on",
                 ssl_certfile=None if tls is None else tls[0],

@@ -104,6 +104,16 @@ def test_headers_that_never_end_end_the_connection(own: Service, port: int) -> N
     assert refused(own, "slow_headers") >= before + 2
 
 
+def test_a_connection_waits_longer_than_its_client(port: int) -> None:
+    # httpx takes up a connection that was idle for up to 5 s; ended in that moment, its request would be lost
+    with dial(port) as connection:
+        connection.sendall(request("GET", "/healthz"))
+        assert connection.recv(65536).startswith(b"HTTP/1.1 200")
+        time.sleep(7.0)
+        connection.sendall(request("GET", "/healthz"))
+        assert connection.recv(65536).startswith(b"HTTP/1.1 200")
+
+
 def test_a_second_request_on_a_connection_has_its_time_too(own: Service, port: int) -> None:
     with dial(port) as connection:
         connection.sendall(request("GET", "/healthz"))

@@ -18,6 +18,7 @@ import uvicorn
 from core.cameras.camera import ELEVEN_PARAMETER_NAMES
 from server.api.app import create_app
 from server.config.rig_file import RigConfig, parse_config
+from server.http.connections import ConnectionLimits
 from server.workflows.service import Service
 from tests.support.tiny_rig import TINY, tiny_rig
 
@@ -54,7 +55,10 @@ def served(service: Service, **app: Any) -> Iterator[httpx.Client]:
     listener.bind(("127.0.0.1", 0))
     listener.listen()  # who comes before the server is up waits in the queue
     settings = uvicorn.Config(
-        create_app(service, close_service=False, **app), log_level="error", timeout_graceful_shutdown=2
+        create_app(service, close_service=False, **app),
+        log_level="error",
+        timeout_keep_alive=ConnectionLimits().idle_s,
+        timeout_graceful_shutdown=2,
     )
     server = uvicorn.Server(settings)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
