@@ -234,22 +234,41 @@ class OpenCVLens:
     def _distorted(self, n: Float) -> Float:
         x, y = n[..., 0], n[..., 1]
         r2 = x * x + y * y
-        radial = self._radial(r2)
-        xd = x * radial + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x)
-        yd = y * radial + self.p1 * (r2 + 2.0 * y * y) + 2.0 * self.p2 * x * y
-        return np.stack([xd, yd], axis=-1)
+        return np.stack(self._shifted(x, y, r2, self._radial(r2)), axis=-1)
+
+    def _shifted(self, x: Float, y: Float, r2: Float, radial: Float) -> tuple[Float, Float]:
+        return (
+            x * radial + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x),
+            y * radial + self.p1 * (r2 + 2.0 * y * y) + 2.0 * self.p2 * x * y,
+        )
 
     def _distorted_jacobian(self, n: Float) -> Float:
         x, y = n[..., 0], n[..., 1]
         r2 = x * x + y * y
-        radial = self._radial(r2)
-        slope = self._radial_slope(r2, radial)
         jac = np.empty((*n.shape[:-1], 2, 2))
-        jac[..., 0, 0] = radial + x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x
-        jac[..., 0, 1] = x * y * slope + 2.0 * self.p1 * x + 2.0 * self.p2 * y
+        jac[..., 0, 0], jac[..., 0, 1], jac[..., 1, 1] = self._jacobian(x, y, r2, self._radial(r2))
         jac[..., 1, 0] = jac[..., 0, 1]
-        jac[..., 1, 1] = radial + y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x
         return jac
+
+    def _jacobian(self, x: Float, y: Float, r2: Float, radial: Float) -> tuple[Float, Float, Float]:
+        """Derivatives of the distortion: x by x, x by y and y by x, y by y."""
+        slope = self._radial_slope(r2, radial)
+        return (
+            radial + x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x,
+            x * y * slope + 2.0 * self.p1 * x + 2.0 * self.p2 * y,
+            radial + y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x,
+        )
+
+    def _newton_step(self, n: Float, d: Float) -> tuple[Float, Float]:
+        """Step x, y by which normalised points distort into ``d``, to first order."""
+        x, y = n[..., 0], n[..., 1]
+        r2 = x * x + y * y
+        radial = self._radial(r2)
+        xd, yd = self._shifted(x, y, r2, radial)
+        off_x, off_y = xd - d[..., 0], yd - d[..., 1]
+        xx, xy, yy = self._jacobian(x, y, r2, radial)
+        det = xx * yy - xy * xy
+        return (yy * off_x - xy * off_y) / det, (xx * off_y - xy * off_x) / det
 
     def _image(self, d: Float) -> Float:
         return np.stack(
@@ -289,15 +308,12 @@ class OpenCVLens:
             # a quotient may level off or rise to a pole, where Newton's method from d itself would leave the branch
             n = self._radially_undistorted(d) if self.is_rational else d.copy()
             for _ in range(_NEWTON_STEPS):
-                residual = self._distorted(n) - d
-                jac = self._distorted_jacobian(n)
-                det = jac[..., 0, 0] * jac[..., 1, 1] - jac[..., 0, 1] * jac[..., 1, 0]
-                step_x = (jac[..., 1, 1] * residual[..., 0] - jac[..., 0, 1] * residual[..., 1]) / det
-                step_y = (jac[..., 0, 0] * residual[..., 1] - jac[..., 1, 0] * residual[..., 0]) / det
+                step_x, step_y = self._newton_step(n, d)
                 n = n - np.stack([step_x, step_y], axis=-1)
                 if np.isfinite(r_max):  # keep Newton on the branch that contains the centre
                     r = np.hypot(n[..., 0], n[..., 1])
-                    n = n * np.where(r > r_max, 0.999 * r_max / r, 1.0)[..., None]
+                    if (r > r_max).any():
+                        n = n * np.where(r > r_max, 0.999 * r_max / r, 1.0)[..., None]
                 if not np.any(np.maximum(np.abs(step_x), np.abs(step_y)) > 1e-14):
                     break
             error = np.abs(self._distorted(n) - d).max(axis=-1) * max(abs(self.fx_px), abs(self.fy_px))

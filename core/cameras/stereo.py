@@ -13,6 +13,8 @@ from core.cameras.camera import Camera, RigidTransform, SpacePoints, project_cam
 from core.errors import InputError
 from core.names import CAMERAS
 
+Rays = tuple[SpacePoints, SpacePoints]
+"""Rays (n, 3) of matched points in both cameras' own frames."""
 _ROUNDING = 1e-12  # of the cameras' distances from the origin: what composed poses leave of a zero
 
 
@@ -68,7 +70,11 @@ class StereoPair:
 
         To first order, through camera 2's lens Jacobian; NaN where a pixel has no ray.
         """
-        return self.epipolar_residual_of_rays(self.cam1.rays_cam(xy1_px), self.cam2.rays_cam(xy2_px))
+        return self.epipolar_residual_of_rays(*self.rays(xy1_px, xy2_px))
+
+    def rays(self, xy1_px: ArrayLike, xy2_px: ArrayLike) -> Rays:
+        """Return the rays of pixels in both cameras' own frames: a pose has no part in them."""
+        return self.cam1.rays_cam(xy1_px), self.cam2.rays_cam(xy2_px)
 
     def epipolar_residual_of_rays(self, ray1: SpacePoints, ray2: SpacePoints) -> Float:
         """Return the same of rays in the cameras' own frames: a lens is inverted once for several poses."""
@@ -93,7 +99,7 @@ class StereoPair:
 
     def triangulate(self, xy1_px: ArrayLike, xy2_px: ArrayLike) -> SpacePoints:
         """Mid-point of the shortest segment between the two rays, in the system frame."""
-        return self.triangulate_rays(self.cam1.rays_cam(xy1_px), self.cam2.rays_cam(xy2_px))
+        return self.triangulate_rays(*self.rays(xy1_px, xy2_px))
 
     def triangulate_rays(self, ray1: SpacePoints, ray2: SpacePoints) -> SpacePoints:
         """Return the same of rays in the cameras' own frames: a lens is inverted once for several poses."""

@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from core.arrays import Float
-from core.cameras.camera import Camera, RigidTransform
-from core.cameras.stereo import StereoPair
+from core.cameras.camera import Camera, RigidTransform, SpacePoints
+from core.cameras.stereo import Rays, StereoPair
 
 CHANGE_NAMES = ("rotation_x_rad", "rotation_y_rad", "rotation_z_rad", "baseline_forward_rad", "baseline_sideways_rad")
 LEVER = 0.3
@@ -55,12 +56,12 @@ def ends_of(pair: StereoPair, change: Float) -> Ends:
     return tuple((changed(pair, change + s), changed(pair, change - s)) for s in np.eye(5) * _STEP_RAD)
 
 
-def offset_slopes(pair: StereoPair, change: Float, xy1_px: Float, xy2_px: Float, ends: Ends | None = None) -> Float:
+def offset_slopes(pair: StereoPair, change: Float, rays: Rays, ends: Ends | None = None) -> Float:
     """Return d(epipolar offset of matched points, px) / d(change), (n, 5), at a change of the pair.
 
-    ``ends`` is :func:`ends_of` of pair and change, where it is known.
+    ``rays`` are the points' in both cameras; ``ends`` is :func:`ends_of` of pair and change, where it is known.
     """
-    one, two = pair.cam1.rays_cam(xy1_px), pair.cam2.rays_cam(xy2_px)
+    one, two = rays
     jacobian = pair.cam2.lens.image_jacobian(two.xyz_mm[..., :2])
     offsets = (
         [side.epipolar_residual_at(one, two, jacobian) for side in sides] for sides in ends or ends_of(pair, change)
@@ -68,12 +69,11 @@ def offset_slopes(pair: StereoPair, change: Float, xy1_px: Float, xy2_px: Float,
     return np.stack([(ahead - back) / (2.0 * _STEP_RAD) for ahead, back in offsets], axis=-1)
 
 
-def point_slopes(pair: StereoPair, xy1_px: Float, xy2_px: Float, ends: Ends | None = None) -> Float:
+def point_slopes(pair: StereoPair, rays: Rays, ends: Ends | None = None) -> Float:
     """Return d(triangulated points of the system frame, mm) / d(change), (n, 3, 5).
 
-    ``ends`` is :func:`ends_of` of the pair at no change, where it is known.
+    ``rays`` are the points' in both cameras; ``ends`` is :func:`ends_of` of the pair at no change, where it is known.
     """
-    rays = pair.cam1.rays_cam(xy1_px), pair.cam2.rays_cam(xy2_px)
     points = ([side.triangulate_rays(*rays).xyz_mm for side in sides] for sides in ends or ends_of(pair, np.zeros(5)))
     return np.stack([(ahead - back) / (2.0 * _STEP_RAD) for ahead, back in points], axis=-1)
 
@@ -86,26 +86,30 @@ class ChangeSlopes:
     ----------
     pair
         The cameras before a change.
-    xy1_px, xy2_px
-        (n, 2) the points in both cameras.
+    rays
+        The points' in both cameras.
     ends
         :func:`ends_of` of the pair at no change, where it is known.
     """
 
     pair: StereoPair
-    xy1_px: Float
-    xy2_px: Float
+    rays: Rays
     ends: Ends | None = None
+
+    def at(self, which: NDArray[np.int64]) -> ChangeSlopes:
+        """Return those of some of the points, by their indices."""
+        one, two = (SpacePoints(ray.xyz_mm[which], ray.valid[which]) for ray in self.rays)
+        return ChangeSlopes(self.pair, (one, two), self.ends)
 
     @cached_property
     def offset(self) -> Float:
         """(n, 5) :func:`offset_slopes` at no change."""
-        return offset_slopes(self.pair, np.zeros(5), self.xy1_px, self.xy2_px, self.ends)
+        return offset_slopes(self.pair, np.zeros(5), self.rays, self.ends)
 
     @cached_property
     def position(self) -> Float:
         """(n, 3, 5) :func:`point_slopes`."""
-        return point_slopes(self.pair, self.xy1_px, self.xy2_px, self.ends)
+        return point_slopes(self.pair, self.rays, self.ends)
 
 
 def plausible_bump(pair: StereoPair) -> Float:

@@ -94,8 +94,9 @@ def _agreeing(
     for limit in (_WIDE_PX, _WIDE_PX, 5.0, 4.0, 3.0, 3.0, 3.0):
         if inliers.sum() < MIN_MATCHES:
             break
-        J = offset_slopes(pair, change, xy1[inliers], xy2[inliers])
-        residual = changed(pair, change).epipolar_residual_px(xy1[inliers], xy2[inliers])
+        rays = pair.rays(xy1[inliers], xy2[inliers])
+        J = offset_slopes(pair, change, rays)
+        residual = changed(pair, change).epipolar_residual_of_rays(*rays)
         normal = J.T @ J / sigma**2 + prior
         change = change - np.linalg.solve(normal, J.T @ residual / sigma**2 + prior @ change)
         left = np.abs(changed(pair, change).epipolar_residual_px(xy1, xy2))
@@ -106,8 +107,8 @@ def _agreeing(
 
 def _most_agreeing(pair: StereoPair, xy1: Float, xy2: Float, prior: NDArray[np.floating[Any]], sigma: float) -> Bool:
     """Matches that agree with the best of many small samples, the offsets taken as linear in the change."""
-    offset = pair.epipolar_residual_px(xy1, xy2)
-    J = offset_slopes(pair, np.zeros(5), xy1, xy2)
+    rays = pair.rays(xy1, xy2)
+    offset, J = pair.epipolar_residual_of_rays(*rays), offset_slopes(pair, np.zeros(5), rays)
     rng = np.random.default_rng(0)  # equal input gives equal output
     index = np.stack([rng.choice(len(xy1), _SAMPLE, replace=False) for _ in range(_TRIES)])
     A, b = J[index], offset[index]

@@ -10,7 +10,7 @@ import numpy as np
 from core.arrays import Float
 from core.cameras.stereo import StereoPair
 from core.field.region.trend import smooth_terms
-from core.orientation.change import ChangeSlopes, point_slopes
+from core.orientation.change import ChangeSlopes
 from core.orientation.matched import MatchedPoints
 from core.robust import spread_indices
 
@@ -64,14 +64,14 @@ class Consequences:
     strain: Float
 
     @staticmethod
-    def of(pair: StereoPair, points: MatchedPoints, known: ChangeSlopes | None = None) -> Consequences | None:
-        """Return those of points; None if fewer than ten can be triangulated. ``known`` are their slopes."""
-        if len(points.xy1_px) == 0:
+    def of(points: ChangeSlopes) -> Consequences | None:
+        """Return those of points by what a change would do to them; None if fewer than ten can be triangulated."""
+        count = len(points.rays[0].xyz_mm)
+        if count == 0:
             return None
-        some = np.unique(spread_indices(len(points.xy1_px), _AT_MOST))
-        xy1, xy2 = points.xy1_px[some], points.xy2_px[some]
-        xyz = pair.triangulate(xy1, xy2).xyz_mm
-        slopes = point_slopes(pair, xy1, xy2) if known is None or len(some) < len(points.xy1_px) else known.position
+        some = np.unique(spread_indices(count, _AT_MOST))
+        known = points if len(some) == count else points.at(some)
+        xyz, slopes = known.pair.triangulate_rays(*known.rays).xyz_mm, known.position
         good = np.isfinite(xyz).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2))
         if good.sum() < 10:
             return None
@@ -112,7 +112,7 @@ def consequence_of(pair: StereoPair, points: MatchedPoints, change: Float, covar
     Consequence or None
         None if fewer than ten points can be triangulated.
     """
-    found = Consequences.of(pair, points)
+    found = Consequences.of(ChangeSlopes(pair, pair.rays(points.xy1_px, points.xy2_px)))
     return None if found is None else found.by(change, covariance)
 
 

@@ -94,24 +94,24 @@ def estimate_change(
     OrientationEstimate
         ``changed(pair, estimate.change)`` is the pair after the change.
     """
-    xy1, xy2 = points.xy1_px, points.xy2_px
+    rays = pair.rays(points.xy1_px, points.xy2_px) if slopes is None else slopes.rays
     unit, size = plausible_bump(pair), _FIRST_RAD if bump_rad is None else bump_rad
     firm = np.linalg.inv(unit)
-    terms = smooth_terms(xy1)
+    terms = smooth_terms(points.xy1_px)
     basis = orthonormal(terms)
     shared = SharedNoise.of(points) if shared is None else shared
     change = np.zeros(5) if start is None else np.array(start, dtype=np.float64)
-    J = offset_slopes(pair, change, xy1, xy2) if slopes is None or start is not None else slopes.offset
+    J = offset_slopes(pair, change, rays) if slopes is None or start is not None else slopes.offset
 
     def left_at(at: Float) -> Float:
         if offset_px is None:
-            return changed(pair, at).epipolar_residual_px(xy1, xy2)
+            return changed(pair, at).epipolar_residual_of_rays(*rays)
         return np.asarray(offset_px + J @ at)
 
     for _ in range(_ITERATIONS):
         residual = left_at(change)
         if offset_px is None:
-            J = offset_slopes(pair, change, xy1, xy2)
+            J = offset_slopes(pair, change, rays)
         weights, _ = robust_weights(residual - smooth_surface(basis, residual))
         variance = effective_variance(J, weights, residual, shared)
         information = (J * weights[:, None]).T @ J / variance

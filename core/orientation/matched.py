@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arrays import Float
+from core.cameras.camera import SpacePoints
 from core.cameras.stereo import StereoPair
 from core.field.points.result import Field
 from core.robust import spread_indices
@@ -74,20 +75,21 @@ def matched_points(
         ok = ok[np.unique(spread_indices(len(ok), at_most))]
     xy1 = np.stack([shape.x_px.ravel()[ok], shape.y_px.ravel()[ok]], axis=1)
     xyz, offset = shape.xyz_mm.reshape(-1, 3)[ok], shape.epipolar_px.ravel()[ok]
-    return MatchedPoints.of(xy1, seen_by_camera2(pair, xy1, xyz, offset), step, subset_px=subset_px)
+    xy2 = seen_by_camera2(pair, pair.cam1.rays_cam(xy1), xyz, offset)
+    return MatchedPoints.of(xy1, xy2, step, subset_px=subset_px)
 
 
-def seen_by_camera2(pair: StereoPair, xy1_px: Float, xyz_mm: Float, offset_px: Float) -> Float:
-    """Return positions (n, 2) in camera 2 of measured points: off their epipolar lines by the offset."""
+def seen_by_camera2(pair: StereoPair, ray1: SpacePoints, xyz_mm: Float, offset_px: Float) -> Float:
+    """Return positions (n, 2) in camera 2 of measured points: off the epipolar lines of ``ray1`` by the offset."""
     on_line = pair.cam2.project(xyz_mm).xy
-    across = across_line(pair, xy1_px, on_line)
-    left = offset_px - pair.epipolar_residual_px(xy1_px, on_line)
+    across = across_line(pair, ray1, on_line)
+    left = offset_px - pair.epipolar_residual_of_rays(ray1, pair.cam2.rays_cam(on_line))
     return np.asarray(on_line + across * (left / (across**2).sum(axis=1))[:, None])
 
 
-def across_line(pair: StereoPair, xy1_px: Float, xy2_px: Float) -> Float:
-    """Return (n, 2) the gradient of the epipolar offset over the position in camera 2: across the line."""
+def across_line(pair: StereoPair, ray1: SpacePoints, xy2_px: Float) -> Float:
+    """Return (n, 2) the gradient of the epipolar offset over the position in camera 2: across the line of ``ray1``."""
     h = _STEP_PX
     ends = np.array([[h, 0.0], [-h, 0.0], [0.0, h], [0.0, -h]])[:, None]
-    right, left, below, above = pair.epipolar_residual_px(xy1_px, xy2_px + ends)
+    right, left, below, above = pair.epipolar_residual_of_rays(ray1, pair.cam2.rays_cam(xy2_px + ends))
     return np.stack([right - left, below - above], axis=1) / (2 * h)

@@ -11,7 +11,7 @@ import numpy as np
 from core.arrays import Float
 from core.calibration import COVARIANCE_NAMES
 from core.calibration.uncertainty import image_derivatives
-from core.cameras.stereo import StereoPair
+from core.cameras.stereo import Rays, StereoPair
 from core.common.derivatives import pseudoinverse
 from core.field.region.trend import smooth_terms
 from core.orientation.change import ChangeSlopes, Ends
@@ -20,14 +20,17 @@ from core.orientation.matched import MatchedPoints, across_line
 from core.orientation.noise import SharedNoise, effective_variance, robust_weights
 
 
-def calibration_slopes(pair: StereoPair, points: MatchedPoints, names: Sequence[str] = COVARIANCE_NAMES) -> Float:
+def calibration_slopes(
+    pair: StereoPair, points: MatchedPoints, names: Sequence[str] = COVARIANCE_NAMES, rays: Rays | None = None
+) -> Float:
     """Return d(epipolar offset, px) / d(both cameras' parameters by name), (n, len(names)), at matched points.
 
     The point that camera 1 sees stays on its pixel's ray; its image in camera 2 moves off the position that was
-    measured. What moves along the line counts for nothing.
+    measured. What moves along the line counts for nothing. ``rays`` are the points', where they are known.
     """
-    xyz = pair.triangulate(points.xy1_px, points.xy2_px).xyz_mm
-    across = across_line(pair, points.xy1_px, points.xy2_px)
+    rays = pair.rays(points.xy1_px, points.xy2_px) if rays is None else rays
+    xyz = pair.triangulate_rays(*rays).xyz_mm
+    across = across_line(pair, rays[0], points.xy2_px)
     A1, A2 = pair.cam1.point_jacobian(xyz), pair.cam2.point_jacobian(xyz)
     by_parameters = image_derivatives(pair, xyz, names)
     by_image1 = np.einsum("nj,njk->nk", across, A2 @ pseudoinverse(A1))
@@ -76,9 +79,7 @@ class StepOffsets:
     @cached_property
     def offset_px(self) -> Float:
         """(n,) the offsets."""
-        if self.stated_px is not None:
-            return self.stated_px
-        return self.pair.epipolar_residual_px(self.points.xy1_px, self.points.xy2_px)
+        return self.pair.epipolar_residual_of_rays(*self.rays) if self.stated_px is None else self.stated_px
 
     @cached_property
     def finite(self) -> StepOffsets:
@@ -87,6 +88,11 @@ class StepOffsets:
         if good.all():
             return self
         return StepOffsets(self.pair, self.points.at(good), self.names, self.offset_px[good], self.ends)
+
+    @cached_property
+    def rays(self) -> Rays:
+        """The points' rays in both cameras, in these cameras' own frames."""
+        return self.pair.rays(self.points.xy1_px, self.points.xy2_px)
 
     @cached_property
     def terms(self) -> Float:
@@ -122,14 +128,14 @@ class StepOffsets:
     @cached_property
     def by_parameters(self) -> Float:
         """(n, p) :func:`calibration_slopes`."""
-        return calibration_slopes(self.pair, self.points, self.names)
+        return calibration_slopes(self.pair, self.points, self.names, self.rays)
 
     @cached_property
     def change_slopes(self) -> ChangeSlopes:
         """What a change of the cameras would do to the points."""
-        return ChangeSlopes(self.pair, self.points.xy1_px, self.points.xy2_px, self.ends)
+        return ChangeSlopes(self.pair, self.rays, self.ends)
 
     @cached_property
     def consequences(self) -> Consequences | None:
         """What any change makes of the points; None with too few."""
-        return Consequences.of(self.pair, self.points, self.change_slopes)
+        return Consequences.of(self.change_slopes)

@@ -81,10 +81,10 @@ def step_points(
     good = (fit.status == PointStatus.OK) & (fit.zncc.min(axis=1) >= options.min_zncc) & np.isfinite(fit.epipolar_px)
     if not good.any():
         return None
-    rays = pair.cam1.rays_cam(xy[good]).xyz_mm
-    xyz = pair.cam1.sys_from_cam.apply(rays / fit.w[good, :1])
+    rays = pair.cam1.rays_cam(xy[good])
+    xyz = pair.cam1.sys_from_cam.apply(rays.xyz_mm / fit.w[good, :1])
     return MatchedPoints.of(
-        xy[good], seen_by_camera2(pair, xy[good], xyz, fit.epipolar_px[good]), subset_px=options.subset_px
+        xy[good], seen_by_camera2(pair, rays, xyz, fit.epipolar_px[good]), subset_px=options.subset_px
     )
 
 

@@ -59,7 +59,8 @@ def check_against(loaded: LoadedCalibration, files: Sequence[Path], measured_wit
     variables = step.variables
     xy1 = np.stack([variables[n].values[ok] for n in ("x_px", "y_px")], axis=1)
     xyz = np.stack([variables[n].values[ok] for n in ("x_mm", "y_mm", "z_mm")], axis=1)
-    xy2 = seen_by_camera2(own.pair, xy1, xyz, variables["epipolar_px"].values[ok].astype(np.float64))
+    ray1 = own.pair.cam1.rays_cam(xy1)
+    xy2 = seen_by_camera2(own.pair, ray1, xyz, variables["epipolar_px"].values[ok].astype(np.float64))
     return EpipolarComparison(
         results=files[0].name,
         measured_with=Residual.of(own.pair.epipolar_residual_px(xy1, xy2)),
