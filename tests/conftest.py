@@ -34,6 +34,8 @@ TESTS = Path(__file__).parent
 # What waits longest begins first, and the many short files fill the workers up at the end
 ORDER = ("contract", "crash", "service", "browser", "accuracy", "page", "unit")
 
+LAZY_WORKER = ("contract", "service")
+
 # Of the deep tier, files of minutes begin first: one of them would be left over at the end on a single core. A worker
 # takes its next file when two tests are left of its own, and would keep a long one waiting: a short one is the fourth
 DEEP_FIRST = (
@@ -99,6 +101,21 @@ def specimen_dir(shared_dir: Path) -> Path:
     if not (folder / "calibration_dice.xml").is_file():
         missing(f"{folder}")
     return folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def worker_with_its_first_task(request: pytest.FixtureRequest) -> Iterator[None]:
+    """A service in a test's own process has no compute worker until a task needs one: most never do.
+
+    Each would take seconds of processor time to get warm. Modules marked ``warm_worker`` have it as a user does.
+    """
+    lazy = request.path.relative_to(TESTS).parts[0] in LAZY_WORKER and not request.node.get_closest_marker(
+        "warm_worker"
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        if lazy:
+            patch.setattr("server.worker.embedded.ComputeWorker.start", lambda _: None)
+        yield
 
 
 @pytest.fixture(scope="module")
