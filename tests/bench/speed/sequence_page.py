@@ -17,7 +17,7 @@ from tests.bench.speed.layout import of_threads, save, table, thousands
 from tests.bench.speed.sequence import PointCost, SeedFigures, SequenceFigures, Used
 
 PARTS = ("sequence", "fresh", "seeds", "points", "memory")
-RATE, FIRST_S, STEP_S, SEEDS_S, COMPILE_S, LARGE_MB = 60_000.0, 3.0, 1.5, 1.0, 30.0, 2000.0
+RATE, FIRST_S, STEP_S, SEEDS_S, COMPILE_S, LARGE_MB, COST = 60_000.0, 3.0, 1.5, 1.0, 10.0, 1500.0, 1.25
 
 
 @dataclass
@@ -55,7 +55,9 @@ class Figures:
         if len(self.points) > 1:
             few, many = self.points[-2], self.points[-1]
             ratio = (many.later_s / many.points) / (few.later_s / few.points)
-            out.append(Row(f"cost of a point, {thousands(many.points)} over {thousands(few.points)} points", ratio, ""))
+            out.append(
+                Row(f"cost of a point, {thousands(many.points)} over {thousands(few.points)} points", ratio, "", COST)
+            )
         for steps, used in self.large.items():
             what = "24 megapixels, 250,000 points: peak memory, " + ("a pair" if steps == 0 else f"and {steps} step")
             out.append(Row(what, used.peak_mb, "MB", LARGE_MB if steps == 0 else None))
