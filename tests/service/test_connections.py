@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import http.client
 import json
 import re
 import socket
@@ -106,12 +107,14 @@ def test_headers_that_never_end_end_the_connection(own: Service, port: int) -> N
 
 def test_a_connection_waits_longer_than_its_client(port: int) -> None:
     # httpx takes up a connection that was idle for up to 5 s; ended in that moment, its request would be lost
-    with dial(port) as connection:
-        connection.sendall(request("GET", "/healthz"))
-        assert connection.recv(65536).startswith(b"HTTP/1.1 200")
+    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=END_S)) as connection:
+        connection.request("GET", "/healthz")
+        assert connection.getresponse().read()
+        held = connection.sock
         time.sleep(7.0)
-        connection.sendall(request("GET", "/healthz"))
-        assert connection.recv(65536).startswith(b"HTTP/1.1 200")
+        connection.request("GET", "/healthz")
+        assert connection.getresponse().status == 200
+        assert connection.sock is held
 
 
 def test_a_second_request_on_a_connection_has_its_time_too(own: Service, port: int) -> None:

@@ -15,7 +15,7 @@ from server.formats.images import decode
 from server.workflows.service import Service
 from tests.support.service_rig import SMALL, data_of, true_cameras, wait_for_job
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.timeout(300), pytest.mark.warm_worker]
 API = "/api/v1"
 
 

@@ -16,6 +16,8 @@ from server.config.rig_file import ServiceSection
 from tests.support.requirements import ROOT
 from tests.support.service_rig import wait_for_rig
 
+pytestmark = pytest.mark.warm_worker
+
 PAGE = ROOT / "docs" / "how_to" / "operate.md"
 TEXT = PAGE.read_text(encoding="utf-8")
 

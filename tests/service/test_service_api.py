@@ -21,6 +21,8 @@ from tests.support.service_rig import new_test, served, tiny_config, wait_for_jo
 
 API = "/api/v1"
 
+pytestmark = pytest.mark.warm_worker
+
 
 # system ---------------------------------------------------------------------------------------------------------
 
