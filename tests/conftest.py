@@ -34,6 +34,7 @@ TESTS = Path(__file__).parent
 # What waits longest begins first, and the many short files fill the workers up at the end
 ORDER = ("contract", "crash", "service", "browser", "accuracy", "page", "unit")
 
+# Tiers whose services have no compute worker until a task needs one, see `worker_with_its_first_task`
 LAZY_WORKER = ("contract", "service")
 
 # Of the deep tier, files of minutes begin first: one of them would be left over at the end on a single core. A worker
@@ -109,11 +110,9 @@ def worker_with_its_first_task(request: pytest.FixtureRequest) -> Iterator[None]
 
     Each would take seconds of processor time to get warm. Modules marked ``warm_worker`` have it as a user does.
     """
-    lazy = request.path.relative_to(TESTS).parts[0] in LAZY_WORKER and not request.node.get_closest_marker(
-        "warm_worker"
-    )
+    tier = request.path.relative_to(TESTS).parts[0]
     with pytest.MonkeyPatch.context() as patch:
-        if lazy:
+        if tier in LAZY_WORKER and request.node.get_closest_marker("warm_worker") is None:
             patch.setattr("server.worker.embedded.ComputeWorker.start", lambda _: None)
         yield
 

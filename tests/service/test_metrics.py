@@ -16,9 +16,9 @@ from server.workflows.service import Service
 from tests.support.service_rig import new_test, wait_for_job, wait_for_rig
 
 API = "/api/v1"
+Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
 
 pytestmark = pytest.mark.warm_worker
-Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
 
 
 def scrape(client: httpx.Client) -> Samples:

@@ -15,9 +15,9 @@ from tests.support.problems import assert_problem
 from tests.support.service_rig import new_test, wait_for_job, wait_for_rig
 
 API = "/api/v1"
+Usage = namedtuple("Usage", "total used free")
 
 pytestmark = pytest.mark.warm_worker
-Usage = namedtuple("Usage", "total used free")
 
 
 @pytest.fixture
