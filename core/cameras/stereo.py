@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from core.arrays import Float
+from core.arrays import Bool, Float
 from core.cameras.camera import Camera, RigidTransform, SpacePoints, project_cam
 from core.errors import InputError
 from core.names import CAMERAS
@@ -16,6 +16,12 @@ from core.names import CAMERAS
 Rays = tuple[SpacePoints, SpacePoints]
 """Rays (n, 3) of matched points in both cameras' own frames."""
 _ROUNDING = 1e-12  # of the cameras' distances from the origin: what composed poses leave of a zero
+
+
+def some_rays(rays: Rays, which: NDArray[np.int64] | Bool) -> Rays:
+    """Return the rays of some of the points, by their indices or (n,) True."""
+    one, two = (SpacePoints(ray.xyz_mm[which], ray.valid[which]) for ray in rays)
+    return one, two
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from core.arrays import Float
-from core.cameras.camera import Camera, RigidTransform, SpacePoints
-from core.cameras.stereo import Rays, StereoPair
+from core.cameras.camera import Camera, RigidTransform
+from core.cameras.stereo import Rays, StereoPair, some_rays
 
 CHANGE_NAMES = ("rotation_x_rad", "rotation_y_rad", "rotation_z_rad", "baseline_forward_rad", "baseline_sideways_rad")
 LEVER = 0.3
@@ -98,8 +98,7 @@ class ChangeSlopes:
 
     def at(self, which: NDArray[np.int64]) -> ChangeSlopes:
         """Return those of some of the points, by their indices."""
-        one, two = (SpacePoints(ray.xyz_mm[which], ray.valid[which]) for ray in self.rays)
-        return ChangeSlopes(self.pair, (one, two), self.ends)
+        return ChangeSlopes(self.pair, some_rays(self.rays, which), self.ends)
 
     @cached_property
     def offset(self) -> Float:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arrays import Bool, Float
-from core.cameras.stereo import StereoPair
+from core.cameras.stereo import Rays, StereoPair, some_rays
 from core.errors import CalibrationError
 from core.field.points.features import Box, detect, match
 from core.field.points.images import MeasureImage
@@ -66,10 +66,11 @@ def coarse_change(pair: StereoPair, matches: MatchedPoints, *, scale: int = 1) -
     sigma = _FEATURE_SIGMA_PX * max(1.0, float(scale))
     if len(xy1) < MIN_MATCHES:
         raise _no_match(len(xy1), 0)
+    rays = pair.rays(xy1, xy2)
     best: tuple[Float, Bool] | None = None
     # over a narrow view a wide prior leaves changes far beyond what is linear in them: the smallest that does is taken
     for size in _BUMPS_RAD:
-        found = _agreeing(pair, xy1, xy2, np.linalg.inv(plausible_bump(pair)) / size**2, sigma)
+        found = _agreeing(pair, rays, np.linalg.inv(plausible_bump(pair)) / size**2, sigma)
         if best is None or found[1].sum() > _CLEARLY_MORE * best[1].sum():
             best = found
     assert best is not None
@@ -85,32 +86,29 @@ def coarse_change(pair: StereoPair, matches: MatchedPoints, *, scale: int = 1) -
     return estimate_change(pair, agreeing, start=change).change
 
 
-def _agreeing(
-    pair: StereoPair, xy1: Float, xy2: Float, prior: NDArray[np.floating[Any]], sigma: float
-) -> tuple[Float, Bool]:
+def _agreeing(pair: StereoPair, rays: Rays, prior: NDArray[np.floating[Any]], sigma: float) -> tuple[Float, Bool]:
     """Change under a prior's inverse covariance, and the matches that agree with it."""
-    inliers = _most_agreeing(pair, xy1, xy2, prior, sigma)
+    inliers = _most_agreeing(pair, rays, prior, sigma)
     change = np.zeros(5)
     for limit in (_WIDE_PX, _WIDE_PX, 5.0, 4.0, 3.0, 3.0, 3.0):
         if inliers.sum() < MIN_MATCHES:
             break
-        rays = pair.rays(xy1[inliers], xy2[inliers])
-        J = offset_slopes(pair, change, rays)
-        residual = changed(pair, change).epipolar_residual_of_rays(*rays)
+        agreeing = some_rays(rays, inliers)
+        J = offset_slopes(pair, change, agreeing)
+        residual = changed(pair, change).epipolar_residual_of_rays(*agreeing)
         normal = J.T @ J / sigma**2 + prior
         change = change - np.linalg.solve(normal, J.T @ residual / sigma**2 + prior @ change)
-        left = np.abs(changed(pair, change).epipolar_residual_px(xy1, xy2))
+        left = np.abs(changed(pair, change).epipolar_residual_of_rays(*rays))
         with np.errstate(invalid="ignore"):
             inliers = np.asarray(left < limit * sigma)
     return change, inliers
 
 
-def _most_agreeing(pair: StereoPair, xy1: Float, xy2: Float, prior: NDArray[np.floating[Any]], sigma: float) -> Bool:
+def _most_agreeing(pair: StereoPair, rays: Rays, prior: NDArray[np.floating[Any]], sigma: float) -> Bool:
     """Matches that agree with the best of many small samples, the offsets taken as linear in the change."""
-    rays = pair.rays(xy1, xy2)
     offset, J = pair.epipolar_residual_of_rays(*rays), offset_slopes(pair, np.zeros(5), rays)
     rng = np.random.default_rng(0)  # equal input gives equal output
-    index = np.stack([rng.choice(len(xy1), _SAMPLE, replace=False) for _ in range(_TRIES)])
+    index = np.stack([rng.choice(len(offset), _SAMPLE, replace=False) for _ in range(_TRIES)])
     A, b = J[index], offset[index]
     normal = np.swapaxes(A, 1, 2) @ A / sigma**2 + prior
     trial = -np.linalg.solve(normal, (np.swapaxes(A, 1, 2) @ b[..., None]) / sigma**2)[..., 0]

@@ -14,7 +14,7 @@ from core.matching.kernels.naming import entry, inner
 from core.threads import run_ranges
 
 _SIXTH = 1.0 / 6.0
-_RANGE = 64  # points: some hundred microseconds
+_RANGE = 64  # points: one to three milliseconds
 
 
 @inner
