@@ -9,9 +9,12 @@ import sqlite3
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
+from serial.urlhandler import protocol_socket
+from starlette.routing import BaseRoute
 
 import server.formats.disk
 from server.api.app import create_app
@@ -21,6 +24,8 @@ from tests.support.hooked_disk import HookedDisk
 from tests.support.power_loss.recording import ThreadWorker
 
 _OWN = ("catalog.", "service.lock", "audit.log")
+#: the application's routes; they are asked for the service each time, and to build them takes longer than a start
+_ROUTES: list[BaseRoute] = []
 
 
 @dataclass
@@ -104,6 +109,8 @@ class AppClient:
 
     def __init__(self, service: Service) -> None:
         app = create_app(service, close_service=False)
+        _ROUTES.extend([] if _ROUTES else app.router.routes)
+        app.router.routes[:] = _ROUTES
         self._client = httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://127.0.0.1/api/v1")
         self._runner = asyncio.Runner()
         self._life = app.router.lifespan_context(app)
@@ -140,8 +147,10 @@ class Lab:
         self.starts = 0
         self.data = folder / "0"
         self.disk = KillingDisk(self.data)
-        self._real = server.formats.disk.disk
+        self._real = server.formats.disk.disk, protocol_socket.time
         server.formats.disk.disk = self.disk
+        # pyserial waits 0.3 s after a line is closed; the next start opens another one
+        protocol_socket.time = SimpleNamespace(sleep=lambda _seconds: None)
         self._open()
 
     def _open(self) -> None:
@@ -152,7 +161,7 @@ class Lab:
     def close(self) -> None:
         """End for good."""
         self._end()
-        server.formats.disk.disk = self._real
+        server.formats.disk.disk, protocol_socket.time = self._real
         shutil.rmtree(self.folder)
 
     def restart(self, aside: Path | None = None) -> None:
