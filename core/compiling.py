@@ -10,6 +10,9 @@ import gc
 from collections.abc import Callable, Iterator
 from typing import Any
 
+CompileElsewhere = Callable[[str, str, Any], None]
+"""Module and qualified name of a kernel, and numba's types of its arguments: returns once it is on disk, if it can."""
+
 COMPILING = "compiling kernels, once per machine, about half a minute"
 """Text for the user."""
 
@@ -42,6 +45,43 @@ def report_compiling(report: Callable[[], None]) -> Iterator[None]:
         yield
     finally:
         event.unregister("numba:compile", listener)  # type: ignore[no-untyped-call]
+
+
+_elsewhere: list[CompileElsewhere] = []
+
+
+@contextlib.contextmanager
+def compile_elsewhere(compile_it: CompileElsewhere) -> Iterator[None]:
+    """Have another process compile the kernels that are not on disk inside the block, and load them then.
+
+    In the process that compiles it, a kernel rounds otherwise than where it is loaded from disk.
+
+    Parameters
+    ----------
+    compile_it
+        Called on the thread that needs a kernel; where the kernel is not on disk after it, it is compiled here.
+    """
+    _elsewhere.append(compile_it)
+    try:
+        yield
+    finally:
+        _elsewhere.remove(compile_it)
+
+
+def ask_elsewhere(dispatcher: Any, arguments: Any) -> bool:
+    """Have a kernel compiled as :func:`compile_elsewhere` says; return False where nothing was said.
+
+    Listeners hear of it as of any compilation.
+    """
+    if not _elsewhere:
+        return False
+    from numba.core import event  # slow to load, and needed for any computation
+
+    function = dispatcher.py_func
+    heard = {"dispatcher": dispatcher, "args": arguments, "return_type": None}
+    with event.trigger_event("numba:compile", data=heard):
+        _elsewhere[-1](function.__module__, function.__qualname__, arguments)
+    return True
 
 
 class NotCompiledError(Exception):

@@ -14,6 +14,7 @@ from core.errors import Cancelled, StereorigError
 from server.base.library_threads import one_library_thread
 from server.base.memory import go_on, hurry
 from server.formats.version import software_version
+from server.worker.kernel_compiler import compiled_aside
 
 # name -> (module, one-line help); each module has add_arguments(parser) and run(args) -> int,
 # and is imported only when it is asked for, so that `--help` and errors in one do not wait for the others
@@ -96,7 +97,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             sub.set_defaults(run=command.run)
     args = parser.parse_args(arguments)
     try:
-        return int(args.run(args))
+        with compiled_aside():
+            return int(args.run(args))
     except Cancelled as error:
         print(f"stereorig: {error}", file=sys.stderr)
         return 130

@@ -26,6 +26,7 @@ from core.errors import Cancelled
 from server.base.library_threads import one_library_thread
 from server.base.memory import settle
 from server.base.priority import end_with_parent, lower_worker
+from server.worker.kernel_compiler import compiled_aside
 
 _log = logging.getLogger("stereorig.worker")
 _current: TaskChannel | None = None
@@ -127,7 +128,7 @@ def serve(
     if warm_up is not None:
         module, name = warm_up.split(":")
         try:
-            with report_compiling(lambda: send(("compiling",))):
+            with compiled_aside(), report_compiling(lambda: send(("compiling",))):
                 getattr(importlib.import_module(module), name)(threads)
         except Exception:  # noqa: BLE001 - the first task will report the error to its caller
             _log.exception("warming up failed")
@@ -142,7 +143,10 @@ def serve(
             return  # the service is gone
         _current = channel = TaskChannel(send, task_id, cancel, keeps_going=True)
         try:
-            with report_compiling(lambda channel=channel: channel.progress(COMPILING, 0, 1)):  # type: ignore[misc]
+            with (
+                compiled_aside(),
+                report_compiling(lambda channel=channel: channel.progress(COMPILING, 0, 1)),  # type: ignore[misc]
+            ):
                 result = function(*args, **kwargs)
         except BaseException as error:  # noqa: BLE001 - carried back to the caller
             _reply_error(send, task_id, error)

@@ -14,11 +14,17 @@ from typing import Any
 
 from numba import njit
 
+from core.compiling import ask_elsewhere
+
 _ALL: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _INNER: dict[str, Any] = {**_ALL, "no_cpython_wrapper": True}
 
 inner = njit(**_INNER)
 """Compile a function that only kernels call: its wrapper for Python would take longer to compile than itself."""
+
+
+ENTRIES: dict[tuple[str, str], Any] = {}
+"""What :func:`entry` has made, by module and qualified name."""
 
 
 def entry(function: Callable[..., Any]) -> Any:
@@ -35,7 +41,21 @@ def entry(function: Callable[..., Any]) -> Any:
             made._cache.flush()
         except OSError:  # not ours to write: compile anew in every process
             made._cache.disable()
+    if made._cache._enabled:
+        _load_what_another_process_compiles(made)
+    ENTRIES[function.__module__, function.__qualname__] = made
     return made
+
+
+def _load_what_another_process_compiles(made: Any) -> None:
+    """Where a kernel is not on disk, ask for it as :func:`core.compiling.compile_elsewhere` says, and look again."""
+    load = made._cache.load_overload
+
+    def load_or_ask(arguments: Any, target: Any) -> Any:
+        found = load(arguments, target)
+        return load(arguments, target) if found is None and ask_elsewhere(made, arguments) else found
+
+    made._cache.load_overload = load_or_ask
 
 
 def stamp_of(sources: Iterable[Path]) -> int:

@@ -1,0 +1,96 @@
+"""Compile a process' missing kernels in another process, so that it takes them from disk as every later one will.
+
+In the process that compiles it, a kernel calls the functions that were compiled before it, each by itself; on disk
+stands the kernel with its own copies of them, optimised as parts of it, which round otherwise. A measurement would differ
+in its last digits from its own repetition.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+from core.compiling import compile_elsewhere, no_collection
+from server.base.priority import end_with_parent
+
+_DONE = b"\n"
+
+
+class KernelCompiler:
+    """A process that compiles what it is asked for, started with the first question.
+
+    One for several kernels: what they share is compiled once.
+    """
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def compile(self, module: str, name: str, arguments: Any) -> None:
+        """Return once a kernel is on disk, or will have to be compiled here.
+
+        Parameters
+        ----------
+        module, name
+            The module that makes the kernel, and its qualified name.
+        arguments
+            numba's types of its arguments.
+        """
+        # a process that ended by itself, for want of memory perhaps, leaves the work to the caller
+        with contextlib.suppress(OSError):
+            process = self._process = self._process or _start()
+            assert process.stdin is not None
+            assert process.stdout is not None
+            pickle.dump((module, name, arguments), process.stdin)
+            process.stdin.flush()
+            process.stdout.read(len(_DONE))
+
+    def close(self) -> None:
+        """End the process."""
+        if self._process is not None:
+            self._process.kill()
+            with self._process:
+                self._process = None
+
+
+@contextlib.contextmanager
+def compiled_aside() -> Iterator[None]:
+    """Have kernels that are not on disk compiled by another process inside the block."""
+    with contextlib.closing(KernelCompiler()) as compiler, compile_elsewhere(compiler.compile):
+        yield
+
+
+def _start() -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, "-m", __name__],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    )
+
+
+def main() -> int:
+    """Compile what the parent asks for, until it asks no more."""
+    end_with_parent()
+    from core.matching.kernels.naming import ENTRIES
+
+    with no_collection():
+        while True:
+            try:
+                module, name, arguments = pickle.load(sys.stdin.buffer)  # noqa: S301 - the parent's own
+            except EOFError:
+                return 0
+            importlib.import_module(module)
+            ENTRIES[module, name].compile(arguments)
+            sys.stdout.buffer.write(_DONE)
+            sys.stdout.buffer.flush()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
