@@ -156,6 +156,7 @@ class Lab:
     def _open(self) -> None:
         self.disk.data = self.data
         self.service = Service(self.config, self.data, worker=ThreadWorker()).start()  # type: ignore[arg-type]
+        self.service.rig.set_scene("plate")  # what is captured goes with what is imported
         self.client = AppClient(self.service)
 
     def close(self) -> None:

@@ -29,7 +29,7 @@ from core.field.seeding.scattered_matches import (
     scattered_shape,
     stretched_motion,
 )
-from core.field.seeding.search_region import box_around, scales, seen_by_camera2
+from core.field.seeding.search_region import box_around, seed_scales, seen_by_camera2
 from core.field.seeding.seeds import (
     Seed,
     as_seeds,
@@ -100,7 +100,7 @@ def match_seeds(inputs: FieldInputs, state: GrowthState) -> int:
     shape1, shape2 = inputs.ref1.shape, inputs.ref2.shape
     box1 = box_around(inputs.xy_px[inputs.usable], reach, shape1)
     box2 = seen_by_camera2(inputs.pair, box1, shape2)
-    for scale in scales((box1, box2), (shape1, shape2)):
+    for scale in seed_scales((box1, box2), (shape1, shape2)):
         found = _match_seeds_at(inputs, state, scale, box1, box2)
         if found > 0:
             return found
