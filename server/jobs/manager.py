@@ -163,11 +163,13 @@ class JobManager:
             raise NotFoundError(f"There is no job {job_id[:40]!r}.", kind="job")
         return found
 
-    def documents(self, limit: int, *, before: str | None = None) -> list[JobRecord]:
-        """Return jobs, newest first; ``before``: only those older than this one."""
+    def documents(self, limit: int, *, before: str | None = None, most: int | None = None) -> list[JobRecord]:
+        """Return jobs, newest first; ``before`` and ``most`` as in :meth:`Catalog.jobs`."""
         with self._lock:
             active = self._unsaved | {j.id: j.document() for j in self._active.values()}
-        return [active.get(d.id, d) for d in self._catalog.jobs(limit=limit, before=before)]
+        if most is not None:
+            active = {name: one.bounded(most) for name, one in active.items()}
+        return [active.get(d.id, d) for d in self._catalog.jobs(limit=limit, before=before, most=most)]
 
     def is_active(self, job_id: str) -> bool:
         """Return True if a job is not finished."""

@@ -15,7 +15,7 @@ from server.formats.calibrations.in_test import LATER, calibration_in
 from server.formats.files import known_sha256
 from server.formats.results.folder import number_of, results_in
 from server.formats.results.reading import ResultHead
-from server.formats.results.settings import current_summary
+from server.formats.results.settings import current_step
 from server.store.durable import known_json
 
 
@@ -73,7 +73,7 @@ def stale_results(files: Sequence[Path], heads: Sequence[ResultHead], folder: Pa
         Of the measurement, where the files do not lie in it.
     """
     folder = files[0].absolute().parent if folder is None else folder.absolute()
-    summary = current_summary(known_json(folder / "summary.json"))
+    summary = known_json(folder / "summary.json", {"steps": _number})
     test = folder.parent.parent if (folder.parent.parent / "steps").is_dir() else None
     steps = {head.step: _images(head.inputs_sha256) for head in heads}
     reference = heads[-1].reference_step or 0
@@ -108,9 +108,13 @@ def stale_results(files: Sequence[Path], heads: Sequence[ResultHead], folder: Pa
 
 def _missing_results(folder: Path, summary: dict[str, Any]) -> list[str]:
     """Results that the measurement's own record names and that are not there."""
-    listed = [step["n"] for step in summary["steps"]]
     there = set(map(number_of, results_in(folder)))
+    listed = summary.get("steps") or []
     return [f"the result of step {n} is gone" for n in listed if isinstance(n, int) and n not in there]
+
+
+def _number(step: object) -> object:
+    return current_step(step)["n"] if isinstance(step, dict) else None
 
 
 def _images(inputs: Mapping[str, str]) -> dict[str, str | None]:

@@ -17,6 +17,7 @@ from core.field.region.cuts import Cuts, from_arrays
 from core.settings import Coverage, CoverageFields
 from core.status import PointStatus
 from server.base.errors import NotFoundError
+from server.base.long_json import nothing
 from server.formats.results.derived import derived_names
 from server.formats.results.folder import home_of, number_of
 from server.formats.results.netcdf import opened
@@ -126,7 +127,7 @@ class Source:
 
 def failed_steps(folder: Path) -> dict[str, dict[str, Any]]:
     """Return the problem of each step that could not be measured, by its number, as ``summary.json`` has it."""
-    failed = known_json(folder / "summary.json").get("steps_failed")
+    failed = known_json(folder / "summary.json", {"steps": nothing}).get("steps_failed")
     return {n: one for n, one in failed.items() if isinstance(one, dict)} if isinstance(failed, dict) else {}
 
 

@@ -6,6 +6,7 @@ calibrations, tests, steps and analyses can be lost at any time; it is rebuilt f
 
 from __future__ import annotations
 
+import functools
 import json
 import logging
 import queue
@@ -171,9 +172,26 @@ class Catalog:
         self.transact(write)
 
     def jobs(
-        self, *, states: tuple[str, ...] | None = None, limit: int | None = None, before: str | None = None
+        self,
+        *,
+        states: tuple[str, ...] | None = None,
+        limit: int | None = None,
+        before: str | None = None,
+        most: int | None = None,
     ) -> list[JobRecord]:
-        """Return jobs, newest first; ``before``: only those whose id is smaller."""
+        """Return jobs, newest first.
+
+        Parameters
+        ----------
+        states
+            Only those in one of these.
+        limit
+            So many at most.
+        before
+            Only those whose id is smaller.
+        most
+            So many entries of each list in their results at most, see :meth:`JobRecord.bounded`.
+        """
 
         def read(c: sqlite3.Connection) -> list[tuple[str]]:
             terms: list[str] = []
@@ -188,7 +206,7 @@ class Catalog:
             query = f"SELECT document FROM jobs {where} ORDER BY id DESC LIMIT ?"
             return c.execute(query, (*values, limit or -1)).fetchall()
 
-        return [JobRecord.model_validate_json(row[0]) for row in self.transact(read)]
+        return [_job_in(row[0], most) for row in self.transact(read)]
 
     def job(self, job_id: str) -> JobRecord | None:
         """Return one job's document."""
@@ -339,3 +357,10 @@ def _replace(c: sqlite3.Connection, where: str, values: tuple[str, ...], entries
     c.execute(f"DELETE FROM entries WHERE {where}", values)
     c.executemany("INSERT OR REPLACE INTO entries VALUES (?, ?, ?, ?)", rows)
     return differences
+
+
+@functools.lru_cache(maxsize=128)
+def _job_in(text: str, most: int | None) -> JobRecord:
+    """Return a job's document as it is listed; those that ended stay as they are, and fill most of a list."""
+    found = JobRecord.model_validate_json(text)
+    return found if most is None else found.bounded(most)

@@ -10,13 +10,14 @@ import hashlib
 import json
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
 from core.errors import FileFormatError
+from server.base import long_json
 from server.base.json_values import without_nan
 from server.base.models import Document
 from server.formats import disk as _disk
@@ -54,8 +55,15 @@ def write_json(path: Path, document: Any, *, checksum: bool = False) -> None:
     write_bytes(path, text.encode() + b"\n", checksum=checksum)
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path, keep: Mapping[str, long_json.Keep] | None = None) -> dict[str, Any]:
     """Read a JSON object.
+
+    Parameters
+    ----------
+    path
+        The file.
+    keep
+        Of lists in it, what is kept of each entry; see :func:`server.base.long_json.loads`.
 
     Raises
     ------
@@ -63,7 +71,7 @@ def read_json(path: Path) -> dict[str, Any]:
         If the file is missing, cut short or no object.
     """
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = long_json.loads(path.read_text(encoding="utf-8"), keep)
     except FileNotFoundError as error:
         raise FileFormatError(f"{path.name} is missing.", code="file_missing", file=path.name) from error
     except (OSError, ValueError) as error:
@@ -127,9 +135,9 @@ def kept_while_unchanged(path: Path, read: Callable[[Path], _Kept]) -> _Kept:
     return made
 
 
-def known_json(path: Path) -> dict[str, Any]:
+def known_json(path: Path, keep: Mapping[str, long_json.Keep] | None = None) -> dict[str, Any]:
     """Read a JSON object; empty where the file is missing or damaged, for readers who can do without it."""
     try:
-        return read_json(path)
+        return read_json(path, keep)
     except FileFormatError:
         return {}

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from server.base.long_json import nothing
 from server.formats.calibrations.in_test import calibration_id_in, calibration_in, measured_with
 from server.formats.results.camera_motion import MOVED_REMEDY
-from server.formats.results.settings import current_summary
+from server.formats.results.settings import current_step
 from server.store.durable import known_json
 
 Level = Literal["failed", "warning"]
@@ -18,6 +19,10 @@ _Steps = Mapping[int, _Summary]
 
 #: share of the region's points with values below which a step warns, and fails
 COVERAGE_WARNING, COVERAGE_FAILED = 0.8, 0.5
+#: entries of steps, measured and captured, that are asked for here: some thousand steps are not held for the others
+_ASKED_FOR = frozenset(
+    {"n", "epipolar_check", "valid_fraction", "valid", "points", "status", "camera_motion", "quality", "warnings"}
+)
 #: steps that a warning names one by one
 _NAMED = 100
 _QUALITY = {
@@ -79,12 +84,11 @@ def analysis_warnings(
     failed
         Steps that could not be measured, by their numbers; as ``summary.json`` has them if left out.
     """
-    summary = current_summary(known_json(folder / "summary.json"))
-    found = {int(one["n"]): one for one in _own_summaries(folder)} or {
-        int(one["n"]): one for one in summary["steps"] if isinstance(one.get("n"), int)
-    }
+    found = {int(one["n"]): _used(one) for one in _own_summaries(folder)}
+    summary = known_json(folder / "summary.json", {"steps": nothing if found else _used})
+    found = found or {int(one["n"]): one for one in summary.get("steps") or [] if isinstance(one.get("n"), int)}
     home = folder.parent.parent if (folder.parent.parent / "steps").is_dir() else None
-    taken = {} if home is None else {n: known_json(home / "steps" / f"{n:04d}" / "step.json") for n in found}
+    taken = {} if home is None else {n: _used(known_json(home / "steps" / f"{n:04d}" / "step.json")) for n in found}
     problems = failed if failed is not None else summary.get("steps_failed")
     made = [
         *_epipolar(found),
@@ -97,6 +101,12 @@ def analysis_warnings(
         *_stale(stale),
     ]
     return sorted(made, key=lambda one: one.level != "failed")
+
+
+def _used(step: object) -> _Summary:
+    """Return the entries of a step that are asked for here, in today's form."""
+    found = current_step(step) if isinstance(step, dict) else {}
+    return {name: value for name, value in found.items() if name in _ASKED_FOR}
 
 
 def _own_summaries(folder: Path) -> Iterable[_Summary]:

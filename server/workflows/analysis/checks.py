@@ -27,7 +27,7 @@ from server.store.tests import TestStore
 _log = logging.getLogger("stereorig.service")
 #: an ``analysis.json`` of more bytes is of many steps: each takes some 190
 _MANY_BYTES = 8_000
-#: for the first answer, and for one that replaces an earlier one
+#: by the first who asks, and by who asks while it is being found
 _WAIT_FIRST_S, _WAIT_S = 0.25, 0.02
 #: files may be replaced in place, which no folder's time shows
 _FRESH_S = 30.0
@@ -100,12 +100,13 @@ class AnalysisChecks:
             age_s = time.monotonic() - kept.at
             current = kept.checks is not None and kept.mark == mark and age_s < _FRESH_S
             rested = kept.checks is None or age_s > kept.took_s / _SHARE
+            first = kept.checks is None and kept.running is None
             if not current and rested and kept.running is None:
                 kept.running = self._beside.submit(self._renew, kept, test_id, analysis_id, problems, mark)
             running = kept.running if kept.mark != mark else None
         if running is not None:
             with contextlib.suppress(TimeoutError):
-                running.result(timeout=_WAIT_FIRST_S if kept.checks is None else _WAIT_S)
+                running.result(timeout=_WAIT_FIRST_S if first else _WAIT_S)
         return kept.checks or _NOT_YET
 
     def _renew(

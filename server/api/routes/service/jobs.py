@@ -35,10 +35,8 @@ def known_job(service: ServiceDep, job_id: JobId) -> JobRecord:
 @router.get("", summary="Jobs, newest first", responses=errors(422))
 def list_jobs(service: ServiceDep, page: ShortPageDep) -> JobList:
     """Return a page of the jobs of this and earlier runs of the service."""
-    jobs = page.cut(service.jobs.documents(page.limit + 1, before=page.after), lambda j: j.id)
-    return JobList.model_validate(
-        {"jobs": [job.bounded(LISTED).plain() for job in jobs], "next_cursor": page.next_cursor}
-    )
+    jobs = page.cut(service.jobs.documents(page.limit + 1, before=page.after, most=LISTED), lambda j: j.id)
+    return JobList.model_validate({"jobs": [job.plain() for job in jobs], "next_cursor": page.next_cursor})
 
 
 @router.get("/{job_id:plain_id}", summary="One job", responses=errors(404, 422))
