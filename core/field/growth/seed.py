@@ -29,7 +29,7 @@ from core.field.seeding.scattered_matches import (
     scattered_shape,
     stretched_motion,
 )
-from core.field.seeding.search_region import box_around, seed_scales, seen_by_camera2
+from core.field.seeding.search_region import box_around, half_serves, scales, seen_by_camera2
 from core.field.seeding.seeds import (
     Seed,
     as_seeds,
@@ -49,6 +49,7 @@ Seeds = Sequence[Seed | Sequence[float]] | NDArray[Any]
 
 _MIN_MATCHES = 12
 _SAMPLE_SHARE = 0.3  # of a sample: the rest may be hidden, or have moved by itself, and is seeded after growth
+_SEEDED_SHARE = 0.7  # of a region's cells: faces beside one another need seeds of their own
 _NEAREST = 3
 _REACH_STEPS = 2.0
 _SEARCHED = 6  # positions
@@ -100,14 +101,23 @@ def match_seeds(inputs: FieldInputs, state: GrowthState) -> int:
     shape1, shape2 = inputs.ref1.shape, inputs.ref2.shape
     box1 = box_around(inputs.xy_px[inputs.usable], reach, shape1)
     box2 = seen_by_camera2(inputs.pair, box1, shape2)
-    for scale in seed_scales((box1, box2), (shape1, shape2)):
-        found = _match_seeds_at(inputs, state, scale, box1, box2)
-        if found > 0:
+    found = 0
+    if half_serves((box1, box2), (shape1, shape2)):
+        cells = len(spread(inputs.xy_px, inputs.usable & ~inputs.repeating, np.zeros(len(inputs.xy_px)))[0])
+        found = _match_seeds_at(inputs, state, 2, box1, box2, stretched=False)
+        if found >= _SEEDED_SHARE * cells:
             return found
-    return 0
+    for scale in scales((box1, box2), (shape1, shape2)):
+        found += _match_seeds_at(inputs, state, scale, box1, box2)
+        if found > 0:
+            break
+    return found
 
 
-def _match_seeds_at(inputs: FieldInputs, state: GrowthState, scale: int, box1: Box, box2: Box) -> int:
+def _match_seeds_at(
+    inputs: FieldInputs, state: GrowthState, scale: int, box1: Box, box2: Box, *, stretched: bool = True
+) -> int:
+    """Seed from matches at one scale; ``stretched``: also of stretched copies, where there are no others."""
     raise_if_cancelled(inputs.cancel)
     known_w, pair = inputs.known_w, inputs.pair
     wanted = [(inputs.ref1, box1)]
@@ -132,7 +142,7 @@ def _match_seeds_at(inputs: FieldInputs, state: GrowthState, scale: int, box1: B
         )
 
     found = put_seeds(motion)
-    if found == 0 and motion is not None:
+    if found == 0 and motion is not None and stretched:
         # a strain or tilt too large for the features' own tolerance
         found = put_seeds(stretched_motion(inputs.ref1.pixels, box1, features[-2], scale))
     return found

@@ -66,12 +66,11 @@ def scales(boxes: tuple[Box, Box], shapes: tuple[tuple[int, int], tuple[int, int
     return out
 
 
-def seed_scales(boxes: tuple[Box, Box], shapes: tuple[tuple[int, int], tuple[int, int]]) -> list[int]:
-    """Return the factors to be tried for seeds: as :func:`scales`, but a half also where images are comfortable.
+def half_serves(boxes: tuple[Box, Box], shapes: tuple[tuple[int, int], tuple[int, int]]) -> bool:
+    """Return True where images that :func:`scales` would not reduce may be tried at half their size first.
 
-    SIFT doubles an image before it looks for features, and speckles of 3 px and more show at half their size: the time is
-    a quarter. Where no seed comes of it, the images follow as they are.
+    SIFT doubles an image before it looks for features, and speckles of 3 px and more show at half their size: it takes a
+    quarter of the time.
     """
     x0, y0, x1, y1 = boxes[0]
-    out = scales(boxes, shapes)
-    return [2, 1] if out == [1] and (x1 - x0) * (y1 - y0) >= _HALF_FROM_PIXELS else out
+    return scales(boxes, shapes) == [1] and (x1 - x0) * (y1 - y0) >= _HALF_FROM_PIXELS
