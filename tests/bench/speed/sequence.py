@@ -129,6 +129,9 @@ def run_child(arguments: list[str], *, threads: int | None = None, cache: Path |
 
     # the command keeps its libraries to one thread; a child that calls it has loaded them before
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    # an installed program has its bytecode, whatever this machine's settings for development are
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    environment["PYTHONPYCACHEPREFIX"] = str(Path(tempfile.gettempdir()) / "stereorig-bench-bytecode")
     if cache is not None:
         environment["NUMBA_CACHE_DIR"] = str(cache)
     start = time.perf_counter()
