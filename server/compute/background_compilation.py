@@ -8,7 +8,6 @@ calibrates meanwhile, and waits only for those that a task needs.
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import time
@@ -19,6 +18,7 @@ import numpy as np
 
 from core.compiling import COMPILING, NotCompiledError, no_collection, refuse_compiling
 from server.base.priority import BELOW_WORKER, LAST, end_with_parent, lower_worker
+from server.worker.kernel_compiler import start_module
 
 _MAX_WAIT_S = 300.0
 _POLL_S = 0.05
@@ -122,14 +122,7 @@ class KernelsAside:
 
 
 def _start(what: str) -> subprocess.Popen[bytes]:
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    return subprocess.Popen(
-        [sys.executable, "-m", __name__, what],
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
+    return start_module(__name__, what)
 
 
 def _compile_shape() -> None:

@@ -1,8 +1,8 @@
 """Compile a process' missing kernels in another process, so that it takes them from disk as every later one will.
 
-In the process that compiles it, a kernel calls the functions that were compiled before it, each by itself; on disk
-stands the kernel with its own copies of them, optimised as parts of it, which round otherwise. A measurement would differ
-in its last digits from its own repetition.
+In the process that compiles it, a kernel calls the functions that were compiled before it, each by itself; on disk it
+has its own copies of them, optimised as parts of it, which round otherwise. A measurement would differ in its last
+digits from its own repetition.
 """
 
 from __future__ import annotations
@@ -65,14 +65,20 @@ def compiled_aside() -> Iterator[None]:
         yield
 
 
-def _start() -> subprocess.Popen[bytes]:
+def start_module(name: str, *arguments: str, talks: bool = False) -> subprocess.Popen[bytes]:
+    """Start a module in a process that finds this program as this one does; ``talks``: with pipes to it and back."""
+    pipe = subprocess.PIPE if talks else subprocess.DEVNULL
     return subprocess.Popen(
-        [sys.executable, "-m", __name__],
+        [sys.executable, "-m", name, *arguments],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
+        stdin=pipe,
+        stdout=pipe,
         stderr=subprocess.DEVNULL,
     )
+
+
+def _start() -> subprocess.Popen[bytes]:
+    return start_module(__name__, talks=True)
 
 
 def main() -> int:
@@ -83,7 +89,7 @@ def main() -> int:
     with no_collection():
         while True:
             try:
-                module, name, arguments = pickle.load(sys.stdin.buffer)  # noqa: S301 - the parent's own
+                module, name, arguments = pickle.load(sys.stdin.buffer)
             except EOFError:
                 return 0
             importlib.import_module(module)

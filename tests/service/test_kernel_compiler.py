@@ -15,9 +15,9 @@ import xarray
 from core.compiling import NotCompiledError, compile_elsewhere, refuse_compiling, report_compiling
 from server.worker import kernel_compiler
 from server.worker.kernel_compiler import KernelCompiler, compiled_aside
+from tests.support.copied_tests import write_test_folder
 from tests.support.measure_command import command
 from tests.support.requirements import ROOT
-from tests.support.copied_tests import write_test_folder
 
 KERNEL = """
 from core.matching.kernels.naming import entry

@@ -69,7 +69,7 @@ def scales(boxes: tuple[Box, Box], shapes: tuple[tuple[int, int], tuple[int, int
 def half_serves(boxes: tuple[Box, Box], shapes: tuple[tuple[int, int], tuple[int, int]]) -> bool:
     """Return True where images that :func:`scales` would not reduce may be tried at half their size first.
 
-    SIFT doubles an image before it looks for features, and speckles of 3 px and more show at half their size: it takes a
+    SIFT doubles an image before it looks for features, and speckles of 3 px and more show at half their size, in a
     quarter of the time.
     """
     x0, y0, x1, y1 = boxes[0]
