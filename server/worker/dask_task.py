@@ -21,6 +21,7 @@ from typing import Any
 
 from server.formats.results.folder import DENSE
 from server.worker import process as worker_process
+from server.worker.kernel_compiler import compiled_aside
 from server.worker.process import TaskChannel
 from server.worker.tasks import StepTask, files_of
 
@@ -78,7 +79,7 @@ def run(name: str, topic: str, threads: int, function: Callable[..., Any], *args
     from distributed import get_worker
 
     worker = get_worker()
-    with _one_at_a_time:
+    with _one_at_a_time, compiled_aside():
         _prepare(threads)
         channel = _Channel(name, lambda report: worker.log_event(topic, report))
         worker_process._current = channel

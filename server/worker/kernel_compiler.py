@@ -43,6 +43,8 @@ class KernelCompiler:
         """
         # a process that ended by itself, for want of memory perhaps, leaves the work to the caller
         with contextlib.suppress(OSError):
+            if self._process is not None and self._process.poll() is not None:
+                self.close()  # it ends with the thread that started it
             process = self._process = self._process or _start()
             assert process.stdin is not None
             assert process.stdout is not None
@@ -53,9 +55,10 @@ class KernelCompiler:
     def close(self) -> None:
         """End the process."""
         if self._process is not None:
-            self._process.kill()
-            with self._process:
-                self._process = None
+            process, self._process = self._process, None
+            process.kill()
+            with contextlib.suppress(OSError), process:  # a question that it did not hear
+                pass
 
 
 @contextlib.contextmanager

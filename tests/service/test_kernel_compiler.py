@@ -72,6 +72,19 @@ def test_where_the_process_dies_it_is_compiled_here(kernel, monkeypatch, instead
     assert sum(kernel.stats.cache_hits.values()) == 0
 
 
+def test_one_that_ended_between_two_questions_is_started_anew(kernel, monkeypatch):
+    started = []
+    start = kernel_compiler._start
+    monkeypatch.setattr(kernel_compiler, "_start", lambda: started.append(start()) or started[-1])
+    with compiled_aside():
+        assert kernel(1.5) == 3.0
+        started[0].kill()
+        started[0].wait()
+        assert kernel(np.float32(1.5)) == 3.0
+    assert len(started) == 2
+    assert sum(kernel.stats.cache_hits.values()) == 2
+
+
 def test_nobody_is_asked_where_compiling_is_refused(kernel):
     asked = []
     with compile_elsewhere(lambda *what: asked.append(what)), refuse_compiling(), pytest.raises(NotCompiledError):
