@@ -6,6 +6,7 @@ import contextlib
 import json
 import time
 from collections.abc import Iterator
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from server.api.models import AnalysisRequest
 from server.formats.images import encode_tiff
 from server.store.documents import JobRecord
 from server.store.indexing.entries import analysis_entry
+from server.workflows.analysis.checks import AnalysisChecks
 from server.workflows.service import Service
 from tests.bench.years.folder import TrueTest
 from tests.support.service_rig import new_test, served, tiny_config
@@ -162,6 +164,26 @@ def test_the_checks_of_an_analysis_of_many_steps_are_made_and_renewed(
         time.sleep(0.1)
     assert client.get(url).json()["stale_reasons"] == [f"step {MANY - 3} is gone"]
     client.post(f"{API}/trash/{trash}:restore").raise_for_status()
+
+
+def test_only_the_first_who_asks_waits_for_the_checks(
+    service: Service, many: str, analyses: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waited: list[float | None] = []
+
+    class Unfinished(Future[None]):
+        def result(self, timeout: float | None = None) -> None:
+            waited.append(timeout)
+            raise TimeoutError
+
+    checks = AnalysisChecks(service.tests)
+    monkeypatch.setattr(checks._beside, "submit", lambda *_: Unfinished())
+    for _ in range(3):
+        assert [one.code for one in checks.of(many, analyses[many]).warnings] == ["not_checked_yet"]
+    checks.close()
+    assert waited[0] is not None
+    assert waited[1:] == [0.02, 0.02]
+    assert waited[0] > 10 * 0.02
 
 
 @pytest.mark.parametrize("path", ["", "/analyses/{}", "/analyses", "/steps?limit=50", "/analyses/{}/steps?limit=50"])
