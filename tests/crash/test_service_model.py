@@ -42,7 +42,7 @@ labels = st.sampled_from(["", "load", "peak", "10 kN"])
 
 @functools.cache
 def pictures() -> Pictures:
-    """Two pairs of a plate, so that most analyses succeed; those with a captured step may not."""
+    """Two pairs of the plate that is before the cameras too, so that analyses succeed."""
     return Pictures(2)
 
 

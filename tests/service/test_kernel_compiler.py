@@ -40,6 +40,15 @@ def kernel(tmp_path, monkeypatch):
     del sys.modules["kernel_of_test"]
 
 
+@pytest.fixture
+def started(monkeypatch):
+    """Collect the processes that are started."""
+    processes = []
+    start = kernel_compiler._start
+    monkeypatch.setattr(kernel_compiler, "_start", lambda: processes.append(start()) or processes[-1])
+    return processes
+
+
 def test_it_is_compiled_by_another_process_and_loaded_here(kernel):
     told = []
     with compiled_aside(), report_compiling(lambda: told.append(True)):
@@ -48,10 +57,7 @@ def test_it_is_compiled_by_another_process_and_loaded_here(kernel):
     assert told == [True]
 
 
-def test_one_process_compiles_all_that_is_asked_for(kernel, monkeypatch):
-    started = []
-    start = kernel_compiler._start
-    monkeypatch.setattr(kernel_compiler, "_start", lambda: started.append(start()) or started[-1])
+def test_one_process_compiles_all_that_is_asked_for(kernel, started):
     with compiled_aside():
         assert kernel(1.5) == 3.0
         assert kernel(np.float32(1.5)) == 3.0
@@ -72,10 +78,7 @@ def test_where_the_process_dies_it_is_compiled_here(kernel, monkeypatch, instead
     assert sum(kernel.stats.cache_hits.values()) == 0
 
 
-def test_one_that_ended_between_two_questions_is_started_anew(kernel, monkeypatch):
-    started = []
-    start = kernel_compiler._start
-    monkeypatch.setattr(kernel_compiler, "_start", lambda: started.append(start()) or started[-1])
+def test_one_that_ended_between_two_questions_is_started_anew(kernel, started):
     with compiled_aside():
         assert kernel(1.5) == 3.0
         started[0].kill()
