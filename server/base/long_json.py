@@ -6,6 +6,7 @@ steps. Here each entry of a document's lists and objects is a call of its own.
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from collections.abc import Callable, Mapping
@@ -30,8 +31,8 @@ def loads(text: str, keep: Mapping[str, Keep] | None = None) -> Any:
     text
         The document.
     keep
-        By the name of one of the document's lists, what is made of each entry as it is read: what nobody needs is not
-        gathered.
+        By the name of one of the document's lists, what is made of each entry as it is read; entries of which nothing
+        (None) is kept are left out.
 
     Raises
     ------
@@ -49,6 +50,12 @@ def loads(text: str, keep: Mapping[str, Keep] | None = None) -> Any:
 
 def nothing(_entry: Any) -> None:
     """Keep nothing of an entry."""
+
+
+def the_first(most: int) -> Keep:
+    """Return what keeps so many entries of one list, and nothing of those behind them."""
+    numbers = itertools.count()
+    return lambda entry: entry if next(numbers) < most else None
 
 
 class _Reader:
@@ -77,9 +84,14 @@ class _Reader:
 
     def _list(self, levels: int, keep: Keep | None) -> list[Any]:
         entries: list[Any] = []
-        while self._another("]", first=not entries):
+        begun = False
+        while self._another("]", first=not begun):
+            begun = True
             entry = self.value(levels - 1, {})
-            entries.append(entry if keep is None else keep(entry))
+            if keep is None:
+                entries.append(entry)
+            elif (kept := keep(entry)) is not None:
+                entries.append(kept)
         return entries
 
     def _object(self, levels: int, keep: Mapping[str, Keep]) -> dict[str, Any]:

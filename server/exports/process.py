@@ -10,18 +10,16 @@ import shutil
 import tempfile
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
 from server.base.errors import QueueFullError
 from server.exports.request import ExportRequest
-from server.worker.embedded import ComputeWorker
 from server.worker.executor import TaskFuture
+from server.worker.resting import RestingWorker
 
 FOLDER = ".exports"
 _MAX_WAITING = 4
-_REST_AFTER_S = 60.0
 _KEPT_FILES = 8  # of exports that were jobs
 
 
@@ -47,10 +45,7 @@ class ExportProcess:
     def __init__(self, data: Path) -> None:
         self._folder = data / FOLDER
         self._lock = threading.Lock()
-        self._worker: ComputeWorker | None = None
-        self._waiting = 0
-        self._rest: threading.Timer | None = None
-        self._closed = False
+        self._process = RestingWorker()
         self._kept: dict[str, Path] = {}  # by job, the oldest first
 
     def clear(self) -> None:
@@ -81,12 +76,9 @@ class ExportProcess:
 
     def check_room(self) -> None:
         """Refuse an export that would be refused by :meth:`run`."""
-        with self._lock:
-            self._check_room()
-
-    def _check_room(self) -> None:
-        if self._closed or self._waiting >= _MAX_WAITING:
-            raise QueueFullError(f"{self._waiting} exports are being made.", code="exports_waiting")
+        waiting = self._process.unfinished
+        if self._process.closed or waiting >= _MAX_WAITING:
+            raise QueueFullError(f"{waiting} exports are being made.", code="exports_waiting")
 
     def submit(self, folder: Path, files: list[Path], request: ExportRequest, out: Path) -> TaskFuture:
         """Begin an export, see :func:`export_task`; raises as :meth:`run`."""
@@ -101,41 +93,10 @@ class ExportProcess:
             ``exports_waiting`` if four are on their way.
         """
         with self._lock:
-            self._check_room()
-            if self._rest is not None:
-                self._rest.cancel()
-                self._rest = None
-            if self._worker is None:
-                self._worker = ComputeWorker(threads=1)
-            future = self._worker.submit(task, *args)
-            self._waiting += 1
-        future.add_done_callback(self._done)
-        return future
-
-    def _done(self, _future: Future[Any]) -> None:
-        with self._lock:
-            self._waiting -= 1
-            if self._waiting == 0 and not self._closed:
-                self._rest = threading.Timer(_REST_AFTER_S, self._end)
-                self._rest.daemon = True
-                self._rest.start()
-
-    def _end(self) -> None:
-        with self._lock:
-            if self._waiting:
-                return
-            worker, self._worker = self._worker, None
-        if worker is not None:
-            worker.shutdown()
+            self.check_room()
+            return self._process.submit(task, *args)
 
     def close(self) -> None:
         """End the process; exports on their way fail."""
-        with self._lock:
-            self._closed = True
-            worker, self._worker = self._worker, None
-            rest, self._rest = self._rest, None
-        if rest is not None:
-            rest.cancel()
-        if worker is not None:
-            worker.shutdown()
+        self._process.close()
         shutil.rmtree(self._folder, ignore_errors=True)

@@ -16,11 +16,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 from core.errors import FileFormatError, StateError, StorageError
 from core.names import CAMERAS
 from server.base.errors import NotFoundError
+from server.base.long_json import Keep, the_first
 from server.formats import disk as _disk
 from server.formats.calibrations.in_test import LATER, calibration_id_in, calibration_in, later_file
 from server.formats.files import fsync_path, known_sha256, recorded_sha256, sha256_of, storage_error
@@ -501,11 +503,9 @@ class TestStore:
             if file.is_file()
         }
 
-    def finished_steps(self, test_id: str, analysis_id: str) -> list[int]:
+    def finished_steps(self, test_id: str, analysis_id: str) -> tuple[int, ...]:
         """Numbers of the steps whose result file is there."""
-        names = names_in(self.analysis_path(test_id, analysis_id))
-        ours = (name[5:-3] for name in names if name.endswith(".nc") and name.startswith("step_"))
-        return [int(n) for n in ours if n.isdecimal()]
+        return _result_numbers(names_in(self.analysis_path(test_id, analysis_id)))
 
     def result_file(self, test_id: str, analysis_id: str, n: int) -> Path:
         """Result file of one step, its checksum verified where it is known.
@@ -563,14 +563,29 @@ class TestStore:
         write_json(path, document)
 
     def summary(self, test_id: str, analysis_id: str) -> SummaryRecord | None:
-        """Return ``summary.json``, or None while it is not there."""
+        """Return ``summary.json`` with its first hundred steps, or None while it is not there."""
         path = self.analysis_path(test_id, analysis_id) / "summary.json"
-        return kept_while_unchanged(path, _summary_in) if path.exists() else None
+        return kept_while_unchanged(path, _short_summary_in) if path.exists() else None
+
+    def whole_summary(self, test_id: str, analysis_id: str) -> SummaryRecord | None:
+        """Return ``summary.json`` with all its steps, which may be many megabytes; None while it is not there."""
+        path = self.analysis_path(test_id, analysis_id) / "summary.json"
+        return _summary_in(path) if path.exists() else None
+
+
+@lru_cache(maxsize=16)  # of some thousand names it takes longer than the answer that asks for it
+def _result_numbers(names: tuple[str, ...]) -> tuple[int, ...]:
+    ours = (name[5:-3] for name in names if name.endswith(".nc") and name.startswith("step_"))
+    return tuple(int(n) for n in ours if n.isdecimal())
 
 
 def _analysis_in(path: Path) -> AnalysisRecord:
     return read_record(AnalysisRecord, path)
 
 
-def _summary_in(path: Path) -> SummaryRecord:
-    return record_of(SummaryRecord, current_summary(read_json(path)), path)
+def _summary_in(path: Path, keep: Mapping[str, Keep] | None = None) -> SummaryRecord:
+    return record_of(SummaryRecord, current_summary(read_json(path, keep)), path)
+
+
+def _short_summary_in(path: Path) -> SummaryRecord:
+    return _summary_in(path, {"steps": the_first(100)})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,10 @@ import pytest
 import stereorig
 from server.api.models import AnalysisRequest
 from server.formats.images import encode_tiff
+from server.results.warnings.checks import checks_of
 from server.store.documents import JobRecord
 from server.store.indexing.entries import analysis_entry
+from server.worker.executor import WorkerDiedError
 from server.workflows.analysis.checks import AnalysisChecks
 from server.workflows.service import Service
 from tests.bench.years.folder import TrueTest
@@ -181,9 +183,31 @@ def test_only_the_first_who_asks_waits_for_the_checks(
     for _ in range(3):
         assert [one.code for one in checks.of(many, analyses[many]).warnings] == ["not_checked_yet"]
     checks.close()
-    assert waited[0] is not None
-    assert waited[1:] == [0.02, 0.02]
-    assert waited[0] > 10 * 0.02
+    assert len(waited) == 1
+
+
+@pytest.mark.parametrize("dies", [False, True])
+def test_the_checks_of_many_steps_are_found_by_a_process_of_their_own(
+    service: Service, many: str, analyses: dict[str, str], monkeypatch: pytest.MonkeyPatch, dies: bool
+) -> None:
+    checks = AnalysisChecks(service.tests)
+    asked: list[Future[Any]] = []
+    submit = checks._process.submit
+
+    def submitted(task: Callable[..., Any], *args: Any) -> Future[Any]:
+        asked.append(Future[Any]() if dies else submit(task, *args))
+        if dies:
+            asked[0].set_exception(WorkerDiedError("It ended.", exit_code=-9, signal=9))
+        return asked[0]
+
+    monkeypatch.setattr(checks._process, "submit", submitted)
+    deadline = time.monotonic() + 60.0
+    while (found := checks.of(many, analyses[many])).warnings[0].code == "not_checked_yet":
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert len(asked) == 1
+    assert found == checks_of(service.tests.analysis_path(many, analyses[many]))
+    checks.close()
 
 
 @pytest.mark.parametrize("path", ["", "/analyses/{}", "/analyses", "/steps?limit=50", "/analyses/{}/steps?limit=50"])

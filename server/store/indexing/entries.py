@@ -81,7 +81,7 @@ def entries_of_test(tests: TestStore, test_id: str, lost: LostJobs, trouble: lis
     def analysis(analysis_id: str) -> Entry:
         document = tests.analysis(test_id, analysis_id)
         runs = tests.analysis_jobs(test_id, analysis_id)
-        summary = tests.summary(test_id, analysis_id)
+        summary = tests.whole_summary(test_id, analysis_id)
         lost.analysis(document, runs, summary)
         job_id = runs[-1].job_id if runs else None
         known = summary is not None and summary.job_id in (None, job_id)

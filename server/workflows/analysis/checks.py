@@ -18,41 +18,23 @@ from pathlib import Path
 
 from core.errors import StereorigError
 from server.base.problem import JobProblem
-from server.formats.calibrations.in_test import calibration_in
-from server.results.staleness import stale_inputs
-from server.results.warnings.analysis import ResultWarning, analysis_warnings
-from server.store.documents import AnalysisRecord
+from server.results.warnings.analysis import ResultWarning
+from server.results.warnings.checks import Checks, checks_of
 from server.store.tests import TestStore
+from server.worker.executor import WorkerDiedError
+from server.worker.resting import RestingWorker
 
 _log = logging.getLogger("stereorig.service")
 #: an ``analysis.json`` of more bytes is of many steps: each takes some 190
 _MANY_BYTES = 8_000
-#: by the first who asks, and by who asks while it is being found
-_WAIT_FIRST_S, _WAIT_S = 0.25, 0.02
+#: of a thousand: checked in a process of its own, since a thread that works for seconds delays all answers
+_LONG_BYTES = 200_000
+#: by the first who asks
+_WAIT_FIRST_S = 0.25
 #: files may be replaced in place, which no folder's time shows
 _FRESH_S = 30.0
 #: share of a processor that the checks may take
 _SHARE = 0.2
-
-
-@dataclass(frozen=True)
-class Checks:
-    """Findings about an analysis.
-
-    Attributes
-    ----------
-    stale
-        Inputs that are gone or were replaced since.
-    warnings
-        Failed checks first.
-    """
-
-    stale: tuple[str, ...]
-    warnings: tuple[ResultWarning, ...]
-
-    def plain_warnings(self) -> list[dict[str, object]]:
-        """Return the warnings as plain values."""
-        return [one.plain() for one in self.warnings]
 
 
 @dataclass
@@ -71,11 +53,13 @@ class AnalysisChecks:
         self._tests = tests
         self._lock = threading.Lock()
         self._kept: dict[tuple[str, str, bool], _Kept] = {}
+        self._process = RestingWorker()
         self._beside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="checks")
 
     def close(self) -> None:
         """End what runs beside."""
         self._beside.shutdown(wait=False, cancel_futures=True)
+        self._process.close()
 
     def of(self, test_id: str, analysis_id: str, failed: Mapping[str, JobProblem] | None = None) -> Checks:
         """Return what is known of an analysis.
@@ -93,7 +77,7 @@ class AnalysisChecks:
         folder = self._tests.analysis_path(test_id, analysis_id)
         problems = None if failed is None else {n: one.plain() for n, one in failed.items()}
         if (folder / "analysis.json").stat().st_size <= _MANY_BYTES:
-            return self._find(test_id, analysis_id, problems)
+            return checks_of(folder, problems)
         mark = self._mark(test_id, folder, problems)
         with self._lock:
             kept = self._kept.setdefault((test_id, analysis_id, problems is None), _Kept())
@@ -102,51 +86,37 @@ class AnalysisChecks:
             rested = kept.checks is None or age_s > kept.took_s / _SHARE
             first = kept.checks is None and kept.running is None
             if not current and rested and kept.running is None:
-                kept.running = self._beside.submit(self._renew, kept, test_id, analysis_id, problems, mark)
-            running = kept.running if kept.mark != mark else None
-        if running is not None:
+                kept.running = self._beside.submit(self._renew, kept, folder, problems, mark)
+            running = kept.running
+        if first and running is not None:
             with contextlib.suppress(TimeoutError):
-                running.result(timeout=_WAIT_FIRST_S if first else _WAIT_S)
+                running.result(timeout=_WAIT_FIRST_S)
         return kept.checks or _NOT_YET
 
-    def _renew(
-        self, kept: _Kept, test_id: str, analysis_id: str, problems: Mapping[str, object] | None, mark: object
-    ) -> None:
+    def _renew(self, kept: _Kept, folder: Path, problems: Mapping[str, object] | None, mark: object) -> None:
         began = time.monotonic()
         found: Checks | None = None
         try:
-            found = self._find(test_id, analysis_id, problems)
+            found = self._find(folder, problems)
         except (StereorigError, OSError) as error:
-            _log.info("analysis %s cannot be checked: %s", analysis_id, error)
+            _log.info("analysis %s cannot be checked: %s", folder.name, error)
         finally:
             with self._lock:
                 kept.running, kept.at, kept.took_s = None, time.monotonic(), time.monotonic() - began
                 kept.mark, kept.checks = mark, found or Checks((), ())
+
+    def _find(self, folder: Path, problems: Mapping[str, object] | None) -> Checks:
+        if (folder / "analysis.json").stat().st_size > _LONG_BYTES:
+            with contextlib.suppress(WorkerDiedError):
+                found: Checks = self._process.submit(checks_of, folder, problems).result()
+                return found
+        return checks_of(folder, problems)
 
     def _mark(self, test_id: str, folder: Path, problems: Mapping[str, object] | None) -> object:
         """Return something cheap that differs whenever the checks may find something else."""
         test = folder.parent.parent
         places = (folder, folder / "analysis.json", folder / "summary.json", test / "test.json")
         return (*map(_changed_ns, places), self._tests.steps_mark(test_id), tuple(problems or ()))
-
-    def _find(self, test_id: str, analysis_id: str, problems: Mapping[str, object] | None) -> Checks:
-        test = self._tests.path(test_id)
-        document = self._tests.analysis(test_id, analysis_id)
-        stale = stale_reasons(test, document)
-        folder = self._tests.analysis_path(test_id, analysis_id)
-        return Checks(tuple(stale), tuple(analysis_warnings(folder, stale=stale, failed=problems)))
-
-
-def stale_reasons(test: Path, document: AnalysisRecord) -> list[str]:
-    """Return what is gone or was replaced since an analysis was made; see :func:`stale_inputs`."""
-    inputs = document.inputs
-    return stale_inputs(
-        test,
-        {int(n): hashes for n, hashes in inputs.steps.items()},
-        calibration=calibration_in(test, inputs.calibration_sha256),
-        calibration_sha256=inputs.calibration_sha256,
-        reference=document.steps[0],
-    )
 
 
 def _changed_ns(path: Path) -> int:

@@ -19,9 +19,9 @@ from server.formats.version import software_version
 from server.jobs.idempotency import RequestMark
 from server.jobs.job import Job, Phase
 from server.results.images.projected_pattern import check_settings
+from server.results.warnings import checks
 from server.store.documents import AnalysisRecord
 from server.store.indexing.entries import analysis_entry
-from server.workflows.analysis import checks
 from server.workflows.analysis.run import AnalysisRun, close
 from server.workflows.analysis.tasks import calibration_changed
 from server.workflows.camera_identity import check_same_cameras

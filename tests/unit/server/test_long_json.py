@@ -51,6 +51,13 @@ def test_of_a_list_only_what_is_wanted_is_kept():
     assert found == {"steps": [1, 2], "more": [{"n": 3}], "of": {"steps": [{"n": 4}]}}
 
 
+def test_entries_of_which_nothing_is_kept_are_left_out():
+    text = json.dumps({"steps": [5, 6, 7], "more": [8]})
+    assert long_json.loads(text, {"steps": long_json.the_first(2)}) == {"steps": [5, 6], "more": [8]}
+    assert long_json.loads(text, {"steps": long_json.nothing}) == {"steps": [], "more": [8]}
+    assert long_json.loads(text, {"steps": lambda n: n if n > 6 else None}) == {"steps": [7], "more": [8]}
+
+
 @pytest.mark.parametrize("other", [None, 3, {"n": 1}])
 def test_what_is_no_list_stays_as_it_is(other):
     assert long_json.loads(json.dumps({"steps": other}), {"steps": long_json.nothing}) == {"steps": other}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -100,7 +101,7 @@ def read(
 
 
 def _page(
-    service: Service, test_id: str, analysis_id: str, steps: list[int], body: GaugeRequest, page: Page
+    service: Service, test_id: str, analysis_id: str, steps: Sequence[int], body: GaugeRequest, page: Page
 ) -> dict[str, object]:
     """Read the gauges in a page of the steps; the files of the others are not touched."""
     folder = service.tests.analysis_path(test_id, analysis_id)
