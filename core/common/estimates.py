@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from core.arrays import Float
-from core.matching.kernels.naming import entry, inner
+from core.matching.kernels.naming import entry_with_arrays, inner
 
 
 @inner
@@ -46,7 +46,7 @@ def _points_of(by_parameters, rotation, out):
             out[i, j] = s
 
 
-@entry
+@entry_with_arrays
 def _estimates(reference, kept, by1, by2, R1, R2, rays, depth2, by_match, whole):
     ray0, along0, across0, px0 = reference
     beside0, seen0, by_image0, normalised0 = kept

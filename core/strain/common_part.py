@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from core.arrays import Bool, Float32, Floats
 from core.field.region.window import window_offsets
-from core.matching.kernels.naming import entry, inner
+from core.matching.kernels.naming import entry_with_arrays, inner
 from core.strain.result import StrainStatus
 from core.strain.window import Slopes
 
@@ -26,7 +26,7 @@ def _through(slopes, by_slope, out):
                     out[i, j] += d * slopes[a, q * k + j]
 
 
-@entry
+@entry_with_arrays
 def _whole(factor, valid, by_slope, good, half, out):
     """Rows ``out`` (r, c, 3, k) of points ``good`` as if all windows were whole; ``factor`` (r, c, 6 k)."""
     rows, cols, m = factor.shape
@@ -63,7 +63,7 @@ def _whole(factor, valid, by_slope, good, half, out):
             _through(slopes, by_slope[r, c], out[r, c])
 
 
-@entry
+@entry_with_arrays
 def _reduced(factor, by_slope, at_rows, at_cols, weights, offsets, out):
     """The same of windows at (n,) rows and columns with weights (n, 2, points) of their own."""
     m = factor.shape[2]

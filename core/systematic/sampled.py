@@ -10,7 +10,7 @@ import numpy as np
 
 from core.arrays import Float, Float32
 from core.matching.image import PAD
-from core.matching.kernels.naming import entry, inner
+from core.matching.kernels.naming import entry_with_arrays, inner
 from core.threads import run_ranges
 
 _SIXTH = 1.0 / 6.0
@@ -133,7 +133,7 @@ def _shifts(subset, current, gx, gy, lx, ly, gain, mean_r, mean_c, out):
     out[2], out[3] = _solved(c00, c01, c10, c11, d0, d1)
 
 
-@entry
+@entry_with_arrays
 def _residual_shifts(pixels, gx, gy, lx, ly, coefficients, order, centres, images, maps, half, pad, out):
     side = 2 * half + 1
     current = np.empty((side, side))

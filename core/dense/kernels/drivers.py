@@ -14,7 +14,7 @@ from core.dense.kernels.cameras import positions
 from core.dense.kernels.finish import finish
 from core.dense.kernels.windows import make_windows
 from core.matching.kernels.drivers import kernel_sources
-from core.matching.kernels.naming import entry, stamp_of
+from core.matching.kernels.naming import entry, entry_with_arrays, stamp_of
 from core.matching.kernels.point import epipolar_shift
 
 _STAMP = stamp_of([*kernel_sources(), *sorted(Path(__file__).parent.glob("*.py"))])
@@ -36,7 +36,7 @@ def _entries(stamp: int):  # type: ignore[no-untyped-def]
             return
         _motion_band(first, last, given, space, out)
 
-    @entry
+    @entry_with_arrays
     def project(lens1, lens2, R, t, rays, state, images, out):
         if stamp < 0:
             return

@@ -53,7 +53,7 @@ class DenseGiven(NamedTuple):
 
 
 class DenseSpace(NamedTuple):
-    """Work space of a thread: rows of pixels in a ring, sums of columns, sums of windows, and small matrices."""
+    """Work space of a thread: rows of pixels in a ring, sums of columns, sums of windows, small matrices, and one state."""
 
     ring: Any
     lines: Any
@@ -66,6 +66,7 @@ class DenseSpace(NamedTuple):
     weights: Any
     normal: Any
     small: Any
+    local: Any
 
 
 class DenseOut(NamedTuple):

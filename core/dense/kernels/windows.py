@@ -174,6 +174,7 @@ def make_windows(images: int) -> DenseKernels:
             weights=np.zeros((images, images)),
             normal=np.zeros((2, 5, 5)),
             small=np.zeros((26, 6)),
+            local=np.zeros(8),
         )
 
     @kernel(f"{images}")
@@ -392,7 +393,7 @@ def make_windows(images: int) -> DenseKernels:
             order,
             variances,
         ) = given
-        ring, lines, tap, tx, ty, sums, windows, levels, weights, normal, small = space
+        ring, lines, tap, tx, ty, sums, windows, levels, weights, normal, small, local = space
         status = out.status
         cols = reference.pixels.shape[1]
         half = subset // 2
@@ -405,7 +406,6 @@ def make_windows(images: int) -> DenseKernels:
         left = math.floor(lattice.x0 + 0.5)
         full = float(subset * subset)
         below = -1  # first row of pixels that is not summed yet
-        local = np.zeros(8)
         per_px = 1.0 / lattice.spacing
         for r in range(first, last):
             y_px = lattice.y0 + r * lattice.step

@@ -171,7 +171,7 @@ def make_cluster_robust(degree: int, images: int, parts: PointKernels, freeze: A
         n = unknowns
         if images == 3 and few == 3 and rigid:
             n = N_RIGID
-            if not nearest_rotation(xc, yc, w, G, rotation):
+            if not nearest_rotation(xc, yc, w, G, rotation, chain):
                 return SINGULAR, 0
             rigid_chain(xc, yc, w, rotation, G, chain)
         result = freeze(

@@ -35,7 +35,6 @@ def _entry(name: str, kernel: Any, stamp: int) -> Any:
     def run(first, last, given, space, out, status, iterations):
         if stamp < 0:  # never; it makes the stamp part of the function
             return
-        # unpacked before the loop: in it numba would count references at each attribute
         reference, patches, which, images, lens1, lens2, R, t, xy, w, G, e, setting = given
         for i in range(first, last):
             status[i], iterations[i] = _point(

@@ -127,10 +127,7 @@ class Equations(NamedTuple):
 
 
 class WorkSpace(NamedTuple):
-    """Work space of a thread for one point after another, so that no point allocates.
-
-    Kernels unpack it at once: numba counts references at each attribute.
-    """
+    """Work space of a thread for one point after another: kernels make no arrays."""
 
     ref: Any
     of_reference: ReferenceSpace

@@ -133,7 +133,7 @@ def make_motion(degree: int) -> FitKernels:
         n = unknowns
         if few == 3 and rigid:
             n = N_RIGID
-            if not nearest_rotation(xc, yc, w, G, rotation):
+            if not nearest_rotation(xc, yc, w, G, rotation, chain):
                 return SINGULAR, 0
             rigid_columns(xc, yc, w, rotation, G)
         lenses = (lens1, lens2)

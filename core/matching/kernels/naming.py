@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,24 +17,30 @@ from numba import njit
 
 from core.compiling import ask_elsewhere
 
-_ALL: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+#: without numba's runtime a kernel can make no array, and counts no references: two atomic instructions a view, on
+#: counters that all threads share, were 5 us a point
+_ALL: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": False}
 _INNER: dict[str, Any] = {**_ALL, "no_cpython_wrapper": True}
+
+tested = njit(**_ALL)
+"""Compile a function that kernels call, and tests."""
 
 inner = njit(**_INNER)
 """Compile a function that only kernels call: its wrapper for Python would take longer to compile than itself."""
-
 
 ENTRIES: dict[tuple[str, str], Any] = {}
 """What :func:`entry` has made, by module and qualified name."""
 
 
-def entry(function: Callable[..., Any]) -> Any:
+def entry(function: Callable[..., Any], *, makes_arrays: bool = False) -> Any:
     """Compile a function that Python calls, and keep it on disk.
+
+    One that makes its work space itself ``makes_arrays``; what it calls in its loops must not.
 
     What another version of the program left there may name classes of arguments that no longer exist; numba would then
     fail at every call. Such an entry is emptied here.
     """
-    made = njit(cache=True, **_ALL)(function)
+    made = njit(cache=True, **{**_ALL, "_nrt": makes_arrays})(function)
     try:
         made._cache._cache_file._load_index()
     except (AttributeError, ImportError):
@@ -45,6 +52,9 @@ def entry(function: Callable[..., Any]) -> Any:
         _load_what_another_process_compiles(made)
     ENTRIES[function.__module__, function.__qualname__] = made
     return made
+
+
+entry_with_arrays = partial(entry, makes_arrays=True)
 
 
 def _load_what_another_process_compiles(made: Any) -> None:

@@ -36,9 +36,9 @@ def _frame(tangents, frame):
 
 
 @inner
-def nearest_rotation(xc, yc, w, G, rotation):
-    """Rotation that carries the reference patch's tangents closest to those in ``G``."""
-    tangents, before, after = np.empty((2, 3)), np.empty((3, 3)), np.empty((3, 3))
+def nearest_rotation(xc, yc, w, G, rotation, work):
+    """Rotation that carries the reference patch's tangents closest to those in ``G``; ``work`` has 8 rows of 3."""
+    before, after, tangents = work[:3], work[3:6], work[6:8]
     for j in range(2):
         r = w[1 + j] / w[0]
         tangents[j, 0], tangents[j, 1], tangents[j, 2] = -xc * r, -yc * r, -r
