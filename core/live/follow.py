@@ -1,9 +1,7 @@
 """Frames followed: each point starts from where it was in the frame before, moved on by the field's smooth velocity.
 
-From such a start one step of the fit is enough. What it leaves is a share of the way that it went, and is measured
-wherever all points are fitted on until they settle: the difference over their standard deviations, per px of that way.
-A frame whose points would be off by more than two hundredths of a standard deviation by that is fitted on, and in any
-frame the points that would be off by a tenth.
+From such a start one step of the fit is enough. What it leaves is a share of the way that it went; points that went
+further, where the motion turned, take another one. How large that share is, is learned from those.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.field.checks.validity import check_neighbours, disagreement_scale
 from core.field.growth.state import SAMPLE_FAR_PX, prepare
-from core.field.points.fitter import PointFits
+from core.field.points.fitter import PointFits, learned_rate
 from core.field.points.images import MeasureImage, refuse_stale, same_size
 from core.field.points.result import Field
 from core.field.points.starts import Starts, image_positions
@@ -34,7 +32,6 @@ from core.measure import ReferencePair
 from core.status import PointStatus
 from core.threads import run_ranges
 
-_OFF_BY, _POINT_OFF_BY = 0.02, 0.1  # of a standard deviation: root mean square of the points, and any of them
 _SMOOTH_FROM = 24  # points, for a velocity of second order
 _AROUND_PX = 8  # about a subset: its way, its taps, and rounding
 _AT_ONCE = 256
@@ -42,10 +39,10 @@ _AT_ONCE = 256
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """A followed frame: its field, and what a step leaves, standard deviations per px of its way; infinite: unknown."""
+    """A followed frame: its field, and the share of a step's motion that is left to be made, as its points show it."""
 
     field: Field
-    left_per_px: float
+    rate: float
 
 
 @dataclass(eq=False)
@@ -110,7 +107,7 @@ class Follower:
         previous: Field,
         before: tuple[Field, float] | None,
         ratio: Float,
-        left_per_px: float,
+        rate: float | None,
     ) -> Followed:
         """Measure a frame.
 
@@ -125,8 +122,8 @@ class Follower:
             points start where they were.
         ratio
             (r, c, 6) standard deviations with all checks over a fit's own.
-        left_per_px
-            What one step leaves, as the frame before had it.
+        rate
+            Share of its motion that a step leaves, as the frame before had it; None: not known yet.
 
         Raises
         ------
@@ -150,50 +147,10 @@ class Follower:
         current = self._prepared(images, previous, w, G)
         given = self._given_for(terms, current)._replace(w=w, G=G)
         ratio = ratio.reshape(-1, 6)[self._index]
-        fits = self._fitted(given, current, had, w, G, ratio, one_step=True)
-        found = had & (fits.status == PointStatus.OK)
-        way = float(np.sqrt(np.mean(fits.moved[found] ** 2))) if found.any() else np.inf
-        with np.errstate(invalid="ignore"):
-            again = had & ~(fits.moved * left_per_px <= _POINT_OFF_BY)
-        if not way * left_per_px <= _OFF_BY:
-            again = had
-        if again.any():
-            fits, left = self._settled(given, current, fits, again, w, G, ratio)
-            if again is had and way > 0.0:  # over a longer way it would be more per px
-                left_per_px = min(left / way, left_per_px)
-        return Followed(self._field(fits, terms, had, previous), left_per_px)
-
-    def _settled(
-        self,
-        given: Given,
-        current: tuple[ImageData, ImageData],
-        fits: _Fits,
-        again: Bool,
-        w: Float,
-        G: Float,
-        ratio: Float,
-    ) -> tuple[_Fits, float]:
-        """Fit points on until they settle; also return the root mean square of the change over their deviations."""
-        terms = w.shape[1]
-        some = np.flatnonzero(again)
-        there = fits.status[some] == PointStatus.OK
-        at_w = np.where(there[:, None], fits.out[some, :terms], w[some])
-        at_G = np.where(there[:, None, None], fits.out[some, terms : 4 * terms].reshape(-1, 3, terms), G[some])
-        given = given._replace(xy=self._xy[some], which=given.which[some], w=at_w, G=at_G, e=given.e[some])
-        constant = self._constant._replace(
-            **{name: getattr(self._constant, name)[some] for name in ("rays", "per_px", "scale", "position")}
-        )
-        new = self._fitted(
-            given, current, np.ones(len(some), bool), w[some], G[some], ratio[some], one_step=False, constant=constant
-        )
-        both = there & (new.status == PointStatus.OK)
-        change = (new.uvw - fits.uvw[some])[both]
-        sigma = np.sqrt(np.diagonal(new.covariance[both], axis1=1, axis2=2)[:, 3:])
-        left = float(np.sqrt(np.mean((change / sigma) ** 2))) if both.any() else np.inf
-        for name in ("out", "status", "moved", "uvw", "covariance"):
-            getattr(fits, name)[some] = getattr(new, name)
-        fits.iterations[some] += new.iterations
-        return fits, left
+        fits = self._fitted(given, current, had, w, G, ratio, rate)
+        rates = fits.out[had & (fits.status == PointStatus.OK), -1]
+        learned = learned_rate(rates, rate, self._inputs.matcher.options)
+        return Followed(self._field(fits, terms, had, previous), learned)
 
     def _fitted(
         self,
@@ -203,12 +160,10 @@ class Follower:
         w: Float,
         G: Float,
         ratio: Float,
-        *,
-        one_step: bool,
-        constant: Constant | None = None,
+        rate: float | None,
     ) -> _Fits:
         (m, terms), matcher = w.shape, self._inputs.matcher
-        options = replace(matcher.options, first_rate=0.0) if one_step else matcher.options
+        options = matcher.options if rate is None else replace(matcher.options, first_rate=rate)
         if terms == 6:
             options = replace(options, patch="quadratic")
         given = given._replace(setting=setting_of(options, [matcher.ref1, matcher.ref2, *current]))
@@ -225,7 +180,7 @@ class Follower:
         status[~had] = PointStatus.NOT_SEEDED
         moved, uvw, covariance = np.full(m, np.nan), np.full((m, 3), np.nan), np.full((m, 6, 6), np.nan)
         arrays = (
-            self._constant if constant is None else constant,
+            self._constant,
             terms,
             out,
             np.ascontiguousarray(w),

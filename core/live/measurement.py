@@ -100,7 +100,7 @@ class _Kept:
     before: Field | None  # the frame before it, for the velocity
     before_s: float | None
     ratio: Float  # (r, c, 6) standard deviations with all checks over a fit's own
-    left_per_px: float  # see Followed
+    rate: float | None  # see Followed
     since_audit: int
 
 
@@ -231,9 +231,9 @@ class LiveMeasurement:
     def _follow(self, images: tuple[MeasureImage, MeasureImage], kept: _Kept, time_s: float | None) -> _Kept | None:
         """Measure a frame from those before it; None where points that were there are lost."""
         before = None if kept.before is None else (kept.before, _intervals(kept.before_s, kept.time_s, time_s))
-        followed = self._follower.measure(images, kept.field, before, kept.ratio, kept.left_per_px)
+        followed = self._follower.measure(images, kept.field, before, kept.ratio, kept.rate)
         if before is not None and self._lost(kept.field, followed.field):  # the motion may have turned
-            followed = self._follower.measure(images, kept.field, None, kept.ratio, kept.left_per_px)
+            followed = self._follower.measure(images, kept.field, None, kept.ratio, kept.rate)
         if self._lost(kept.field, followed.field):
             return None
         return _Kept(
@@ -244,7 +244,7 @@ class LiveMeasurement:
             before=kept.field,
             before_s=kept.time_s,
             ratio=kept.ratio,
-            left_per_px=followed.left_per_px,
+            rate=followed.rate,
             since_audit=kept.since_audit + 1,
         )
 
@@ -268,11 +268,11 @@ class LiveMeasurement:
             )
         ratio = np.ones((*field.shape, 6))
         if field.references is None and field.starts is not None and self.options.blur is None:
-            own = self._follower.measure(images, field, None, ratio, np.inf).field
+            own = self._follower.measure(images, field, None, ratio, None).field
             there = field.valid & own.valid
             with_checks, alone = (np.diagonal(f.covariance[there], axis1=1, axis2=2) for f in (field, own))
             ratio[there] = np.sqrt(with_checks / alone)
-        return _Kept(number, images, field, time_s, None, None, ratio, np.inf, 0)
+        return _Kept(number, images, field, time_s, None, None, ratio, None, 0)
 
     def _keep(self, frame: _Kept) -> None:
         references = frame.field.references

@@ -53,7 +53,7 @@ class DenseGiven(NamedTuple):
 
 
 class DenseSpace(NamedTuple):
-    """Work space of a thread: rows of pixels in a ring, sums of columns, sums of windows, small matrices, and one state."""
+    """Work space of a thread: rows of pixels in a ring, sums of columns and windows, small matrices, one state."""
 
     ring: Any
     lines: Any

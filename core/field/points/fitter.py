@@ -199,16 +199,8 @@ class Fitter:
         return replace(self, options=replace(self.options, patch="quadratic"))
 
     def converging(self, rate: Float) -> Fitter:
-        """Return the same matcher for points that converge as a sample (m,) of them did.
-
-        Nine in ten of the sample converged at least that fast; no slower rate is taken than what is assumed anyhow,
-        nor any from a few points.
-        """
-        known = rate[np.isfinite(rate)]
-        if len(known) < _RATE_FROM:
-            return self
-        first = min(float(np.quantile(known, _RATE_QUANTILE)), self.options.first_rate)
-        return replace(self, options=replace(self.options, first_rate=first))
+        """Return the same matcher for points that converge as a sample (m,) of them did, see :func:`learned_rate`."""
+        return replace(self, options=replace(self.options, first_rate=learned_rate(rate, None, self.options)))
 
     def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
         """Refine points from start values and reject those that fail the checks of a single point."""
@@ -291,6 +283,18 @@ class Fitter:
         with np.errstate(invalid="ignore"):
             good &= (depth / w[:, 0] > 0.0) & (det > 0.0) & (size < MAX_SHEAR) & (det > size**2 / MAX_SHEAR)
         return np.asarray(good)
+
+
+def learned_rate(rate: Float, known: float | None, options: MatchOptions) -> float:
+    """Return what is to be assumed after a point's first step, of points that converged at ``rate`` (m,), NaN or not.
+
+    Nine in ten of them converged at least that fast. No slower rate is taken than what is assumed anyhow, and from a
+    few points none: the one that is ``known`` stays.
+    """
+    finite = rate[np.isfinite(rate)]
+    if len(finite) < _RATE_FROM:
+        return options.first_rate if known is None else known
+    return min(float(np.quantile(finite, _RATE_QUANTILE)), options.first_rate)
 
 
 def _mask(n: int, index: NDArray[np.intp]) -> Bool:
