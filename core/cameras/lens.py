@@ -10,7 +10,7 @@ marked in ``valid``; its coordinates are then NaN and must not be used.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -22,6 +22,8 @@ SEIDEL = 0.0
 OPENCV = 1.0
 N_KERNEL_PARAMETERS = 15
 _NEWTON_STEPS = 30
+#: coordinates of arrays that are kept with what they were inverted to: smaller ones are inverted at once
+_FEW, _MANY = 500, 100_000
 _BISECTIONS = 30  # to 1e-9 of the branch; Newton's method does the rest
 
 
@@ -301,6 +303,11 @@ class OpenCVLens:
     def normalised_from_image(self, xy_px: ArrayLike) -> MappedPoints:
         """Invert by Newton's method; not valid where it does not return to the pixel within 1e-9."""
         xy = np.asarray(xy_px, dtype=np.float64)
+        if _FEW <= xy.size <= _MANY:
+            return _inverted(self, xy.shape, xy.tobytes())
+        return self._normalised_from_image(xy)
+
+    def _normalised_from_image(self, xy: Float) -> MappedPoints:
         yd = (xy[..., 1] - self.cy_px) / self.fy_px
         d = np.stack([(xy[..., 0] - self.cx_px - self.skew_px * yd) / self.fx_px, yd], axis=-1)
         r_max = np.sqrt(self._r2_max)
@@ -373,6 +380,14 @@ class OpenCVLens:
                 self.k6,
             ]
         )
+
+
+@lru_cache(maxsize=8)
+def _inverted(lens: OpenCVLens, shape: tuple[int, ...], pixels: bytes) -> MappedPoints:
+    """Invert a lens at pixels that were asked for lately: every step of a sequence asks a dozen times for the same."""
+    found = lens._normalised_from_image(np.frombuffer(pixels).reshape(shape))
+    found.xy.flags.writeable = found.valid.flags.writeable = False
+    return found
 
 
 def _smallest_positive_root(coefficients: list[float]) -> float:
