@@ -22,8 +22,8 @@ from core.compiling import ask_elsewhere
 _ALL: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": False}
 _INNER: dict[str, Any] = {**_ALL, "no_cpython_wrapper": True}
 
-tested = njit(**_ALL)
-"""Compile a function that kernels call, and tests."""
+outer = njit(**_ALL)
+"""Compile a function that kernels call, and Python."""
 
 inner = njit(**_INNER)
 """Compile a function that only kernels call: its wrapper for Python would take longer to compile than itself."""

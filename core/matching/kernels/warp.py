@@ -20,7 +20,7 @@ from numba.extending import intrinsic
 from core.cameras.lens import SEIDEL
 from core.matching.image import PAD
 from core.matching.kernels.loops import data, monomials
-from core.matching.kernels.naming import inner, kernel, tested
+from core.matching.kernels.naming import inner, kernel, outer
 from core.matching.kernels.vectors import DOUBLE, LONG, Vec, at, load, spread, store
 
 _NEWTON_STEPS = 20
@@ -120,7 +120,7 @@ def _slopes(lens, near, u, v):
     return lens[1] * a11 + lens[3] * a12, lens[1] * a12 + lens[3] * a22, lens[2] * a12, lens[2] * a22
 
 
-@tested
+@outer
 def lens_jacobian(lens, u, v):
     """Return d(image px) / d(normalised) at (u, v): the four entries row by row."""
     if is_rational(lens):
@@ -317,7 +317,7 @@ def _make_set_up_nodes(rational: bool) -> Any:
 _set_up_plain_nodes, _set_up_rational_nodes = _make_set_up_nodes(False), _make_set_up_nodes(True)
 
 
-@tested
+@outer
 def set_up_nodes(lens, dx, dy, half, xc, yc, q, powers):
     """Rays of the nodes in camera 1, relative to the point's.
 
@@ -420,7 +420,7 @@ def _polynomials(_typingctx: Any, lens: Any, m: Any, powers: Any, out: Any) -> A
     return sig, codegen
 
 
-@tested
+@outer
 def set_up_warp(lens, m, powers, rows, cols, stride, lead, work, p):
     """Prepare the pixel loop for one image, into which ``m`` maps the patch.
 
