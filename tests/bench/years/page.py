@@ -12,7 +12,7 @@ import numpy as np
 from server.formats.version import software_version
 from tests.bench.documents.prose import wrapped
 from tests.bench.years.measure import Cost
-from tests.bench.years.soak import Soak, verdicts
+from tests.bench.years.soak import MACHINE, Soak, verdicts
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 PAGE = DOCS / "explanation" / "years.md"
@@ -105,6 +105,13 @@ def draw_soak(soak: Soak) -> None:
     plt.close(figure)
 
 
+def _machines_own(soak: Soak) -> str:
+    """Say how fast the machine itself was after the warm-up, early and late."""
+    late = np.array([value for at, value in soak.series[MACHINE] if at >= soak.warm_s])
+    first, last = (float(np.median(part)) for part in (late[: len(late) // 2], late[len(late) // 2 :]))
+    return f"{MACHINE[0].upper()}{MACHINE[1:]}: {first:.2f} in the first half of that time, {last:.2f} in the second."
+
+
 def write_soak(soak: Soak) -> None:
     """Write the section on the soak."""
     draw_soak(soak)
@@ -120,6 +127,6 @@ def write_soak(soak: Soak) -> None:
         f"{soak.seconds / 60:.0f} minutes; {_machine()}; load of the machine {np.mean(soak.load):.1f} ({first:.1f} in the first "
         f"quarter, {last:.1f} in the last). Done: {did}"
         f"{'' if soak.live else '; no live measurement: this version has none'}. Answers that were not as they should be: {len(soak.wrong)}. "
-        f"Growth is from minute {soak.warm_s / 60:.0f} to the end."
+        f"Growth is from minute {soak.warm_s / 60:.0f} to the end. {_machines_own(soak)}"
     )
     _between("soak", wrapped(text) + "\n\n" + "\n".join(rows) + "\n\n![Soak](../figures/soak.png)")

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import hashlib
 import json
 import os
 import sys
@@ -34,6 +35,9 @@ EVERY_S = 0.25
 STEPS_A_TEST = 200
 WARM_S = 600.0
 _BLOCKS = 20
+_FIXED = bytes(2_000_000)
+MACHINE = "a fixed calculation, ms of processor time"
+"""A series that shows whether the machine itself became slower meanwhile."""
 #: growth after the warm-up that is allowed, over the rest of the run
 ALLOWED = {
     "memory of the service, MiB": 16.0,
@@ -247,6 +251,9 @@ class Work:
                 self.note("memory of its worker, MiB", max((c.memory_info().rss for c in children), default=0) / 2**20)
                 self.note("open files", process.num_fds())
                 self.note("threads", process.num_threads())
+                began = time.thread_time()
+                hashlib.sha256(_FIXED).digest()
+                self.note(MACHINE, (time.thread_time() - began) * 1e3)
                 self.soak.load.append(os.getloadavg()[0])
             time.sleep(1.0)
 
