@@ -58,7 +58,7 @@ class Constant(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def convert(first, last, constant, terms, out, start_w, start_g, ratio, status, moved, uvw, covariance):
+def convert(first, last, constant, terms, out, start_w, start_g, ratio, status, uvw, covariance):
     """Check points ``first`` to ``last``, and give displacement and covariance of those that pass.
 
     Parameters
@@ -75,8 +75,6 @@ def convert(first, last, constant, terms, out, start_w, start_g, ratio, status, 
         (n, 6) standard deviations with all checks over a fit's own.
     status
         (n,) int8, changed: what is not OK stays.
-    moved
-        (n,) out: from start to result in an image, px; NaN where a point has no result.
     uvw
         (n, 3) out, mm, system frame.
     covariance
@@ -88,7 +86,6 @@ def convert(first, last, constant, terms, out, start_w, start_g, ratio, status, 
     half = np.empty((6, 4))
     d = np.empty(3)
     for i in range(first, last):
-        moved[i] = np.nan
         if status[i] != _OK:
             continue
         numbers = out[i]
@@ -125,7 +122,6 @@ def convert(first, last, constant, terms, out, start_w, start_g, ratio, status, 
         if not (good and px < far_px):
             status[i] = _NOT_CONVERGED
             continue
-        moved[i] = px
         d[0], d[1], d[2] = g00 - x, g10 - y, g20 - 1.0
         for r in range(3):
             along, motion = 0.0, 0.0

@@ -52,7 +52,6 @@ class _Fits:
     out: Float
     status: NDArray[np.int8]
     iterations: NDArray[np.int32]
-    moved: Float
     uvw: Float
     covariance: Float
 
@@ -178,7 +177,7 @@ class Follower:
             at_once=_AT_ONCE,
         )
         status[~had] = PointStatus.NOT_SEEDED
-        moved, uvw, covariance = np.full(m, np.nan), np.full((m, 3), np.nan), np.full((m, 6, 6), np.nan)
+        uvw, covariance = np.full((m, 3), np.nan), np.full((m, 6, 6), np.nan)
         arrays = (
             self._constant,
             terms,
@@ -187,12 +186,11 @@ class Follower:
             np.ascontiguousarray(G),
             np.ascontiguousarray(ratio),
             status,
-            moved,
             uvw,
             covariance,
         )
         run_ranges(lambda first, last: convert(first, last, *arrays), m, _AT_ONCE)
-        return _Fits(out, status, iterations, moved, uvw, covariance)
+        return _Fits(out, status, iterations, uvw, covariance)
 
     def _given_for(self, terms: int, current: tuple[ImageData, ImageData]) -> Given:
         matcher = self._inputs.matcher

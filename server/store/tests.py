@@ -53,6 +53,8 @@ MAX_STEPS = 9999
 #: a step's document may be taken away by hand, which the folder of the steps does not show
 _LOOK_AGAIN_S = 2.0
 _STEP_FOLDER = re.compile(r"(?:incomplete-\d+-)?(\d{4})")
+#: of a summary, kept between questions: an answer shows fewer, and of some thousand each has kilobytes
+_SUMMARY_STEPS = 100
 _DELETED = re.compile(r"(\d{4})\.deleted")
 
 
@@ -563,7 +565,7 @@ class TestStore:
         write_json(path, document)
 
     def summary(self, test_id: str, analysis_id: str) -> SummaryRecord | None:
-        """Return ``summary.json`` with its first hundred steps, or None while it is not there."""
+        """Return ``summary.json`` with its first steps (:data:`_SUMMARY_STEPS`), or None while it is not there."""
         path = self.analysis_path(test_id, analysis_id) / "summary.json"
         return kept_while_unchanged(path, _short_summary_in) if path.exists() else None
 
@@ -588,4 +590,4 @@ def _summary_in(path: Path, keep: Mapping[str, Keep] | None = None) -> SummaryRe
 
 
 def _short_summary_in(path: Path) -> SummaryRecord:
-    return _summary_in(path, {"steps": the_first(100)})
+    return _summary_in(path, {"steps": the_first(_SUMMARY_STEPS)})
