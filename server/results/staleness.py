@@ -16,7 +16,10 @@ from server.formats.files import known_sha256
 from server.formats.results.folder import number_of, results_in
 from server.formats.results.reading import ResultHead
 from server.formats.results.settings import current_step
-from server.store.durable import known_json
+from server.store.durable import UnchangedFiles, known_json
+
+#: checksums of steps, which are asked for again and again while an analysis runs
+_RECORDED = UnchangedFiles(2_000)
 
 
 def stale_inputs(
@@ -50,7 +53,7 @@ def stale_inputs(
         if not mark.is_file():
             found.append(f"{input_name} is gone")
             continue
-        recorded = _recorded(mark)
+        recorded = _RECORDED.made_of(mark, _recorded)
         for cam in CAMERAS:
             image = folder / f"{cam}.tif"
             if recorded is not None and cam in recorded and recorded[cam] != hashes.get(cam):

@@ -101,38 +101,52 @@ def read_record(kind: type[Record], path: Path) -> Record:
     return record_of(kind, read_json(path), path)
 
 
-_Kept = TypeVar("_Kept")
-_kept: OrderedDict[tuple[str, object], tuple[tuple[int, int, int], object]] = OrderedDict()
-_keeping = threading.Lock()
+Made = TypeVar("Made")
 #: smaller files are read in less time than it takes to notice
 _LARGE_BYTES = 40_000
-_MAX_KEPT = 16
 
 
-def kept_while_unchanged(path: Path, read: Callable[[Path], _Kept]) -> _Kept:
-    """Return what ``read`` makes of a file; of a large one, what it made last, unless the file was touched since.
+class UnchangedFiles:
+    """What was made of files, kept while they are not touched; shared by all who ask, so that nobody may change it.
 
-    What is returned is shared: nobody may change it.
+    Parameters
+    ----------
+    at_most
+        Files whose contents are kept: those that were asked for last.
+    least_bytes
+        Smaller files are read every time.
     """
-    try:
-        stat = path.stat()
-    except OSError:
-        return read(path)
-    if stat.st_size < _LARGE_BYTES:
-        return read(path)
-    # the time of the inode's change, which no program can set
-    mark, key = (stat.st_ino, stat.st_ctime_ns, stat.st_size), (str(path), read)
-    with _keeping:
-        if (known := _kept.get(key)) is not None and known[0] == mark:
-            _kept.move_to_end(key)
-            return known[1]  # type: ignore[return-value]
-    made = read(path)
-    with _keeping:
-        _kept[key] = mark, made
-        _kept.move_to_end(key)
-        if len(_kept) > _MAX_KEPT:
-            _kept.popitem(last=False)
-    return made
+
+    def __init__(self, at_most: int, *, least_bytes: int = 0) -> None:
+        self._at_most, self._least_bytes = at_most, least_bytes
+        self._kept: OrderedDict[tuple[str, object], tuple[tuple[int, int, int], object]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def made_of(self, path: Path, read: Callable[[Path], Made]) -> Made:
+        """Return what ``read`` makes of a file, or what it made last, unless the file was touched since."""
+        try:
+            stat = path.stat()
+        except OSError:
+            return read(path)
+        if stat.st_size < self._least_bytes:
+            return read(path)
+        # the time of the inode's change, which no program can set
+        mark, key = (stat.st_ino, stat.st_ctime_ns, stat.st_size), (str(path), read)
+        with self._lock:
+            if (known := self._kept.get(key)) is not None and known[0] == mark:
+                self._kept.move_to_end(key)
+                return known[1]  # type: ignore[return-value]
+        made = read(path)
+        with self._lock:
+            self._kept[key] = mark, made
+            self._kept.move_to_end(key)
+            if len(self._kept) > self._at_most:
+                self._kept.popitem(last=False)
+        return made
+
+
+kept_while_unchanged = UnchangedFiles(16, least_bytes=_LARGE_BYTES).made_of
+"""Return what a function makes of a large file, see :meth:`UnchangedFiles.made_of`."""
 
 
 def known_json(path: Path, keep: Mapping[str, long_json.Keep] | None = None) -> dict[str, Any]:

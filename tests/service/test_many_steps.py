@@ -17,10 +17,12 @@ import pytest
 import stereorig
 from server.api.models import AnalysisRequest
 from server.formats.images import encode_tiff
-from server.results.warnings.checks import checks_of
+from server.results.warnings import checks as results_checks
+from server.results.warnings.checks import checks_of, state_of
 from server.store.documents import JobRecord
 from server.store.indexing.entries import analysis_entry
 from server.worker.executor import WorkerDiedError
+from server.workflows.analysis import checks as service_checks
 from server.workflows.analysis.checks import AnalysisChecks
 from server.workflows.service import Service
 from tests.bench.years.folder import TrueTest
@@ -207,6 +209,31 @@ def test_the_checks_of_many_steps_are_found_by_a_process_of_their_own(
         time.sleep(0.05)
     assert len(asked) == 1
     assert found == checks_of(service.tests.analysis_path(many, analyses[many]))
+    checks.close()
+
+
+def test_checks_of_some_age_are_confirmed_without_reading_the_steps(
+    service: Service, few: str, analyses: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checks = AnalysisChecks(service.tests)
+    deadline = time.monotonic() + 60.0
+    while (found := checks.of(few, analyses[few])).warnings[0].code == "not_checked_yet":
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    looked: list[Path] = []
+
+    def noted(folder: Path) -> bytes:
+        looked.append(folder)
+        return state_of(folder)
+
+    monkeypatch.setattr(results_checks, "state_of", noted)
+    monkeypatch.setattr(results_checks, "checks_of", lambda *_: pytest.fail("read again"))
+    monkeypatch.setattr(service_checks, "_FRESH_S", 0.0)
+    monkeypatch.setattr(service_checks, "_SHARE", 1e9)
+    while len(looked) < 2:
+        assert checks.of(few, analyses[few]) == found
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
     checks.close()
 
 

@@ -11,7 +11,7 @@ from server.base.long_json import nothing
 from server.formats.calibrations.in_test import calibration_id_in, calibration_in, measured_with
 from server.formats.results.camera_motion import MOVED_REMEDY
 from server.formats.results.settings import current_step
-from server.store.durable import known_json
+from server.store.durable import UnchangedFiles, known_json
 
 Level = Literal["failed", "warning"]
 _Summary = Mapping[str, Any]
@@ -23,6 +23,8 @@ COVERAGE_WARNING, COVERAGE_FAILED = 0.8, 0.5
 _ASKED_FOR = frozenset(
     {"n", "epipolar_check", "valid_fraction", "valid", "points", "status", "camera_motion", "quality", "warnings"}
 )
+#: of the steps of an analysis that runs all but the newest are as they were when they were asked for last
+_STEPS = UnchangedFiles(2_000)
 #: steps that a warning names one by one
 _NAMED = 100
 _QUALITY = {
@@ -84,11 +86,11 @@ def analysis_warnings(
     failed
         Steps that could not be measured, by their numbers; as ``summary.json`` has them if left out.
     """
-    found = {int(one["n"]): _used(one) for one in _own_summaries(folder)}
+    found = {int(one["n"]): one for one in _own_summaries(folder)}
     summary = known_json(folder / "summary.json", {"steps": nothing if found else _used})
     found = found or {int(one["n"]): one for one in summary.get("steps") or [] if isinstance(one.get("n"), int)}
     home = folder.parent.parent if (folder.parent.parent / "steps").is_dir() else None
-    taken = {} if home is None else {n: _used(known_json(home / "steps" / f"{n:04d}" / "step.json")) for n in found}
+    taken = {} if home is None else {n: _step_in(home / "steps" / f"{n:04d}" / "step.json") for n in found}
     problems = failed if failed is not None else summary.get("steps_failed")
     made = [
         *_epipolar(found),
@@ -109,10 +111,19 @@ def _used(step: object) -> _Summary:
     return {name: value for name, value in found.items() if name in _ASKED_FOR}
 
 
+def _read_step(path: Path) -> _Summary:
+    return _used(known_json(path))
+
+
+def _step_in(path: Path) -> _Summary:
+    """Return the entries of a file of one step that are asked for here."""
+    return _STEPS.made_of(path, _read_step)
+
+
 def _own_summaries(folder: Path) -> Iterable[_Summary]:
     """Yield the summaries that the service keeps beside each step's result."""
     for path in sorted(folder.glob("step_[0-9]*.json")):
-        found = known_json(path)
+        found = _step_in(path)
         if isinstance(found.get("n"), int) and path.with_suffix(".nc").exists():
             yield found
 

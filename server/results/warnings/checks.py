@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+import os
+import stat
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from server.formats.calibrations.in_test import calibration_in
+from core.names import CAMERAS
+from server.formats.calibrations.in_test import LATER, calibration_id_in, calibration_in, measured_with
 from server.results.staleness import stale_inputs
 from server.results.warnings.analysis import ResultWarning, analysis_warnings
 from server.store.documents import AnalysisRecord
-from server.store.durable import read_record
+from server.store.durable import known_json, read_record
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,66 @@ def checks_of(folder: Path, failed: Mapping[str, object] | None = None) -> Check
     """
     stale = stale_reasons(folder.parent.parent, read_record(AnalysisRecord, folder / "analysis.json"))
     return Checks(tuple(stale), tuple(analysis_warnings(folder, stale=stale, failed=failed)))
+
+
+def checks_if_changed(
+    folder: Path, failed: Mapping[str, object] | None, before: bytes | None
+) -> tuple[bytes, Checks | None]:
+    """Return the state of what the checks look at, and the findings; None for these where it is as ``before``.
+
+    Parameters
+    ----------
+    folder, failed
+        As in :func:`checks_of`.
+    before
+        State at which the same was asked for.
+    """
+    state = state_of(folder)
+    return state, None if state == before else checks_of(folder, failed)
+
+
+def state_of(folder: Path) -> bytes:
+    """Return a digest that differs whenever a file differs that :func:`checks_of` looks at.
+
+    By the files' sizes, and by times that no program can set; without a look into those of the steps, of which there
+    may be thousands in each of a hundred analyses.
+    """
+    test = folder.parent.parent
+    calibration_id = calibration_id_in(known_json(test / "test.json"), measured_with(folder)) or ""
+    reviewed = test.parent.parent / "calibrations" / Path(calibration_id).name
+    digest = hashlib.blake2b(digest_size=16)
+    for path in (folder, test, test / LATER, reviewed):
+        for line in _files_in(path):
+            digest.update(line)
+    of_a_step = ("step.json", *(f"{cam}.tif" for cam in CAMERAS))
+    for step in sorted(_entries_of(test / "steps")):
+        for line in _stated(f"{step}/{name}" for name in of_a_step):
+            digest.update(line)
+    return digest.digest()
+
+
+def _entries_of(folder: Path) -> list[str]:
+    try:
+        with os.scandir(folder) as entries:
+            return [entry.path for entry in entries]
+    except OSError:
+        return []
+
+
+def _files_in(folder: Path) -> Iterator[bytes]:
+    return _stated(sorted(_entries_of(folder)), folders=False)
+
+
+def _stated(paths: Iterable[str], *, folders: bool = True) -> Iterator[bytes]:
+    for path in paths:
+        try:
+            found = os.stat(path)  # noqa: PTH116 - ten thousands of them
+        except OSError:
+            yield f"{path}\n".encode(errors="surrogateescape")
+            continue
+        if folders or not stat.S_ISDIR(found.st_mode):
+            mark = (found.st_ino, found.st_ctime_ns, found.st_size)
+            yield f"{path} {mark}\n".encode(errors="surrogateescape")
 
 
 def stale_reasons(test: Path, document: AnalysisRecord) -> list[str]:

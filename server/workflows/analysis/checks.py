@@ -19,7 +19,7 @@ from pathlib import Path
 from core.errors import StereorigError
 from server.base.problem import JobProblem
 from server.results.warnings.analysis import ResultWarning
-from server.results.warnings.checks import Checks, checks_of
+from server.results.warnings.checks import Checks, checks_if_changed, checks_of
 from server.store.tests import TestStore
 from server.worker.executor import WorkerDiedError
 from server.worker.resting import RestingWorker
@@ -31,7 +31,7 @@ _MANY_BYTES = 8_000
 _LONG_BYTES = 200_000
 #: by the first who asks
 _WAIT_FIRST_S = 0.25
-#: files may be replaced in place, which no folder's time shows
+#: files may be replaced in place, which no folder's time shows; then only what has changed is read again
 _FRESH_S = 30.0
 #: share of a processor that the checks may take
 _SHARE = 0.2
@@ -41,6 +41,8 @@ _SHARE = 0.2
 class _Kept:
     mark: object = None
     checks: Checks | None = None
+    state: bytes | None = None
+    problems: Mapping[str, object] | None = None
     at: float = 0.0
     took_s: float = 0.0
     running: Future[None] | None = field(default=None, repr=False)
@@ -96,21 +98,28 @@ class AnalysisChecks:
     def _renew(self, kept: _Kept, folder: Path, problems: Mapping[str, object] | None, mark: object) -> None:
         began = time.monotonic()
         found: Checks | None = None
+        state: bytes | None = None
         try:
-            found = self._find(folder, problems)
+            known = kept.state if problems == kept.problems else None
+            state, found = self._find(folder, problems, known)
+            found = found or kept.checks
         except (StereorigError, OSError) as error:
             _log.info("analysis %s cannot be checked: %s", folder.name, error)
         finally:
             with self._lock:
                 kept.running, kept.at, kept.took_s = None, time.monotonic(), time.monotonic() - began
                 kept.mark, kept.checks = mark, found or Checks((), ())
+                kept.state, kept.problems = state, problems
 
-    def _find(self, folder: Path, problems: Mapping[str, object] | None) -> Checks:
+    def _find(
+        self, folder: Path, problems: Mapping[str, object] | None, before: bytes | None
+    ) -> tuple[bytes, Checks | None]:
+        asked = folder, problems, before
         if (folder / "analysis.json").stat().st_size > _LONG_BYTES:
             with contextlib.suppress(WorkerDiedError):
-                found: Checks = self._process.submit(checks_of, folder, problems).result()
+                found: tuple[bytes, Checks | None] = self._process.submit(checks_if_changed, *asked).result()
                 return found
-        return checks_of(folder, problems)
+        return checks_if_changed(*asked)
 
     def _mark(self, test_id: str, folder: Path, problems: Mapping[str, object] | None) -> object:
         """Return something cheap that differs whenever the checks may find something else."""
