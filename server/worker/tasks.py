@@ -80,8 +80,8 @@ class StepTask:
     noise
         Path of the noise models, or None.
     earlier
-        By number, the steps between the reference and this one that were measured: this one may be matched against
-        them.
+        By number, the steps after the reference that this one may be matched against: later references, and the step
+        before it.
     keeps_starts
         True if later steps start from what this one finds.
     against

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from server.formats.images import encode_tiff, read_image
+from server.workflows.analysis import run
 from tests.support.copied_tests import write_test_folder
 from tests.support.running_analyses import API, BODY, Host, begin, contents, folder_of, wait_for_steps
 from tests.support.service_rig import a_second, wait_for_job
@@ -82,6 +83,27 @@ def assert_same_results(host: Host, one: str, two: str) -> None:
         assert_close({k: v for k, v in a_step.items() if k not in timings}, b_step)
     w = contents(folder_of(host, one) / f"step_{STEPS - 1:04d}.nc")["w_mm"]
     assert np.nanmax(np.abs(w)) > 0.05  # a plate that bends
+
+
+@pytest.mark.parametrize(
+    ("update", "given"),
+    [("auto", [[], [0], [0, 1], [0, 2], [0, 3]]), ("always", [[], [0], [0, 1], [0, 1, 2], [0, 1, 2, 3]])],
+)
+def test_a_step_is_given_the_references_and_the_step_before_it_not_all_before_it(
+    host: Host, test_url: str, monkeypatch: pytest.MonkeyPatch, update: str, given: list[list[int]]
+) -> None:
+    seen: dict[int, list[int]] = {}
+    task_of = run.task_of
+
+    def noted(tests: Any, document: Any, n: int, done: Any, *more: Any, **named: Any) -> Any:
+        seen[n] = list(done)
+        task = task_of(tests, document, n, done, *more, **named)
+        assert list(task.earlier) == [k for k in done if k != 0]
+        return task
+
+    monkeypatch.setattr(run, "task_of", noted)
+    succeed(host.client, begin(host.client, test_url, reference_update=update)[1])
+    assert [seen[n] for n in range(STEPS)] == given
 
 
 # going on -------------------------------------------------------------------------------------------------------

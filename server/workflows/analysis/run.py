@@ -58,7 +58,8 @@ class AnalysisRun:
         self._summaries: dict[int, StepOutcome] = {}  # of the steps that are finished
         self._plain: dict[int, tuple[StepOutcome, dict[str, object]]] = {}
         self._failed: dict[int, StereorigError] = {}  # in this run
-        self._done: dict[int, StepFiles] = {}  # in their order: what the next step is measured from
+        self._done: dict[int, StepFiles] = {}  # in their order: what the next step is measured from, the last one last
+        self._references: dict[int, None] = {}  # of the steps measured so far, in the order of their first use
         self._next = 0  # index of that step
 
     def __call__(self, job: Job) -> dict[str, object]:
@@ -143,12 +144,20 @@ class AnalysisRun:
     def _measure_next(self, job: Job) -> None:
         n = self._document.steps[self._next]
         if n in self._summaries:
-            self._done[n] = self._service.tests.step(self._test_id, n)
+            self._go_on_from(n)
         else:
             job.check()
             self._service.require_room()  # while what the job ends with can still be written
             self._measure_one(job, self._next, n)
         self._next += 1
+
+    def _go_on_from(self, n: int) -> None:
+        """Keep what later steps may be measured from: this step, and the references so far, not all steps before it."""
+        reference = self._plain_of(self._summaries[n]).get("reference_step")
+        if reference is not None:
+            self._references[int(str(reference))] = None
+        kept = {k: step for k, step in self._done.items() if k in self._references}
+        self._done = {**kept, n: self._service.tests.step(self._test_id, n)}
 
     def _measure_one(self, job: Job, index: int, n: int) -> None:
         service, document, steps = self._service, self._document, self._document.steps
@@ -174,8 +183,7 @@ class AnalysisRun:
         steps = self._document.steps
         while self._next < len(steps) and (self._next == 0 or is_certain(self._summaries.get(steps[self._next]))):
             self._measure_next(job)  # the reference, and what goes on without a gap
-        before = [self._summaries[n].plain().get("reference_step") for n in self._done]
-        later = [int(str(n)) for n in dict.fromkeys(before) if n is not None and n != steps[0]]
+        later = [n for n in self._references if n != steps[0]]
         order = steps[self._next :]
         plan = Blocks(
             order,
@@ -272,7 +280,7 @@ class AnalysisRun:
         found = without_nan({**summary, "wall_s": seconds, "seconds": seconds})
         service.tests.put_step_summary(self._test_id, analysis_id, n, found)
         self._summaries[n] = StepOutcome.model_validate(found)
-        self._done[n] = service.tests.step(self._test_id, n)
+        self._go_on_from(n)
         self._publish(job)
         service.hub.publish("result", {"test_id": self._test_id, "analysis_id": analysis_id, "n": n, "job_id": job.id})
 

@@ -43,7 +43,7 @@ def task_of(
     Parameters
     ----------
     done
-        Steps that were measured before, in their order.
+        Steps that were measured before and that this one may be matched against or start from, in their order.
     following
         Number of the step that will probably be asked for next.
     folder
@@ -99,11 +99,11 @@ def task_of(
 
 def images_of(n: int, step: StepFiles) -> StepImages:
     """Return a stored step's images as the worker gets them."""
-    sha256 = step.document.sha256
+    sha256, record = step.document.sha256, step.document.plain()
     return StepImages(
         n=n,
         files=(step.cam1, step.cam2),
         sha256=(sha256["cam1"], sha256["cam2"]),
-        averages=averages_of(step.document.plain()),
-        grey_from=grey_from_of(step.document.plain()),
+        averages=averages_of(record),
+        grey_from=grey_from_of(record),
     )
