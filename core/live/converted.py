@@ -7,6 +7,7 @@ longer than the fit of a frame's thousand points; this is the same for points th
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -14,8 +15,9 @@ from numba import njit
 
 from core.arrays import Float
 from core.cameras.stereo import StereoPair
-from core.field.points.fitter import MAX_EPIPOLAR_PX, MAX_SHEAR
-from core.field.points.starts import MIN_COSINE, depth_per_px
+from core.field.points.fitter import MAX_EPIPOLAR_PX
+from core.field.points.scales import SOURCES, depth_per_px, is_plausible, px_per_ray
+from core.matching.kernels.naming import stamp_of
 from core.status import PointStatus
 
 _OK = int(PointStatus.OK)
@@ -44,11 +46,10 @@ class Constant(NamedTuple):
     @staticmethod
     def of(pair: StereoPair, rays: Float, w0: Float, position: Float, *, min_zncc: float, far_px: float) -> Constant:
         """Return it for points with inverse depths ``w0`` (n,)."""
-        slopes = pair.cam1.lens.image_jacobian(rays[:, :2])
         return Constant(
             np.array(rays),
             depth_per_px(pair, rays, w0),
-            np.sqrt(np.abs(np.linalg.det(slopes))),
+            px_per_ray(pair, rays)[:, 0].copy(),
             np.array(pair.cam1.cam_from_sys.rotation),
             np.array(pair.cam2_from_cam1.inverse().translation_mm),
             np.array(position),
@@ -57,101 +58,92 @@ class Constant(NamedTuple):
         )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def convert(first, last, constant, terms, out, start_w, start_g, ratio, status, uvw, covariance):
-    """Check points ``first`` to ``last``, and give displacement and covariance of those that pass.
+def _converter(stamp):
+    @njit(cache=True, nogil=True, error_model="numpy")
+    def convert(first, last, constant, terms, out, start_w, start_g, ratio, status, uvw, covariance):
+        """Check points ``first`` to ``last``, and give displacement and covariance of those that pass.
 
-    Parameters
-    ----------
-    constant
-        A :class:`Constant`.
-    terms
-        3 for plane patches, 6 for curved ones.
-    out
-        (n, ...) as :func:`core.matching.kernels.motion.n_motion_out` has it.
-    start_w, start_g
-        (n, terms), (n, 3, terms) what the fit began with.
-    ratio
-        (n, 6) standard deviations with all checks over a fit's own.
-    status
-        (n,) int8, changed: what is not OK stays.
-    uvw
-        (n, 3) out, mm, system frame.
-    covariance
-        (n, 6, 6) out, mm^2, system frame, of X, Y, Z, U, V, W.
-    """
-    rays, per_px, scale, R, centre2, position, min_zncc, far_px = constant
-    at = 4 * terms
-    J = np.zeros((6, 4))
-    half = np.empty((6, 4))
-    d = np.empty(3)
-    for i in range(first, last):
-        if status[i] != _OK:
-            continue
-        numbers = out[i]
-        if not min(numbers[at + 1], numbers[at + 2], numbers[at + 3]) >= min_zncc:
-            status[i] = _LOW_CORRELATION
-            continue
-        if not abs(numbers[at]) <= MAX_EPIPOLAR_PX:
-            status[i] = _EPIPOLAR_MISMATCH
-            continue
-        w0, w1, w2 = numbers[0], numbers[1], numbers[2]
-        g00, g01, g02 = numbers[terms], numbers[terms + 1], numbers[terms + 2]
-        g10, g11, g12 = numbers[2 * terms], numbers[2 * terms + 1], numbers[2 * terms + 2]
-        g20, g21, g22 = numbers[3 * terms], numbers[3 * terms + 1], numbers[3 * terms + 2]
-        x, y = rays[i, 0], rays[i, 1]
-        # faces both cameras
-        n0, n1, n2 = w1, w2, w0 - w1 * x - w2 * y
-        length = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
-        p0, p1, p2 = x / w0, y / w0, 1.0 / w0
-        q0, q1, q2 = p0 - centre2[0], p1 - centre2[1], p2 - centre2[2]
-        cosine1 = (n0 * p0 + n1 * p1 + n2 * p2) / (length * math.sqrt(p0 * p0 + p1 * p1 + p2 * p2))
-        cosine2 = (n0 * q0 + n1 * q1 + n2 * q2) / (length * math.sqrt(q0 * q0 + q1 * q1 + q2 * q2))
-        good = w0 > 0.0 and cosine1 > MIN_COSINE and cosine2 > MIN_COSINE
-        # in front of the camera, not mirrored, no stretch too large for a patch
-        a00, a01 = (g01 - g00 * g21 / g20) / g20, (g02 - g00 * g22 / g20) / g20
-        a10, a11 = (g11 - g10 * g21 / g20) / g20, (g12 - g10 * g22 / g20) / g20
-        det = a00 * a11 - a01 * a10
-        square = 0.5 * (a00 * a00 + a01 * a01 + a10 * a10 + a11 * a11)
-        good = good and g20 / w0 > 0.0 and det > 0.0 and det > square / MAX_SHEAR
-        good = good and square < MAX_SHEAR * MAX_SHEAR
-        # near its start
-        across = g00 / g20 - start_g[i, 0, 0] / start_g[i, 2, 0]
-        down = g10 / g20 - start_g[i, 1, 0] / start_g[i, 2, 0]
-        px = max(abs(w0 - start_w[i, 0]) / per_px[i], math.sqrt(across * across + down * down) * scale[i])
-        if not (good and px < far_px):
-            status[i] = _NOT_CONVERGED
-            continue
-        d[0], d[1], d[2] = g00 - x, g10 - y, g20 - 1.0
-        for r in range(3):
-            along, motion = 0.0, 0.0
-            for k in range(3):
-                along += (x if k == 0 else (y if k == 1 else 1.0)) * R[k, r]
-                motion += d[k] * R[k, r]
-                J[3 + r, 1 + k] = R[k, r] / w0
-            uvw[i, r] = motion / w0
-            J[r, 0] = -along / (w0 * w0)
-            J[3 + r, 0] = -motion / (w0 * w0)
-        own = numbers[at + 5 : at + 30]
-        for r in range(6):
-            for c in range(4):
-                half[r, c] = 0.0
-                for k in range(4):
-                    half[r, c] += J[r, k] * own[5 * k + c]
-        trace = 0.0
-        for r in range(6):
-            for c in range(6):
-                s = 0.0
-                for k in range(4):
-                    s += half[r, k] * J[c, k]
-                covariance[i, r, c] = s
-            if r < 3:
-                trace += covariance[i, r, r]
-        # as in a step: the shape alone is the joint estimate plus an error independent of it
-        if position[i, 0, 0] + position[i, 1, 1] + position[i, 2, 2] > trace:
+        Parameters
+        ----------
+        constant
+            A :class:`Constant`.
+        terms
+            3 for plane patches, 6 for curved ones.
+        out
+            (n, ...) as :func:`core.matching.kernels.motion.n_motion_out` has it.
+        start_w, start_g
+            (n, terms), (n, 3, terms) what the fit began with.
+        ratio
+            (n, 6) standard deviations with all checks over a fit's own.
+        status
+            (n,) int8, changed: what is not OK stays.
+        uvw
+            (n, 3) out, mm, system frame.
+        covariance
+            (n, 6, 6) out, mm^2, system frame, of X, Y, Z, U, V, W.
+        """
+        if stamp < 0:  # never; it makes the stamp part of the function
+            return
+        rays, per_px, scale, R, centre2, position, min_zncc, far_px = constant
+        at = 4 * terms
+        J = np.zeros((6, 4))
+        half = np.empty((6, 4))
+        d = np.empty(3)
+        for i in range(first, last):
+            if status[i] != _OK:
+                continue
+            numbers = out[i]
+            if not min(numbers[at + 1], numbers[at + 2], numbers[at + 3]) >= min_zncc:
+                status[i] = _LOW_CORRELATION
+                continue
+            if not abs(numbers[at]) <= MAX_EPIPOLAR_PX:
+                status[i] = _EPIPOLAR_MISMATCH
+                continue
+            w0, g00, g10, g20 = numbers[0], numbers[terms], numbers[2 * terms], numbers[3 * terms]
+            x, y = rays[i, 0], rays[i, 1]
+            good = is_plausible(centre2, x, y, numbers[:terms], numbers[terms:at], True)
+            # near its start
+            across = g00 / g20 - start_g[i, 0, 0] / start_g[i, 2, 0]
+            down = g10 / g20 - start_g[i, 1, 0] / start_g[i, 2, 0]
+            px = max(abs(w0 - start_w[i, 0]) / per_px[i], math.sqrt(across * across + down * down) * scale[i])
+            if not (good and px < far_px):
+                status[i] = _NOT_CONVERGED
+                continue
+            d[0], d[1], d[2] = g00 - x, g10 - y, g20 - 1.0
             for r in range(3):
-                for c in range(3):
-                    covariance[i, r, c] = position[i, r, c]
-        for r in range(6):
-            for c in range(6):
-                covariance[i, r, c] *= ratio[i, r] * ratio[i, c]
+                along, motion = 0.0, 0.0
+                for k in range(3):
+                    along += (x if k == 0 else (y if k == 1 else 1.0)) * R[k, r]
+                    motion += d[k] * R[k, r]
+                    J[3 + r, 1 + k] = R[k, r] / w0
+                uvw[i, r] = motion / w0
+                J[r, 0] = -along / (w0 * w0)
+                J[3 + r, 0] = -motion / (w0 * w0)
+            own = numbers[at + 5 : at + 30]
+            for r in range(6):
+                for c in range(4):
+                    half[r, c] = 0.0
+                    for k in range(4):
+                        half[r, c] += J[r, k] * own[5 * k + c]
+            trace = 0.0
+            for r in range(6):
+                for c in range(6):
+                    s = 0.0
+                    for k in range(4):
+                        s += half[r, k] * J[c, k]
+                    covariance[i, r, c] = s
+                if r < 3:
+                    trace += covariance[i, r, r]
+            # as in a step: the shape alone is the joint estimate plus an error independent of it
+            if position[i, 0, 0] + position[i, 1, 1] + position[i, 2, 2] > trace:
+                for r in range(3):
+                    for c in range(3):
+                        covariance[i, r, c] = position[i, r, c]
+            for r in range(6):
+                for c in range(6):
+                    covariance[i, r, c] *= ratio[i, r] * ratio[i, c]
+
+    return convert
+
+
+convert = _converter(stamp_of([*SOURCES, Path(__file__)]))

@@ -198,4 +198,4 @@ def lens_of(camera: Camera) -> Float:
 def own(array: Float) -> Float:
     """Return a copy in doubles."""
     # the kernels are compiled for writable contiguous arrays; a read-only one would compile them again
-    return np.array(array, dtype=np.float64)
+    return np.array(array, dtype=np.float64, order="C")

@@ -158,8 +158,15 @@ def _excess_blur(points: PointFits, pair: StereoPair, rays: Float, index: np.nda
     G = points.G[index]
     depth = G[:, 2, 0, None, None]
     affine = (G[:, :2, 1:3] - G[:, :2, :1] * (G[:, 2:, 1:3] / depth)) / depth
-    turned = np.maximum(np.linalg.svd(affine, compute_uv=False)[:, 1], 1e-6)
+    turned = np.maximum(_narrower(affine), 1e-6)
     return _excess(np.stack([seen, turned, seen * turned], axis=1))
+
+
+def _narrower(m: Float) -> Float:
+    """Return the smaller singular value (m,) of matrices (m, 2, 2)."""
+    square = (m**2).sum(axis=(1, 2))
+    det = np.abs(m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] * m[:, 1, 0])
+    return np.asarray(det / np.sqrt(0.5 * (square + np.sqrt(np.maximum(square**2 - 4.0 * det**2, 0.0)))))
 
 
 def _excess(width: Float) -> Float:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from core.arrays import Bool, Float
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.observed_scatter import bring_to_observed
-from core.field.points.starts import depth_per_px
+from core.field.points.scales import depth_per_px, px_per_ray
 from core.matching.cluster_robust import cluster_robust_covariances
 from core.progress import CancelToken, raise_if_cancelled
 from core.robust import spread_indices
@@ -327,7 +327,7 @@ def _sigma_px(
     if sd.shape[1] == 2:
         return np.zeros(len(index)), sd[:, 0] / per_px
     z = points.G[index, 2, 0]  # of the current point, times w
-    px = np.sqrt(np.abs(np.linalg.det(fitter.pair.cam1.lens.image_jacobian(rays[:, :2]))))
+    px = px_per_ray(fitter.pair, rays)[:, 0]
     return np.maximum(sd[:, 1], sd[:, 2]) * px / z, sd[:, 3] * w / z**2 / per_px
 
 

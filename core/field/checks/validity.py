@@ -19,7 +19,7 @@ from core.field.checks.epipolar_mismatch import EpipolarLimits, epipolar_mismatc
 from core.field.checks.groups import connected, neighbour_pairs
 from core.field.checks.lost_correlation import CorrelationLimits, lost_correlation
 from core.field.points.fitter import PointFits
-from core.field.points.starts import depth_per_px
+from core.field.points.scales import depth_per_px, px_per_ray
 from core.field.region.neighbours import N_QUANTITIES, compare_with_neighbours, sorting_network
 from core.field.region.visibility import Visibility
 from core.robust import MAD_TO_SIGMA
@@ -197,8 +197,7 @@ def disagreement_scale(pair: StereoPair, rays: Float, w0: Float) -> Float:
     ok = np.flatnonzero(np.isfinite(w0))
     if len(ok):
         scale[ok, 0] = scale[ok, 3] = w0[ok] / depth_per_px(pair, rays[ok], w0[ok])
-        J = pair.cam1.lens.image_jacobian(rays[ok, :2])
-        scale[ok, 1], scale[ok, 2] = np.linalg.norm(J[:, :, 0], axis=1), np.linalg.norm(J[:, :, 1], axis=1)
+        scale[ok, 1:3] = px_per_ray(pair, rays[ok])[:, 1:]
     return scale
 
 

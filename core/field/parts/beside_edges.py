@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from core.arrays import Bool, Float
 from core.field.points.fitter import Fitter, PointFits
-from core.field.points.starts import depth_per_px
+from core.field.points.scales import depth_per_px, px_per_ray
 from core.robust import MAD_TO_SIGMA, spread_indices
 
 _FLOOR_PX = 0.05
@@ -80,7 +80,7 @@ def _quantities(fitter: Fitter, points: PointFits, rays: Float, valid: NDArray[n
         return [(w[:, :3], per_px)]
     G = points.G[valid]
     depth = G[:, 2, 0]
-    one_px = 1.0 / np.sqrt(np.abs(np.linalg.det(fitter.pair.cam1.lens.image_jacobian(rays[valid, :2]))))
+    one_px = 1.0 / px_per_ray(fitter.pair, rays[valid])[:, 0]
     place = [(G[:, k, :3] - (G[:, k, :1] / depth[:, None]) * G[:, 2, :3]) / depth[:, None] for k in (0, 1)]
     for k in (0, 1):
         place[k][:, 0] = G[:, k, 0] / depth

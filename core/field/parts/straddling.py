@@ -23,7 +23,7 @@ from core.field.parts.beside_edges import beside_edges
 from core.field.parts.subset_parts import Pull, pull_of_parts
 from core.field.parts.subset_residuals import SubsetResiduals, subset_residuals
 from core.field.points.fitter import Fitter, PointFits
-from core.field.points.starts import depth_per_px
+from core.field.points.scales import depth_per_px, px_per_ray
 from core.progress import CancelToken, raise_if_cancelled
 from core.robust import spread_indices
 from core.settings import DEFAULT_MAX_SIGMA_PX
@@ -206,7 +206,6 @@ def _unit_px(fitter: Fitter, points: PointFits, index: NDArray[np.intp], rays: F
     out[:, 0] = 1.0 / per_px
     if fitter.comparisons == 3:
         z = points.G[index, 2, 0]
-        px = np.sqrt(np.abs(np.linalg.det(fitter.pair.cam1.lens.image_jacobian(rays[index, :2]))))
-        out[:, 1] = out[:, 2] = px / z
+        out[:, 1] = out[:, 2] = px_per_ray(fitter.pair, rays[index])[:, 0] / z
         out[:, 3] = w0 / z**2 / per_px
     return out

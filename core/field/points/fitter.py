@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
-from core.field.points.starts import depth_per_px, faces_both_cameras
+from core.field.points.scales import far_from_start, plausible
 from core.field.region.visibility import Visibility
 from core.matching.arguments import VisiblePixels
 from core.matching.fit import fit_motion, fit_shape
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from core.field.points.crew import Crew
 
 MAX_EPIPOLAR_PX = 3.0
-MAX_SHEAR = 4.0
 _RATE_FROM, _RATE_QUANTILE = 30, 0.9
 _KEPT = ("w", "G", "epipolar_px", "zncc")
 
@@ -243,7 +242,9 @@ class Fitter:
             off = fits.ok & ~(np.abs(fits.epipolar_px) <= MAX_EPIPOLAR_PX)
             fits.reject(off, PointStatus.EPIPOLAR_MISMATCH)
         ok = np.flatnonzero(fits.ok)
-        fits.reject(_mask(n, ok[~self._plausible(xy_px[ok], fits.w[ok], fits.G[ok])]), PointStatus.NOT_CONVERGED)
+        rays = self.pair.cam1.rays_cam(xy_px).xyz_mm[ok]
+        good = plausible(self.pair, rays, fits.w[ok], None if self.cur1 is None else fits.G[ok])
+        fits.reject(_mask(n, ok[~good]), PointStatus.NOT_CONVERGED)
         return fits
 
     def visible(self, xy_px: Float) -> VisiblePixels | None:
@@ -253,36 +254,13 @@ class Fitter:
     def far_from_start(self, xy_px: Float, fits: PointFits, w: Float, G: Float | None, limit_px: float) -> Bool:
         """Return (n,) True where a fit ended further than ``limit_px`` from its start in any image."""
         rays = self.pair.cam1.rays_cam(xy_px).xyz_mm
-        with np.errstate(invalid="ignore", divide="ignore"):
-            px = np.abs(fits.w[:, 0] - w[:, 0]) / depth_per_px(self.pair, rays, w[:, 0])
-            far = ~(px < limit_px)
-            if G is not None and self.cur1 is not None:
-                J = self.pair.cam1.lens.image_jacobian(rays[:, :2])
-                scale = np.sqrt(np.abs(np.linalg.det(J)))
-                a, b = fits.G[:, :2, 0] / fits.G[:, 2:, 0], G[:, :2, 0] / G[:, 2:, 0]
-                far |= ~(np.linalg.norm(a - b, axis=1) * scale < limit_px)
-        return np.asarray(far)
+        return far_from_start(self.pair, rays, fits.w, fits.G, w, None if self.cur1 is None else G, limit_px)
 
     def _terms_of(self, start: Float) -> Float:
         """A start without the terms that the patch does not have, zeros for those that the start does not have."""
         if start.shape[-1] >= self.terms:
             return start[..., : self.terms]
         return np.concatenate([start, np.zeros((*start.shape[:-1], self.terms - start.shape[-1]))], axis=-1)
-
-    def _plausible(self, xy_px: Float, w: Float, G: Float) -> Bool:
-        rays = self.pair.cam1.rays_cam(xy_px).xyz_mm
-        good = faces_both_cameras(self.pair, rays, w)
-        if self.cur1 is None or len(w) == 0:
-            return np.asarray(good)
-        # current: in front of the camera, not mirrored, and no stretch too large for a patch
-        depth = G[:, 2, 0]
-        columns = G[:, :2, 1:3] - G[:, :2, :1] * (G[:, 2:, 1:3] / depth[:, None, None])
-        affine = columns / depth[:, None, None]  # camera 1's current image over its reference image, normalised
-        det = np.linalg.det(affine)
-        size = np.linalg.norm(affine, axis=(1, 2)) / np.sqrt(2.0)
-        with np.errstate(invalid="ignore"):
-            good &= (depth / w[:, 0] > 0.0) & (det > 0.0) & (size < MAX_SHEAR) & (det > size**2 / MAX_SHEAR)
-        return np.asarray(good)
 
 
 def learned_rate(rate: Float, known: float | None, options: MatchOptions) -> float:

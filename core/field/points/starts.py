@@ -17,9 +17,6 @@ import numpy as np
 from core.arrays import Float
 from core.cameras.stereo import StereoPair
 
-MIN_COSINE = 0.1
-"""Between a patch's normal and a camera's ray, below which the patch is too steep."""
-
 
 @dataclass(frozen=True, eq=False)
 class Starts:
@@ -81,20 +78,6 @@ def image_shift_px(pair: StereoPair, rays: Float, w_a: Float, w_b: Float) -> Flo
             for p in (pose.apply(rays / w[..., None]) for w in (w_a, w_b))
         ]
     return np.asarray(np.linalg.norm(images[0] - images[1], axis=-1))
-
-
-def depth_per_px(pair: StereoPair, rays: Float, w0: Float) -> Float:
-    """Return |d w0| (n,) that moves camera 2's image by one pixel: the scale of every limit on depth."""
-    step = 1e-6 * np.abs(w0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(step / np.maximum(image_shift_px(pair, rays, w0, w0 + step), 1e-12))
-
-
-def faces_both_cameras(pair: StereoPair, rays: Float, w: Float, *, min_cosine: float = MIN_COSINE) -> np.ndarray:
-    """Return (n,) True where the patch's front faces both cameras, no steeper than ``min_cosine``."""
-    with np.errstate(invalid="ignore"):
-        c1, c2 = view_cosines(pair, rays, w)
-        return np.asarray((w[:, 0] > 0) & (c1 > min_cosine) & (c2 > min_cosine))
 
 
 def view_cosines(pair: StereoPair, rays: Float, w: Float) -> tuple[Float, Float]:

@@ -14,7 +14,8 @@ import numpy as np
 from core.arrays import Bool, Float, Float32
 from core.cameras.stereo import StereoPair
 from core.field.points.fitter import Fitter, PointFits
-from core.field.points.starts import depth_per_px, image_shift_px
+from core.field.points.scales import depth_per_px
+from core.field.points.starts import image_shift_px
 from core.field.seeding.epipolar_search import distinct, normalise, sample, tilted
 
 _BEYOND = 0.5  # of the range of depths, on either side

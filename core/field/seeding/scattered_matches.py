@@ -12,7 +12,8 @@ from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.errors import ImageError
 from core.field.points.features import Box, Features, match
-from core.field.points.starts import Starts, depth_per_px
+from core.field.points.scales import depth_per_px
+from core.field.points.starts import Starts
 from core.field.seeding.local_fit import AreSeparated, consistent, robust_local_fits
 from core.field.seeding.stretched import stretched_features, stretches
 

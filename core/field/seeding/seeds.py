@@ -15,7 +15,8 @@ from core.arrays import Bool, Float
 from core.cameras.stereo import StereoPair
 from core.errors import RegionError
 from core.field.points.fitter import Fitter, PointFits
-from core.field.points.starts import Starts, depth_per_px
+from core.field.points.scales import depth_per_px
+from core.field.points.starts import Starts
 from core.field.region.visibility import Visibility
 from core.field.seeding.epipolar_search import sweep
 from core.field.seeding.scattered_matches import ScatteredMotion, ScatteredShape, combine, motion_starts, shape_starts

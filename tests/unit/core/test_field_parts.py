@@ -14,7 +14,8 @@ from core.errors import InputError
 from core.field.checks.validity import ValidityOptions, apply_validity_checks, neighbour_disagreement
 from core.field.points.features import detect, match
 from core.field.points.fitter import PointFits
-from core.field.points.starts import current_position, faces_both_cameras, move_matrix, move_w
+from core.field.points.scales import plausible
+from core.field.points.starts import current_position, move_matrix, move_w
 from core.field.region.neighbours import compare_with_neighbours, sorting_network
 from core.field.seeding.epipolar_search import sweep
 from core.field.seeding.local_fit import consistent, robust_local_fits
@@ -111,9 +112,9 @@ def test_start_values_from_an_image_map_put_the_patch_where_a_rigid_motion_puts_
 
 
 def test_a_patch_seen_from_behind_or_edge_on_is_not_plausible() -> None:
-    assert faces_both_cameras(pair(), RAYS, plane_w(0.0, 0.0)).all()
-    assert not faces_both_cameras(pair(), RAYS, plane_w(1.45, 0.0)).any()
-    assert not faces_both_cameras(pair(), RAYS, -plane_w(0.0, 0.0)).any()
+    assert plausible(pair(), RAYS, plane_w(0.0, 0.0), None).all()
+    assert not plausible(pair(), RAYS, plane_w(1.45, 0.0), None).any()
+    assert not plausible(pair(), RAYS, -plane_w(0.0, 0.0), None).any()
 
 
 def test_local_fits_ignore_wrong_samples() -> None:

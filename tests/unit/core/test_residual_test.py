@@ -16,7 +16,7 @@ from core.field.growth.seed import seed_shape
 from core.field.growth.state import begin, prepare
 from core.field.points.fitter import PointFits
 from core.field.points.observed_scatter import bring_to_observed, observed_over_reported
-from core.field.points.starts import depth_per_px
+from core.field.points.scales import depth_per_px
 from core.field.region.region import PointGrid
 from core.matching import MatchOptions, fit_motion, fit_shape
 from core.matching.cluster_robust import cluster_robust_covariance
