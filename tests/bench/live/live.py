@@ -42,6 +42,12 @@ PICTURES = 12
 MAIN_POINTS = 1024
 #: points, and the spacing and width of the square that holds them
 FIELDS = {100: (31, 279), 324: (18, 306), 1024: (10, 310), 2025: (7, 308), 5041: (5, 350)}
+#: subset and interpolation of further runs at the main number of points; what a body leaves out is the default
+FASTER: tuple[dict[str, Any], ...] = (
+    {"interpolation": "cubic"},
+    {"subset_px": 15},
+    {"interpolation": "cubic", "subset_px": 15},
+)
 API = "/api/v1"
 RIG = tiny_rig(
     image_size_px="image_size_px = [512, 480]",
@@ -66,6 +72,8 @@ class Run:
     load: float = 0.0
     busy_ms: float = float("nan")
     """Processor time of the computation a measured pair."""
+    settings: dict[str, Any] = field(default_factory=dict)
+    """Those that it ran with, the defaults included."""
 
     @property
     def rate_hz(self) -> float:
@@ -134,8 +142,10 @@ def serving(playback: Playback) -> Iterator[tuple[Service, httpx.Client, str]]:
         yield service, client, test_id
 
 
-def measure(client: httpx.Client, test_id: str, points: int, seconds: float, *, captures: bool) -> Run:
-    """Measure live for some seconds."""
+def measure(
+    client: httpx.Client, test_id: str, points: int, seconds: float, *, captures: bool = False, **settings: Any
+) -> Run:
+    """Measure live for some seconds; ``settings`` are entries of the request's body."""
     spacing, width = FIELDS[points]
     x, y = 256 - width // 2, 240 - width // 2
     body = {
@@ -144,6 +154,7 @@ def measure(client: httpx.Client, test_id: str, points: int, seconds: float, *, 
         "spacing_px": spacing,
         "field": True,
         "silence_ms": 5000,
+        **settings,
     }
     client.post(f"{API}/tests/{test_id}/live", json=body).raise_for_status()
     until = time.monotonic() + 180.0
@@ -157,7 +168,7 @@ def measure(client: httpx.Client, test_id: str, points: int, seconds: float, *, 
     context = multiprocessing.get_context("spawn")
     reader = context.Process(target=read_values, args=(port, f"{API}/tests/{test_id}/live/ws", theirs, seconds))
     reader.start()
-    run = Run(points, seconds)
+    run = Run(points, seconds, settings=live["settings"])
     before, began = client.get(f"{API}/tests/{test_id}/live").json()["account"], time.monotonic()
     loads, busy_before = [], _busy_s(worker)
     while time.monotonic() < began + seconds + 0.5:
@@ -202,16 +213,19 @@ def main() -> int:
     parser.add_argument("--page", action="store_true", help="write docs/explanation/live_speed.md")
     args = parser.parse_args()
     playback = Playback(rig_of_size(SIZE))
-    runs = []
+    runs, faster = [], []
     with serving(playback) as (_, client, test_id):
         main_run = measure(client, test_id, MAIN_POINTS, 60.0 * args.minutes, captures=True)
         print("with a stored step a second:", _line(main_run), flush=True)
         for points in FIELDS:
-            runs.append(measure(client, test_id, points, args.seconds, captures=False))
+            runs.append(measure(client, test_id, points, args.seconds))
             print(_line(runs[-1]), flush=True)
+        for settings in FASTER:
+            faster.append(measure(client, test_id, MAIN_POINTS, args.seconds, **settings))
+            print(settings, _line(faster[-1]), flush=True)
     print(json.dumps({k: v for k, v in asdict(main_run).items() if k not in ("latency_ms", "memory_mib")}))
     if args.page:
-        write_page(main_run, runs)
+        write_page(main_run, runs, faster)
     return 0
 
 

@@ -26,8 +26,8 @@ RATE_HZ = 50.0
 _IDLE_LOAD = 3.0
 
 
-def write_page(main: Run, runs: list[Run]) -> None:
-    """Write page and plot."""
+def write_page(main: Run, runs: list[Run], faster: list[Run]) -> None:
+    """Write page and plot; ``faster`` are runs with other settings, at as many points as the main one."""
     _draw(main, runs)
     rows = "\n".join(
         f"| p{q:g} | {asked:g} | {main.percentile(q):.1f} | {'held' if main.percentile(q) <= asked else '**missed**'} |"
@@ -37,6 +37,11 @@ def write_page(main: Run, runs: list[Run]) -> None:
         f"| {run.points:,} | {run.rate_hz:.1f} | {run.percentile(50.0):.1f} | {run.percentile(99.0):.1f} | "
         f"{run.account['skipped']} | {run.account['refused']} |"
         for run in runs
+    )
+    by_settings = "\n".join(
+        f"| {run.settings['subset_px']} | {run.settings['interpolation']} | {run.rate_hz:.1f} | "
+        f"{run.percentile(50.0):.1f} | {run.percentile(99.0):.1f} | {run.busy_ms:.1f} |"
+        for run in (next(run for run in runs if run.points == main.points), *faster)
     )
     first, last = np.array(main.memory_mib[: len(main.memory_mib) // 4 + 1]), np.array(main.memory_mib[-5:])
     grown = last.mean(axis=0) - first.mean(axis=0)
@@ -61,7 +66,8 @@ def write_page(main: Run, runs: list[Run]) -> None:
                 ),
                 f"## {main.points:,} points and 12 gauges beside a stored step a second",
                 wrapped(
-                    f"{main.seconds / 60.0:.1f} minutes, subsets of 21 px, quintic; {main.rate_hz:.1f} values a second; "
+                    f"{main.seconds / 60.0:.1f} minutes, subsets of {main.settings['subset_px']} px, "
+                    f"{main.settings['interpolation']}; {main.rate_hz:.1f} values a second; "
                     f"{main.captures} steps were stored meanwhile. The computation took {main.busy_ms:.1f} ms of "
                     "processor time a pair, all of its threads together."
                 ),
@@ -76,6 +82,13 @@ def write_page(main: Run, runs: list[Run]) -> None:
                 "## Rate by points",
                 "| points | values/s | p50, ms | p99, ms | skipped | refused |\n| --- | --- | --- | --- | --- | --- |\n"
                 + rates,
+                f"## {main.points:,} points with other settings",
+                wrapped(
+                    "What a live measurement takes by its subsets and interpolation; a value's standard deviation goes "
+                    "with the width of the subset, and the cubic spline's bias is about three times the quintic's."
+                ),
+                "| subset, px | interpolation | values/s | p50, ms | p99, ms | processor time a pair, ms |\n"
+                "| --- | --- | --- | --- | --- | --- |\n" + by_settings,
             ]
         )
         + "\n",
