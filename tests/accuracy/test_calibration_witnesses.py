@@ -137,6 +137,7 @@ def test_covariances_are_those_of_mrcal_of_a_pinhole(
     lengths_agree(ParameterCovariance(pair, names, covariance), points, theirs)
 
 
+@pytest.mark.normal_depth("pinhole, board of 0.05 mm")
 @pytest.mark.parametrize("case", CASES, ids=[c.name for c in CASES])
 def test_shapes_are_no_worse_than_opencvs_and_far_better_where_lens_and_board_have_errors(case) -> None:  # type: ignore[no-untyped-def]
     runs = [compare(case, seed, mrcal=False) for seed in (101, 102, 103)]

@@ -9,6 +9,7 @@ from tests.support.line_noise import clean_pictures, scatter_over_claim
 REPEATS = 24
 
 
+@pytest.mark.normal_depth("2.0-True")
 @pytest.mark.parametrize(("noise", "photons"), [(1.0, False), (2.0, True)])
 def test_a_lines_offsets_scatter_as_claimed_whatever_the_blur_and_the_noise(noise: float, photons: bool) -> None:
     for name, grey in clean_pictures().items():

@@ -46,6 +46,7 @@ def shape_of(part: Part, images: tuple[np.ndarray, np.ndarray], grid: PointGrid,
     return measure_shape(part.pair, *images, grid, OPTIONS, **more)  # type: ignore[arg-type]
 
 
+@pytest.mark.normal_depth("corner0")
 @pytest.mark.parametrize("corner", [(0, 0), (6, 3), (10, 8)])
 def test_all_pillars_are_reached_from_any_corner_of_the_region(
     steps: Part, images: tuple[np.ndarray, np.ndarray], corner: tuple[int, int]

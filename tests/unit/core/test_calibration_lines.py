@@ -49,6 +49,7 @@ def views(seed: int, sigma_px: float = 0.003) -> list[CalibrationView]:
     ]
 
 
+@pytest.mark.normal_depth("0.0")
 @pytest.mark.parametrize("tolerance", [0.0, 0.004])
 def test_the_parameters_scatter_as_their_covariance_says(tolerance: float) -> None:
     options = CalibrationOptions(lens="paper", axis_tilt_sigma_rad=0.0)

@@ -12,7 +12,7 @@ import pytest
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.images import MeasureImage
 from core.field.points.result import Field
-from core.field.points.starts import depth_per_px
+from core.field.points.scales import depth_per_px
 from core.field.seeding.local_search import deeper_range, depth_range, search_shapes, steep_tilts, tilts
 from core.field.seeding.predicted import local_motion, predicted_motion, seen_elsewhere
 from core.field.sequence.still_visible import still_visible
@@ -52,6 +52,7 @@ def rays() -> np.ndarray:
     return PAIR.cam1.rays_cam(XY).xyz_mm
 
 
+@pytest.mark.normal_depth("0.0-0", "40.0-1")
 @pytest.mark.parametrize(("degrees", "axis"), [(0.0, 0), (40.0, 0), (40.0, 1), (-45.0, 1)])
 def test_a_search_finds_faces_of_any_tilt_from_the_depths_alone(degrees: float, axis: int) -> None:
     matcher, plane = fitter(degrees, axis)
