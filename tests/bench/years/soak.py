@@ -38,6 +38,8 @@ _BLOCKS = 20
 _FIXED = bytes(2_000_000)
 MACHINE = "a fixed calculation, ms of processor time"
 """A series that shows whether the machine itself became slower meanwhile."""
+PROCESSOR = "processor time of {}, ms a second"
+"""Series of who works how much: what a service needs more of with its age shows here whatever the machine's speed."""
 #: growth after the warm-up that is allowed, over the rest of the run
 ALLOWED = {
     "memory of the service, MiB": 16.0,
@@ -204,13 +206,17 @@ class Work:
     def reads(self, client: httpx.Client) -> None:
         """Ask for documents, about ten a second."""
         while self.going():
-            paths = ["/jobs", "/rig", "/tests"]
-            paths += [f"/tests/{self.test}", f"/tests/{self.test}/steps?limit=50"] if self.test else []
-            paths += [self.analysis] if self.analysis else []
-            for path in paths:
+            paths = {"jobs": "/jobs", "rig": "/rig", "tests": "/tests"}
+            if self.test:
+                paths |= {"a test": f"/tests/{self.test}", "steps": f"/tests/{self.test}/steps?limit=50"}
+            if self.analysis:
+                paths["an analysis"] = self.analysis
+            for name, path in paths.items():
                 began = time.monotonic()
                 if self.ask(client, "GET", path):
-                    self.note("a document, ms", (time.monotonic() - began) * 1e3)
+                    taken_ms = (time.monotonic() - began) * 1e3
+                    self.note("a document, ms", taken_ms)
+                    self.note(f"document: {name}, ms", taken_ms)
                     self.count("documents")
                 time.sleep(0.1)
 
@@ -244,8 +250,11 @@ class Work:
 
     def watch(self, process: psutil.Process) -> None:
         """Note what service and worker hold, once a second; the worker is the child that holds most."""
+        used = _Used(process)
         while self.going():
             with contextlib.suppress(psutil.Error):
+                for name, ms_a_s in used.since_last():
+                    self.note(PROCESSOR.format(name), ms_a_s)
                 self.note("memory of the service, MiB", process.memory_info().rss / 2**20)
                 children = process.children(recursive=True)
                 self.note("memory of its worker, MiB", max((c.memory_info().rss for c in children), default=0) / 2**20)
@@ -256,6 +265,36 @@ class Work:
                 self.note(MACHINE, (time.thread_time() - began) * 1e3)
                 self.soak.load.append(os.getloadavg()[0])
             time.sleep(1.0)
+
+
+class _Used:
+    """Processor time of the service, of its children, and of this program with its browser, since the last look."""
+
+    def __init__(self, service: psutil.Process) -> None:
+        self._service, self._own = service, psutil.Process()
+        self._at, self._last = time.monotonic(), self._now()
+
+    def _now(self) -> dict[psutil.Process, tuple[str, float]]:
+        children = self._service.children(recursive=True)
+        others = [p for p in self._own.children(recursive=True) if p not in children and p != self._service]
+        groups = {"the service": [self._service], "its children": children, "clients and browser": [self._own, *others]}
+        found = {}
+        for name, processes in groups.items():
+            for process in processes:
+                with contextlib.suppress(psutil.Error):
+                    times = process.cpu_times()
+                    found[process] = (name, times.user + times.system)
+        return found
+
+    def since_last(self) -> list[tuple[str, float]]:
+        """Return milliseconds a second for each group; a process that ended meanwhile is not counted."""
+        at, now = time.monotonic(), self._now()
+        sums: dict[str, float] = {}
+        for process, (name, used_s) in now.items():
+            before_s = self._last.get(process, (name, 0.0))[1]
+            sums[name] = sums.get(name, 0.0) + 1e3 * (used_s - before_s)
+        apart, self._at, self._last = max(at - self._at, 1e-3), at, now
+        return [(name, ms / apart) for name, ms in sums.items()]
 
 
 @contextlib.contextmanager
