@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -122,10 +123,12 @@ def _step_in(path: Path) -> _Summary:
 
 def _own_summaries(folder: Path) -> Iterable[_Summary]:
     """Yield the summaries that the service keeps beside each step's result."""
-    for path in sorted(folder.glob("step_[0-9]*.json")):
-        found = _step_in(path)
-        if isinstance(found.get("n"), int) and path.with_suffix(".nc").exists():
-            yield found
+    there = set(os.listdir(folder)) if folder.is_dir() else set()  # noqa: PTH208 - names of some thousand files
+    for name in sorted(there):
+        if name.startswith("step_") and name.endswith(".json") and f"{name[:-5]}.nc" in there:
+            found = _step_in(folder / name)
+            if isinstance(found.get("n"), int):
+                yield found
 
 
 def _of(numbers: Sequence[int]) -> str:
