@@ -1,7 +1,8 @@
 """One live measurement: a thread takes the newest pair, a thread has it measured, a third watches for silence.
 
-Between the first two lies one slot: a pair that is not measured when the next one comes is skipped. The computation is
-a process of its own, so that analyses and captures go on beside it.
+Between the first two lies one slot: a pair that is not measured when the next one comes is skipped, and one that has
+waited there for long, while the next is near. The computation is a process of its own, so that analyses and captures go
+on beside it.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from server.worker.embedded import make_worker
 from server.worker.executor import WorkerDiedError
 from server.worker.tasks import LiveTask, Plain, begin_live, measure_live
 from server.workflows.live.account import Account
+from server.workflows.live.pace import Pace
 from server.workflows.live.read_channels import ReadChannels
 from server.workflows.live.series import LiveSeries, Moment
 
@@ -96,6 +98,7 @@ class LiveRun:
         self._ending = threading.Event()
         self._changed = threading.Condition()
         self._slot: Pair | None = None
+        self._pace: Pace | None = None  # of cameras that run free; others are fired as pairs are wanted
         self._fault: str | None = None
         self._gone: str | None = None  # why no pairs come; None where they do
         self._number = 0
@@ -156,7 +159,10 @@ class LiveRun:
             try:
                 pairs = self._rig.pair
                 if pairs.fires:  # nothing is exposed that would be thrown away
+                    self._pace = None
                     self._await_empty()
+                elif self._pace is None:
+                    self._pace = Pace()
                 mark, passed, pair = pairs.newest(mark, self._check)
             except _Ended:
                 return
@@ -169,6 +175,9 @@ class LiveRun:
                 continue
             self.account.came(passed + 1)
             self.account.skipped(passed)
+            if self._pace is not None:
+                with self._changed:
+                    self._pace.came(_arrived_s(pair), passed)
             if not pair.accepted:
                 self.account.refused("skew_too_large")
                 self._lost("skew_too_large")
@@ -218,12 +227,19 @@ class LiveRun:
 
     def _next(self) -> Pair:
         with self._changed:
-            while self._slot is None:
+            while (wait_s := self._wait_s()) > 0.0:
                 self._check()
-                self._changed.wait(_WATCH_S * 10)
+                self._changed.wait(wait_s)
             taken, self._slot = self._slot, None
+            assert taken is not None, "waited for"
             self._changed.notify_all()
             return taken
+
+    def _wait_s(self) -> float:
+        """Return how long the slot is to be watched before the pair in it is taken."""
+        if self._slot is None:
+            return _WATCH_S * 10
+        return 0.0 if self._pace is None else self._pace.wait_s(_arrived_s(self._slot), time.monotonic())
 
     def _measure_one(self, pair: Pair) -> None:
         pixels, frame = tuple(pair[cam].pixels for cam in CAMERAS), pair.cam1
@@ -237,8 +253,7 @@ class LiveRun:
             self._lost(error.code)
             return
         self._number += 1
-        # arrival in memory: of the later frame
-        latency_ms = 1e3 * (time.monotonic() - max(pair[cam].host_ns for cam in CAMERAS) / 1e9)
+        latency_ms = 1e3 * (time.monotonic() - _arrived_s(pair))
         self.account.measured(found["how"], latency_ms, time.monotonic())
         gauges = {name: _gauge(self.kinds[name], one) for name, one in found["gauges"].items()}
         values = {name: {q: number["value"] for q, number in gauge["values"].items()} for name, gauge in gauges.items()}
@@ -256,7 +271,7 @@ class LiveRun:
                 "how": found["how"],
                 "points": found["points"],
                 "status": found["status"],
-                "arrived_s": max(pair[cam].host_ns for cam in CAMERAS) / 1e9,
+                "arrived_s": _arrived_s(pair),
                 "latency_ms": round(latency_ms, 3),
                 "gauges": gauges,
             }
@@ -308,6 +323,11 @@ class _HostClock:
 
     def utc(self, at_ns: int) -> str:
         return utc_text(self._zero + timedelta(microseconds=at_ns / 1e3))
+
+
+def _arrived_s(pair: Pair) -> float:
+    """Time at which a pair was in memory: its later frame."""
+    return max(pair[cam].host_ns for cam in CAMERAS) / 1e9
 
 
 def _gauge(kind: str, found: Plain) -> Plain:
