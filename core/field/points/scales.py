@@ -72,7 +72,7 @@ def far_from_start(
     """
     n, pose = len(w), pair.cam2_from_cam1
     motion = start_G is not None
-    g, start_g = (own(G if one is None else one).reshape(n, -1) for one in (G, start_G))
+    g, start_g = (_flat(G if one is None else one) for one in (G, start_G))
     out = np.empty(n, np.bool_)
     cameras = lens_of(pair.cam1), lens_of(pair.cam2), own(pose.rotation), own(pose.translation_mm)
     _all_far_from_start(0, n, cameras, own(rays), own(w), g, own(start_w), start_g, motion, float(limit_px), out)
@@ -92,10 +92,15 @@ def plausible(pair: StereoPair, rays: Float, w: Float, G: Float | None) -> Bool:
         As in :func:`far_from_start`; ``G`` None of a shape.
     """
     n, motion = len(w), G is not None
-    g = np.zeros((n, 3 * w.shape[1])) if G is None else own(G).reshape(n, -1)
+    g = np.zeros((n, 3 * w.shape[1])) if G is None else _flat(G)
     out = np.empty(n, np.bool_)
     _all_plausible(0, n, own(pair.cam2_from_cam1.inverse().translation_mm), own(rays), own(w), g, motion, out)
     return out
+
+
+def _flat(G: Float) -> Float:
+    """(n, 9 or 18) of G (n, 3, 3 or 6), also of no points."""
+    return own(G).reshape(len(G), 3 * G.shape[2])
 
 
 @inner

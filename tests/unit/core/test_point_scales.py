@@ -139,3 +139,13 @@ def test_far_is_as_the_images_show_it(cameras: StereoPair, motion: bool) -> None
             px = np.where(np.isfinite(px) & np.isfinite(moved), np.fmax(px, moved), np.nan)
     np.testing.assert_array_equal(got, ~(px < 3.0))
     assert 0.1 < got.mean() < 0.9
+
+
+@pytest.mark.parametrize("terms", [3, 6])
+def test_no_points_have_no_scales(terms: int) -> None:
+    rays, w, G = np.zeros((0, 3)), np.zeros((0, terms)), np.zeros((0, 3, terms))
+    assert len(depth_per_px(pair(), rays, w[:, 0])) == 0
+    assert px_per_ray(pair(), rays).shape == (0, 3)
+    for motion in (None, G):
+        assert len(plausible(pair(), rays, w, motion)) == 0
+        assert len(far_from_start(pair(), rays, w, G, w, motion, 3.0)) == 0
