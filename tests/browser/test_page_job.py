@@ -129,6 +129,7 @@ def grey_of(picture: bytes) -> int:
     return int(np.asarray(Image.open(io.BytesIO(picture)).convert("L"))[0, 0])
 
 
+@pytest.mark.deep  # the tutorial goes most of this way in the normal tier
 def test_from_the_rig_to_the_report(page: Watched, client: httpx.Client, made: Made) -> None:
     shown = page.open()
     audit = in_every_size(shown)

@@ -99,6 +99,7 @@ def same_as_its_file(result: dic.Result, path: Path) -> None:
             assert found.tobytes() == stored[name].values.tobytes(), (path.name, name)
 
 
+@pytest.mark.normal_depth("always")
 @pytest.mark.parametrize("update", ["never", "always"])
 def test_a_folder_measured_through_both_doors_is_the_same_to_the_last_bit(
     data: Path, tmp_path: Path, update: str

@@ -31,6 +31,7 @@ def rig_text(moves: str) -> str:
 
 
 @pytest.mark.timeout(300)
+@pytest.mark.normal_depth("target")
 @pytest.mark.parametrize("moves", ["target", "both_cameras"])
 def test_one_axis_calibrates_over_the_api(tmp_path: Path, moves: str) -> None:
     config = parse_config(rig_text(moves))
