@@ -405,7 +405,7 @@ class JobManager:
             _log.exception("the state of job %s could not be written", job.id)
 
     def _show(self, job: Job, change: str) -> None:
-        document = {**job.document().bounded(_SHOWN).plain(), "change": change}
+        document = {**job.document().kept().bounded(_SHOWN).plain(), "change": change}
         if change == "progress":
             del document["result"]  # progress comes ten times a second
         self._hub.publish("job", document)

@@ -26,9 +26,6 @@ T = TypeVar("T")
 Entry = tuple[str, str, str, Mapping[str, object]]
 _log = logging.getLogger("stereorig.store")
 _PATIENCE_S = 30.0
-#: of an analysis' job; they were megabytes, to be read with every list of jobs
-_KEPT_STEPS = 5
-
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS jobs (
     id TEXT PRIMARY KEY, state TEXT NOT NULL, document TEXT NOT NULL
@@ -161,7 +158,7 @@ class Catalog:
 
     def put_job(self, job: JobRecord, request: tuple[str, str, str, Ids] | None = None) -> None:
         """Insert or update a job; with the request (scope, key, body_sha256, made) that asked for it, both or none."""
-        text = _job_text(job)
+        text = json.dumps(job.kept().plain())
 
         def write(c: sqlite3.Connection) -> None:
             c.execute("INSERT OR REPLACE INTO jobs (id, state, document) VALUES (?, ?, ?)", (job.id, job.state, text))
@@ -316,7 +313,7 @@ class Catalog:
 
     def restore(self, jobs: list[JobRecord], requests: list[tuple[str, str, str, Ids]]) -> None:
         """Take over jobs and requests (scope, key, body_sha256, made) that were found elsewhere."""
-        job_rows = [(job.id, job.state, _job_text(job)) for job in jobs]
+        job_rows = [(job.id, job.state, json.dumps(job.kept().plain())) for job in jobs]
         request_rows = [(scope, key, digest, json.dumps(made)) for scope, key, digest, made in requests]
 
         def write(c: sqlite3.Connection) -> None:
@@ -336,11 +333,6 @@ class Catalog:
             return value
 
         return self.transact(write)
-
-
-def _job_text(job: JobRecord) -> str:
-    """Return a job as it is kept; the figures of an analysis' steps lie beside their results."""
-    return json.dumps((job.bounded(_KEPT_STEPS, only="steps") if job.kind == "analysis" else job).plain())
 
 
 def _rows(entries: list[Entry]) -> list[tuple[str, str, str, str]]:

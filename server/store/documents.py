@@ -18,6 +18,9 @@ from server.formats.records import Record
 #: entry of ``test.json``; the second is its earlier name
 METADATA_NAMES = ("metadata", "facts")
 
+#: of an analysis' job that has ended; they were megabytes, to be read with every list of jobs
+KEPT_STEPS = 5
+
 
 class Progress(Document):
     """Progress of a job."""
@@ -60,6 +63,10 @@ class JobRecord(Document):
             elif isinstance(value, dict) and len(value) > most:
                 cut |= {name: dict(list(value.items())[:most]), f"n_{name}": len(value)}
         return self if not cut else self.model_copy(update={"result": {**(self.result or {}), **cut}})
+
+    def kept(self) -> JobRecord:
+        """Return the record as it is kept: some figures of an analysis' steps, which lie beside their results."""
+        return self.bounded(KEPT_STEPS, only="steps") if self.kind == "analysis" else self
 
     def ended(self, state: JobState, finished_utc: str, problem: JobProblem | None) -> JobRecord:
         """Return the record of the job's end."""

@@ -145,7 +145,9 @@ class UnchangedFiles:
         return made
 
 
-kept_while_unchanged = UnchangedFiles(16, least_bytes=_LARGE_BYTES).made_of
+#: a summary of a hundred steps is two megabytes when read
+_LARGE_KEPT = 6
+kept_while_unchanged = UnchangedFiles(_LARGE_KEPT, least_bytes=_LARGE_BYTES).made_of
 """Return what a function makes of a large file, see :meth:`UnchangedFiles.made_of`."""
 
 
