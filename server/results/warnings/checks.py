@@ -83,7 +83,7 @@ def state_of(folder: Path) -> bytes:
     reviewed = test.parent.parent / "calibrations" / Path(calibration_id).name
     digest = hashlib.blake2b(digest_size=16)
     for path in (folder, test, test / LATER, reviewed):
-        for line in _files_in(path):
+        for line in _stated(sorted(_entries_of(path))):
             digest.update(line)
     of_a_step = ("step.json", *(f"{cam}.tif" for cam in CAMERAS))
     for step in sorted(_entries_of(test / "steps")):
@@ -100,18 +100,15 @@ def _entries_of(folder: Path) -> list[str]:
         return []
 
 
-def _files_in(folder: Path) -> Iterator[bytes]:
-    return _stated(sorted(_entries_of(folder)), folders=False)
-
-
-def _stated(paths: Iterable[str], *, folders: bool = True) -> Iterator[bytes]:
+def _stated(paths: Iterable[str]) -> Iterator[bytes]:
+    """Yield a line for each file, and for each path that is not there; none for a folder."""
     for path in paths:
         try:
             found = os.stat(path)  # noqa: PTH116 - ten thousands of them
         except OSError:
             yield f"{path}\n".encode(errors="surrogateescape")
             continue
-        if folders or not stat.S_ISDIR(found.st_mode):
+        if not stat.S_ISDIR(found.st_mode):
             mark = (found.st_ino, found.st_ctime_ns, found.st_size)
             yield f"{path} {mark}\n".encode(errors="surrogateescape")
 

@@ -239,7 +239,8 @@ class LiveRun:
         """Return how long the slot is to be watched before the pair in it is taken."""
         if self._slot is None:
             return _WATCH_S * 10
-        return 0.0 if self._pace is None else self._pace.wait_s(_arrived_s(self._slot), time.monotonic())
+        pace = self._pace  # the thread that takes pairs may end it meanwhile
+        return 0.0 if pace is None else pace.wait_s(_arrived_s(self._slot), time.monotonic())
 
     def _measure_one(self, pair: Pair) -> None:
         pixels, frame = tuple(pair[cam].pixels for cam in CAMERAS), pair.cam1
