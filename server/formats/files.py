@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import os
 import secrets
 from collections.abc import Iterator
 from pathlib import Path
@@ -42,15 +43,18 @@ def fsync_path(path: Path) -> None:
     _disk.disk.sync(path)
 
 
-_hashes: dict[tuple[str, int, int, int], str] = {}
+def mark_of(found: os.stat_result) -> tuple[int, int, int]:
+    """Return what differs once a file was touched: the time of its inode's change, which no program can set."""
+    return found.st_ino, found.st_ctime_ns, found.st_size
+
+
+_hashes: dict[tuple[str, tuple[int, int, int]], str] = {}
 _MAX_HASHES = 100_000
 
 
 def known_sha256(path: Path) -> str:
     """As `sha256_of`, but a file that was not touched since is not read again."""
-    stat = path.stat()
-    # the time of the inode's change, which no program can set
-    key = str(path), stat.st_ino, stat.st_ctime_ns, stat.st_size
+    key = str(path), mark_of(path.stat())
     if key not in _hashes:
         if len(_hashes) >= _MAX_HASHES:
             _hashes.clear()

@@ -130,8 +130,7 @@ class UnchangedFiles:
             return read(path)
         if stat.st_size < self._least_bytes:
             return read(path)
-        # the time of the inode's change, which no program can set
-        mark, key = (stat.st_ino, stat.st_ctime_ns, stat.st_size), (str(path), read)
+        mark, key = files.mark_of(stat), (str(path), read)
         with self._lock:
             if (known := self._kept.get(key)) is not None and known[0] == mark:
                 self._kept.move_to_end(key)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from core.names import CAMERAS
 from server.formats.calibrations.in_test import LATER, calibration_id_in, calibration_in, measured_with
+from server.formats.files import mark_of
 from server.results.staleness import stale_inputs
 from server.results.warnings.analysis import ResultWarning, analysis_warnings
 from server.store.documents import AnalysisRecord
@@ -109,8 +110,7 @@ def _stated(paths: Iterable[str]) -> Iterator[bytes]:
             yield f"{path}\n".encode(errors="surrogateescape")
             continue
         if not stat.S_ISDIR(found.st_mode):
-            mark = (found.st_ino, found.st_ctime_ns, found.st_size)
-            yield f"{path} {mark}\n".encode(errors="surrogateescape")
+            yield f"{path} {mark_of(found)}\n".encode(errors="surrogateescape")
 
 
 def stale_reasons(test: Path, document: AnalysisRecord) -> list[str]:
