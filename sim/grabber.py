@@ -87,6 +87,11 @@ class TriggerLine:
         self._faults: dict[str, GrabberFaults] = {}
         self._waiting: dict[str, queue.SimpleQueue[Pulse | None]] = {}
 
+    @property
+    def newest(self) -> Pulse:
+        """The pulse that came last; number 0 before the first."""
+        return self._newest
+
     def listen(self, cam: str, orders: queue.SimpleQueue[Pulse | None] | None) -> None:
         """Send the pulses of the line to a camera in hardware trigger mode; ``None`` ends that."""
         with self._lock:

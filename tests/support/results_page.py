@@ -49,22 +49,26 @@ class Bench:
         return np.array(answer.json()["values"], dtype=float)
 
 
+def capture_plate(client: httpx.Client, name: str) -> tuple[str, str]:
+    """Calibrate, and capture the plate under three pressures; return the ids of calibration and test."""
+    wait_for_rig(client)
+    accepted = client.post(f"{API}/calibrations", json={"positions_mm": [0, 5], "held_out_mm": [2], "frames": 2}).json()
+    assert wait_for_job(client, accepted["job"])["state"] == "succeeded"
+    calibration_id = str(accepted["calibration_id"])
+    test_id = str(client.post(f"{API}/tests", json={"name": name, "calibration_id": calibration_id}).json()["id"])
+    for pressure in (0.0, 344.5, 689.0):
+        client.put(f"{API}/sim/scene", json={"scene": "plate", "load": pressure})
+        step = {"label": f"{pressure} kPa", "load_n": 2 * pressure, "channels": {"stroke_mm": pressure / 100}}
+        assert client.post(f"{API}/tests/{test_id}/steps", json=step).status_code == 201
+    return calibration_id, test_id
+
+
 def make_plate(data: Path) -> dict[str, str]:
     """Calibrate, capture the plate under three pressures and measure it; return the ids of test and analysis."""
     service = Service(parse_config(SMALL), data).start()
     try:
         with served(service) as client:
-            wait_for_rig(client)
-            accepted = client.post(
-                f"{API}/calibrations", json={"positions_mm": [0, 5], "held_out_mm": [2], "frames": 2}
-            )
-            assert wait_for_job(client, accepted.json()["job"])["state"] == "succeeded"
-            body = {"name": "plate <b>&", "calibration_id": accepted.json()["calibration_id"]}
-            test_id = str(client.post(f"{API}/tests", json=body).json()["id"])
-            for pressure in (0.0, 344.5, 689.0):
-                client.put(f"{API}/sim/scene", json={"scene": "plate", "load": pressure})
-                step = {"label": f"{pressure} kPa", "load_n": 2 * pressure, "channels": {"stroke_mm": pressure / 100}}
-                assert client.post(f"{API}/tests/{test_id}/steps", json=step).status_code == 201
+            _, test_id = capture_plate(client, "plate <b>&")
             asked = {"region": {"rectangle": RECTANGLE}, "subset_px": 25, "spacing_px": 10, "strain": {"window": 5}}
             made = client.post(f"{API}/tests/{test_id}/analyses", json=asked).json()
             assert wait_for_job(client, made["job"])["state"] == "succeeded"

@@ -23,11 +23,14 @@ SIZE = (64, 48)
 
 
 class MovingWorld:
-    """A textured wall that moves at a known speed; noise makes every frame its own."""
+    """A textured wall that moves at a known speed; noise makes every frame its own.
 
-    def __init__(self, speed_px_s: float = 0.0) -> None:
+    It stands where it is at the newest pulse of the trigger line: a busy machine exposes later than a frame is stamped.
+    """
+
+    def __init__(self, line: TriggerLine, speed_px_s: float = 0.0) -> None:
         self.speed_px_s = speed_px_s
-        self._began = time.monotonic()
+        self._line, self._began_ns = line, time.monotonic_ns()
         # a sum of waves can be shifted by any fraction of a pixel without an interpolator
         rng = np.random.default_rng(7)
         self._waves = [(*rng.uniform(-1.2, 1.2, 2), rng.uniform(0, 2 * np.pi)) for _ in range(60)]
@@ -35,7 +38,7 @@ class MovingWorld:
     def expose(self, cam: CameraName, *, exposure_ms: float, gain_db: float, rng: np.random.Generator | None) -> Pixels:
         assert rng is not None
         y, x = np.mgrid[0 : SIZE[1], 0 : SIZE[0]].astype(float)
-        x -= self.speed_px_s * (time.monotonic() - self._began)
+        x -= self.speed_px_s * (self._line.newest.at_ns - self._began_ns) / 1e9
         image = sum(np.sin(a * x + b * y + c) for a, b, c in self._waves) * 15.0 + 128.0
         return np.clip(image + rng.normal(0, 1.0, x.shape), 0, 255).astype(np.uint8)
 
@@ -57,7 +60,7 @@ class Bench:
         **unit_options: Any,
     ) -> None:
         self.line = TriggerLine()
-        self.world = MovingWorld(speed_px_s)
+        self.world = MovingWorld(self.line, speed_px_s)
         self.latency_s = latency_s
         self.lost: list[tuple[CameraName, CameraError]] = []
         self.units: dict[CameraName, CameraUnit] = {
