@@ -101,7 +101,8 @@ class WireAxis:
         return cls(motor, low_mm, high_mm, 4 * velocity, 10 * acceleration)
 
 
-_MAX_RECEIVED = 200_000
+#: some ten minutes of a service that asks where its stage is
+_MAX_RECEIVED = 20_000
 
 
 @dataclass(frozen=True)

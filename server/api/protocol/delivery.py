@@ -39,6 +39,10 @@ class Delivery:
                 await answer.head(self._app)
             else:
                 await self._app(answer.scope, receive, answer.forward)
+        except* anyio.BrokenResourceError:
+            # FastAPI lets this through where who followed a stream left while an event was on its way
+            if not answer.endless:
+                raise
         finally:
             # which operation it was: the counter of requests reads it from the scope that it was given
             if "route" in answer.scope:
@@ -69,6 +73,7 @@ class _Answer:
         self._start: Message | None = None
         self._compressor: Any = None
         self._ended = asyncio.Event()
+        self.endless = False
 
     async def head(self, app: ASGIApp) -> None:
         """Let the GET be answered, send its headers alone, and end what would go on."""
@@ -88,6 +93,7 @@ class _Answer:
         if message["type"] == "http.response.start":
             self._start = message
             if MutableHeaders(scope=message).get("content-type", "").startswith(_ENDLESS):
+                self.endless = True
                 # nothing may happen for long: who listens must hear at once that it is heard
                 if self._head:
                     await self._finish_head()
