@@ -8,7 +8,7 @@
 //     tests/bench/speed/peers/opencorr_bench.cpp \
 //     $OPENCORR/src/oc_{calibration,cubic_bspline,deformation,dic,feature_affine,fftcc,gradient,icgn,image}.cpp \
 //     $OPENCORR/src/oc_{nearest_neighbor,sift,stereovision,subset}.cpp \
-//     -lopencv_core -lopencv_imgproc -lopencv_imgcodecs -lopencv_features2d -lfftw3f -lfftw3
+//     -lopencv_core -lopencv_imgproc -lopencv_imgcodecs -lopencv_features2d -lopencv_flann -lfftw3f -lfftw3
 //
 // and names it to the bench: STEREORIG_BENCH_OPENCORR=$PWD/build/opencorr_bench make bench
 #include <cmath>
