@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from core.errors import StateError
 from server.formats.files import known_sha256, recorded_sha256
 from server.store.folder import now_utc
-from server.store.tests import TestStore
+from server.store.tests.tests import TestStore
 
 
 @dataclass(frozen=True)
@@ -23,13 +23,13 @@ class Content:
 def content_of(tests: TestStore, test_id: str) -> Content:
     """Return the numbers of a test's complete steps and result files, and the SHA-256 of all their checksums."""
     digest = hashlib.sha256()
-    steps = tests.step_numbers(test_id)
+    steps = tests.steps.numbers(test_id)
     for n in steps:
-        digest.update(f"{n} {sorted(tests.step(test_id, n).document.sha256.items())}\n".encode())
+        digest.update(f"{n} {sorted(tests.steps.read(test_id, n).document.sha256.items())}\n".encode())
     results = 0
-    for analysis_id in tests.analysis_ids(test_id):
-        for n in tests.finished_steps(test_id, analysis_id):
-            path = tests.analysis_path(test_id, analysis_id) / f"step_{n:04d}.nc"
+    for analysis_id in tests.analyses.ids(test_id):
+        for n in tests.analyses.finished_steps(test_id, analysis_id):
+            path = tests.analyses.path(test_id, analysis_id) / f"step_{n:04d}.nc"
             digest.update(f"{analysis_id} {n} {recorded_sha256(path) or known_sha256(path)}\n".encode())
             results += 1
     return Content(len(steps), results, digest.hexdigest())

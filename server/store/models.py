@@ -20,7 +20,7 @@ from server.base.models import Document
 from server.formats.files import fsync_path, known_sha256
 from server.store.durable import make_folder, read_record, record_of, write_bytes, write_json
 from server.store.folder import is_id, now_utc
-from server.store.tests import TestStore
+from server.store.tests.tests import TestStore
 
 FOLDER = "models"
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from server.store.folder import DataFolder
 from server.store.indexing.build import reindex
-from server.store.tests import TestStore, quarantine
+from server.store.tests.steps import quarantine
+from server.store.tests.tests import TestStore
 from server.store.verify import Verification, require_data_folder, verify
 
 
@@ -63,7 +64,7 @@ def _tidy(root: Path, tests: TestStore) -> list[str]:
         for step in sorted((path / "steps").iterdir()) if (path / "steps").is_dir() else ():
             if step.is_dir() and step.name.isdigit() and not (step / "step.json").is_file():
                 done.append(f"quarantined {step.relative_to(root)} as {quarantine(step).name}: it has no step.json")
-        for analysis_id in tests.analysis_ids(test_id):
-            for beside in tests.drop_half_written(test_id, analysis_id):
+        for analysis_id in tests.analyses.ids(test_id):
+            for beside in tests.analyses.drop_half_written(test_id, analysis_id):
                 done.append(f"removed {beside.relative_to(root)}: its result was never announced")
     return done

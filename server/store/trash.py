@@ -21,7 +21,7 @@ from server.formats.files import fsync_path, storage_error
 from server.store.documents import TrashEntry
 from server.store.durable import make_folder, read_json, write_json
 from server.store.folder import DataFolder, is_id, now_utc
-from server.store.tests import MAX_STEPS, deleted_mark
+from server.store.tests.steps import MAX_STEPS, deleted_mark
 
 Kind = Literal["test", "step", "analysis", "calibration", "noise"]
 _CONTENT = "content"

@@ -20,7 +20,7 @@ from server.formats.files import recorded_sha256, sha256_of, storage_error
 from server.formats.results.folder import DENSE
 from server.store.durable import read_json
 from server.store.folder import check_format, is_id, is_in_use
-from server.store.tests import number_of
+from server.store.tests.steps import number_of
 
 Level = Literal["damaged", "incomplete", "index", "foreign"]
 

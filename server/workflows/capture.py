@@ -88,7 +88,7 @@ def commit_pair(
         "image_size_px": sizes,
     }
     images: dict[str, bytes] = {cam: encode_tiff(captured.pixels[cam]) for cam in CAMERAS}
-    return _announce(service, test_id, service.tests.add_step(test_id, images, document))
+    return _announce(service, test_id, service.tests.steps.add(test_id, images, document))
 
 
 def off_zero_warnings(moves: str, dz_mm: Mapping[str, float]) -> list[str]:
@@ -139,7 +139,7 @@ def import_step(service: Service, test_id: str, data: dict[str, bytes], metadata
         **({"grey_from": grey_from} if grey_from else {}),
     }
     data = {cam: encode_tiff(images[cam]) for cam in CAMERAS}
-    return _announce(service, test_id, service.tests.add_step(test_id, data, document))
+    return _announce(service, test_id, service.tests.steps.add(test_id, data, document))
 
 
 def _check_content(images: dict[str, GrayImage]) -> None:
@@ -162,9 +162,9 @@ def _check_content(images: dict[str, GrayImage]) -> None:
 def _check_sizes(service: Service, test_id: str, sizes: dict[str, list[int]]) -> None:
     """Refuse images that cannot be measured with the test's calibration, or with its other images."""
     known: dict[str, tuple[str, list[int]]] = {}
-    number = service.tests.first_step(test_id)
+    number = service.tests.steps.first(test_id)
     if number is not None:
-        first = service.tests.step(test_id, number).document.image_size_px
+        first = service.tests.steps.read(test_id, number).document.image_size_px
         known |= {cam: ("the test's others are", list(size)) for cam, size in first.items()}
     if service.tests.is_calibrated(test_id):
         calibration = load_calibration(service.tests.calibration_file(test_id))

@@ -76,7 +76,8 @@ def import_channels(service: Service, test_id: str, table: ChannelTable, how: Al
     """
     factor = _load_factor(table, how.load)
     steps = [
-        service.tests.step(test_id, int(str(one["n"]))).document for one in service.catalog.entries("step", test_id)
+        service.tests.steps.read(test_id, int(str(one["n"]))).document
+        for one in service.catalog.entries("step", test_id)
     ]
     times = {step.n: step_time(step.plain()) for step in steps}
     zero_s = _zero(table, how, times)
@@ -185,6 +186,6 @@ def _keep(
     changes: dict[str, object] = {"channels": {**step.channels, **values}}
     if load is not None and load in values:
         changes["load_n"] = factor * values[load]
-    entry = step_entry(service.tests.update_step(test_id, step.n, changes))
+    entry = step_entry(service.tests.steps.update(test_id, step.n, changes))
     service.catalog.put_entry("step", test_id, f"{step.n:04d}", entry)
     service.hub.publish("step", {"test_id": test_id, **entry})

@@ -73,13 +73,13 @@ def _name(service: Service, kind: Kind, ids: Ids) -> str:
             return ""  # what is damaged can be deleted too
     if kind == "step":
         try:
-            return str(service.tests.step(str(ids["test_id"]), int(ids["n"])).document.label or "")
+            return str(service.tests.steps.read(str(ids["test_id"]), int(ids["n"])).document.label or "")
         except StereorigError as error:
             if error.code == "not_found":
                 raise
             return ""
     if kind == "analysis":
-        service.tests.analysis_path(str(ids["test_id"]), str(ids["analysis_id"]))
+        service.tests.analyses.path(str(ids["test_id"]), str(ids["analysis_id"]))
         return ""
     if kind == "calibration":
         service.calibrations.path(str(ids["calibration_id"]))

@@ -36,7 +36,7 @@ from server.store.indexing.clean_stop import take_mark
 from server.store.models import ModelStore
 from server.store.noise import NoiseStore
 from server.store.recipes import RecipeStore
-from server.store.tests import TestStore
+from server.store.tests.tests import TestStore
 from server.store.trash import Trash
 from server.worker.dask_cluster import ClusterExecutor
 from server.worker.embedded import ComputeWorker, make_worker

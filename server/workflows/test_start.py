@@ -99,8 +99,8 @@ def give_calibration(service: Service, test_id: str, asked: str, *, in_force: bo
 def _check_fits(service: Service, test_id: str, calibration_id: str, path: Path) -> None:
     loaded = load_calibration(path)
     sizes = {"cam1": loaded.image_size1_px, "cam2": loaded.image_size2_px}
-    for n in service.tests.step_numbers(test_id):
-        step = service.tests.step(test_id, n).document
+    for n in service.tests.steps.numbers(test_id):
+        step = service.tests.steps.read(test_id, n).document
         for cam, size in step.image_size_px.items():
             of = sizes.get(cam)
             if of is not None and list(of) != size:

@@ -110,7 +110,7 @@ class Watches:
 
     def _last(self, test_id: str, channel: str) -> tuple[int, float] | None:
         """Newest step that bears a channel, and its value; read once until there are other steps."""
-        mark = self._service.tests.steps_mark(test_id)
+        mark = self._service.tests.steps.mark(test_id)
         known = self._known.get((test_id, channel))
         if known is None or known[0] != mark:
             known = mark, self._newest(test_id, channel)
@@ -119,8 +119,8 @@ class Watches:
 
     def _newest(self, test_id: str, channel: str) -> tuple[int, float] | None:
         tests = self._service.tests
-        for n in tests.newest_steps(test_id):
-            value = value_of(tests.step(test_id, n).document, channel)
+        for n in tests.steps.newest(test_id):
+            value = value_of(tests.steps.read(test_id, n).document, channel)
             if value is not None:
                 return n, value
         return None

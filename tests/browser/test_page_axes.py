@@ -35,11 +35,11 @@ def page(chromium: Browser, bench: Bench) -> Iterator[Watched]:
 def strip(bench: Bench) -> str:
     """Results of a tension of 2,000 um/m along the image's vertical, without noise."""
     tests = bench.service.tests
-    stored = tests.analysis(bench.test_id, bench.analysis_id).plain()
+    stored = tests.analyses.read(bench.test_id, bench.analysis_id).plain()
     kept = {k: stored[k] for k in ("kind", "settings", "inputs", "software")}
-    document = tests.create_analysis(bench.test_id, {**kept, "steps": [0, 1], "label": "tension"})
+    document = tests.analyses.create(bench.test_id, {**kept, "steps": [0, 1], "label": "tension"})
     bench.service.catalog.put_entry("analysis", bench.test_id, document.id, analysis_entry(document))
-    folder = tests.analysis_path(bench.test_id, document.id)
+    folder = tests.analyses.path(bench.test_id, document.id)
     for n, motion in enumerate((None, pulled)):
         field = make_field(motion, shape=shape)
         strain = None if motion is None else surface_strain(field, StrainOptions(window=5), subset_px=SUBSET)

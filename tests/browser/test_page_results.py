@@ -204,12 +204,12 @@ def test_the_interval_is_chosen_and_a_click_shows_the_budget(page: Watched, benc
 
 
 def test_numbers_without_the_calibrations_uncertainty_say_so(page: Watched, bench: Bench) -> None:
-    whole = bench.service.tests.analysis_path(bench.test_id, bench.analysis_id)
-    stored = bench.service.tests.analysis(bench.test_id, bench.analysis_id).plain()
+    whole = bench.service.tests.analyses.path(bench.test_id, bench.analysis_id)
+    stored = bench.service.tests.analyses.read(bench.test_id, bench.analysis_id).plain()
     kept = {k: stored[k] for k in ("kind", "settings", "steps", "inputs", "software")}
-    document = bench.service.tests.create_analysis(bench.test_id, {**kept, "label": "as imported"})
+    document = bench.service.tests.analyses.create(bench.test_id, {**kept, "label": "as imported"})
     bench.service.catalog.put_entry("analysis", bench.test_id, document.id, analysis_entry(document))
-    folder = bench.service.tests.analysis_path(bench.test_id, document.id)
+    folder = bench.service.tests.analyses.path(bench.test_id, document.id)
     for n in stored["steps"]:
         field = replace(read_field(whole / f"step_{n:04d}.nc"), common=None, causes=None)
         write_field(
@@ -478,7 +478,7 @@ def test_an_areas_statistics_are_the_gauges(page: Watched, bench: Bench) -> None
 
 def exported_triangles(bench: Bench, analysis_id: str) -> int:
     """Number of triangles of step 2 in the mesh that is exported."""
-    field = read_field(bench.service.tests.result_file(bench.test_id, analysis_id, 2))
+    field = read_field(bench.service.tests.analyses.result_file(bench.test_id, analysis_id, 2))
     return len(triangles_of(field.x_px, field.y_px, field.valid, field.cuts))
 
 
@@ -568,7 +568,7 @@ def test_settings_checks_and_files(page: Watched, bench: Bench) -> None:
     with at.expect_download() as saved:
         at.get_by_role("button", name="Save the file").click()
     assert saved.value.suggested_filename.endswith(".nc")
-    stored = bench.service.tests.result_file(bench.test_id, bench.analysis_id, 2)
+    stored = bench.service.tests.analyses.result_file(bench.test_id, bench.analysis_id, 2)
     with library, xarray.open_dataset(saved.value.path()) as one, xarray.open_dataset(stored) as other:
         xarray.testing.assert_identical(one[list(other.variables)].drop_attrs(), other.drop_attrs())
         # what was recorded with the step stands beside its result
@@ -628,7 +628,7 @@ def test_on_a_tablet_and_in_the_dark(chromium: Browser, bench: Bench) -> None:
 
 def test_a_failed_check_stands_at_the_head_of_the_results_and_in_the_lists(page: Watched, bench: Bench) -> None:
     doubtful = with_a_cut(bench.service, bench.test_id, bench.analysis_id)
-    folder = bench.service.tests.analysis_path(bench.test_id, doubtful)
+    folder = bench.service.tests.analyses.path(bench.test_id, doubtful)
     check = {"level": "failed", "offset_px": 0.115, "reason": "camera 2 sees the points 0.115 px off"}
     found = {"n": 2, "points": 900, "valid": 371, "valid_fraction": 371 / 900, "epipolar_check": check, "status": {}}
     (folder / "step_0002.json").write_text(json.dumps(found))
@@ -979,7 +979,7 @@ def test_gauges_field_limits_and_colours_are_there_again_and_go_into_the_report(
     at.get_by_label("Field", exact=True).select_option("w_mm")
     drawn(at, "2 w_mm reference")
     at.wait_for_function("() => document.querySelector('[data-role=colourbar]').dataset.low === '-0.02'")
-    metadata = find_source(bench.service.tests.analysis_path(bench.test_id, bench.analysis_id)).metadata
+    metadata = find_source(bench.service.tests.analyses.path(bench.test_id, bench.analysis_id)).metadata
     assert metadata.gauges is not None
     [gauge] = metadata.gauges.extensometers
     assert (gauge.name, gauge.a_px, gauge.b_px) == ("E1", (80.0, 100.0), (160.0, 110.0))

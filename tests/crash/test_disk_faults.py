@@ -19,7 +19,7 @@ from server.store.folder import DataFolder
 from server.store.indexing.build import rebuild
 from server.store.noise import NoiseStore
 from server.store.repair import repair
-from server.store.tests import TestStore
+from server.store.tests.tests import TestStore
 from server.store.verify import verify
 from tests.support.faulty_disk import WAYS, FaultyDisk, Way
 
@@ -71,7 +71,7 @@ class Session:
         self._keep(self.tests.path(test_id) / "test.json")
         for k in range(4):
             images = {cam: encode_tiff(image(10 * k + int(cam[-1]))) for cam in ("cam1", "cam2")}
-            step = self._ask(lambda k=k, images=images: self.tests.add_step(test_id, images, {"label": f"load {k}"}))
+            step = self._ask(lambda k=k, images=images: self.tests.steps.add(test_id, images, {"label": f"load {k}"}))
             if step is not None:
                 folder = self.tests.path(test_id) / "steps" / f"{step.n:04d}"
                 for name in ("cam1.tif", "cam2.tif", "step.json"):
@@ -82,9 +82,9 @@ class Session:
         # a change that was refused may be there or not (the rename was made, its fsync failed), but never half
         assert self.tests.read(test_id).name in ({"renamed"} if updated is not None else {"one", "renamed"})
         self._keep(self.tests.path(test_id) / "test.json")
-        analysis = self._ask(lambda: self.tests.create_analysis(test_id, {"settings": {}}, mask=b"no picture"))
+        analysis = self._ask(lambda: self.tests.analyses.create(test_id, {"settings": {}}, mask=b"no picture"))
         if analysis is not None:
-            self._ask(lambda: self.tests.put_summary(test_id, analysis.id, {"steps": []}))
+            self._ask(lambda: self.tests.analyses.put_summary(test_id, analysis.id, {"steps": []}))
 
 
 @pytest.mark.normal_depth("full", "write_error")
@@ -122,7 +122,7 @@ def test_every_call_that_can_fail_fails_once(way: Way, tmp_path: Path, monkeypat
 
 def add_steps(tests: TestStore, test_id: str, images: dict[str, bytes]) -> None:
     for _ in range(5):
-        tests.add_step(test_id, images, {})
+        tests.steps.add(test_id, images, {})
 
 
 @pytest.mark.fault(3)
@@ -136,8 +136,8 @@ def test_after_the_disk_has_room_again_the_same_test_goes_on(tmp_path: Path, mon
         with pytest.raises(StorageError):
             add_steps(tests, test_id, images)
         monkeypatch.undo()
-        assert tests.add_step(test_id, images, {}).n == tests.step_numbers(test_id)[-1]
-    numbers = tests.step_numbers(test_id)
+        assert tests.steps.add(test_id, images, {}).n == tests.steps.numbers(test_id)[-1]
+    numbers = tests.steps.numbers(test_id)
     assert numbers == list(range(len(numbers))), "no number is lost to a full disk"
     catalog = Catalog(folder.root / "catalog.sqlite").open()
     rebuild(catalog, folder, CalibrationStore(folder), tests)

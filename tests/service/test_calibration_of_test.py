@@ -103,7 +103,7 @@ def test_a_test_without_calibration_is_given_one_and_then_another_and_each_analy
     for analysis, calibration_id in listed.items():
         shown = client.get(f"{API}/tests/{test_id}/analyses/{analysis}").json()
         assert (shown["calibration_id"], shown["stale"], shown["stale_reasons"]) == (calibration_id, False, [])
-        folder = service.tests.analysis_path(test_id, analysis)
+        folder = service.tests.analyses.path(test_id, analysis)
         report = find_source(folder)
         assert report.calibration is not None
         assert report.calibration.sha256 == shown["calibration_sha256"]

@@ -175,7 +175,7 @@ def test_a_burst_ends_where_the_disk_fails_and_what_it_told_is_there(
     client: httpx.Client, service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     test_id = new_test(client)
-    add, calls = service.tests.add_step, 0
+    add, calls = service.tests.steps.add, 0
 
     def add_or_fail(*args: Any) -> Any:
         nonlocal calls
@@ -184,7 +184,7 @@ def test_a_burst_ends_where_the_disk_fails_and_what_it_told_is_there(
             raise StorageError("No space left.", code="storage_full")
         return add(*args)
 
-    monkeypatch.setattr(service.tests, "add_step", add_or_fail)
+    monkeypatch.setattr(service.tests.steps, "add", add_or_fail)
     job = client.post(f"{API}/tests/{test_id}/steps", params={"attached": True}, json={"count": 5}).json()["job"]
     assert (job["state"], job["problem"]["code"]) == ("failed", "storage_full")
     assert [s["n"] for s in job["result"]["steps"]] == [0, 1] == steps_of(client, test_id)

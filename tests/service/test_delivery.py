@@ -96,7 +96,7 @@ def test_a_steps_label_can_be_corrected_and_nothing_else(client: httpx.Client, s
     refused(
         client.patch(url, json={"label": "7"}, headers={"If-Match": before.headers["etag"]}), 412, "precondition_failed"
     )
-    assert service.tests.verified_step(test_id, 0).document.label == "6 kN"
+    assert service.tests.steps.verified(test_id, 0).document.label == "6 kN"
     refused(client.patch(f"{url}1", json={"label": "7"}, headers={"If-Match": "*"}), 404, "not_found")
 
 

@@ -40,8 +40,8 @@ def url(service: Service, tmp_path_factory: pytest.TempPathFactory) -> str:
     """An analysis whose results were put there, with a step whose images are gone since."""
     test = service.tests.create({"name": "Panel", "specimen": "", "notes": ""}, None)
     document = {"kind": "displacement", "steps": [0, 1, 2], "settings": {}, "inputs": {"steps": {"0": {}}}}
-    analysis = service.tests.create_analysis(test.id, document)
-    write_results(service.tests.analysis_path(test.id, analysis.id))
+    analysis = service.tests.analyses.create(test.id, document)
+    write_results(service.tests.analyses.path(test.id, analysis.id))
     return f"/api/v1/tests/{test.id}/analyses/{analysis.id}/export"
 
 
@@ -92,8 +92,8 @@ def test_files_hold_what_was_asked_for(client: httpx.Client, url: str) -> None:
 def test_dense_fields_are_exported_on_request(client: httpx.Client, service: Service) -> None:
     test = service.tests.create({"name": "Dense", "specimen": "", "notes": ""}, None)
     document = {"kind": "displacement", "steps": [0, 1, 2], "settings": {}, "inputs": {"steps": {"0": {}}}}
-    analysis = service.tests.create_analysis(test.id, document)
-    folder = service.tests.analysis_path(test.id, analysis.id)
+    analysis = service.tests.analyses.create(test.id, document)
+    folder = service.tests.analyses.path(test.id, analysis.id)
     write_results(folder)
     url = f"/api/v1/tests/{test.id}/analyses/{analysis.id}/export"
     none = client.get(url, params={"format": "csv", "dense": "true"})
@@ -137,7 +137,7 @@ def test_refusals_are_problems(
 
 def test_no_finished_step(client: httpx.Client, service: Service) -> None:
     test = service.tests.create({"name": "", "specimen": "", "notes": ""}, None)
-    analysis = service.tests.create_analysis(test.id, {"kind": "profile", "steps": [0], "settings": {}})
+    analysis = service.tests.analyses.create(test.id, {"kind": "profile", "steps": [0], "settings": {}})
     reply = client.get(f"/api/v1/tests/{test.id}/analyses/{analysis.id}/export", params={"format": "csv"})
     assert (reply.status_code, reply.json()["code"]) == (404, "no_results")
 
@@ -239,8 +239,8 @@ def test_dense_fields_come_by_a_job_as_at_once_in_the_axes_of_the_ordinary_field
 ) -> None:
     test = service.tests.create({"name": "Dense job", "specimen": "", "notes": ""}, None)
     document = {"kind": "displacement", "steps": [0, 1], "settings": {}, "inputs": {"steps": {"0": {}}}}
-    analysis = service.tests.create_analysis(test.id, document)
-    folder = service.tests.analysis_path(test.id, analysis.id)
+    analysis = service.tests.analyses.create(test.id, document)
+    folder = service.tests.analyses.path(test.id, analysis.id)
     write_results(folder, 2, reference_step="0")
     shutil.copytree(folder, folder / "dense")
     for path in (folder / "dense").glob("step_*.nc"):

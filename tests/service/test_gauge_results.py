@@ -447,8 +447,8 @@ def test_strain_is_made_anew_along_the_new_axes(tmp_path: Path, capsys: pytest.C
 @pytest.fixture(scope="module")
 def url(service: Service, client: httpx.Client) -> str:
     test_id = new_test(client)
-    document = service.tests.create_analysis(test_id, {"kind": "displacement", "steps": [0, 1, 2]})
-    fill(service.tests.analysis_path(test_id, document.id))
+    document = service.tests.analyses.create(test_id, {"kind": "displacement", "steps": [0, 1, 2]})
+    fill(service.tests.analyses.path(test_id, document.id))
     return f"{API}/tests/{test_id}/analyses/{document.id}/gauges"
 
 
@@ -523,7 +523,7 @@ def test_unknown_and_unfinished_analyses(service: Service, client: httpx.Client,
     missing = url.rsplit("/", 2)[0] + "/a999999-abcdef/gauges"
     assert client.post(missing, json=BODY).status_code == 404
     test_id = url.split("/tests/")[1].split("/")[0]
-    empty = service.tests.create_analysis(test_id, {"kind": "displacement", "steps": [0]})
+    empty = service.tests.analyses.create(test_id, {"kind": "displacement", "steps": [0]})
     answer = client.post(f"{API}/tests/{test_id}/analyses/{empty.id}/gauges", json=BODY)
     assert (answer.status_code, answer.json()["code"]) == (409, "no_results")
 

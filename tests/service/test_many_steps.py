@@ -102,15 +102,15 @@ def test_the_client_follows_the_pages(client: httpx.Client, many: str) -> None:
 def _analysis(service: Service, test_id: str, steps: int) -> str:
     """An analysis whose results are there; what is in them is not asked for."""
     body = AnalysisRequest.model_validate({"region": {"rectangle": [30, 30, 120, 110]}})
-    sha256 = service.tests.step(test_id, 0).document.sha256
+    sha256 = service.tests.steps.read(test_id, 0).document.sha256
     document: dict[str, Any] = {
         "kind": "displacement",
         "settings": body.stored().model_dump(mode="json"),
         "steps": list(range(steps)),
         "inputs": {"calibration_sha256": None, "steps": {str(n): sha256 for n in range(steps)}},
     }
-    made = service.tests.create_analysis(test_id, document)
-    folder = service.tests.analysis_path(test_id, made.id)
+    made = service.tests.analyses.create(test_id, document)
+    folder = service.tests.analyses.path(test_id, made.id)
     for n in range(steps - 1):  # the last one failed
         (folder / f"step_{n:04d}.nc").write_bytes(b"")
         valid = 30 if n == steps - 2 else 100
@@ -118,7 +118,7 @@ def _analysis(service: Service, test_id: str, steps: int) -> str:
         (folder / f"step_{n:04d}.json").write_text(json.dumps(figures))
     problem = {"code": "image_blank", "cause": "It is blank.", "remedy": "Capture it again.", "detail": "It is blank."}
     summary = {"state": "succeeded", "steps": [{"n": n} for n in range(steps - 1)], "steps_failed": {}}
-    service.tests.put_summary(test_id, made.id, summary | {"steps_failed": {str(steps - 1): problem}})
+    service.tests.analyses.put_summary(test_id, made.id, summary | {"steps_failed": {str(steps - 1): problem}})
     service.catalog.put_entry("analysis", test_id, made.id, analysis_entry(made))
     return made.id
 
@@ -208,7 +208,7 @@ def test_the_checks_of_many_steps_are_found_by_a_process_of_their_own(
         assert time.monotonic() < deadline
         time.sleep(0.05)
     assert len(asked) == 1
-    assert found == checks_of(service.tests.analysis_path(many, analyses[many]))
+    assert found == checks_of(service.tests.analyses.path(many, analyses[many]))
     checks.close()
 
 

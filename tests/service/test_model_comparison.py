@@ -54,8 +54,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def url(service: Service, client: httpx.Client, folder: Path) -> str:
     """Of an analysis with the result of step 1."""
     test_id = new_test(client)
-    document = service.tests.create_analysis(test_id, {"kind": "displacement", "steps": [1]})
-    result = service.tests.analysis_path(test_id, document.id) / "step_0001.nc"
+    document = service.tests.analyses.create(test_id, {"kind": "displacement", "steps": [1]})
+    result = service.tests.analyses.path(test_id, document.id) / "step_0001.nc"
     result.write_bytes((folder / "step_0001.nc").read_bytes())
     return f"{API}/tests/{test_id}/analyses/{document.id}"
 
@@ -204,7 +204,7 @@ def test_models_are_listed_verified_and_deleted(service: Service, client: httpx.
 def test_the_report_shows_the_newest_models(service: Service, client: httpx.Client, url: str, folder: Path) -> None:
     stiff = kept(client, url, folder / "wrong.xdmf", folder / "wrong.h5", unit="mm")
     test_id, analysis_id = stiff["test_id"], url.split("/")[-1]
-    page = make_report(find_source(service.tests.analysis_path(test_id, analysis_id))).page.decode()
+    page = make_report(find_source(service.tests.analyses.path(test_id, analysis_id))).page.decode()
     part = page[page.index('<section id="models">') :].split("</section>")[0]
     assert "wrong.xdmf" in part
     assert "The model is refuted" in part

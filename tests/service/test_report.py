@@ -119,7 +119,7 @@ class Measurement:
 
     @property
     def folder(self) -> Path:
-        return self.service.tests.analysis_path(self.test_id, self.analysis_id)
+        return self.service.tests.analyses.path(self.test_id, self.analysis_id)
 
     @property
     def data(self) -> Path:

@@ -569,7 +569,7 @@ def test_a_thousand_requests_at_once_and_abandoned_streams_leave_the_recording_a
     assert taken == list(range(len(taken)))
     assert len(taken) >= 4
     assert client.get(f"{API}/tests/{test_id}").status_code == 200
-    assert service.tests.step_numbers(test_id) == taken
+    assert service.tests.steps.numbers(test_id) == taken
     # each got its answer or was refused in words, but for some at the limit of connections
     assert statuses.count(200) >= 600
     assert set(statuses) <= {0, 200, 429, 503}

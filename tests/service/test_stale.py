@@ -269,13 +269,13 @@ def test_what_changes_between_asking_and_measuring_is_refused(
         "label": "",
         "inputs": analysis_start.inputs_of(service, test_folder.name, [0, 1], test_folder / "calibration.json"),
     }
-    made = service.tests.create_analysis(test_folder.name, document)
+    made = service.tests.analyses.create(test_folder.name, document)
     spoil(test_folder, "the reference was taken again")
     with pytest.raises(FileFormatError) as caught:
         task_of(service.tests, made, 1, {}, None)
     assert caught.value.code == "step_changed"
     _, test_folder = copied_in(taken, service)
-    made = service.tests.create_analysis(test_folder.name, document)
+    made = service.tests.analyses.create(test_folder.name, document)
     spoil(test_folder, "the calibration was replaced")
     with pytest.raises(FileFormatError) as caught:
         task_of(service.tests, made.model_copy(update={"test_id": test_folder.name}), 1, {}, None)

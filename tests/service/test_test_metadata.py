@@ -123,7 +123,7 @@ def test_a_captured_step_keeps_what_the_rig_file_tells(client: httpx.Client, ser
     client.put(f"{API}/sim/scene", json={"scene": "plate", "load": 0.0})
     answer = client.post(f"{API}/tests/{test_id}/steps", json={})
     assert answer.status_code == 201, answer.text
-    rig = service.tests.step(test_id, 0).document.plain()["rig"]
+    rig = service.tests.steps.read(test_id, 0).document.plain()["rig"]
     assert (rig["name"], rig["simulated"], rig["trigger"], rig["lighting"]) == ("tiny rig", True, "software", None)
     assert rig["cameras"]["cam1"]["exposure_ms"] == pytest.approx(10.0)
     assert "lens" not in rig["cameras"]["cam1"]

@@ -21,7 +21,7 @@ from server.store.calibrations import CalibrationStore
 from server.store.catalog import Catalog
 from server.store.folder import DataFolder
 from server.store.indexing.build import rebuild
-from server.store.tests import TestStore
+from server.store.tests.tests import TestStore
 from server.store.trash import Trash
 from server.store.verify import verify
 from server.workflows.service import Service
@@ -103,14 +103,14 @@ def test_a_deleted_steps_number_is_not_given_again(service: Service, client: htt
     delete(client, f"/tests/{everything}/steps/0")
     assert client.get(f"{API}/tests/{everything}").json()["incomplete_steps"] == []
     assert add_step(client, everything, 1) == 1
-    assert service.tests.deleted_steps(everything) == [0]
+    assert service.tests.steps.deleted(everything) == [0]
 
 
 def test_what_a_job_or_a_capture_uses_is_not_deleted(service: Service, client: httpx.Client) -> None:
     go = threading.Event()
     test_id = new_test(client)
     add_step(client, test_id, 1)
-    analysis_id = service.tests.create_analysis(test_id, {"kind": "profile", "steps": [0]}).id
+    analysis_id = service.tests.analyses.create(test_id, {"kind": "profile", "steps": [0]}).id
     subject = {"test_id": test_id, "analysis_id": analysis_id}
     job = service.jobs.submit("analysis", "x", subject, [Phase("compute", lambda _: go.wait(20) and None)])
     try:
@@ -181,7 +181,7 @@ def small_test(folder: DataFolder, steps: int = 2) -> str:
     tests = TestStore(folder)
     test_id = str(tests.create({"name": "one"}, None).id)
     for k in range(steps):
-        tests.add_step(test_id, {"cam1": picture(k), "cam2": picture(k + 100)}, {})
+        tests.steps.add(test_id, {"cam1": picture(k), "cam2": picture(k + 100)}, {})
     return test_id
 
 

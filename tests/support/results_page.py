@@ -112,12 +112,12 @@ VERTICAL = ((155.0, 50.0), (155.0, 120.0))
 
 def with_a_cut(service: Service, test_id: str, analysis_id: str, line: Sequence[tuple[float, float]] = VERTICAL) -> str:
     """The plate's results with three points missing, a cut (between two columns), and 1 um more deflection."""
-    whole = service.tests.analysis_path(test_id, analysis_id)
-    stored = service.tests.analysis(test_id, analysis_id).plain()
+    whole = service.tests.analyses.path(test_id, analysis_id)
+    stored = service.tests.analyses.read(test_id, analysis_id).plain()
     kept = {k: stored[k] for k in ("kind", "settings", "steps", "inputs", "software")}
-    document = service.tests.create_analysis(test_id, {**kept, "label": "with a cut"})
+    document = service.tests.analyses.create(test_id, {**kept, "label": "with a cut"})
     service.catalog.put_entry("analysis", test_id, document.id, analysis_entry(document))
-    folder = service.tests.analysis_path(test_id, document.id)
+    folder = service.tests.analyses.path(test_id, document.id)
     for n in stored["steps"]:
         field = read_field(whole / f"step_{n:04d}.nc")
         field.status[4, 5] = field.status[4, 6] = field.status[8, 2] = 6

@@ -12,7 +12,7 @@ from pathlib import Path
 from core.errors import InputError
 from server.cli.terminal import ProgressLine
 from server.store.folder import DataFolder
-from server.store.tests import TestStore
+from server.store.tests.tests import TestStore
 from server.store.verify import require_data_folder
 from server.worker.tasks import measure_step
 from server.workflows.repetition.repeat import Repetition, repeat
@@ -37,13 +37,13 @@ def run(args: argparse.Namespace) -> int:
     require_data_folder(args.data)
     tests = TestStore(DataFolder(args.data))
     test_id, _, analysis_id = args.analysis.partition("/")
-    wanted = [analysis_id] if analysis_id else tests.analysis_ids(test_id)
+    wanted = [analysis_id] if analysis_id else tests.analyses.ids(test_id)
     if not wanted:
         raise InputError(f"Test {test_id} has no analysis.", code="no_results", remedy="Measure it first.")
     found = []
     with _folder(args.out) as out:
         for one in wanted:
-            tests.analysis_path(test_id, one)
+            tests.analyses.path(test_id, one)
             into = out / one
             into.mkdir()
             found.append(_repeat(tests, test_id, one, into))

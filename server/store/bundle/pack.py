@@ -16,7 +16,7 @@ from server.formats.version import software_version
 from server.store.bundle.content import CRATE, FORMAT, MANIFEST, UNFINISHED, BundleFile, files_of
 from server.store.bundle.crate import Measured, crate
 from server.store.folder import DataFolder, now_utc
-from server.store.tests import TestStore
+from server.store.tests.tests import TestStore
 from server.store.verify import verify_test
 
 _CHUNK_BYTES = 1 << 20
@@ -95,7 +95,8 @@ def pack(data: Path, test_id: str, out: Path, *, licence: str | None = None) -> 
             "files": {name: found.plain() for name, found in files.items()},
         }
         analyses = [
-            Measured(tests.analysis(test_id, one), tests.summary(test_id, one)) for one in tests.analysis_ids(test_id)
+            Measured(tests.analyses.read(test_id, one), tests.analyses.summary(test_id, one))
+            for one in tests.analyses.ids(test_id)
         ]
         shown = crate(
             tests.read(test_id),

@@ -21,7 +21,7 @@ from server.store.indexing.clean_stop import Times, leave_mark, take_mark, times
 from server.store.indexing.entries import calibration_entry, check_trash, entries_of_test, test_entry
 from server.store.indexing.lost_jobs import LostJobs
 from server.store.noise import NoiseStore
-from server.store.tests import TestStore
+from server.store.tests.tests import TestStore
 
 _log = logging.getLogger("stereorig.service")
 #: the background's share of a processor: requests come first
@@ -87,7 +87,7 @@ class Index:
         self._remove_halves_of_tests(set(there))
         self.differences += self._catalog.replace_tests(calibrations, tests, gone=indexed - set(there)) + trouble
         lost.restore(self._catalog, self._folder.ids)
-        self._catalog.before_parts = self._tests.before_change = self.read
+        self._catalog.before_parts = self._tests.folders.before_change = self.read
         self._begun = True
 
     def _reserve(self, test_id: str) -> None:

@@ -12,7 +12,7 @@ from server.store.catalog import Entry
 from server.store.documents import AnalysisRecord, StepRecord, TestRecord
 from server.store.folder import DataFolder, is_id
 from server.store.indexing.lost_jobs import LostJobs
-from server.store.tests import TestStore
+from server.store.tests.tests import TestStore
 from server.store.trash import Trash
 
 
@@ -79,9 +79,9 @@ def entries_of_test(tests: TestStore, test_id: str, lost: LostJobs, trouble: lis
         return "step", test_id, f"{n:04d}", step_entry(document)
 
     def analysis(analysis_id: str) -> Entry:
-        document = tests.analysis(test_id, analysis_id)
-        runs = tests.analysis_jobs(test_id, analysis_id)
-        summary = tests.whole_summary(test_id, analysis_id)
+        document = tests.analyses.read(test_id, analysis_id)
+        runs = tests.analyses.jobs(test_id, analysis_id)
+        summary = tests.analyses.whole_summary(test_id, analysis_id)
         lost.analysis(document, runs, summary)
         job_id = runs[-1].job_id if runs else None
         known = summary is not None and summary.job_id in (None, job_id)
@@ -89,9 +89,9 @@ def entries_of_test(tests: TestStore, test_id: str, lost: LostJobs, trouble: lis
         return "analysis", test_id, analysis_id, analysis_entry(document, job_id, failed)
 
     take(f"test {test_id}", test)
-    for n, document in tests.step_documents(test_id):
+    for n, document in tests.steps.documents(test_id):
         take(f"step {n} of test {test_id}", partial(step, n, document))
-    for analysis_id in tests.analysis_ids(test_id):
+    for analysis_id in tests.analyses.ids(test_id):
         take(f"analysis {analysis_id} of test {test_id}", partial(analysis, analysis_id))
     return entries
 

@@ -20,7 +20,7 @@ from core.errors import StereorigError
 from server.base.problem import JobProblem
 from server.results.warnings.analysis import ResultWarning
 from server.results.warnings.checks import Checks, checks_if_changed, checks_of
-from server.store.tests import TestStore
+from server.store.tests.tests import TestStore
 from server.worker.executor import WorkerDiedError
 from server.worker.resting import RestingWorker
 
@@ -76,7 +76,7 @@ class AnalysisChecks:
         FileFormatError, NotFoundError
             Of an analysis of few steps that is not there, or cannot be read.
         """
-        folder = self._tests.analysis_path(test_id, analysis_id)
+        folder = self._tests.analyses.path(test_id, analysis_id)
         problems = None if failed is None else {n: one.plain() for n, one in failed.items()}
         if (folder / "analysis.json").stat().st_size <= _MANY_BYTES:
             return checks_of(folder, problems)
@@ -125,7 +125,7 @@ class AnalysisChecks:
         """Return something cheap that differs whenever the checks may find something else."""
         test = folder.parent.parent
         places = (folder, folder / "analysis.json", folder / "summary.json", test / "test.json")
-        return (*map(_changed_ns, places), self._tests.steps_mark(test_id), tuple(problems or ()))
+        return (*map(_changed_ns, places), self._tests.steps.mark(test_id), tuple(problems or ()))
 
 
 def _changed_ns(path: Path) -> int:

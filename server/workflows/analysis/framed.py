@@ -83,7 +83,9 @@ def result_in(
         Variable that will be read of it: one that is the same in every frame is read where it is stored, and strain is
         made anew for its own components alone.
     """
-    return file_in(service, test_id, analysis_id, service.tests.result_file(test_id, analysis_id, n), frame, name)
+    return file_in(
+        service, test_id, analysis_id, service.tests.analyses.result_file(test_id, analysis_id, n), frame, name
+    )
 
 
 def file_in(
@@ -129,7 +131,7 @@ def variable_of_frame(variables: Sequence[str] | None) -> str | None:
 
 def _reference(service: Service, test_id: str, analysis_id: str) -> Path | None:
     """Return the reference's result, through which a frame is laid; None where it is not there."""
-    reference = service.tests.analysis(test_id, analysis_id).steps[0]
-    if reference not in service.tests.finished_steps(test_id, analysis_id):
+    reference = service.tests.analyses.read(test_id, analysis_id).steps[0]
+    if reference not in service.tests.analyses.finished_steps(test_id, analysis_id):
         return None
-    return service.tests.result_file(test_id, analysis_id, reference)
+    return service.tests.analyses.result_file(test_id, analysis_id, reference)

@@ -22,7 +22,7 @@ from server.results.warnings.analysis import analysis_warnings
 from server.store.documents import AnalysisRecord, Finished, StepOutcome
 from server.store.folder import now_utc
 from server.store.indexing.entries import analysis_entry
-from server.store.tests import StepFiles
+from server.store.tests.steps import StepFiles
 from server.worker.dask_cluster import ClusterError
 from server.worker.executor import WorkerDiedError
 from server.worker.tasks import StepTask, measure_step
@@ -98,11 +98,11 @@ class AnalysisRun:
     def _load(self, job: Job) -> None:
         """Take over what another run finished; a result without summary, or damaged, is measured again."""
         tests, analysis_id = self._service.tests, str(job.subject["analysis_id"])
-        document = tests.analysis(self._test_id, analysis_id)
-        known = tests.step_summaries(self._test_id, analysis_id)
+        document = tests.analyses.read(self._test_id, analysis_id)
+        known = tests.analyses.step_summaries(self._test_id, analysis_id)
         for n in document.steps:
             with contextlib.suppress(StereorigError):
-                tests.result_file(self._test_id, analysis_id, n)
+                tests.analyses.result_file(self._test_id, analysis_id, n)
                 if n in known:
                     self._summaries[n] = known[n]
         self._loaded = document
@@ -157,7 +157,7 @@ class AnalysisRun:
         if reference is not None:
             self._references[int(str(reference))] = None
         kept = {k: step for k, step in self._done.items() if k in self._references}
-        self._done = {**kept, n: self._service.tests.step(self._test_id, n)}
+        self._done = {**kept, n: self._service.tests.steps.read(self._test_id, n)}
 
     def _measure_one(self, job: Job, index: int, n: int) -> None:
         service, document, steps = self._service, self._document, self._document.steps
@@ -278,7 +278,7 @@ class AnalysisRun:
         service, analysis_id = self._service, self._document.id
         seconds = round(seconds, 3)
         found = without_nan({**summary, "wall_s": seconds, "seconds": seconds})
-        service.tests.put_step_summary(self._test_id, analysis_id, n, found)
+        service.tests.analyses.put_step_summary(self._test_id, analysis_id, n, found)
         self._summaries[n] = StepOutcome.model_validate(found)
         self._go_on_from(n)
         self._publish(job)
@@ -290,16 +290,16 @@ class AnalysisRun:
             return
         measured = self._document.inputs.calibration_sha256
         calibration = self._service.tests.calibration_file(self._test_id, measured)
-        check_same_cameras(calibration, self._service.tests.step(self._test_id, n).document.cameras, f"Step {n}")
+        check_same_cameras(calibration, self._service.tests.steps.read(self._test_id, n).document.cameras, f"Step {n}")
 
     def _take_new_steps(self) -> bool:
         """Add the steps committed since to the analysis; return True if there are any."""
         tests, steps = self._service.tests, self._document.steps
         known = set(steps)
-        new = [n for n in tests.step_numbers(self._test_id) if n > steps[0] and n not in known]
+        new = [n for n in tests.steps.numbers(self._test_id) if n > steps[0] and n not in known]
         if new:
-            hashes = {str(n): tests.step(self._test_id, n).document.sha256 for n in new}
-            self._loaded = tests.extend_analysis(self._test_id, self._document.id, new, hashes)
+            hashes = {str(n): tests.steps.read(self._test_id, n).document.sha256 for n in new}
+            self._loaded = tests.analyses.extend(self._test_id, self._document.id, new, hashes)
         return bool(new)
 
     def _result(self, job: Job) -> dict[str, object]:
@@ -314,7 +314,7 @@ class AnalysisRun:
                 remedy=self._failed[first].remedy,
                 steps_failed=sorted(self._failed),
             )
-        folder = self._service.tests.analysis_path(self._test_id, self._document.id)
+        folder = self._service.tests.analyses.path(self._test_id, self._document.id)
         problems = {str(n): problem_of(error).plain() for n, error in self._failed.items()}
         found["warnings"] = [one.plain() for one in analysis_warnings(folder, failed=problems)]
         return found
@@ -322,7 +322,7 @@ class AnalysisRun:
 
 def close(service: Service, job: Job, test_id: str, analysis_id: str, state: str) -> None:
     """Write ``summary.json``: what was found in the steps that were finished, however the job ended."""
-    found, document = Finished.model_validate(job.result or {}), service.tests.analysis(test_id, analysis_id)
+    found, document = Finished.model_validate(job.result or {}), service.tests.analyses.read(test_id, analysis_id)
     summary = SequenceSummary(
         state=state,
         software_version=software_version(),
@@ -335,11 +335,11 @@ def close(service: Service, job: Job, test_id: str, analysis_id: str, state: str
     ).document()
     problem = None if job.record.problem is None else job.record.problem.plain()
     summary |= {"analysis_id": analysis_id, "job_id": job.id, "problem": problem}
-    service.tests.put_summary(test_id, analysis_id, summary)
+    service.tests.analyses.put_summary(test_id, analysis_id, summary)
     if found.steps_failed:
         entry = analysis_entry(document, job.id, [int(n) for n in found.steps_failed])
         service.catalog.put_entry("analysis", test_id, analysis_id, entry)
     if state == "succeeded" and not found.steps_failed:
-        service.tests.drop_starts(test_id, analysis_id)
+        service.tests.analyses.drop_starts(test_id, analysis_id)
     else:
-        service.tests.drop_half_written(test_id, analysis_id)  # by a worker that was ended in the middle
+        service.tests.analyses.drop_half_written(test_id, analysis_id)  # by a worker that was ended in the middle

@@ -36,7 +36,7 @@ def goes_in_blocks(
     if settings.side_by_side == "never" or settings.reference_update == "always":
         return False
     open_steps = [n for n in steps if not is_certain(summaries.get(n)) and n != document.steps[0]]
-    if open_steps and service.tests.has_heads(document.test_id, document.id):
+    if open_steps and service.tests.analyses.has_heads(document.test_id, document.id):
         return True
     return len(open_steps) >= 2 * SHORTEST and service.executor.width > 1
 
@@ -120,7 +120,7 @@ def measure_in_blocks(
 
 def _task_of(service: Service, document: AnalysisRecord, ask: Ask, *, shares: bool) -> StepTask:
     needed = [n for n in ask.references if n != ask.previous] + ([] if ask.previous is None else [ask.previous])
-    earlier = {n: service.tests.step(document.test_id, n) for n in needed}
+    earlier = {n: service.tests.steps.read(document.test_id, n) for n in needed}
     return replace(
         task_of(service.tests, document, ask.n, earlier, None, shares=shares),
         previous=ask.previous,

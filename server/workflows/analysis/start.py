@@ -39,7 +39,7 @@ def steps_to_measure(service: Service, test_id: str, reference: int, wanted: lis
     InputError
         ``step_missing`` if a step that was asked for does not exist, or all are and one is gone.
     """
-    there = service.tests.step_numbers(test_id)
+    there = service.tests.steps.numbers(test_id)
     if reference not in there:
         raise StateError(
             f"Test {test_id} has no step {reference} to refer to; it has {len(there)} steps.",
@@ -55,7 +55,7 @@ def steps_to_measure(service: Service, test_id: str, reference: int, wanted: lis
             f"Test {test_id} has no step {missing[0]}.", code="step_missing", remedy="Ask for steps that exist."
         )
     # an incomplete step keeps its folder and its number; one that was deleted is not missed
-    numbers = {*there, *service.tests.incomplete_steps(test_id), *service.tests.deleted_steps(test_id)}
+    numbers = {*there, *service.tests.steps.incomplete(test_id), *service.tests.steps.deleted(test_id)}
     gone = [n for n in range(reference, max(numbers)) if n not in numbers]
     if gone and everything:
         raise InputError(
@@ -70,7 +70,7 @@ def inputs_of(service: Service, test_id: str, steps: list[int], calibration: Pat
     """Checksums of everything that an analysis reads, fixed when it is made."""
     return {
         "calibration_sha256": sha256_of(calibration),
-        "steps": {str(n): service.tests.step(test_id, n).document.sha256 for n in steps},
+        "steps": {str(n): service.tests.steps.read(test_id, n).document.sha256 for n in steps},
     }
 
 
@@ -114,7 +114,7 @@ def check_region(
     service: Service, test_id: str, reference: int, settings: AnalysisSettings, mask: bytes | None
 ) -> None:
     """Refuse a region that leaves nothing to measure, before a job is made of it; see :func:`make_grid`."""
-    image = read_image(service.tests.step(test_id, reference).cam1)
+    image = read_image(service.tests.steps.read(test_id, reference).cam1)
     make_grid(settings, None if mask is None else decode_mask(mask), (image.shape[0], image.shape[1]))
 
 
@@ -159,14 +159,14 @@ def begin(
     calibration = made_with.file
     measured = steps_to_measure(service, test_id, settings.reference, steps)
     for n in measured:
-        check_same_cameras(calibration, service.tests.step(test_id, n).document.cameras, f"Step {n}")
+        check_same_cameras(calibration, service.tests.steps.read(test_id, n).document.cameras, f"Step {n}")
     noise = None if noise_id is None else service.noise.file(noise_id)
     if noise is not None:
         record = NoiseRecord.model_validate({"noise_id": noise_id, **load_noise(noise).record()})
         settings = settings.model_copy(update={"noise": record})
     check_region(service, test_id, measured[0], settings, mask)
     if settings.seeds_cam2 is not None:
-        rows, cols = read_image(service.tests.step(test_id, measured[0]).cam2).shape
+        rows, cols = read_image(service.tests.steps.read(test_id, measured[0]).cam2).shape
         check_seeds(calibration, settings, (cols, rows))
     service.require_room()
     document = {
@@ -183,7 +183,7 @@ def begin(
 
     def prepare(job: Job) -> Ids:
         run = {"job_id": job.id, **request.document()}
-        stored = service.tests.create_analysis(test_id, document, mask, noise, run)
+        stored = service.tests.analyses.create(test_id, document, mask, noise, run)
         return {"analysis_id": stored.id}
 
     job = submit(service, test_id, prepare, request, follow=follow)
@@ -211,7 +211,7 @@ def submit(
         on_end=lambda job, state: close(service, job, test_id, str(job.subject["analysis_id"]), state),
     )
     analysis_id = str(job.subject["analysis_id"])
-    stored = service.tests.analysis(test_id, analysis_id)
+    stored = service.tests.analyses.read(test_id, analysis_id)
     service.catalog.put_entry("analysis", test_id, analysis_id, analysis_entry(stored, job.id))
     return job
 
@@ -236,8 +236,8 @@ def continue_analysis(
 
 
 def _continue(service: Service, test_id: str, analysis_id: str, request: RequestMark, *, other_version: bool) -> Job:
-    document = service.tests.analysis(test_id, analysis_id)
-    runs = service.tests.analysis_jobs(test_id, analysis_id)
+    document = service.tests.analyses.read(test_id, analysis_id)
+    runs = service.tests.analyses.jobs(test_id, analysis_id)
     if runs and service.jobs.is_active(runs[-1].job_id):
         raise StateError(
             f"Analysis {analysis_id} is being worked on.",
@@ -245,7 +245,7 @@ def _continue(service: Service, test_id: str, analysis_id: str, request: Request
             remedy="Follow its job, or cancel it first.",
             job_id=runs[-1].job_id,
         )
-    summary = service.tests.summary(test_id, analysis_id)
+    summary = service.tests.analyses.summary(test_id, analysis_id)
     if summary is not None and summary.state == "succeeded" and not summary.steps_failed:
         raise StateError(
             f"Analysis {analysis_id} is finished: nothing is left to continue.",
@@ -271,7 +271,7 @@ def _continue(service: Service, test_id: str, analysis_id: str, request: Request
         )
 
     def prepare(job: Job) -> Ids:
-        service.tests.add_analysis_job(test_id, analysis_id, {"job_id": job.id, **request.document()})
+        service.tests.analyses.add_job(test_id, analysis_id, {"job_id": job.id, **request.document()})
         return {"analysis_id": analysis_id}
 
     return submit(service, test_id, prepare, request, follow=document.follow)

@@ -9,7 +9,8 @@ from core.errors import FileFormatError, StereorigError
 from server.formats.files import sha256_of
 from server.formats.results.settings import stored_settings
 from server.store.documents import AnalysisRecord
-from server.store.tests import StepFiles, TestStore
+from server.store.tests.steps import StepFiles
+from server.store.tests.tests import TestStore
 from server.worker.tasks import StepImages, StepTask, averages_of, grey_from_of
 
 
@@ -58,7 +59,7 @@ def task_of(
     """
     test_id, displacement = document.test_id, document.kind == "displacement"
     reference = document.steps[0] if displacement else n
-    ref, now = (tests.verified_step(test_id, k) for k in (reference, n))
+    ref, now = (tests.steps.verified(test_id, k) for k in (reference, n))
     for k, step in ((reference, ref), (n, now)):
         if step.document.sha256 != document.inputs.steps.get(str(k)):
             raise FileFormatError(
@@ -76,11 +77,11 @@ def task_of(
     after = None
     if following is not None and displacement:
         with contextlib.suppress(StereorigError):  # what is wrong with it is said at its own turn
-            after = tests.step(test_id, following)
+            after = tests.steps.read(test_id, following)
     about = {"label": now.document.label or "", "test_step": str(n)}
     if now.document.load_n is not None:
         about["load_n"] = repr(now.document.load_n)
-    folder = folder or tests.analysis_path(test_id, document.id)
+    folder = folder or tests.analyses.path(test_id, document.id)
     return StepTask(
         folder=folder,
         calibration=calibration,

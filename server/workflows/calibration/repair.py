@@ -70,7 +70,7 @@ def begin(
         )
     images = []
     for n in dict.fromkeys(steps):
-        step = service.tests.verified_step(test_id, n)
+        step = service.tests.steps.verified(test_id, n)
         check_same_cameras(original, step.document.cameras, f"Step {n}")
         sha256 = step.document.sha256
         averages = averages_of(step.document.plain())

@@ -31,11 +31,11 @@ def start_certificate(
     """
     service.require_room()
     service.exports.check_room()
-    folder = service.tests.analysis_path(test_id, analysis_id)
+    folder = service.tests.analyses.path(test_id, analysis_id)
 
     def run(job: Job) -> dict[str, object]:
-        for n in service.tests.finished_steps(test_id, analysis_id):
-            service.tests.result_file(test_id, analysis_id, n)  # whose checksum is compared
+        for n in service.tests.analyses.finished_steps(test_id, analysis_id):
+            service.tests.analyses.result_file(test_id, analysis_id, n)  # whose checksum is compared
         certificate_id = service.certificates.new_id()
         out = service.exports.new_folder()
         try:

@@ -52,7 +52,7 @@ def show_procedure(service: Service, test_id: str) -> dict[str, object]:
         return {"plan": None, "frames": 1, "steps": [], "next": None}
     asked = planned(service, test_id)
     steps = procedure_of(asked.plan, moves=service.config.calibration.moves)
-    number = service.tests.next_number(test_id)
+    number = service.tests.steps.next_number(test_id)
     taken = {int(str(one["n"])) for one in service.catalog.entries("step", test_id, limit=len(steps))}
     following = next_step(steps, number)
     states = {step.n: "taken" if step.n in taken else "missing" if step.n < number else "to_come" for step in steps}
@@ -80,7 +80,7 @@ def start_next(service: Service, test_id: str, *, confirmed: bool, request: Requ
     service.require_room()
     asked = planned(service, test_id)
     steps = procedure_of(asked.plan, moves=service.config.calibration.moves)
-    step = next_step(steps, service.tests.next_number(test_id))
+    step = next_step(steps, service.tests.steps.next_number(test_id))
     if step is None:
         raise StateError(
             f"All {len(steps)} steps of the procedure are taken.",
@@ -128,7 +128,7 @@ def _stage_at_reference(service: Service, test_id: str) -> Mapping[str, float]:
     StateError
         ``procedure_reference`` if the reference was not captured on this rig.
     """
-    known = service.tests.step(test_id, 0).document.plain().get("dz_mm")
+    known = service.tests.steps.read(test_id, 0).document.plain().get("dz_mm")
     if not isinstance(known, dict) or not all(isinstance(known.get(cam), int | float) for cam in CAMERAS):
         raise StateError(
             "Where the stage stood at the reference is not known: step 0 was not captured with it.",

@@ -54,13 +54,13 @@ class LiveRuns:
                     test_id=self._run.test_id,
                 )
             made_with = calibration_of(service, test_id, None)
-            if asked.reference not in service.tests.step_numbers(test_id):
+            if asked.reference not in service.tests.steps.numbers(test_id):
                 raise StateError(
                     f"Test {test_id} has no step {asked.reference} to refer to.",
                     code="no_steps",
                     remedy="Capture or import the reference first.",
                 )
-            reference = service.tests.verified_step(test_id, asked.reference)
+            reference = service.tests.steps.verified(test_id, asked.reference)
             check_same_cameras(made_with.file, service.rig.identities(), "A live frame")
             rows, cols = read_image(reference.cam1).shape
             settings = _stored(asked, (cols, rows))

@@ -21,7 +21,7 @@ def start_repetition(service: Service, test_id: str, analysis_id: str) -> Job:
     QueueFullError
         Too many computations wait.
     """
-    service.tests.analysis_path(test_id, analysis_id)
+    service.tests.analyses.path(test_id, analysis_id)
 
     def run(job: Job) -> dict[str, object]:
         folder = service.exports.new_folder()

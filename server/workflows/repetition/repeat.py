@@ -12,7 +12,8 @@ from server.formats.environment import Change
 from server.formats.files import sha256_of
 from server.results.repeated import WITHIN_U, StepRepetition, Verdict, changes_of, compare_results
 from server.store.documents import AnalysisRecord
-from server.store.tests import StepFiles, TestStore
+from server.store.tests.steps import StepFiles
+from server.store.tests.tests import TestStore
 from server.worker.dask_cluster import ClusterError
 from server.worker.executor import WorkerDiedError
 from server.worker.tasks import StepTask
@@ -108,8 +109,8 @@ def repeat(
         ``checksum_mismatch``, ``step_changed``, ``calibration_changed``: what it was measured from is not there any
         more, so that nothing can be repeated.
     """
-    document = tests.analysis(test_id, analysis_id)
-    finished, failed = tests.finished_steps(test_id, analysis_id), _failed(tests, test_id, analysis_id)
+    document = tests.analyses.read(test_id, analysis_id)
+    finished, failed = tests.analyses.finished_steps(test_id, analysis_id), _failed(tests, test_id, analysis_id)
     wanted = [n for n in document.steps if n in finished or n in failed]
     if not set(wanted) & set(finished):
         raise StateError(
@@ -117,13 +118,13 @@ def repeat(
             code="analysis_unmeasured",
             remedy="Continue the analysis first, or name another one.",
         )
-    _copy_inputs(tests.analysis_path(test_id, analysis_id), document, folder)
+    _copy_inputs(tests.analyses.path(test_id, analysis_id), document, folder)
     done: dict[int, StepFiles] = {}
     found: list[StepRepetition] = []
     changes: dict[Change, None] = {}
     for k, n in enumerate(wanted):
         on_step(n, k, len(wanted))
-        before = tests.result_file(test_id, analysis_id, n) if n in finished else None
+        before = tests.analyses.result_file(test_id, analysis_id, n) if n in finished else None
         found.append(_one(tests, document, n, done, folder, measure, before, failed.get(n)))
         if before is not None and n in done:
             changes |= dict.fromkeys(changes_of(before, result_in(folder, n)))
@@ -154,7 +155,7 @@ def _one(
             raise  # nothing can be measured after it
         was = "was measured" if before is not None else f"had failed with {failed_by}"
         return StepRepetition(n, "differs", (f"it {was}, and fails now: {error.code}: {error.cause}",))
-    done[n] = tests.step(document.test_id, n)
+    done[n] = tests.steps.read(document.test_id, n)
     if before is None:
         return StepRepetition(n, "differs", (f"it had failed with {failed_by}, and is measured now",))
     return compare_results(before, result_in(folder, n), n)
@@ -167,7 +168,7 @@ def result_in(folder: Path, n: int) -> Path:
 
 def _failed(tests: TestStore, test_id: str, analysis_id: str) -> dict[int, str]:
     """Codes of the steps that failed."""
-    summary = tests.summary(test_id, analysis_id)
+    summary = tests.analyses.summary(test_id, analysis_id)
     return {} if summary is None else {int(n): problem.code for n, problem in summary.steps_failed.items()}
 
 

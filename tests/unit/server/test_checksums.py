@@ -14,7 +14,7 @@ from server.store.catalog import Catalog
 from server.store.folder import DataFolder
 from server.store.indexing.build import rebuild
 from server.store.noise import NoiseStore
-from server.store.tests import TestStore
+from server.store.tests.tests import TestStore
 from server.store.verify import verify
 
 
@@ -80,7 +80,7 @@ def test_a_step_whose_document_cannot_be_read_takes_no_other_with_it(tmp_path: P
     tests = TestStore(folder)
     test_id = tests.create({"name": "one"}, None).id
     for _ in range(4):
-        tests.add_step(test_id, {"cam1": b"1", "cam2": b"2"}, {})
+        tests.steps.add(test_id, {"cam1": b"1", "cam2": b"2"}, {})
     (tests.path(test_id) / "steps" / "0001" / "step.json").write_text('{"n": 1, ')
     catalog = Catalog(folder.root / "catalog.sqlite").open()
     lines = rebuild(catalog, folder, CalibrationStore(folder), tests)

@@ -18,7 +18,7 @@ from server.store.catalog import Catalog
 from server.store.folder import DataFolder
 from server.store.indexing.build import Index
 from server.store.indexing.clean_stop import MARK, leave_mark, take_mark
-from server.store.tests import TestStore
+from server.store.tests.tests import TestStore
 
 LONG_AGO_NS = time.time_ns() - 3_600_000_000_000
 
@@ -53,7 +53,7 @@ class Bench:
         for n in range(steps):
             images = {"cam1": b"one", "cam2": b"two"}
             request = {"scope": f"tests/{made.id}/steps", "key": f"k{n}", "body_sha256": "0"}
-            self.tests.add_step(made.id, images, {"label": f"{n}", "source": "import", "request": request})
+            self.tests.steps.add(made.id, images, {"label": f"{n}", "source": "import", "request": request})
         return made.id
 
     def labels(self, test_id: str) -> list[object]:
@@ -187,7 +187,7 @@ def test_a_test_that_was_changed_by_hand_meanwhile_is_read_again_and_no_other(
     change(bench.folder.tests / one)
     changed = "t000099-abcdef" if change is _folder_copied else one
     assert bench.start()["waiting"] == {changed}
-    there = bench.tests.step_numbers(changed)
+    there = bench.tests.steps.numbers(changed)
     assert len(bench.catalog.entries("step", changed)) == len(there)
     assert bench.labels(two) == ["0", "1"]
     bench.stop()
@@ -207,7 +207,7 @@ def test_a_test_that_was_removed_meanwhile_is_in_no_list(bench: Bench) -> None:
 def test_a_test_that_was_changed_just_before_the_stop_is_read_again(bench: Bench) -> None:
     bench.start()
     two = bench.tests.ids()[1]
-    bench.tests.add_step(two, {"cam1": b"1", "cam2": b"2"}, {"label": "unseen"})  # killed before it was announced
+    bench.tests.steps.add(two, {"cam1": b"1", "cam2": b"2"}, {"label": "unseen"})  # killed before it was announced
     bench.stop()
     assert bench.start()["waiting"] == {two}
     assert bench.labels(two) == ["0", "1", "unseen"]

@@ -32,7 +32,7 @@ from server.base.models import Ids, JobState
 from server.base.problem import JobProblem
 from server.jobs.idempotency import RequestMark
 from server.store.documents import Finished, SummaryRecord
-from server.store.tests import MAX_STEPS
+from server.store.tests.steps import MAX_STEPS
 from server.workflows.analysis import start as analysis_start
 from server.workflows.analysis.warnings import with_warnings
 from server.workflows.service import Service
@@ -145,7 +145,7 @@ class _Course:
 
 
 def _course(service: Service, test_id: str, analysis_id: str) -> _Course:
-    summary = service.tests.summary(test_id, analysis_id)
+    summary = service.tests.analyses.summary(test_id, analysis_id)
     entry = service.catalog.entry("analysis", test_id, analysis_id) or {}
     job_id = entry.get("job_id")
     state: JobState = "interrupted" if summary is None else summary.state
@@ -165,7 +165,7 @@ def _course(service: Service, test_id: str, analysis_id: str) -> _Course:
 
 def analysis_reply(service: Service, test_id: str, analysis_id: str) -> AnalysisReply:
     """Return an analysis as the API shows it, with its first steps."""
-    document = service.tests.analysis(test_id, analysis_id)
+    document = service.tests.analyses.read(test_id, analysis_id)
     course = _course(service, test_id, analysis_id)
     first = document.steps[:WHOLE]
     if course.summary is not None:
@@ -173,11 +173,11 @@ def analysis_reply(service: Service, test_id: str, analysis_id: str) -> Analysis
             update={"steps": course.summary.steps[:FIGURES], "steps_failed": _first(course.summary.steps_failed)}
         ).plain()
     else:
-        known = service.tests.step_summaries(test_id, analysis_id, first[:FIGURES])
+        known = service.tests.analyses.step_summaries(test_id, analysis_id, first[:FIGURES])
         steps = [known[n].plain() for n in first[:FIGURES] if n in known]
         about = {"analysis_id": analysis_id, "state": course.state, "job_id": course.job_id}
         shown = {**about, "steps": steps} if steps else None
-    finished = service.tests.finished_steps(test_id, analysis_id)
+    finished = service.tests.analyses.finished_steps(test_id, analysis_id)
     checks = service.checks.of(test_id, analysis_id, course.failed)
     inputs = document.inputs.model_copy(update={"steps": dict(islice(document.inputs.steps.items(), WHOLE))})
     reply = {
@@ -229,11 +229,11 @@ def list_analysis_steps(
     first: Annotated[int, Query(ge=0, le=MAX_STEPS, description="Number of the first step in the answer.")] = 0,
 ) -> AnalysisStepList:
     """Return a page of the steps that an analysis measures, each with what became of it."""
-    document = service.tests.analysis(test_id, analysis_id)
+    document = service.tests.analyses.read(test_id, analysis_id)
     failed = _course(service, test_id, analysis_id).failed
     numbers = page.of(sorted(n for n in document.steps if n >= first), lambda n: f"{n:04d}")
-    finished = set(service.tests.finished_steps(test_id, analysis_id))
-    known = service.tests.step_summaries(test_id, analysis_id, numbers) if figures else {}
+    finished = set(service.tests.analyses.finished_steps(test_id, analysis_id))
+    known = service.tests.analyses.step_summaries(test_id, analysis_id, numbers) if figures else {}
     steps = []
     for n in numbers:
         state = "finished" if n in finished else "failed" if str(n) in failed else "waiting"
@@ -270,7 +270,7 @@ async def continue_analysis(
 
 def _go_on(service: Service, test_id: str, analysis_id: str, body: ContinueRequest | None, key: str | None) -> Ids:
     body = body or ContinueRequest.model_validate({})
-    service.tests.analysis_path(test_id, analysis_id)
+    service.tests.analyses.path(test_id, analysis_id)
     request = mark(f"tests/{test_id}/analyses/{analysis_id}:continue", key, body)
 
     def make() -> Ids:
@@ -297,7 +297,7 @@ async def finish_analysis(
 
 
 def _finish(service: Service, test_id: str, analysis_id: str) -> Ids:
-    service.tests.analysis_path(test_id, analysis_id)
-    runs = service.tests.analysis_jobs(test_id, analysis_id)
+    service.tests.analyses.path(test_id, analysis_id)
+    runs = service.tests.analyses.jobs(test_id, analysis_id)
     job = service.jobs.finish(runs[-1].job_id if runs else "")
     return {"job_id": job.id, "analysis_id": analysis_id}

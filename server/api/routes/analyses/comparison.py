@@ -62,8 +62,8 @@ async def compare(
 def _inputs(
     service: Service, test_id: str, analysis_id: str, body: ComparisonRequest
 ) -> tuple[list[str], str, str, dict[str, object]]:
-    steps = service.tests.finished_steps(test_id, analysis_id)
+    steps = service.tests.analyses.finished_steps(test_id, analysis_id)
     wanted = steps if body.step is None or body.step not in steps else [body.step]
-    files = [str(service.tests.result_file(test_id, analysis_id, n)) for n in wanted]
+    files = [str(service.tests.analyses.result_file(test_id, analysis_id, n)) for n in wanted]
     record = service.models.read(test_id, body.model_id)
     return files, str(service.models.file(test_id, body.model_id)), record.name, record.reading

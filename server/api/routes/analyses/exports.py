@@ -189,9 +189,9 @@ def begin_export(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, 
 def _prepared(
     service: Service, test_id: str, analysis_id: str, wanted: list[int] | None, dense: bool
 ) -> tuple[list[Path], dict[str, str]]:
-    document = service.tests.analysis(test_id, analysis_id)
-    there = service.tests.finished_steps(test_id, analysis_id)
-    files = [service.tests.result_file(test_id, analysis_id, n) for n in (there if wanted is None else wanted)]
+    document = service.tests.analyses.read(test_id, analysis_id)
+    there = service.tests.analyses.finished_steps(test_id, analysis_id)
+    files = [service.tests.analyses.result_file(test_id, analysis_id, n) for n in (there if wanted is None else wanted)]
     if not files:
         raise NotFoundError(
             f"Analysis {analysis_id} has no finished step.",

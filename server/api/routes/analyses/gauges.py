@@ -44,11 +44,11 @@ def field(
     step: Annotated[int, Query(ge=0, le=9999, description="Number of the step.")],
 ) -> Response:
     """Answer with a result file (NetCDF-4) of the step as `align` and `remove_rigid` ask for; nothing is stored."""
-    source = service.tests.result_file(test_id, analysis_id, step)
-    reference = service.tests.analysis(test_id, analysis_id).steps[0]
+    source = service.tests.analyses.result_file(test_id, analysis_id, step)
+    reference = service.tests.analyses.read(test_id, analysis_id).steps[0]
     # a frame is laid through the reference's shape
-    steps = {reference, step} if reference in service.tests.finished_steps(test_id, analysis_id) else {step}
-    files = [service.tests.result_file(test_id, analysis_id, n) for n in sorted(steps)]
+    steps = {reference, step} if reference in service.tests.analyses.finished_steps(test_id, analysis_id) else {step}
+    files = [service.tests.analyses.result_file(test_id, analysis_id, n) for n in sorted(steps)]
     with tempfile.TemporaryDirectory() as folder:
         writer = FieldWriter(Path(folder), source.parent, body)
         readings = read_gauges(files, body.model_copy(update={"steps": None}), writer)
@@ -84,7 +84,7 @@ def read(
     JSON holds a page of the steps, 100 unless `limit` says otherwise; `next_cursor` leads to the others. A table is a
     file with all of them.
     """
-    steps = service.tests.finished_steps(test_id, analysis_id)
+    steps = service.tests.analyses.finished_steps(test_id, analysis_id)
     asked = asked_of(service, test_id, frame)
     if asked is not None and body.align is not None:
         raise InputError(
@@ -93,7 +93,7 @@ def read(
     body = body if asked is None else body.model_copy(update={"align": asked})
     if format == "json":
         return _page(service, test_id, analysis_id, steps, body, page)
-    readings = read_gauges([service.tests.result_file(test_id, analysis_id, n) for n in steps], body)
+    readings = read_gauges([service.tests.analyses.result_file(test_id, analysis_id, n) for n in steps], body)
     headers = {"Content-Disposition": f'attachment; filename="{test_id}_{analysis_id}_gauges.{format}"'}
     if format == "csv":
         return Response(gauges_csv(readings), media_type="text/csv; charset=utf-8", headers=headers)
@@ -104,12 +104,12 @@ def _page(
     service: Service, test_id: str, analysis_id: str, steps: Sequence[int], body: GaugeRequest, page: Page
 ) -> dict[str, object]:
     """Read the gauges in a page of the steps; the files of the others are not touched."""
-    folder = service.tests.analysis_path(test_id, analysis_id)
+    folder = service.tests.analyses.path(test_id, analysis_id)
     asked = [number_of(path) for path in steps_asked([folder / f"step_{n:04d}.nc" for n in steps], body)]
     shown = [n for n in asked if body.steps is None or n in body.steps]
     only = page.of(shown, lambda n: f"{n:04d}")
     needed = sorted({*only, asked[0], *(() if body.difference_from is None else (body.difference_from,))})
-    files = [service.tests.result_file(test_id, analysis_id, n) for n in needed]
+    files = [service.tests.analyses.result_file(test_id, analysis_id, n) for n in needed]
     readings = read_gauges(files, body.model_copy(update={"steps": needed}), only=only)
     whole = {"settings": body.model_dump(mode="json"), "next_cursor": page.next_cursor}
     return readings.document() | whole

@@ -44,9 +44,9 @@ def get_history(
     frame: FrameText = None,
 ) -> HistoryReply:
     """Return a variable of the nearest point in a page of the finished steps, with its standard uncertainty."""
-    finished = sorted(service.tests.finished_steps(test_id, analysis_id))
+    finished = sorted(service.tests.analyses.finished_steps(test_id, analysis_id))
     chosen = page.of(finished, lambda n: f"{n:04d}")
-    first = service.tests.result_file(test_id, analysis_id, finished[0] if finished else 0)
+    first = service.tests.analyses.result_file(test_id, analysis_id, finished[0] if finished else 0)
     place = nearest_point(first, x_px, y_px)
     files = [result_in(service, test_id, analysis_id, n, frame, name) for n in chosen]
     found = point_history(files, name, place)

@@ -138,7 +138,7 @@ def show_scale(
 ) -> ScaleReply:
     """Return the length of a pixel of camera 1 on the surface, from feature matches with camera 2."""
     pair = load_calibration(service.tests.calibration_file(test_id)).pair
-    images = service.tests.verified_step(test_id, step)
+    images = service.tests.steps.verified(test_id, step)
     one, two = (
         MeasureImage(read_image(path), f"{cam} of step {step}")
         for cam, path in (("cam1", images.cam1), ("cam2", images.cam2))
@@ -158,7 +158,7 @@ def check_seeds(service: ServiceDep, test_id: TestId, body: SeedsRequest) -> See
             remedy="Give as many, null where a position is not known.",
         )
     pair = load_calibration(service.tests.calibration_file(test_id)).pair
-    rows, cols = read_image(service.tests.step(test_id, body.reference).cam2).shape
+    rows, cols = read_image(service.tests.steps.read(test_id, body.reference).cam2).shape
     seeds = [Seed(one, other) for one, other in zip(body.seeds, two, strict=True)]
     off = distances_px(pair, seeds)
     return SeedsReply.model_validate(

@@ -128,7 +128,7 @@ def get_step_pixels(
         x_px=x_px,
         y_px=y_px,
         values=pixels[y_px : y_px + rows, x_px : x_px + columns].tolist(),
-        grey_scale=float(service.tests.step(test_id, n).document.grey_scale or 1),
+        grey_scale=float(service.tests.steps.read(test_id, n).document.grey_scale or 1),
         full_scale=full_scale,
     )
 
@@ -180,7 +180,7 @@ def _full_scale(pixels: GrayImage, stated: float | None) -> float:
 
 def step_image(service: Service, test_id: str, n: int, cam: str) -> tuple[GrayImage, float]:
     """Return a step's image, its checksum checked, and its largest grey level."""
-    step = service.tests.verified_step(test_id, n)
+    step = service.tests.steps.verified(test_id, n)
     pixels = read_image(step.cam1 if cam == "cam1" else step.cam2)
     depth = (step.document.bit_depth or {}).get(cam)
     full_scale = None if depth is None else (2**depth - 1) * (step.document.grey_scale or 1)

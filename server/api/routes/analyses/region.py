@@ -50,7 +50,7 @@ class FoundRegionReply(Reply):
 def find_region(service: ServiceDep, test_id: TestId, body: FindRegionRequest) -> FoundRegionReply:
     """Find the specimen by its texture: as far as camera 2 sees and matches it. Nothing is kept."""
     pair = load_calibration(service.tests.calibration_file(test_id)).pair
-    step = service.tests.verified_step(test_id, body.reference)
+    step = service.tests.steps.verified(test_id, body.reference)
     one, two = (
         MeasureImage(read_image(path), f"{cam} of step {body.reference}")
         for cam, path in (("cam1", step.cam1), ("cam2", step.cam2))

@@ -62,14 +62,14 @@ async def get_report(
 def _framed(service: Service, test_id: str, analysis_id: str, frame: str | None, folder: Path) -> list[str]:
     if asked_of(service, test_id, frame) is None:
         return []
-    steps = service.tests.finished_steps(test_id, analysis_id)
-    files = [service.tests.result_file(test_id, analysis_id, n) for n in steps]
+    steps = service.tests.analyses.finished_steps(test_id, analysis_id)
+    files = [service.tests.analyses.result_file(test_id, analysis_id, n) for n in steps]
     return [str(path) for path in results_in_frame(service, test_id, files, frame, folder)]
 
 
 def _prepared(service: Service, test_id: str, analysis_id: str) -> tuple[str, list[str]]:
-    document = service.tests.analysis(test_id, analysis_id)
-    there = service.tests.finished_steps(test_id, analysis_id)
+    document = service.tests.analyses.read(test_id, analysis_id)
+    there = service.tests.analyses.finished_steps(test_id, analysis_id)
     if not there:
         raise NotFoundError(
             f"Analysis {analysis_id} has no finished step.",
@@ -77,7 +77,7 @@ def _prepared(service: Service, test_id: str, analysis_id: str) -> tuple[str, li
             remedy="Wait for its job, or measure again.",
         )
     for n in there:
-        service.tests.result_file(test_id, analysis_id, n)  # whose checksum is compared
-    return str(service.tests.analysis_path(test_id, analysis_id)), analysis_start.stale_reasons(
+        service.tests.analyses.result_file(test_id, analysis_id, n)  # whose checksum is compared
+    return str(service.tests.analyses.path(test_id, analysis_id)), analysis_start.stale_reasons(
         service, test_id, document
     )

@@ -122,7 +122,7 @@ def list_fields(
     frame: FrameText = None,
 ) -> FieldList:
     """Return name, unit, meaning and dimensions of every variable; what the values of a status mean; the cuts."""
-    path = service.tests.result_file(test_id, analysis_id, n)
+    path = service.tests.analyses.result_file(test_id, analysis_id, n)
     fields, described = [asdict(v) for v in list_variables(path)], read_head(path).frame
     asked = asked_of(service, test_id, frame)
     if asked is not None:
@@ -154,8 +154,8 @@ def get_positions(
     format: Annotated[Literal["json", "npy"], Query(description="Form of the answer.")] = "json",  # noqa: A002
 ) -> Response:
     """Return column and row of each point, where it is at that step, by the calibration; null where it has none."""
-    result = service.tests.result_file(test_id, analysis_id, n)
-    measured = service.tests.analysis(test_id, analysis_id).inputs.calibration_sha256
+    result = service.tests.analyses.result_file(test_id, analysis_id, n)
+    measured = service.tests.analyses.read(test_id, analysis_id).inputs.calibration_sha256
     positions = image_positions(result, service.tests.calibration_file(test_id, measured), cam)
     if format == "npy":
         buffer = io.BytesIO()

@@ -101,7 +101,7 @@ def check_distance(service: ServiceDep, calibration_id: CalibrationId, body: Dis
     else:
         assert body.step is not None
         target = target_of(body.step.target.plain(), "step.target")
-        step = service.tests.verified_step(body.step.test_id, body.step.n)
+        step = service.tests.steps.verified(body.step.test_id, body.step.n)
         images = read_image(step.cam1), read_image(step.cam2)
         found = distance_of_target(loaded, images, target, distance_sigma_mm=body.distance_sigma_mm)
         how = body.step.model_dump(mode="json", exclude_none=True)

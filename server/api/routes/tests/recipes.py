@@ -23,7 +23,7 @@ RecipeId = Annotated[str, Path(max_length=40, description="Id of a recipe.")]
 def reference_size_px(service: Service, test_id: str, n: int = 0) -> tuple[int, int] | None:
     """Return width and height of camera 1's image of a step; None where it cannot be read."""
     try:
-        step = service.tests.step(test_id, n)
+        step = service.tests.steps.read(test_id, n)
         known = step.document.image_size_px.get("cam1")
         if known is None:
             rows, cols = read_image(step.cam1).shape
@@ -35,7 +35,7 @@ def reference_size_px(service: Service, test_id: str, n: int = 0) -> tuple[int, 
 
 def check_against_test(service: Service, test_id: str, recipe: Recipe) -> None:
     """Refuse a recipe that was drawn over other images than a test's; see :meth:`Recipe.check_fits`."""
-    numbers = service.tests.step_numbers(test_id)
+    numbers = service.tests.steps.numbers(test_id)
     size = reference_size_px(service, test_id, numbers[0]) if numbers else None
     if size is not None:
         recipe.check_fits(*size)

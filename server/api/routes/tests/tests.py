@@ -57,7 +57,7 @@ def _reply(service: Service, test_id: str) -> dict[str, object]:
         "steps": steps,
         "steps_next_cursor": None if n_steps <= WHOLE else cursor_of(f"{steps[-1]['n']:04d}"),
         "newest_step": service.catalog.last_entry("step", test_id),
-        "incomplete_steps": service.tests.incomplete_steps(test_id),
+        "incomplete_steps": service.tests.steps.incomplete(test_id),
         "analyses": service.catalog.entries("analysis", test_id),
     }
 
@@ -262,13 +262,13 @@ def list_steps(
     rest = service.catalog.entries("step", test_id, after=page.after, limit=page.limit + 1)
     steps = page.cut(rest, lambda s: f"{s['n']:04d}")
     if channels:
-        steps = [{**one, "channels": service.tests.step(test_id, one["n"]).document.channels} for one in steps]
+        steps = [{**one, "channels": service.tests.steps.read(test_id, one["n"]).document.channels} for one in steps]
     return StepList.model_validate({"steps": steps, "next_cursor": page.next_cursor})
 
 
 def step_reply(service: Service, test_id: str, n: int) -> dict[str, object]:
     """Return a step as the API shows it."""
-    return service.tests.step(test_id, n).document.shown()
+    return service.tests.steps.read(test_id, n).document.shown()
 
 
 @router.get("/{test_id}/steps/{n}", summary="One step", responses=errors(404, 422))
@@ -282,10 +282,10 @@ def patch_step(
     service: ServiceDep, test_id: TestId, n: StepNumber, body: StepPatch, response: Response, if_match: IfMatch = None
 ) -> StepReply:
     """Change the label; what was taken stays as it is. If-Match names which state of the step was meant."""
-    service.tests.step(test_id, n)
+    service.tests.steps.read(test_id, n)
     with service.changes:
         require_match(if_match, etag_of(step_reply(service, test_id, n)), f"step {n} of test {test_id}")
-        document = service.tests.update_step(test_id, n, {"label": body.label})
+        document = service.tests.steps.update(test_id, n, {"label": body.label})
         entry = step_entry(document)
         service.catalog.put_entry("step", test_id, f"{n:04d}", entry)
     service.hub.publish("step", {"test_id": test_id, **entry})
@@ -306,7 +306,7 @@ def get_step_image(
     format: Annotated[Literal["tiff", "png"], Query(description="As stored, or for looking at.")] = "tiff",  # noqa: A002
 ) -> Response:
     """Return the image as stored, after checking its checksum."""
-    step = service.tests.verified_step(test_id, n)
+    step = service.tests.steps.verified(test_id, n)
     path = step.cam1 if cam == "cam1" else step.cam2
     if format == "tiff":
         return Response(path.read_bytes(), media_type="image/tiff")

@@ -93,7 +93,7 @@ def post_channels(
         return {name: value for name, value in values.items() if value is not None}
 
     made, _ = service.once(sent.scope, key, sent.body_sha256, make)
-    step = None if made.get("n") is None else service.tests.step(test_id, int(made["n"])).document
+    step = None if made.get("n") is None else service.tests.steps.read(test_id, int(made["n"])).document
     values: dict[str, object] = {name: made.get(name) for name in ("reason", "value", "last_value")}
     if step is not None and "reason" not in made:  # the step has it, the catalogue was lost
         value, last = (None, None) if step.watch is None else (step.watch.value, step.watch.last_value)

@@ -64,14 +64,14 @@ def get_analysis_recipe(service: ServiceDep, test_id: TestId, analysis_id: Analy
 
 
 def _recipe_of(service: Service, test_id: str, analysis_id: str) -> dict[str, object]:
-    made = service.tests.analysis(test_id, analysis_id)
+    made = service.tests.analyses.read(test_id, analysis_id)
     stored = stored_settings(made.settings)
     kept = {
         k: v for k, v in stored.model_dump(mode="json").items() if k in RecipeSettings.model_fields and k != "region"
     }
     kept |= {"kind": made.kind or "displacement", "noise_id": None if stored.noise is None else stored.noise.noise_id}
     region = {k: v for k, v in stored.region.model_dump(mode="json", exclude={"mask"}).items() if v is not None}
-    mask = service.tests.analysis_path(test_id, analysis_id) / "mask.png"
+    mask = service.tests.analyses.path(test_id, analysis_id) / "mask.png"
     if mask.is_file():
         region["mask_png_base64"] = base64.b64encode(mask.read_bytes()).decode()
     drawn = {k: v for k, v in service.tests.workspace(test_id).items() if k in ("gauges", "display")}

@@ -1,0 +1,1 @@
+"""Tests on disk, their steps and their analyses."""
