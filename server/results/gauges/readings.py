@@ -2,46 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from core.arrays import Float
-from core.common.budget import UNKNOWN, Budget, budget_of
 from core.errors import InputError, MeasurementError, StateError
 from core.field.common import notes_of
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
 from core.gauge.align import Alignment, aligned
-from core.gauge.area import area_statistics, points_within
-from core.gauge.extensometer import extensometer
+from core.gauge.area import points_within
 from core.gauge.line import positions_along
 from core.gauge.locate import positions_from_mm
-from core.gauge.reading import Reading, reading_of
-from core.gauge.rigid import RigidMotion, rigid_motion, without_rigid_motion
-from core.gauge.sampling import Samples, sample
-from core.names import BUDGET
-from core.strain.reference import reference_share
-from core.strain.result import StrainField
+from core.gauge.rigid import rigid_motion, without_rigid_motion
 from server.formats.calibrations.in_test import calibration_id_in
 from server.formats.files import sha256_of
-from server.formats.gauges.readings import (
-    AreaReading,
-    AreaStatistics,
-    ExtensometerReading,
-    FrameReading,
-    GaugeReadings,
-    LineReading,
-    Number,
-    Numbers,
-    PointReading,
-    Problem,
-    RigidMotionReading,
-    StepReadings,
-)
+from server.formats.gauges.readings import GaugeReadings, Problem, RigidMotionReading, StepReadings
 from server.formats.gauges.stated import stated
 from server.formats.results.folder import home_of, number_of
 from server.formats.results.layout import COVARIANCE_NAMES
@@ -52,9 +30,10 @@ from server.results.channels import recorded_with
 from server.results.gauges.differences import Kept, with_differences
 from server.results.gauges.fields import FieldWriter
 from server.results.gauges.frames import lay, text_of
-from server.results.gauges.numbers import finite, number, plain
+from server.results.gauges.motions import frame_reading, motion_reading
 from server.results.gauges.request import ExtensometerGauge, GaugeRequest, LineGauge, PointGauge
-from server.results.gauges.variables import STRAIN_NAMES, Variables, component_of
+from server.results.gauges.values import of_area, of_extensometer, of_line, of_point
+from server.results.gauges.variables import Variables
 from server.results.images.projected_pattern import check_gauges
 from server.results.reader import read_variable
 from server.results.staleness import stale_results
@@ -62,8 +41,6 @@ from server.store.durable import known_json
 
 _Positions = dict[str | None, list[tuple[float, float]]]
 MAX_NUMBERS = 3_000_000
-_MOTION = (("rotation", "rad"), ("translation", "mm"))
-_EXTENSOMETER_UNITS = {"length0_mm": "mm", "length_mm": "mm", "elongation_mm": "mm", "strain": "1", "true_strain": "1"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +157,7 @@ def read_gauges(
     if request.align is not None:
         frame = f"{text_of(request.align)}; before: {frame}"
     statement = Statement(Included.in_all(included), request)
-    laid = None if alignment is None else _frame_reading(alignment)
+    laid = None if alignment is None else frame_reading(alignment)
     return GaugeReadings(
         software_version=software_version(),
         settings=request.model_dump(mode="json"),
@@ -310,229 +287,18 @@ def _read_step(
         except MeasurementError as error:
             return step.reading(problem=Problem(error.code, error.cause, error.remedy))
         field = without_rigid_motion(field, motion, shared=step.shared)
-        taken_out = _motion_reading(motion)
+        taken_out = motion_reading(motion)
     if fields is not None:
-        frame = None if alignment is None else _frame_reading(alignment)
+        frame = None if alignment is None else frame_reading(alignment)
         fields(step.path, step.sha256, step.head, field, frame, taken_out)
     variables = Variables(step.path, field, step.shared, measured=measured, turned=alignment is not None)
     names = variables.known(request.variables or COVARIANCE_NAMES)
     found.update(names)
     return step.reading(
         rigid_motion=taken_out,
-        points=[_point(variables, kept, names, p.name, *positions[p.name]) for p in request.points],
-        extensometers=[_extensometer(variables, kept, e.name, *positions[e.name]) for e in request.extensometers],
-        lines=[_line(variables, names, line) for line in request.lines],
-        areas=[_area(variables, kept, names, a.name, a.corners()) for a in request.areas],
+        points=[of_point(variables, kept, names, p.name, *positions[p.name]) for p in request.points],
+        extensometers=[of_extensometer(variables, kept, e.name, *positions[e.name]) for e in request.extensometers],
+        lines=[of_line(variables, names, line) for line in request.lines],
+        areas=[of_area(variables, kept, names, a.name, a.corners()) for a in request.areas],
         not_told=notes_of(field),
     )
-
-
-def _at_positions(
-    variables: Variables, names: Sequence[str], positions: Samples, first: dict[str, Reading] | None = None
-) -> dict[str, Numbers]:
-    """Read variables at positions; ``first`` takes the readings at the first one."""
-    own = np.arange(len(positions.xy_px))
-    variance = np.diagonal(positions.covariance(variables.shared, own, own), axis1=-2, axis2=-1)
-    at_reference = positions.reference_alone()
-    frozen = (
-        None
-        if at_reference is None
-        else np.diagonal(at_reference.covariance(variables.shared, own, own), axis1=-2, axis2=-1)
-    )
-    common, causes = positions.common(), variables.field.causes
-    of_calibration = np.full(variance.shape, np.nan) if common is None else (common**2).sum(axis=-1)
-    out = {}
-    for name in names:
-        variable, sigma = variables.get(name)
-        k = component_of(name)
-        if k is not None:
-            s = np.sqrt(variance[:, k] + np.nan_to_num(of_calibration[:, k]))
-        elif sigma is not None:
-            s = positions.of(sigma)  # as if the errors of the points about it were one
-        else:
-            s = np.full(len(own), np.nan)
-        part = np.full(len(own), np.nan) if k is None else np.sqrt(of_calibration[:, k])
-        budgets: Sequence[Budget] = [UNKNOWN] * len(own)
-        rows = None if common is None or k is None else common[:, k]
-        if k is not None:
-            budgets = [
-                budget_of(
-                    float(variance[i, k]),
-                    None if frozen is None else float(frozen[i, k]),
-                    None if common is None else common[i, k],
-                    causes,
-                )
-                for i in own
-            ]
-        elif name in STRAIN_NAMES and variables.strain is not None:
-            budgets, part, rows = _of_strain(variables, variables.strain, STRAIN_NAMES.index(name), positions, s)
-        values = positions.of(variable.values)
-        if first is not None:
-            row = None if rows is None else rows[0]
-            first[name] = Reading(float(values[0]), float(s[0]), float(part[0]), budgets[0], row, causes)
-        out[name] = Numbers(_list(values), _list(s), variable.units, _list(part), _by_part(budgets))
-    return out
-
-
-def _of_strain(
-    variables: Variables, strain: StrainField, axis: int, positions: Samples, sigma: Float
-) -> tuple[list[Budget], Float, Float | None]:
-    """Budgets of a strain at positions, common parts and factors."""
-    common = None if strain.common is None else positions.of(strain.common[..., axis, :])
-    part = np.full(len(sigma), np.nan) if common is None else np.linalg.norm(common, axis=-1)
-    own = np.maximum(sigma**2 - np.nan_to_num(part) ** 2, 0.0)
-    field = variables.field
-    at_points = reference_share(variables.measured, strain)
-    share = None if at_points is None else positions.of(at_points[..., axis])
-    budgets = [
-        budget_of(
-            float(own[i]),
-            None if share is None else float(share[i] * own[i]),
-            None if common is None else common[i],
-            field.causes,
-        )
-        for i in range(len(own))
-    ]
-    return budgets, np.asarray(part), common
-
-
-def _by_part(budgets: Sequence[Budget]) -> dict[str, list[float | None]] | None:
-    """Return budgets of positions as a list a part; None where nothing is known."""
-    found = [one.document() for one in budgets]
-    names = [name for name in BUDGET if any(name in one for one in found)]
-    return {name: [one.get(name) for one in found] for name in names} or None
-
-
-def _at(budget: Mapping[str, Sequence[float | None]] | None, i: int) -> dict[str, float] | None:
-    found = {} if budget is None else {name: values[i] for name, values in budget.items()}
-    return {name: value for name, value in found.items() if value is not None} or None
-
-
-def _point(
-    variables: Variables, kept: list[Kept], names: Sequence[str], name: str | None, xy: tuple[float, float]
-) -> PointReading:
-    positions = sample(variables.field, [xy])
-    rows: dict[str, Reading] = {}
-    found = _at_positions(variables, names, positions, rows)
-    kept += [Kept(name, "point", n, found[n].units, reading) for n, reading in rows.items()]
-    values = {
-        n: Number(
-            reading.value[0], reading.sigma[0], reading.units, reading.sigma_calibration[0], _at(reading.budget, 0)
-        )
-        for n, reading in found.items()
-    }
-    return PointReading(name, xy, positions.missing[0], values)
-
-
-def _line(variables: Variables, names: Sequence[str], line: LineGauge) -> LineReading:
-    xy, distance = positions_along(variables.field, line.vertices_px, line.count)
-    positions = sample(variables.field, xy)
-    return LineReading(
-        name=line.name,
-        x_px=xy[:, 0].tolist(),
-        y_px=xy[:, 1].tolist(),
-        distance_px=distance.tolist(),
-        missing=list(positions.missing),
-        values=_at_positions(variables, names, positions),
-    )
-
-
-def _extensometer(
-    variables: Variables, kept: list[Kept], name: str | None, a: tuple[float, float], b: tuple[float, float]
-) -> ExtensometerReading:
-    got = extensometer(variables.field, a, b, shared=variables.shared)
-    readings: dict[str, Reading] = {n: getattr(got, n) for n in _EXTENSOMETER_UNITS}
-    values = {n: number(r, _EXTENSOMETER_UNITS[n]) for n, r in readings.items()}
-    kept += [Kept(name, "extensometer", n, _EXTENSOMETER_UNITS[n], r) for n, r in readings.items()]
-    return ExtensometerReading(name, a, b, got.missing, values)
-
-
-def _area(
-    variables: Variables,
-    kept: list[Kept],
-    names: Sequence[str],
-    name: str | None,
-    corners: list[tuple[float, float]] | None,
-) -> AreaReading:
-    field = variables.field
-    inside = points_within(field, corners)
-    values = {}
-    for n in names:
-        variable, _ = variables.get(n)
-        # the correlation of other variables' errors is not known here: no uncertainty of their mean
-        own = variables.own_sigma(n)
-        of_position = component_of(n) in range(3)
-        shared = variables.shared.positions if of_position else variables.shared
-        got = area_statistics(
-            field,
-            variable.values,
-            None if own is None else own.own,
-            inside,
-            shared=shared,
-            common=None if own is None else own.common,
-            sigma_reference=None if own is None else own.reference,
-        )
-        of_strain = variables.mean_strain_variance(inside) if n in STRAIN_NAMES and got.count else None
-        if of_strain is not None:
-            axis = STRAIN_NAMES.index(n)
-            mean = reading_of(
-                got.mean,
-                float(of_strain.own[axis]),
-                None if of_strain.reference is None else float(of_strain.reference[axis]),
-                None if of_strain.common is None else of_strain.common[axis],
-                of_strain.causes,
-            )
-            got = replace(got, mean_sigma=mean.sigma, mean_sigma_calibration=mean.sigma_calibration, mean_reading=mean)
-        kept.append(Kept(name, "area", n, variable.units, got.mean_reading))
-        values[n] = AreaStatistics(
-            units=variable.units,
-            count=got.count,
-            mean=finite(got.mean),
-            mean_sigma=finite(got.mean_sigma),
-            sd=finite(got.sd),
-            rms=finite(got.rms),
-            min=finite(got.minimum),
-            max=finite(got.maximum),
-            mean_sigma_calibration=finite(got.mean_sigma_calibration),
-            mean_budget=plain(got.mean_reading.budget),
-        )
-    valid = int((inside & field.valid).sum())
-    missing = "" if valid else "no valid point in the area"
-    return AreaReading(name, int(inside.sum()), valid, missing, values)
-
-
-def _frame_reading(alignment: Alignment) -> FrameReading:
-    sigma = np.sqrt(np.diag(alignment.covariance))
-    return FrameReading(
-        rotation=alignment.rotation.tolist(),
-        origin_mm=alignment.origin_mm.tolist(),
-        sigma_rad=sigma[:3].tolist(),
-        sigma_origin_mm=sigma[3:].tolist(),
-        residual_rms_mm=alignment.residual_rms_mm,
-        points=alignment.points,
-        budget_rad=[one.document() for one in alignment.budgets[:3]],
-        budget_origin_mm=[one.document() for one in alignment.budgets[3:]],
-    )
-
-
-def _motion_reading(motion: RigidMotion) -> RigidMotionReading:
-    sigma = np.sqrt(np.diag(motion.covariance))
-    found = np.concatenate([motion.rotation_vector_rad, motion.translation_mm])
-    names = [f"{quantity}_{axis}_{unit}" for quantity, unit in _MOTION for axis in "xyz"]
-    units = [unit for _, unit in _MOTION for _ in range(3)]
-    numbers = zip(names, found, sigma, units, motion.sigma_common, motion.budgets, strict=True)
-    return RigidMotionReading(
-        values={
-            name: number(Reading(float(value), float(s), float(part), budget), unit)
-            for name, value, s, unit, part, budget in numbers
-        },
-        centre_mm=motion.centre_mm.tolist(),
-        covariance=motion.covariance.tolist(),
-        points=motion.points,
-        residual_rms_mm=motion.residual_rms_mm,
-        noise_ratio=motion.noise_ratio,
-    )
-
-
-def _list(values: Float) -> list[float | None]:
-    return [finite(v) for v in values]
