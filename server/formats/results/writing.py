@@ -18,34 +18,28 @@ from numpy.typing import NDArray
 
 from core.common.factor import Causes
 from core.field.points.dense_record import METHOD, NEIGHBOURS
-from core.field.points.result import Field, References, Rejected
-from core.field.region.cuts import Cuts, as_arrays
-from core.field.sequence.propagated import current_covariance
-from core.names import CAUSES
+from core.field.points.result import Field
 from core.status import STATUS_MEANINGS, PointStatus
 from core.strain import StrainField
 from server.formats.environment import current_environment
 from server.formats.results.layout import (
-    COLUMN_BY_COLUMN,
     COMPARISONS,
     COVARIANCE_NAMES,
     CURVATURE,
-    ENTRIES,
     FORMAT_VERSION,
     FROZEN,
     MOTION,
-    PROPAGATED_FROM,
     SHAPE,
     packed,
 )
 from server.formats.results.netcdf import written_dataset
+from server.formats.results.parts import put, put_causes, put_cuts, put_measured, put_references, put_rejected
 from server.formats.results.strain import put_strain
 from server.formats.results.uncertainty import Included
 
 # measured numbers end in random bits: deflating them takes three quarters of the writing time and saves a quarter of
 # the file. Repeating values are always deflated; everything is where at least this share of the points has no numbers
 _MANY_EMPTY = 0.2
-_REPETITIVE = ("x_px", "y_px", "status", "iterations", "zncc")
 _FRAMES = {
     "target": "sys: X_sys, Y_sys in the calibration target's plane at its first position, Z_sys away from the cameras",
     "camera1": "sys = camera 1: X along the rows, Y down the columns, Z along the optical axis, away from the camera",
@@ -83,30 +77,8 @@ class Provenance:
     extra: Mapping[str, str] = field(default_factory=dict)
 
 
-def _put(
-    dataset: Any,
-    name: str,
-    values: NDArray[Any],
-    dims: tuple[str, ...],
-    *,
-    units: str,
-    long_name: str,
-    dtype: str,
-    sparse: bool = False,
-) -> None:
-    fill = np.nan if dtype.startswith("f") else False
-    pack: dict[str, Any] = {}
-    if sparse or name in _REPETITIVE:
-        pack = {"compression": "zlib", "complevel": 1, "shuffle": True}
-    if dims[-1] == "cause":  # column by column: each is smooth over the points, and has few digits
-        pack = COLUMN_BY_COLUMN | {"chunksizes": (*values.shape[:2], 1, 1)}
-    variable = dataset.createVariable(name, dtype, dims, fill_value=fill, **pack)
-    variable.setncatts({"units": units, "long_name": long_name})
-    dataset.put(variable, values.astype(dtype, copy=False))
-
-
 def _put_status(dataset: Any, status: NDArray[np.int8]) -> None:
-    _put(dataset, "status", status, ("row", "col"), units="1", long_name="what can be said about the point", dtype="i1")
+    put(dataset, "status", status, ("row", "col"), units="1", long_name="what can be said about the point", dtype="i1")
     dataset.variables["status"].setncatts(
         {
             "flag_values": np.array([s.value for s in PointStatus], dtype=np.int8),
@@ -130,9 +102,9 @@ def fill(dataset: Any, result: Field, provenance: Provenance, strain: StrainFiel
             values = values[..., v.component]
         smooth = result.smoothing is not None and v.attribute == "uvw_mm"
         long_name = f"{v.long_name}, smoothed" if smooth else v.long_name
-        _put(dataset, v.name, values, ("row", "col"), units=v.units, long_name=long_name, dtype=v.dtype, sparse=sparse)
+        put(dataset, v.name, values, ("row", "col"), units=v.units, long_name=long_name, dtype=v.dtype, sparse=sparse)
     _put_status(dataset, result.status)
-    _put(
+    put(
         dataset,
         "iterations",
         result.iterations,
@@ -141,7 +113,7 @@ def fill(dataset: Any, result: Field, provenance: Provenance, strain: StrainFiel
         long_name="iterations of the fit",
         dtype="i4",
     )
-    _put(
+    put(
         dataset,
         "zncc",
         result.zncc,
@@ -153,13 +125,13 @@ def fill(dataset: Any, result: Field, provenance: Provenance, strain: StrainFiel
     dataset.variables["zncc"].comparisons = " ".join(COMPARISONS[: result.zncc.shape[-1]])
     _put_covariance(dataset, result, sparse=sparse)
     if result.rejected is not None:
-        _put_rejected(dataset, result.rejected)
+        put_rejected(dataset, result.rejected)
     if result.cuts:
-        _put_cuts(dataset, result.cuts)
+        put_cuts(dataset, result.cuts)
     if strain is not None:
         put_strain(dataset, strain, sparse=sparse, included=Included.of_field(result).text)
     if result.references is not None:
-        _put_references(dataset, result.references)
+        put_references(dataset, result.references)
     dataset.setncatts(_attributes(provenance, moved=result.has_motion))
     if result.has_motion:
         matched = provenance.reference if result.references is None else result.references.step
@@ -192,7 +164,7 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
         dataset.createDimension("i", n)
         dataset.createDimension("j", n)
     total = result.total_covariance
-    _put(
+    put(
         dataset,
         "covariance",
         packed(total) if result.has_motion else total,
@@ -211,8 +183,8 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
         dataset.createDimension("component", n)
         causes = Causes.untold(result.common.shape[-1]) if result.causes is None else result.causes
         dataset.createDimension("cause", len(causes.columns))
-        _put_causes(dataset, causes)
-        _put(
+        put_causes(dataset, causes)
+        put(
             dataset,
             "common_factor",
             result.common,
@@ -230,7 +202,7 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
         )
     if result.frozen is not None:
         dataset.createDimension("frozen", len(FROZEN))
-        _put(
+        put(
             dataset,
             "reference_covariance",
             packed(result.frozen),
@@ -249,7 +221,7 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
         )
     sigma = result.sigma_mm
     for k, name in enumerate(names):
-        _put(
+        put(
             dataset,
             f"sigma_{name}",
             sigma[..., k],
@@ -260,131 +232,6 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
             sparse=sparse,
         )
         dataset.variables[f"sigma_{name}"].includes = included
-
-
-def _put_causes(dataset: Any, causes: Causes) -> None:
-    width = max(len(name) for name in CAUSES)
-    dataset.createDimension("cause_length", width)
-    variable = dataset.createVariable("cause", "S1", ("cause", "cause_length"))
-    variable.setncatts(
-        {
-            "long_name": "where a column's unit cause comes from; the same causes in all steps of a test",
-            "units": "1",
-            "_Encoding": "ascii",
-        }
-    )
-    if causes.columns:
-        dataset.put(variable, np.array(causes.columns, dtype=f"S{width}"))
-
-
-def _put_rejected(dataset: Any, rejected: Rejected) -> None:
-    of_point = [("x_mm", rejected.xyz_mm[..., 0]), ("y_mm", rejected.xyz_mm[..., 1]), ("z_mm", rejected.xyz_mm[..., 2])]
-    if rejected.uvw_mm is not None:
-        of_point += [(f"{name}_mm", rejected.uvw_mm[..., k]) for k, name in enumerate("uvw")]
-    what = "at a point that a check rejected, see its status; not checked, without uncertainty"
-    for name, values in of_point:
-        _put(
-            dataset,
-            f"rejected_{name}",
-            values,
-            ("row", "col"),
-            units="mm",
-            long_name=f"{name} {what}",
-            dtype="f8",
-            sparse=True,
-        )
-    _put(
-        dataset,
-        "rejected_epipolar_px",
-        rejected.epipolar_px,
-        ("row", "col"),
-        units="pixel",
-        long_name=f"offset across the epipolar line {what}",
-        dtype="f4",
-        sparse=True,
-    )
-    _put(
-        dataset,
-        "rejected_zncc",
-        rejected.zncc,
-        ("row", "col", "comparison"),
-        units="1",
-        long_name=f"correlation of each comparison {what}",
-        dtype="f4",
-        sparse=True,
-    )
-
-
-def _put_cuts(dataset: Any, cuts: Cuts) -> None:
-    points, of_line = as_arrays(cuts)
-    dataset.createDimension("cut_point", len(points))
-    for k, (name, along) in enumerate((("cut_x_px", "column"), ("cut_y_px", "row"))):
-        _put(
-            dataset,
-            name,
-            points[:, k],
-            ("cut_point",),
-            units="pixel",
-            long_name=f"{along} in camera 1's reference image of a point of a cut: nothing reaches over it",
-            dtype="f8",
-        )
-    _put(
-        dataset, "cut_line", of_line, ("cut_point",), units="1", long_name="which cut the point belongs to", dtype="i4"
-    )
-
-
-def _put_references(dataset: Any, references: References) -> None:
-    _put(
-        dataset,
-        "reference_step",
-        references.steps,
-        ("row", "col"),
-        units="1",
-        dtype="i4",
-        long_name="step that the point was matched against; without numbers, the newest such step that shows it",
-        sparse=True,
-    )
-    for origin, cause in PROPAGATED_FROM.items():
-        values = getattr(references, f"{origin}_px2")
-        for name, (i, j) in ENTRIES.items():
-            _put(
-                dataset,
-                f"propagated_{origin}_{name}_px2",
-                values[..., i, j],
-                ("row", "col"),
-                units="pixel2",
-                dtype="f8",
-                long_name=f"covariance by {cause} of the point's position in camera 1, propagated to later steps "
-                "that are matched against this one",
-            )
-
-
-def _put_measured(dataset: Any, result: Field, measured: Field) -> None:
-    """Write the start values of later steps, where they differ from the field that is shown."""
-    if result.smoothing is not None and measured.uvw_mm is not None:
-        for k, name in enumerate(("u", "v", "w")):
-            _put(
-                dataset,
-                f"measured_{name}_mm",
-                measured.uvw_mm[..., k],
-                ("row", "col"),
-                units="mm",
-                dtype="f8",
-                long_name=f"displacement from the reference, {name.upper()}, as measured, before smoothing",
-            )
-    if not measured.has_motion or (result.covariance is measured.covariance and result.common is None):
-        return
-    if "frozen" not in dataset.dimensions:
-        dataset.createDimension("frozen", len(FROZEN))
-    _put(
-        dataset,
-        "measured_current_covariance",
-        packed(current_covariance(measured)),
-        ("row", "col", "frozen"),
-        units="mm2",
-        dtype="f4",
-        long_name="covariance of the current position as measured, by image noise alone: xx xy xz yy yz zz",
-    )
 
 
 def _attributes(provenance: Provenance, *, moved: bool) -> dict[str, object]:
@@ -439,4 +286,4 @@ def write_field(
     with written_dataset(Path(path), checksum=checksum) as dataset:
         fill(dataset, result, provenance, strain)
         if measured is not None:
-            _put_measured(dataset, result, measured)
+            put_measured(dataset, result, measured)
