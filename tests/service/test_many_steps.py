@@ -212,6 +212,21 @@ def test_the_checks_of_many_steps_are_found_by_a_process_of_their_own(
     checks.close()
 
 
+def test_who_asks_while_the_service_closes_hears_what_is_known(
+    service: Service, many: str, analyses: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed = AnalysisChecks(service.tests)
+    closed.close()
+    assert [one.code for one in closed.of(many, analyses[many]).warnings] == ["not_checked_yet"]
+    waiting: Future[Any] = Future()
+    waiting.cancel()
+    waiting.set_running_or_notify_cancel()
+    checks = AnalysisChecks(service.tests)
+    monkeypatch.setattr(checks._beside, "submit", lambda *_: waiting)  # closed while somebody waits
+    assert [one.code for one in checks.of(many, analyses[many]).warnings] == ["not_checked_yet"]
+    checks.close()
+
+
 def test_checks_of_some_age_are_confirmed_without_reading_the_steps(
     service: Service, few: str, analyses: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

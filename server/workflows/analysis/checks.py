@@ -12,7 +12,7 @@ import os
 import threading
 import time
 from collections.abc import Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -88,10 +88,12 @@ class AnalysisChecks:
             rested = kept.checks is None or age_s > kept.took_s / _SHARE
             first = kept.checks is None and kept.running is None
             if not current and rested and kept.running is None:
-                kept.running = self._beside.submit(self._renew, kept, folder, problems, mark)
+                # a request that was begun before the service closes gets what is known
+                with contextlib.suppress(RuntimeError):
+                    kept.running = self._beside.submit(self._renew, kept, folder, problems, mark)
             running = kept.running
         if first and running is not None:
-            with contextlib.suppress(TimeoutError):
+            with contextlib.suppress(TimeoutError, CancelledError):
                 running.result(timeout=_WAIT_FIRST_S)
         return kept.checks or _NOT_YET
 
