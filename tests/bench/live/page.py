@@ -12,6 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import NullFormatter
 
+from server.workflows.live.series import KEPT_FRAMES
 from tests.bench.documents.prose import wrapped
 
 if TYPE_CHECKING:
@@ -43,8 +44,8 @@ def write_page(main: Run, runs: list[Run], faster: list[Run]) -> None:
         f"{run.percentile(50.0):.1f} | {run.percentile(99.0):.1f} | {run.busy_ms:.1f} |"
         for run in (next(run for run in runs if run.points == main.points), *faster)
     )
-    first, last = np.array(main.memory_mib[: len(main.memory_mib) // 4 + 1]), np.array(main.memory_mib[-5:])
-    grown = last.mean(axis=0) - first.mean(axis=0)
+    quarter, last = np.array(main.memory_mib[len(main.memory_mib) // 4 :][:5]), np.array(main.memory_mib[-5:])
+    grown = last.mean(axis=0) - quarter.mean(axis=0)
     busy = main.load > _IDLE_LOAD
     load = f"The machine's load average was {main.load:.1f} on {os.cpu_count()} cores" + (
         ": other programs ran on it, and these figures are no measure of an idle machine." if busy else "."
@@ -76,8 +77,8 @@ def write_page(main: Run, runs: list[Run], faster: list[Run]) -> None:
                 wrapped(
                     f"Of {account['frames']:,} pairs {account['measured']:,} were measured ({account['step']} with all "
                     f"checks), {account['skipped']:,} skipped for a newer one, {account['refused']} refused. Resident "
-                    f"memory grew by {grown[0]:+.1f} MiB (service) and {grown[1]:+.1f} MiB (computation) from the first "
-                    "quarter to the end."
+                    f"memory grew by {grown[0]:+.1f} MiB (service) and {grown[1]:+.1f} MiB (computation) from the "
+                    f"end of the first quarter to the end; before, the last {KEPT_FRAMES:,} values were gathered."
                 ),
                 "## Rate by points",
                 "| points | values/s | p50, ms | p99, ms | skipped | refused |\n| --- | --- | --- | --- | --- | --- |\n"
