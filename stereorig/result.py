@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +16,6 @@ from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels
 from core.gauge.area import AreaStatistics, area_statistics, points_within
 from core.gauge.extensometer import Extensometer, extensometer
-from core.gauge.reading import reading_of
 from core.gauge.rigid import RigidMotion, rigid_motion, without_rigid_motion
 from core.settings import AnalysisSettings, StrainSettings
 from core.strain import StrainField, StrainOptions, surface_strain
@@ -165,16 +164,8 @@ class Result:
         found = area_statistics(field, values, None, inside, shared=shared)
         if name not in _STRAIN or self.strain is None or not found.count:
             return found
-        k = _STRAIN.index(name)
         of = mean_strain_variance(self.field, self.strain.options, inside, subset_px=self.strain.subset_px)
-        mean = reading_of(
-            found.mean,
-            float(of.own[k]),
-            None if of.reference is None else float(of.reference[k]),
-            None if of.common is None else of.common[k],
-            of.causes,
-        )
-        return replace(found, mean_sigma=mean.sigma, mean_sigma_calibration=mean.sigma_calibration, mean_reading=mean)
+        return found.with_mean_variance(*of.of(_STRAIN.index(name)))
 
     @cached_property
     def _shared(self) -> SharedPixels:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from core.arrays import Bool, Float, Floats
+from core.common.factor import Causes
 from core.errors import RegionError
 from core.field.points.result import Field
 from core.field.points.shared_pixels import SharedPixels, steps_px
@@ -46,6 +47,13 @@ class AreaStatistics:
     mean_sigma: float
     mean_sigma_calibration: float = float("nan")
     mean_reading: Reading = MISSING
+
+    def with_mean_variance(
+        self, own: float, frozen: float | None, common: Float | None, causes: Causes | None
+    ) -> AreaStatistics:
+        """Return them with another uncertainty of the mean, from what :func:`reading_of` takes."""
+        mean = reading_of(self.mean, own, frozen, common, causes)
+        return replace(self, mean_sigma=mean.sigma, mean_sigma_calibration=mean.sigma_calibration, mean_reading=mean)
 
 
 def points_within(field: Field, polygon_px: ArrayLike | None) -> Bool:

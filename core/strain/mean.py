@@ -48,14 +48,15 @@ class MeanStrainVariance:
     @property
     def budgets(self) -> tuple[Budget, ...]:
         """The budgets of the three means."""
-        return tuple(
-            budget_of(
-                float(self.own[k]),
-                None if self.reference is None else float(self.reference[k]),
-                None if self.common is None else self.common[k],
-                self.causes,
-            )
-            for k in range(3)
+        return tuple(budget_of(*self.of(axis)) for axis in range(3))
+
+    def of(self, axis: int) -> tuple[float, float | None, Float | None, Causes | None]:
+        """Of one mean: own variance, the reference pair's part of it, common factor (k,) and its causes."""
+        return (
+            float(self.own[axis]),
+            None if self.reference is None else float(self.reference[axis]),
+            None if self.common is None else self.common[axis],
+            self.causes,
         )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from core.common.budget import UNKNOWN, Budget, budget_of
 from core.gauge.area import area_statistics, points_within
 from core.gauge.extensometer import extensometer
 from core.gauge.line import positions_along
-from core.gauge.reading import Reading, reading_of
+from core.gauge.reading import Reading
 from core.gauge.sampling import Samples, sample
 from core.names import BUDGET
 from core.strain.reference import reference_share
@@ -185,15 +184,7 @@ def of_area(
         )
         of_strain = variables.mean_strain_variance(inside) if n in STRAIN_NAMES and got.count else None
         if of_strain is not None:
-            axis = STRAIN_NAMES.index(n)
-            mean = reading_of(
-                got.mean,
-                float(of_strain.own[axis]),
-                None if of_strain.reference is None else float(of_strain.reference[axis]),
-                None if of_strain.common is None else of_strain.common[axis],
-                of_strain.causes,
-            )
-            got = replace(got, mean_sigma=mean.sigma, mean_sigma_calibration=mean.sigma_calibration, mean_reading=mean)
+            got = got.with_mean_variance(*of_strain.of(STRAIN_NAMES.index(n)))
         kept.append(Kept(name, "area", n, variable.units, got.mean_reading))
         values[n] = AreaStatistics(
             units=variable.units,
