@@ -744,7 +744,7 @@ def bars(at: Page) -> list[float]:
     for size in ((1440, 900), (1024, 768), (390, 844)):
         at.set_viewport_size({"width": size[0], "height": size[1]})
         # charts are drawn anew a moment after the window has another size
-        at.wait_for_function("document.documentElement.scrollWidth <= document.documentElement.clientWidth")
+        at.wait_for_function("() => document.documentElement.scrollWidth <= document.documentElement.clientWidth")
         found.append(at.evaluate("document.getElementById('bar').offsetHeight"))
     return found
 

@@ -123,7 +123,7 @@ def first_paint(made: Browser, url: str) -> list[Figure]:
                 page.goto(f"{url}/#/{screen}")
                 page.wait_for_selector("h1")
                 found = "performance.getEntriesByName('first-contentful-paint')[0]?.startTime"
-                page.wait_for_function(found)
+                page.wait_for_function(f"() => {found}")
                 times.append(float(page.evaluate(found)) / 1e3)
         figures.append(
             Figure(f"first paint, {screen}, median of {PAINTS}", statistics.median(times), "s", max_value=1.0)
