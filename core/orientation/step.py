@@ -72,11 +72,12 @@ def step_points(
     if len(xy) == 0:
         return None
     images = [image.prepared(options.interpolation, None, options.blur) for image in (image1, image2)]
-    own = "gradients" not in vars(images[0])  # another match has made them else
-    if own and (slopes is not None or images[0].raw.size > _LARGE_PIXELS):
+    if slopes is not None or images[0].raw.size > _LARGE_PIXELS:
         images[0] = copy.copy(images[0])
-        if slopes is not None:
-            vars(images[0])["slopes"] = slopes
+    if slopes is not None:
+        # whatever another match has made of this image meanwhile
+        vars(images[0]).pop("gradients", None)
+        vars(images[0])["slopes"] = slopes
     fit = fit_shape(pair, images[0], images[1], xy, start, options.match_options())
     good = (fit.status == PointStatus.OK) & (fit.zncc.min(axis=1) >= options.min_zncc) & np.isfinite(fit.epipolar_px)
     if not good.any():

@@ -90,29 +90,31 @@ class CameraWatch:
         result: Field,
         images: Images,
         *,
-        shape: Callable[[], Field],
+        shape: Field,
         previous: int | None,
-        before: Callable[[int], tuple[Field, Images]],
+        before: tuple[Field, Images] | None,
     ) -> CameraMotion | None:
-        """Judge a step that was measured.
+        """Judge a step that was measured; it may have been measured and judged before.
 
         Parameters
         ----------
         n, result, images
             The step.
         shape
-            Returns the reference's shape.
+            The reference's.
         previous
             Number of the step measured before, None for the first two.
         before
-            Returns field and images of an earlier step.
+            Field and images of that step, for this comparison alone; None: those it was judged with.
 
         Returns
         -------
         CameraMotion or None
             None where too few points could be matched.
         """
-        step = self._of(n, lambda: (result, images))
+        if n != self.reference:
+            self._steps.pop(n, None)
+        step = self._of(n, result, images)
         if step is None:
             return None
         names, covariance = (COVARIANCE_NAMES, None) if self.covariance is None else self.covariance
@@ -121,10 +123,10 @@ class CameraWatch:
         )
         if n == self.reference:
             return CameraMotion.of(against_calibration, None, None)
-        reference = self._of(self.reference, lambda: (shape(), images))
+        reference = self._of(self.reference, shape, images)
         earlier = None
         if previous is not None and previous != self.reference:
-            earlier = self._of(previous, lambda: before(previous))
+            earlier = self._steps.get(previous) if before is None else self._offsets(previous, *before)
         compared: tuple[tuple[StepOffsets | None, Against], ...] = ((reference, "reference"), (earlier, "last_step"))
         against_reference, against_last = (
             None
@@ -134,22 +136,20 @@ class CameraWatch:
         )
         return CameraMotion.of(against_calibration, against_reference, against_last)
 
-    def forget(self, n: int) -> None:
-        """Let a step be looked at anew when it is asked for again."""
-        if n != self.reference:
-            self._steps.pop(n, None)
-
-    def _of(self, n: int, step: Callable[[], tuple[Field, Images]]) -> StepOffsets | None:
+    def _of(self, n: int, result: Field, images: Images) -> StepOffsets | None:
+        """Offsets of a step: those known of it, or else of this field and these images, kept from now on."""
         if n not in self._steps:
-            result, images = step()
-            points = (
-                matched_points(self.pair, result, self.options.subset_px, at_most=SAMPLE)
-                if n == self.reference
-                else step_points(self.pair, result, *images, self.options, self.slopes and self.slopes())
-            )
-            names = COVARIANCE_NAMES if self.covariance is None else self.covariance[0]
-            self._steps[n] = None if points is None else StepOffsets(self.pair, points, names, ends=self._ends)
+            self._steps[n] = self._offsets(n, result, images)
             others = [k for k in self._steps if k != self.reference]
             for k in others[: max(len(others) - _KEPT, 0)]:
                 del self._steps[k]
         return self._steps[n]
+
+    def _offsets(self, n: int, result: Field, images: Images) -> StepOffsets | None:
+        points = (
+            matched_points(self.pair, result, self.options.subset_px, at_most=SAMPLE)
+            if n == self.reference
+            else step_points(self.pair, result, *images, self.options, self.slopes and self.slopes())
+        )
+        names = COVARIANCE_NAMES if self.covariance is None else self.covariance[0]
+        return None if points is None else StepOffsets(self.pair, points, names, ends=self._ends)

@@ -10,6 +10,7 @@ import json
 import time
 import weakref
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -73,6 +74,14 @@ class FinishedStep:
     summary: dict[str, Any]
 
 
+@dataclass(frozen=True, eq=False)
+class _Judged:
+    """What is known of a step's cameras, and of the systematic terms of its field."""
+
+    motion: CameraMotion | None
+    terms: Systematic
+
+
 @dataclass(eq=False)
 class SequenceMeasurement:
     """The measurement of a sequence: the parts that its steps share, and the measuring and finishing of each.
@@ -125,8 +134,9 @@ class SequenceMeasurement:
         self._generation = 0
         self._last_images: tuple[int, Pair] | None = None
         self._sequence: Updating | None = None
-        self._motions: dict[int, CameraMotion | None] = {}
-        self._terms: dict[int, Systematic] = {}
+        self._beside = ThreadPoolExecutor(1, thread_name_prefix="stereorig-judge")
+        self._judged: dict[int, Future[_Judged]] = {}
+        self._watched: int | None = None  # the last step that was given to the watch
         self._dense = DenseSteps(self.calibration.pair, self.options, self.settings.dense_step_px)
         self._smooth: SmoothSlopes | None = None
         self._watch = CameraWatch(
@@ -151,7 +161,7 @@ class SequenceMeasurement:
         if generation != self._generation:
             own = self.file_of(self.reference.n)
             self._fields = {path: f for path, f in self._fields.items() if path == own}
-            self._sequence, self._generation = None, generation
+            self._sequence, self._generation, self._watched = None, generation, None
 
     def read(self, step: StepImages) -> Pair:
         """Read both images of a step; everything derived from them is computed on the calling thread."""
@@ -222,20 +232,16 @@ class SequenceMeasurement:
                 return self._matched(step.n, images, lambda: self._updating(shape).begin_at(images, against, **more))
             result = self._matched(step.n, images, lambda: self._updating(shape).measure(images, previous_step, **more))
             self._last_images = None if self.settings.reference_update == "never" else (step.n, images)
-        self._watch.forget(step.n)  # it may have been measured before
-        if from_head and previous is not None:
-            self._watch.forget(previous)
-        self._motions[step.n] = self._watch.judge(
+        self._judged[step.n] = self._beside.submit(
+            self._judge,
             step.n,
             result,
             images or (self.pair.image1, self.pair.image2),
-            shape=lambda: self._field(self.reference.n),
+            shape=result if step.n == self.reference.n else self._field(self.reference.n),
             previous=previous,
-            before=lambda n: (self._field(n), self._previous_images(n)),
+            before=self._unwatched(previous),
         )
-        self._terms[step.n] = self._systematic(result, images)
-        if from_head and previous is not None:
-            self._watch.forget(previous)
+        self._watched = step.n
         if self._dense.wanted:
             self._dense.measure(
                 step.n,
@@ -274,16 +280,36 @@ class SequenceMeasurement:
     def _reference_slopes(self) -> SlopeFilter | None:
         return self.pair.image1.prepared(self.options.interpolation, None, self.options.blur).slopes
 
-    def _systematic(self, result: Field, images: Pair | None) -> Systematic:
-        """Systematic terms of a step's field; ``images`` are the step's, which the reference itself needs none of."""
+    def _unwatched(self, previous: int | None) -> tuple[Field, Pair] | None:
+        """Field and images of the step before, where the cameras' watch was not given just these."""
+        if previous is None or previous == self.reference.n or (previous == self._watched and not self._from_head):
+            return None
+        return self._field(previous), self._previous_images(previous)
+
+    def _judge(
+        self,
+        n: int,
+        result: Field,
+        images: Pair,
+        *,
+        shape: Field,
+        previous: int | None,
+        before: tuple[Field, Pair] | None,
+    ) -> _Judged:
+        """Judge cameras and systematic terms of a measured step: beside the measurement of the next one."""
+        motion = self._watch.judge(n, result, images, shape=shape, previous=previous, before=before)
+        return _Judged(motion, self._systematic(result, images))
+
+    def _systematic(self, result: Field, images: Pair) -> Systematic:
+        """Systematic terms of a step's field; ``images`` are the step's."""
+        of_step = images if result.has_motion else ()
         prepared = [
             image.prepared(self.options.interpolation, None, self.options.blur)
-            for image in (self.pair.image1, self.pair.image2, *(images or ()))
+            for image in (self.pair.image1, self.pair.image2, *of_step)
         ]
         if self._smooth is None:
             self._smooth = SmoothSlopes.of(prepared[0])
-        others = prepared[1 : 4 if result.has_motion else 2]
-        return terms_of(result, self.calibration.pair, self._smooth, others, subset_px=self.settings.subset_px)
+        return terms_of(result, self.calibration.pair, self._smooth, prepared[1:], subset_px=self.settings.subset_px)
 
     def _matched(self, n: int, images: Pair, measure: Callable[[], Field]) -> Field:
         """Return what is measured; where nothing matches, say so if a camera turned too far."""
@@ -329,10 +355,9 @@ class SequenceMeasurement:
         shown = self._common.of(mark_extrapolated(shown, self._volume))
         strain = strain_of_step(shown, StrainOptions.of(self.settings.strain), subset_px=subset_px)
         path = self.file_of(step.n)
-        terms = self._terms.pop(step.n, None)
-        systematic = None if terms is None else with_strain(terms, shown, strain, subset_px=subset_px).document()
-        if systematic is not None:
-            about = {**about, "systematic": json.dumps(systematic, sort_keys=True)}
+        judged = self._judged.pop(step.n).result()
+        systematic = with_strain(judged.terms, shown, strain, subset_px=subset_px).document()
+        about = {**about, "systematic": json.dumps(systematic, sort_keys=True)}
         summary = {
             "n": step.n,
             "step": step.n,
@@ -342,7 +367,7 @@ class SequenceMeasurement:
                 rbe_px=self._rbe_px,
                 reference=self.reference.n,
                 imported=self.calibration.imported,
-                camera_motion=self._motions.pop(step.n, None),
+                camera_motion=judged.motion,
                 systematic=systematic,
             ).document(),
             "strain": None if strain is None else summarise_strain(strain, shown).document(),
@@ -369,7 +394,7 @@ class SequenceMeasurement:
         step: StepImages,
         dense: DenseStep,
         about: Mapping[str, str],
-        systematic: Mapping[str, Any] | None,
+        systematic: Mapping[str, Any],
         *,
         in_service: bool,
     ) -> dict[str, Any]:
@@ -380,8 +405,8 @@ class SequenceMeasurement:
         path = dense_result(self.file_of(step.n))
         make_folder(path.parent)
         # what sharp texture does to a match is the same; the ordinary patches' own terms are not a dense field's
-        terms = {"interpolation": None if systematic is None else systematic.get("interpolation")}
-        more = {**about, "systematic": json.dumps({**terms, "patch_order": None, "strain_window": None})}
+        terms = {"interpolation": systematic["interpolation"], "patch_order": None, "strain_window": None}
+        more = {**about, "systematic": json.dumps(terms)}
         provenance = self._provenance(step, dense.field, more)
         settings = {**provenance.settings, "spacing_px": self.settings.dense_step_px, "strain": None}
         write_field(path, shown, replace(provenance, settings=settings), checksum=in_service)

@@ -19,7 +19,6 @@ from core.field.points.patch import PatchChoice, UsedPatch, asked_for
 from core.field.points.result import Field
 from core.field.region.find_visible import with_visibility
 from core.field.region.region import PointGrid, check_region
-from core.field.region.repeats import repeats
 from core.field.region.visibility import Visibility
 from core.field.settings import MeasureOptions
 from core.matching.image import ImageData
@@ -88,7 +87,7 @@ class FieldInputs:
     def repeating(self) -> Bool:
         """(n,) True where the texture repeats itself, so that no seed may lie there."""
         out = np.zeros(len(self.xy_px), bool)
-        out[self.usable] = repeats(self.ref1.pixels, self.xy_px[self.usable], subset_px=self.options.subset_px)
+        out[self.usable] = self.ref1.repeating(self.xy_px[self.usable], self.options.subset_px)
         return out
 
     def on_shape(self, shape: Field, previous: Field | None) -> FieldInputs:

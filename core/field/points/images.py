@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.arrays import Float
+from core.arrays import Bool, Float
 from core.errors import ImageError
 from core.field.points.features import Box, Features, Picture, detect_all
+from core.field.region.repeats import Peaks, repeats
 from core.matching.blur import Blur
 from core.matching.image import ImageData, prepare
 from core.noise import NoiseModel
@@ -51,11 +52,12 @@ class MeasureImage:
         self._features: dict[tuple[Box, int], Features] = {}
         self._variance: list[tuple[int, Blur | None, Float, Float]] = []  # of one set of points at most
         self._contrast: dict[tuple[float, float, float, float] | None, tuple[float, float, float]] = {}
+        self._peaks: Peaks = {}
         if isinstance(image, MeasureImage):
             self.noise = image.noise if noise is None else noise
             self.pixels: NDArray[Any] = image.pixels
             self._prepared, self._features, self._variance = image._prepared, image._features, image._variance
-            self._contrast = image._contrast
+            self._contrast, self._peaks = image._contrast, image._peaks
         elif isinstance(image, ImageData):
             self.pixels = image.pixels if image.unblurred is None else np.ascontiguousarray(image.unblurred)
             kind: Interpolation = "cubic" if image.order == 3 else "quintic"
@@ -115,6 +117,10 @@ class MeasureImage:
             out[here] = np.maximum(np.asarray(square)[r, c] - np.asarray(about)[r, c] ** 2, 0.0)
         self._variance[:] = [(subset_px, blur, np.array(xy_px), out)]
         return out
+
+    def repeating(self, xy_px: Float, subset_px: int) -> Bool:
+        """Return (n,) True where the texture repeats itself about points (n, 2); places looked at are kept."""
+        return repeats(self.pixels, xy_px, subset_px=subset_px, known=self._peaks)
 
     def contrast(self, box: tuple[float, float, float, float] | None = None) -> tuple[float, float, float]:
         """Return smallest and largest grey level and largest correlation of neighbouring pixels, in a box.

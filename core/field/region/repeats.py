@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from core.arrays import Bool, Float
 from core.robust import spread_indices
+from core.threads import run_ranges
 
 _ALIKE = 0.85  # correlation of a square, twice a subset wide, with another one; random speckles reach half of it
 _OWN_PEAK = 0.5  # connected to the square's own position above this: its own peak
@@ -22,7 +23,11 @@ _MIN_HALF_PX = 12
 _TRIED = 24
 
 
-def repeats(pixels: NDArray[Any], xy_px: Float, *, subset_px: int) -> Bool:
+Peaks = dict[tuple[int, int, int], float]
+"""Highest correlation with another square, by the subset's width and the pixel (x, y)."""
+
+
+def repeats(pixels: NDArray[Any], xy_px: Float, *, subset_px: int, known: Peaks | None = None) -> Bool:
     """Return (n,) True where camera 1's texture repeats itself within two subsets.
 
     Parameters
@@ -33,20 +38,30 @@ def repeats(pixels: NDArray[Any], xy_px: Float, *, subset_px: int) -> Bool:
         (n, 2) positions; two dozen spread over them are examined, each of the others follows the nearest of these.
     subset_px
         Width of a subset.
+    known
+        What was found in this image before; what is found now is added.
     """
     n = len(xy_px)
     if n == 0:
         return np.zeros(0, bool)
+    known = {} if known is None else known
     tried = np.unique(spread_indices(n, min(_TRIED, n)))
-    found = np.array([_second_peak(pixels, xy_px[i], subset_px) > _ALIKE for i in tried])
+    places = [(subset_px, round(float(x)), round(float(y))) for x, y in xy_px[tried]]
+    new = [place for place in places if place not in known]
+
+    def look(first: int, last: int) -> None:
+        for place in new[first:last]:
+            known[place] = _second_peak(pixels, *place)
+
+    run_ranges(look, len(new), 1)
+    found = np.array([known[place] > _ALIKE for place in places])
     nearest = np.asarray(cKDTree(xy_px[tried]).query(xy_px)[1])
     return np.asarray(found[nearest])
 
 
-def _second_peak(pixels: NDArray[Any], xy_px: Float, subset_px: int) -> float:
-    """Highest correlation of the square about a position with another one; -1 too near to the image's border."""
+def _second_peak(pixels: NDArray[Any], subset_px: int, x: int, y: int) -> float:
+    """Highest correlation of the square about a pixel with another one; -1 too near to the image's border."""
     rows, cols = pixels.shape
-    x, y = (round(float(v)) for v in xy_px)
     half = min(max(subset_px, _MIN_HALF_PX), x, y, cols - 1 - x, rows - 1 - y)
     if half < _MIN_HALF_PX:
         return -1.0

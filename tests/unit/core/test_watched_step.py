@@ -1,0 +1,55 @@
+"""Offsets of a step's own images: the same whatever else is being made of these images meanwhile."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from core.cameras.camera import Camera
+from core.cameras.stereo import StereoPair
+from core.field.points.images import MeasureImage
+from core.field.region.region import PointGrid
+from core.field.seeding.seeds import Seed
+from core.measure import MeasureOptions, ReferencePair
+from core.orientation.step import step_points
+from tests.support.disc_images import discs
+
+SIZE, DISPARITY_PX = 200, 6.0
+_ALIKE = {
+    "phd_px": 1000.0,
+    "cx_px": 100.0,
+    "cy_px": 100.0,
+    "kappa_per_px2": 0.0,
+    "aspect": 1.0,
+    "alpha_rad": 0.0,
+    "beta_rad": 0.0,
+    "gamma_rad": 0.0,
+    "y0_mm": 0.0,
+    "z0_mm": 100.0,
+}
+BESIDE = StereoPair(Camera.from_paper(**_ALIKE, x0_mm=0.0), Camera.from_paper(**_ALIKE, x0_mm=-0.6))
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_gradients_that_another_match_has_made_change_no_offset(given: bool) -> None:
+    def pictures(moved_px: float) -> list[np.ndarray]:
+        return [discs(SIZE, 4, shift_px=moved_px + shift) for shift in (0.0, -DISPARITY_PX)]
+
+    options = MeasureOptions(subset_px=21, patch="affine")
+    grid = PointGrid.rectangle(30, 30, SIZE - 30, SIZE - 30, spacing_px=10)
+    reference = ReferencePair(BESIDE, *pictures(0.0))
+    seeds = [Seed(xy_px=(100.0, 100.0), xy2_px=(100.0 - DISPARITY_PX, 100.0))]
+    shape = reference.shape(grid, options, seeds=seeds)
+    now = pictures(0.3)
+    motion = reference.motion(*now, grid, options, shape=shape)
+    slopes = reference.image1.prepared("quintic").slopes if given else None
+    found = []
+    for made in (False, True):
+        one, two = (MeasureImage(picture) for picture in now)
+        if made:
+            assert one.prepared("quintic").gradients[0].shape == (SIZE, SIZE)
+        points = step_points(BESIDE, motion, one, two, options, slopes)
+        assert points is not None
+        found.append(np.concatenate([points.xy1_px, points.xy2_px], axis=1))
+    assert len(found[0]) > 50
+    assert np.array_equal(found[0], found[1])
