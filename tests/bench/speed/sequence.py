@@ -60,6 +60,8 @@ STAGES = (
 BESIDE = (
     "read and decode",
     "splines",
+    "cameras' offsets",
+    "systematic",
     "common factor",
     "strain",
     "window's bias",
