@@ -133,6 +133,6 @@ def _positive(matrices: Float) -> Float:
 
 def notes_of(field: Field) -> tuple[str, ...]:
     """Return what budgets of a field's quantities do not tell apart, and what they do not include."""
-    at_reference = None if field.frozen_covariance is None else 0.0
+    at_reference = 0.0 if field.tells_reference else None
     row = None if field.common is None else np.zeros(field.common.shape[-1])
     return budget_of(0.0, at_reference, row, field.causes).notes

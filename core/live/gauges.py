@@ -27,7 +27,7 @@ from core.gauge.sampling import sample
 from core.settings import StrainTensor
 from core.status import PointStatus
 from core.strain.surface import surface_frames
-from core.strain.tensors import strain_of, strain_slopes
+from core.strain.tensors import pulls_of, strain_of, strain_slopes
 
 GaugeKind = Literal["point", "extensometer", "area"]
 UNITS: Mapping[GaugeKind, Mapping[str, str]] = {
@@ -291,7 +291,7 @@ def _numbers(gauges: Sequence[LiveGauge], sums: Float, normals: Float) -> tuple[
         gradient = of_motion @ per_mm
         strain = strain_of(frame, gradient, tensor)
         numbers[areas, 3:] = strain
-        slopes[areas, 3:, 1:] = strain_slopes(frame, gradient, tensor, per_mm, strain)
+        slopes[areas, 3:, 1:] = strain_slopes(pulls_of(frame, gradient, tensor), tensor, per_mm, strain)
     return numbers, slopes
 
 

@@ -200,9 +200,10 @@ def _plane(ray: Float, w: Float) -> Float:
 def tangent_frames(normals: Float) -> Float:
     """Columns: X_sys projected on the patch (Y_sys where the patch is normal to X_sys), its partner, the normal."""
     n = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
-    steep = np.abs(n[..., :1]) > 0.999
-    axis = np.where(steep, np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0]))
-    a = axis - n * (axis * n).sum(-1, keepdims=True)
+    steep = np.abs(n[..., 0]) > 0.999
+    axis = np.zeros(n.shape)
+    axis[..., 0], axis[..., 1] = ~steep, steep
+    a = axis - n * np.where(steep, n[..., 1], n[..., 0])[..., None]
     a = a / np.linalg.norm(a, axis=-1, keepdims=True)
     return np.stack([a, np.cross(n, a), n], axis=-1)
 

@@ -24,7 +24,7 @@ from core.matching.geometry import tangent_frames
 from core.names import BUDGET, BudgetName
 from core.plan.settings import PlannedMeasurement
 from core.plan.synthetic import PlannedField, Sizes, laid_about, planned_field
-from core.strain.tensors import strain_of, strain_slopes
+from core.strain.tensors import pulls_of, strain_of, strain_slopes
 from core.strain.window import plane_weights
 
 Of = Literal["point", "length", "mean", "strain"]
@@ -215,7 +215,7 @@ def _strain_sigma(field: Field, half: int, shared: SharedPixels) -> Float:
     per_mm = np.linalg.inv(np.swapaxes(frame, -1, -2) @ slope[None, :3])
     gradient = slope[None, 3:] @ per_mm
     strain = strain_of(frame, gradient, "green_lagrange")
-    D = strain_slopes(frame, gradient, "green_lagrange", per_mm, strain)[0]
+    D = strain_slopes(pulls_of(frame, gradient, "green_lagrange"), "green_lagrange", per_mm, strain)[0]
     v = np.zeros((*field.shape, 3, 6))
     v[at] = np.einsum("iab,an->nib", D, weights)
     window = (slice(0, side), slice(0, side))

@@ -105,7 +105,7 @@ def mean_strain_variances(
     shared = SharedPixels.of(field, subset_px)
     slopes, surface, left, _ = surface_slopes(field, options, shared)
     good = slopes.status == StrainStatus.OK
-    by_slope = strain_slopes(surface.frame, surface.gradient, options.tensor, surface.per_mm, surface.strain)
+    by_slope = strain_slopes(surface.pulls, options.tensor, surface.per_mm, surface.strain)
     frozen = field.frozen_covariance
     there = field.valid[..., None, None]
     roots = roots_of(np.where(there, field.covariance, 0.0))

@@ -38,6 +38,8 @@ class OnSurface:
         (n, 6, 6) the points' covariance, mean over each window.
     strain
         (n, 3) exx, eyy, exy.
+    pulls
+        (n, 2, 6) of :func:`core.strain.tensors.pulls_of`.
     """
 
     frame: Float
@@ -45,12 +47,13 @@ class OnSurface:
     gradient: Float
     around: Float
     strain: Float
+    pulls: Float
 
     def covariance(self, spread: Float, tensor: StrainTensor, at: np.ndarray | slice = slice(None)) -> Float:
         """Covariance (m, 3, 3) of the strain of some points, from the spread (m, 2, 2) of the slopes in grid steps."""
         per_mm = self.per_mm[at]
         spread = np.swapaxes(per_mm, -1, -2) @ spread @ per_mm
-        return strain_covariance(self.frame[at], self.gradient[at], tensor, self.around[at], spread, self.strain[at])
+        return strain_covariance(self.pulls[at], tensor, self.around[at], spread, self.strain[at])
 
 
 def raise_order(slopes: Slopes, surface: OnSurface, tensor: StrainTensor) -> tuple[Slopes, Float, Bool]:
@@ -71,20 +74,20 @@ def raise_order(slopes: Slopes, surface: OnSurface, tensor: StrainTensor) -> tup
         The slopes; (r, c, 3) variance of exx, eyy, exy that the planes' bias adds, zero for quadratics and whole
         windows; (r, c) True for quadratics.
     """
-    assert slopes.second_spread is not None
     good = slopes.status == StrainStatus.OK
     number = np.cumsum(good).reshape(good.shape) - 1
     left, raised = np.zeros((*good.shape, 3)), np.zeros(good.shape, bool)
     slope, spread, moments = slopes.slope.copy(), slopes.spread.copy(), slopes.moments.copy()
-    bending = _metric_gradients(slopes, tensor)
+    bending = _bending(slopes, tensor)
     for (rows, cols, weights), seen in zip(slopes.reduced, slopes.seen, strict=True):
         ok = np.flatnonzero(slopes.status[rows, cols] == StrainStatus.OK)
         if len(ok) == 0:
             continue
         r, c = rows[ok], cols[ok]
         at = number[r, c]
-        curved = slopes.windows.quadratics(r, c, seen[ok], weights[ok])
-        steep, noise = _around(bending, slopes.second_spread, good, r, c, seen[ok])
+        kinds, which = distinct_windows(seen[ok])
+        curved = slopes.windows.quadratics(r, c, kinds, which, weights[ok])
+        steep, noise = _around(bending, r, c, kinds, which)
         per_mm = surface.per_mm[at]
         off = np.einsum("mak,mbk->mab", steep, curved.bent)
         off = np.swapaxes(per_mm, -1, -2) @ (0.5 * (off + np.swapaxes(off, -1, -2))) @ per_mm
@@ -118,23 +121,27 @@ def _metric_gradients(slopes: Slopes, tensor: StrainTensor) -> Float:
     return np.where(np.isfinite(out), out, 0.0)
 
 
-def _around(
-    bending: Float, noise: Float, good: Bool, rows: np.ndarray, cols: np.ndarray, seen: Bool
-) -> tuple[Float, Float]:
+def _bending(slopes: Slopes, tensor: StrainTensor) -> Float:
+    """(r, c, 16) one, gradients (2, 3) and their spread (3, 3), times the certainty of the window about the point."""
+    assert slopes.second_spread is not None
+    noise, flat = slopes.second_spread, (*slopes.status.shape, -1)
+    trace = np.trace(noise, axis1=-2, axis2=-1)
+    known = (slopes.status == StrainStatus.OK) & (trace > 0.0)
+    weight = np.where(known, 1.0 / np.where(known, trace, 1.0), 0.0)
+    gradients = _metric_gradients(slopes, tensor).reshape(flat)
+    out = np.concatenate([np.ones((*weight.shape, 1)), gradients, noise.reshape(flat)], axis=-1)
+    out *= weight[..., None]
+    return out
+
+
+def _around(bending: Float, rows: np.ndarray, cols: np.ndarray, kinds: Bool, which: np.ndarray) -> tuple[Float, Float]:
     """Mean over the windows about the points seen, weighted by their certainty: gradients (m, 2, 3), spread (m, 3, 3).
 
     Neighbouring windows share most of their points, so that averaging is taken not to lessen the noise.
     """
-    half = int(np.sqrt(seen.shape[1])) // 2
-    trace = np.trace(noise, axis1=-2, axis2=-1)
-    known = good & (trace > 0.0)
-    weight = np.where(known, 1.0 / np.where(known, trace, 1.0), 0.0)
-    flat = (*good.shape, -1)
-    both = np.concatenate([np.ones((*good.shape, 1)), bending.reshape(flat), noise.reshape(flat)], axis=-1)
-    both *= weight[..., None]
-    kinds, which = distinct_windows(seen)
+    half = int(np.sqrt(kinds.shape[1])) // 2
     counted = kinds[:, None].astype(np.float64)
-    out = window_sums(both, rows, cols, which, counted, half, from_centre=False)[:, 0]
+    out = window_sums(bending, rows, cols, which, counted, half, from_centre=False)[:, 0]
     out /= np.where(out[:, :1] > 0.0, out[:, :1], 1.0)
     return out[:, 1:7].reshape(-1, 2, 3), out[:, 7:].reshape(-1, 3, 3)
 

@@ -9,7 +9,7 @@ from core.arrays import Bool, Float
 from core.field.points.result import Field
 from core.matching.geometry import tangent_frames
 from core.strain.result import StrainField
-from core.strain.tensors import strain_covariance
+from core.strain.tensors import pulls_of, strain_covariance
 
 
 def reference_share(field: Field, strain: StrainField, points: Bool | None = None) -> Float | None:
@@ -34,8 +34,7 @@ def reference_share(field: Field, strain: StrainField, points: Bool | None = Non
     A strain takes the points' noise along the tangents where they have gone, and what the motion makes of that of the
     positions: both parts of the noise go the strain's own way, with the same weights of the window.
     """
-    frozen = field.frozen_covariance
-    if frozen is None or not field.has_motion:
+    if field.frozen is None or not field.has_motion:
         return None
     good = strain.valid & field.valid
     if points is not None:
@@ -44,14 +43,14 @@ def reference_share(field: Field, strain: StrainField, points: Bool | None = Non
     gradient = _moved(field, good, frame) - frame
     per_mm = np.linalg.inv(np.swapaxes(frame, -1, -2) @ _grid_tangents(field)[good])
     even = np.swapaxes(per_mm, -1, -2) @ per_mm  # a whole window's slopes are equally sure along columns and rows
-
-    def variance(points: Float) -> Float:
-        made = strain_covariance(frame, gradient, strain.options.tensor, points[good], even, strain.strain[good])
-        return np.asarray(np.diagonal(made, axis1=1, axis2=2))
-
+    both = np.stack([field.covariance[good]] * 2)  # of all noise, and of the reference's
+    both[1, :, 3:, 3:] = field.frozen[good]
+    tensor = strain.options.tensor
+    made = strain_covariance(pulls_of(frame, gradient, tensor), tensor, both, even, strain.strain[good])
+    variance, of_reference = np.diagonal(made, axis1=2, axis2=3)
     out = np.full((*field.shape, 3), np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
-        out[good] = np.clip(variance(frozen) / variance(field.covariance), 0.0, 1.0)
+        out[good] = np.clip(of_reference / variance, 0.0, 1.0)
     return out
 
 
@@ -61,7 +60,8 @@ def _grid_tangents(field: Field) -> Float:
     known = np.isfinite(out).all(axis=(-1, -2))
     if not known.any():
         return np.broadcast_to(np.eye(3, 2), out.shape)
-    out[~known] = np.median(out[known], axis=0)
+    if not known.all():
+        out[~known] = np.median(out[known], axis=0)
     return np.asarray(out)
 
 

@@ -90,17 +90,17 @@ class StrainField:
             return self.covariance
         return np.asarray(self.covariance + self.common @ np.swapaxes(self.common, -1, -2))
 
-    @property
+    @cached_property
     def sigma(self) -> Float:
         """(r, c, 3) standard deviations of exx, eyy, exy."""
         return np.sqrt(np.diagonal(self.total_covariance, axis1=-2, axis2=-1))
 
-    @property
+    @cached_property
     def principal(self) -> Float:
         """(r, c, 2) principal strains, the larger first."""
         return principal_of(self.strain)
 
-    @property
+    @cached_property
     def angle_rad(self) -> Float:
         """(r, c) from axis 1 to the direction of the larger principal strain, towards axis 2; -pi/2 to pi/2."""
         e = self.strain

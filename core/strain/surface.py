@@ -18,7 +18,7 @@ from core.strain.common_part import common_part
 from core.strain.one_sided import OnSurface, raise_order
 from core.strain.options import StrainOptions
 from core.strain.result import StrainField, StrainStatus
-from core.strain.tensors import strain_of, strain_of_stretch, strain_slopes
+from core.strain.tensors import pulls_of, strain_of, strain_of_stretch, strain_slopes
 from core.strain.window import Slopes, window_slopes
 
 _POINTS_AT_ONCE = 4096  # what stays in the processor's cache
@@ -109,9 +109,7 @@ def _common_part(field: Field, slopes: Slopes, surface: OnSurface, options: Stra
     place, flat = np.flatnonzero(good), by_slope.reshape(-1, 3, 12)
     for first in range(0, len(place), _POINTS_AT_ONCE):
         some = slice(first, first + _POINTS_AT_ONCE)
-        part = strain_slopes(
-            surface.frame[some], surface.gradient[some], options.tensor, surface.per_mm[some], surface.strain[some]
-        )
+        part = strain_slopes(surface.pulls[some], options.tensor, surface.per_mm[some], surface.strain[some])
         flat[place[some]] = part.reshape(-1, 3, 12)
     return common_part(field.common, field.valid, slopes, by_slope, options.window // 2)
 
@@ -175,7 +173,8 @@ def _at(good: Bool, around: Float, slopes: Slopes, field: Field, options: Strain
     frame = surface_frames(slope[:, :3], field.normal_sys[good])
     per_mm = np.linalg.inv(np.swapaxes(frame, -1, -2) @ slope[:, :3])
     gradient = slope[:, 3:] @ per_mm
-    return OnSurface(frame, per_mm, gradient, around, strain_of(frame, gradient, options.tensor))
+    strain, pulls = strain_of(frame, gradient, options.tensor), pulls_of(frame, gradient, options.tensor)
+    return OnSurface(frame, per_mm, gradient, around, strain, pulls)
 
 
 def surface_frames(tangents: Float, towards: Float) -> Float:
@@ -206,8 +205,7 @@ def _patch_strain(field: Field, options: StrainOptions) -> Float | None:
         return None
     ok = field.valid
     out = np.full((*field.shape, 3), np.nan)
-    frame = tangent_frames(field.normal_sys[ok])[..., :2]
-    out[ok] = strain_of_stretch(field.stretch[ok], field.rotation_rad[ok], frame, options.tensor)
+    out[ok] = strain_of_stretch(field.stretch[ok], field.rotation_rad[ok], field.normal_sys[ok], options.tensor)
     return out
 
 

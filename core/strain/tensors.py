@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from core.arrays import Float
+from core.matching.geometry import tangent_frames
 from core.settings import StrainTensor
 from core.strain.result import principal_of
 
@@ -27,7 +28,7 @@ def strain_of(frame: Float, gradient: Float, tensor: StrainTensor) -> Float:
     return hencky_of_green(green) if tensor == "hencky" else green
 
 
-def strain_of_stretch(stretch: Float, rotation_rad: Float, frame: Float, tensor: StrainTensor) -> Float:
+def strain_of_stretch(stretch: Float, rotation_rad: Float, normals_sys: Float, tensor: StrainTensor) -> Float:
     """Strain (n, 3) of patches whose stretch minus one (Biot strain) e11, e22, e12 and rotation vector are known.
 
     Parameters
@@ -36,13 +37,14 @@ def strain_of_stretch(stretch: Float, rotation_rad: Float, frame: Float, tensor:
         (n, 3) in the tangent frame.
     rotation_rad
         (n, 3) rotation vectors, system frame.
-    frame
-        (n, 3, 2) unit tangents of the reference patch, system frame.
+    normals_sys
+        (n, 3) unit normals of the reference patch.
     tensor
         Which strain.
     """
     biot = _matrix(stretch)
     if tensor == "infinitesimal":
+        frame = tangent_frames(normals_sys)[..., :2]
         moved = Rotation.from_rotvec(rotation_rad).as_matrix() @ frame
         return strain_of(frame, moved @ (np.eye(2) + biot) - frame, tensor)
     green = _components(biot + 0.5 * biot @ biot)
@@ -69,19 +71,17 @@ def as_tensor(small: Float, strain: Float, tensor: StrainTensor) -> Float:
     return np.einsum("nij,nj->ni", _hencky_slope(strain), small) if tensor == "hencky" else small
 
 
-def strain_covariance(
-    frame: Float, gradient: Float, tensor: StrainTensor, points: Float, spread: Float, strain: Float
-) -> Float:
-    """Covariance (n, 3, 3) of exx, eyy, exy.
+def strain_covariance(pulls: Float, tensor: StrainTensor, points: Float, spread: Float, strain: Float) -> Float:
+    """Covariance (..., n, 3, 3) of exx, eyy, exy.
 
     Parameters
     ----------
-    frame, gradient
-        (n, 3, 2) as above.
+    pulls
+        (n, 2, 6) of :func:`pulls_of`.
     tensor
         Which strain.
     points
-        (n, 6, 6) covariance of X Y Z U V W of the window's points.
+        (..., n, 6, 6) covariance of X Y Z U V W of the window's points.
     spread
         (n, 2, 2) sum over pairs of points of c_k rho_kl c_l^T in 1/mm^2, c the points' weights in the gradient and rho
         the correlation of their errors.
@@ -93,8 +93,7 @@ def strain_covariance(
     An error of the positions changes the tangents by d_j = sum c_kj (dX, dU)_k, six numbers for each of j = 1, 2. The
     strain follows as de_ij = 1/2 (A_i . d_j + A_j . d_i), and cov(d_i, d_j) = spread_ij points.
     """
-    A = _pulls(frame, gradient, tensor)
-    Q = A @ points @ _transposed(A)
+    Q = pulls @ points @ _transposed(pulls)
     q11, q22, q12 = Q[..., 0, 0], Q[..., 1, 1], Q[..., 0, 1]
     k11, k22, k12 = spread[..., 0, 0], spread[..., 1, 1], spread[..., 0, 1]
     out = np.empty((*q11.shape, 3, 3))
@@ -110,26 +109,25 @@ def strain_covariance(
     return out
 
 
-def strain_slopes(frame: Float, gradient: Float, tensor: StrainTensor, per_mm: Float, strain: Float) -> Float:
+def strain_slopes(pulls: Float, tensor: StrainTensor, per_mm: Float, strain: Float) -> Float:
     """Return (n, 3, 2, 6), derivatives of exx, eyy, exy over the slopes of X Y Z U V W over column and row.
 
     Parameters
     ----------
-    frame, gradient, tensor
+    pulls, tensor
         As in :func:`strain_covariance`.
     per_mm
         (n, 2, 2) steps of column and row (first index) per mm along the frame's axes (second).
     strain
         (n, 3) the strain itself.
     """
-    A = _pulls(frame, gradient, tensor)
-    along = A[:, :, None, None, :] * np.swapaxes(per_mm, -1, -2)[:, None, :, :, None]  # (n, i, j, a, 6)
+    along = pulls[:, :, None, None, :] * np.swapaxes(per_mm, -1, -2)[:, None, :, :, None]  # (n, i, j, a, 6)
     out = np.stack([along[:, 0, 0], along[:, 1, 1], 0.5 * (along[:, 0, 1] + along[:, 1, 0])], axis=1)
     return np.einsum("nij,njab->niab", _hencky_slope(strain), out) if tensor == "hencky" else out
 
 
-def _pulls(frame: Float, gradient: Float, tensor: StrainTensor) -> Float:
-    """A (n, 2, 6): the strain follows as de_ij = 1/2 (A_i . d_j + A_j . d_i)."""
+def pulls_of(frame: Float, gradient: Float, tensor: StrainTensor) -> Float:
+    """Return A (n, 2, 6): a strain follows as de_ij = 1/2 (A_i . d_j + A_j . d_i), see :func:`strain_covariance`."""
     moved = frame + gradient
     if tensor == "infinitesimal":
         of_motion = frame

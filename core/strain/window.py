@@ -120,9 +120,11 @@ class ReducedWindows:
         slope = np.swapaxes(self.sums(rows, cols, which, by_kind), 1, 2)
         return found[which], slope, spread[which], moments[which], by_kind[which]
 
-    def quadratics(self, rows: np.ndarray, cols: np.ndarray, seen: Bool, planes: Float) -> Quadratics:
-        """Return the quadratics of windows with these connected points (m, n) and weights (m, 2, n) of planes."""
-        raised = self.fitted(rows, cols, *distinct_windows(seen), 2)
+    def quadratics(
+        self, rows: np.ndarray, cols: np.ndarray, kinds: Bool, which: np.ndarray, planes: Float
+    ) -> Quadratics:
+        """Return the quadratics of windows, as :meth:`fitted` takes them, with weights (m, 2, n) of planes."""
+        raised = self.fitted(rows, cols, kinds, which, 2)
         return Quadratics(*raised, second_moments(planes, self.options.window // 2))
 
 

@@ -49,7 +49,8 @@ def window_term(field: Field, strain: StrainField, *, subset_px: int) -> Term:
     patch = tuple((subset_px**2 - 1) / 12.0 / s**2 if plane else 0.0 for s in step)
     # whole windows alone: in cut ones planes and quadratics have biases of their own, which are in sigma
     used = strain.status == StrainStatus.OK
-    turned = _turned(np.where(used[..., None], strain.strain, np.nan), _turns(field))
+    turns = _turns(field)
+    turned = _turned(np.where(used[..., None], strain.strain, np.nan), turns)
     bends = [_second(turned, axis, lag) for axis in (1, 0)]
     # E_cc, E_rr and E_cr of the grid's columns and rows
     moments = np.array(
@@ -60,7 +61,7 @@ def window_term(field: Field, strain: StrainField, *, subset_px: int) -> Term:
         ]
     )
     off = 0.5 * (moments[:, 0] * bends[0] + moments[:, 1] * bends[1])
-    off = _turned(off, -_turns(field))
+    off = _turned(off, -turns)
     shared = SharedPixels.of(field, subset_px)
     ratio = _noise_ratio(half, lag, moments, shared, step)
     variance = np.diagonal(strain.covariance, axis1=-2, axis2=-1) * ratio
@@ -84,8 +85,9 @@ def _turns(field: Field) -> Float:
     frame = tangent_frames(field.normal_sys)[..., :2]
     tangent = np.full(field.xyz_mm.shape, np.nan)
     tangent[:, 1:-1] = field.xyz_mm[:, 2:] - field.xyz_mm[:, :-2]
-    along = (frame * tangent[..., None]).sum(axis=-2)
-    return np.asarray(np.arctan2(along[..., 1], along[..., 0]))
+    x, y, z = np.moveaxis(tangent, -1, 0)
+    along, across = (frame[..., 0, k] * x + frame[..., 1, k] * y + frame[..., 2, k] * z for k in range(2))
+    return np.asarray(np.arctan2(across, along))
 
 
 def _turned(e: Float, angle: Float) -> Float:

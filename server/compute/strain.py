@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from core.field.points.result import Field
 from core.field.points.smoothing_record import Smoothing
 from core.field.smoothed import smoothed_displacement
+from core.robust import median
 from core.settings import StrainOrder
 from core.strain import StrainField, StrainOptions, StrainStatus, surface_strain
 from server.formats.results.budgets import spread_points, strain_budgets
@@ -129,7 +130,7 @@ def summarise_strain(strain: StrainField, field: Field) -> StrainSummary:
         status={s.name.lower(): int((strain.status == s).sum()) for s in StrainStatus if (strain.status == s).any()},
         mean_microstrain=_figures(strain.strain[valid], np.mean),
         sd_microstrain=_figures(strain.strain[valid], np.std),
-        noise_floor_microstrain=_figures(strain.sigma[valid], np.median),
+        noise_floor_microstrain=_figures(strain.sigma[valid], median),
         budget_median_microstrain={
             name: {part: 1e6 * value for part, value in one.median.items()} for name, one in budgets.items()
         },

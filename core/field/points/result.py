@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -185,6 +186,11 @@ class Field:
         return np.asarray(self.covariance + self.common @ np.swapaxes(self.common, -1, -2))
 
     @property
+    def tells_reference(self) -> bool:
+        """True if the reference pair's part of the own covariance is told apart."""
+        return not self.has_motion or self.frozen is not None
+
+    @property
     def frozen_covariance(self) -> Float | None:
         """(r, c, n, n) the reference pair's part of the own covariance; None where it is not told apart."""
         if not self.has_motion:
@@ -201,10 +207,13 @@ class Field:
         frozen = self.frozen_covariance
         return None if frozen is None else replace(self, covariance=frozen, frozen=None, common=None, causes=None)
 
-    @property
+    @cached_property
+    def common_variance(self) -> Floats | None:
+        """(r, c, 3 or 6) variances of the common part; None where it is not known."""
+        return None if self.common is None else np.einsum("...nk,...nk->...n", self.common, self.common)
+
+    @cached_property
     def sigma_mm(self) -> Float:
         """(r, c, 3 or 6) standard deviations, the root of the total covariance's diagonal."""
         own = np.diagonal(self.covariance, axis1=-2, axis2=-1)
-        if self.common is None:
-            return np.sqrt(own)
-        return np.asarray(np.sqrt(own + np.einsum("...nk,...nk->...n", self.common, self.common)))
+        return np.sqrt(own if self.common_variance is None else own + self.common_variance)

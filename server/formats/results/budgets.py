@@ -11,7 +11,7 @@ from core.arrays import Bool, Float, Floats
 from core.common.factor import Causes
 from core.field.points.result import Field
 from core.names import BUDGET, BudgetName, Cause
-from core.robust import spread_indices
+from core.robust import median, spread_indices
 from core.strain import StrainField
 from core.strain.reference import reference_share
 from server.formats.results.layout import COVARIANCE_NAMES
@@ -42,7 +42,7 @@ class PointBudget:
     def median(self) -> dict[str, float]:
         """The median of each part over the points that have it; empty without any."""
         found = {name: part[np.isfinite(part)] for name, part in self.parts.items()}
-        return {name: float(np.median(part)) for name, part in found.items() if part.size}
+        return {name: median(part) for name, part in found.items() if part.size}
 
     def at(self, k: int) -> dict[str, float | None]:
         """Return one point's."""

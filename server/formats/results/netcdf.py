@@ -43,6 +43,7 @@ class NewDataset(netCDF4.Dataset):
         waiting = self.__dict__["_waiting"]
         while waiting:
             variable, values = waiting.pop(0)
+            variable.set_auto_maskandscale(False)  # they are as the file is to hold them
             variable[...] = values
 
     def _redef(self) -> None:

@@ -15,6 +15,7 @@ from core.field.checks.epipolar_offset import EpipolarCheck, check_epipolar
 from core.field.points.patch import PatchChoice
 from core.field.points.result import Field
 from core.field.points.smoothing_record import Smoothing
+from core.robust import median
 from core.status import PointStatus
 from server.formats.results.budgets import field_budgets, spread_points
 from server.formats.results.camera_motion import CameraMotion
@@ -165,10 +166,8 @@ def summarise(
     epipolar = result.epipolar_px[valid]
     names = ("x_mm", "y_mm", "z_mm", "u_mm", "v_mm", "w_mm")[: result.covariance.shape[-1]]
     sigma = result.sigma_mm[valid]
-    common = None
-    if result.common is not None:
-        some = result.common[valid]
-        common = np.einsum("...nk,...nk->...n", some, some)
+    zncc = result.zncc[valid]
+    of_calibration = None if result.common_variance is None else np.sqrt(result.common_variance[valid])
     summary = StepSummary(
         kind="displacement" if result.has_motion else "shape",
         points=points,
@@ -181,14 +180,11 @@ def summarise(
         epipolar_residual_rms_px=_rms(epipolar / 2),
         epipolar_check=check_epipolar(result, rbe_px, imported=imported),
         plane_residual_rms_mm=_rms(plane_residuals_mm(result.xyz_mm[valid])) if n >= 4 else None,
-        zncc_median={
-            name: float(np.median(result.zncc[valid][:, k])) if n else None
-            for k, name in enumerate(COMPARISONS[: result.zncc.shape[-1]])
-        },
-        sigma_median_mm={name: float(np.median(sigma[:, k])) if n else None for k, name in enumerate(names)},
+        zncc_median={name: median(zncc[:, k]) if n else None for k, name in enumerate(COMPARISONS[: zncc.shape[-1]])},
+        sigma_median_mm={name: median(sigma[:, k]) if n else None for k, name in enumerate(names)},
         sigma_calibration_median_mm=None
-        if common is None
-        else {name: float(np.median(np.sqrt(common[:, k]))) if n else None for k, name in enumerate(names)},
+        if of_calibration is None
+        else {name: median(of_calibration[:, k]) if n else None for k, name in enumerate(names)},
         budget_median_mm={name: one.median for name, one in field_budgets(result, spread_points(valid)).items()},
         uncertainty_includes=Included.of_field(result).text,
         smoothing=result.smoothing,

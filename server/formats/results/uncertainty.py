@@ -57,7 +57,7 @@ class Included:
     def of_field(field: Field) -> Included:
         """Return what the uncertainties of a field in memory include."""
         causes: tuple[str, ...] = ("matching",)
-        if field.frozen_covariance is not None:
+        if field.tells_reference:
             causes += ("reference",)
         if field.common is None:
             return Included(False, causes)

@@ -184,9 +184,9 @@ def test_the_strains_derivatives_over_the_positions_are_its_differences(tensor, 
     field = make_field(lambda a, b: np.stack([a, b, 0.1 * a - 0.05 * b], axis=-1), lambda p: p @ F.T, shape=(7, 7))
     options = StrainOptions(window=7, tensor=tensor, order=order)
     slopes, surface, _, _ = surface_slopes(field, options, SharedPixels.of(field, 33))
-    frame, per_mm, gradient, strain = surface.frame, surface.per_mm, surface.gradient, surface.strain
+    per_mm, strain = surface.per_mm, surface.strain
     at = int(np.flatnonzero((slopes.status == StrainStatus.OK).ravel()).tolist().index(3 * 7 + 3))
-    D = strain_slopes(frame, gradient, tensor, per_mm, strain)[at]
+    D = strain_slopes(surface.pulls, tensor, per_mm, strain)[at]
     # the axes also turn within the plane, by a tenth of a tilt: that share of the strain, for slopes per mm
     small = 0.15 * np.abs(strain[at]).max() * np.abs(per_mm[at]).max()
     row, col = np.mgrid[-3:4, -3:4]
@@ -387,9 +387,7 @@ def test_the_common_factor_goes_through_each_windows_own_weights(order):
     slopes, surface, _, _ = surface_slopes(field, options, SharedPixels(33))
     good = slopes.status == StrainStatus.OK
     D = np.zeros((*field.shape, 3, 12))
-    D[good] = strain_slopes(surface.frame, surface.gradient, "green_lagrange", surface.per_mm, surface.strain).reshape(
-        -1, 3, 12
-    )
+    D[good] = strain_slopes(surface.pulls, "green_lagrange", surface.per_mm, surface.strain).reshape(-1, 3, 12)
     found = common_part(field.common, field.valid, slopes, D, 2)
     own = {(r, c): w for rows, cols, many in slopes.reduced for r, c, w in zip(rows, cols, many, strict=True)}
     offsets = window_offsets(2)[0]
