@@ -206,10 +206,12 @@ class LiveRun:
                 pair = self._next()
                 try:
                     self._measure_one(pair)
-                except WorkerDiedError as error:
+                except StereorigError as error:
                     self.account.refused(error.code)
                     self._lost(error.code)
-                    self._begin()
+                    # its process died over the frame, or between two: another one was started, which knows nothing
+                    if error.code in (WorkerDiedError.code, "live_ended"):
+                        self._begin()
         except _Ended:
             pass
         except StereorigError as error:
@@ -248,14 +250,7 @@ class LiveRun:
     def _measure_one(self, pair: Pair) -> None:
         pixels, frame = self._shared.put([pair[cam].pixels for cam in CAMERAS]), pair.cam1
         exposed_ns = frame.host_ns if frame.exposed_ns is None else frame.exposed_ns
-        try:
-            found = self._result(_FRAME_S, measure_live, pixels, exposed_ns / 1e9)
-        except (WorkerDiedError, _Ended):
-            raise
-        except StereorigError as error:
-            self.account.refused(error.code)
-            self._lost(error.code)
-            return
+        found = self._result(_FRAME_S, measure_live, pixels, exposed_ns / 1e9)
         self._number += 1
         latency_ms = 1e3 * (time.monotonic() - _arrived_s(pair))
         self.account.measured(found["how"], latency_ms, time.monotonic())
