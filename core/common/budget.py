@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,7 +65,7 @@ class Budget:
     def document(self) -> dict[str, float]:
         """Return what is known by name, in the order of :data:`core.names.BUDGET`."""
         values = {name: getattr(self, name) for name in BUDGET}
-        return {name: float(value) for name, value in values.items() if value is not None and np.isfinite(value)}
+        return {name: float(value) for name, value in values.items() if value is not None and math.isfinite(value)}
 
     def scaled(self, factor: float) -> Budget:
         """Return the budget of the quantity times a number."""

@@ -251,8 +251,8 @@ class Follower:
             strict=True,
         ):
             rows, cols = image.shape
-            with np.errstate(invalid="ignore"):
-                low, high = np.nanmin(positions, axis=0) - reach, np.nanmax(positions, axis=0) + reach
+            along = np.ascontiguousarray(positions.T)  # a minimum over rows of two takes ten times as long
+            low, high = np.fmin.reduce(along, axis=1) - reach, np.fmax.reduce(along, axis=1) + reach
             x0, y0 = np.clip(np.floor(np.nan_to_num(low)), 0, [cols - 1, rows - 1]).astype(int)
             x1, y1 = np.clip(np.ceil(np.nan_to_num(high)) + 1, [x0 + 1, y0 + 1], [cols, rows]).astype(int)
             boxes.append((int(x0), int(y0), int(x1), int(y1)))

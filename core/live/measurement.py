@@ -99,7 +99,7 @@ class _Kept:
     time_s: float | None
     before: Field | None  # the frame before it, for the velocity
     before_s: float | None
-    ratio: Float  # (r, c, 6) standard deviations with all checks over a fit's own
+    ratio: Float | None  # (r, c, 6) standard deviations with all checks over a fit's own; None: not yet known
     rate: float | None  # see Followed
     since_audit: int
 
@@ -230,10 +230,12 @@ class LiveMeasurement:
 
     def _follow(self, images: tuple[MeasureImage, MeasureImage], kept: _Kept, time_s: float | None) -> _Kept | None:
         """Measure a frame from those before it; None where points that were there are lost."""
+        # of a step it is found now: the step's own values, which took the longest, need not wait for it
+        ratio = self._ratio_of(kept) if kept.ratio is None else kept.ratio
         before = None if kept.before is None else (kept.before, _intervals(kept.before_s, kept.time_s, time_s))
-        followed = self._follower.measure(images, kept.field, before, kept.ratio, kept.rate)
+        followed = self._follower.measure(images, kept.field, before, ratio, kept.rate)
         if before is not None and self._lost(kept.field, followed.field):  # the motion may have turned
-            followed = self._follower.measure(images, kept.field, None, kept.ratio, kept.rate)
+            followed = self._follower.measure(images, kept.field, None, ratio, kept.rate)
         if self._lost(kept.field, followed.field):
             return None
         return _Kept(
@@ -243,7 +245,7 @@ class LiveMeasurement:
             time_s=time_s,
             before=kept.field,
             before_s=kept.time_s,
-            ratio=kept.ratio,
+            ratio=ratio,
             rate=followed.rate,
             since_audit=kept.since_audit + 1,
         )
@@ -266,13 +268,17 @@ class LiveMeasurement:
                 code="nothing_measured",
                 remedy="Check that both cameras see the surface, and that nothing hides it.",
             )
+        return _Kept(number, images, field, time_s, None, None, None, None, 0)
+
+    def _ratio_of(self, step: _Kept) -> Float:
+        """Return a step's standard deviations over those of a fit by itself (r, c, 6); 1 where there is no point."""
+        field = step.field
         ratio = np.ones((*field.shape, 6))
-        if field.references is None and field.starts is not None and self.options.blur is None:
-            own = self._follower.measure(images, field, None, ratio, None).field
-            there = field.valid & own.valid
-            with_checks, alone = (np.diagonal(f.covariance[there], axis1=1, axis2=2) for f in (field, own))
-            ratio[there] = np.sqrt(with_checks / alone)
-        return _Kept(number, images, field, time_s, None, None, ratio, None, 0)
+        own = self._follower.measure(step.images, field, None, ratio, None).field
+        there = field.valid & own.valid
+        with_checks, alone = (np.diagonal(f.covariance[there], axis1=1, axis2=2) for f in (field, own))
+        ratio[there] = np.sqrt(with_checks / alone)
+        return ratio
 
     def _keep(self, frame: _Kept) -> None:
         references = frame.field.references

@@ -225,11 +225,12 @@ class ComputeWorker(TaskExecutor):
         if not self._wait_ready(task, connection, process):
             return self._died(process)
         self._cancel.clear()
-        self._kills, next_reading = MemoryWatch.now(), 0.0
+        self._kills, next_reading = MemoryWatch({}), 0.0
         try:
             connection.send((task.id, task.function, task.args, task.kwargs))
         except (BrokenPipeError, ConnectionResetError):
             return self._died(process)
+        self._kills = MemoryWatch.now()  # the task does not wait for it
         stop_at: float | None = None
         while True:
             if stop_at is None and (task.future.stop_requested.is_set() or self._closing.is_set()):

@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from core.names import CAMERAS
 from core.settings import StoredSettings
+from server.worker.shared_images import Placed
 
 #: what crosses the process' border: numbers, texts, lists and objects of them
 Plain = dict[str, Any]
@@ -367,9 +368,9 @@ def begin_live(task: LiveTask) -> Plain:
     return begun
 
 
-def measure_live(pixels: tuple[Any, Any], time_s: float) -> Plain:
+def measure_live(pixels: Placed, time_s: float) -> Plain:
     """Measure a frame of the live measurement that was begun; returns readings and counts of points by status."""
-    found: Plain = _heavy("server.compute.live.frames").measure(pixels, time_s)
+    found: Plain = _heavy("server.compute.live.frames").measure(pixels.read(), time_s)
     return found
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import httpx
 import numpy as np
+import psutil
 import pytest
 
 from core.errors import FileFormatError
@@ -444,3 +445,18 @@ def test_lines_are_off_unless_the_rig_file_asks(tmp_path: Path) -> None:
     assert parse_config(SMALL).live.tcp_port is None
     with pytest.raises(Exception, match="tcp_token is needed"):
         parse_config(SMALL.replace("[sim]\n", '[live]\ntcp_port = 0\ntcp_host = "0.0.0.0"\n\n[sim]\n', 1))
+
+
+def test_it_goes_on_when_its_process_died(client: httpx.Client, test_id: str) -> None:
+    client.post(f"{API}/tests/{test_id}/live:stop")
+    client.post(f"{API}/tests/{test_id}/live", json=GAUGES).raise_for_status()
+    await_frames(client, test_id, 2)
+    computation = next(
+        p for p in psutil.Process().children() if any("memfd:stereorig" in m.path for m in p.memory_maps())
+    )
+    computation.kill()
+    computation.wait(10.0)
+    number = client.get(f"{API}/tests/{test_id}/live").json()["values"]["number"]
+    after = await_frames(client, test_id, number + 3)
+    assert after["account"]["refused_by"] in ({"worker_died": 1}, {"live_ended": 1})  # over a frame, or between two
+    client.post(f"{API}/tests/{test_id}/live:stop").raise_for_status()

@@ -17,6 +17,7 @@ from core.live.measurement import LiveFrame, LiveMeasurement, LiveOptions
 from core.measure import ReferencePair
 from core.names import CAMERAS
 from core.settings import Outline
+from server.base.memory import settle
 from server.formats.calibrations.recognise import load_calibration
 from server.formats.calibrations.volume import parameter_covariance, volume_of
 from server.formats.images import read_image
@@ -60,6 +61,7 @@ def begin(task: LiveTask) -> Plain:
         source=parameter_covariance(loaded),
         volume=volume_of(loaded),
     )
+    settle()  # it lasts as long as the process: the collector's round after each frame leaves it out
     shape = _running.shape
     return {
         "points": int(shape.valid.sum()),

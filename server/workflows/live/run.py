@@ -27,6 +27,7 @@ from server.rig import Rig
 from server.rig.cameras import PairMark
 from server.worker.embedded import make_worker
 from server.worker.executor import WorkerDiedError
+from server.worker.shared_images import SharedImages
 from server.worker.tasks import LiveTask, Plain, begin_live, measure_live
 from server.workflows.live.account import Account
 from server.workflows.live.pace import Pace
@@ -93,6 +94,7 @@ class LiveRun:
         """Number of the newest frame with a field, and its displacements (r, c, 3), mm."""
         self.since_utc = utc_text(datetime.now(UTC))
         self._worker = make_worker(threads, lowered=False)
+        self._shared = SharedImages()
         self._newest: Plain = {"number": 0, "valid": False, "reason": "starting", "gauges": {}}
         self._spoke = time.monotonic()
         self._ending = threading.Event()
@@ -122,6 +124,7 @@ class LiveRun:
                 thread.join(timeout=5.0)
         self.lines.stop()
         self._worker.shutdown()
+        self._shared.close()
         if self.state != "failed":
             self.state = "ended"
         self._publish_invalid(self.state)
@@ -203,10 +206,12 @@ class LiveRun:
                 pair = self._next()
                 try:
                     self._measure_one(pair)
-                except WorkerDiedError as error:
+                except StereorigError as error:
                     self.account.refused(error.code)
                     self._lost(error.code)
-                    self._begin()
+                    # its process died over the frame, or between two: another one was started, which knows nothing
+                    if error.code in (WorkerDiedError.code, "live_ended"):
+                        self._begin()
         except _Ended:
             pass
         except StereorigError as error:
@@ -243,16 +248,9 @@ class LiveRun:
         return 0.0 if pace is None else pace.wait_s(_arrived_s(self._slot), time.monotonic())
 
     def _measure_one(self, pair: Pair) -> None:
-        pixels, frame = tuple(pair[cam].pixels for cam in CAMERAS), pair.cam1
+        pixels, frame = self._shared.put([pair[cam].pixels for cam in CAMERAS]), pair.cam1
         exposed_ns = frame.host_ns if frame.exposed_ns is None else frame.exposed_ns
-        try:
-            found = self._result(_FRAME_S, measure_live, pixels, exposed_ns / 1e9)
-        except (WorkerDiedError, _Ended):
-            raise
-        except StereorigError as error:
-            self.account.refused(error.code)
-            self._lost(error.code)
-            return
+        found = self._result(_FRAME_S, measure_live, pixels, exposed_ns / 1e9)
         self._number += 1
         latency_ms = 1e3 * (time.monotonic() - _arrived_s(pair))
         self.account.measured(found["how"], latency_ms, time.monotonic())
