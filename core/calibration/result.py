@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from core.arrays import Float
-from core.calibration.checks.measures import CheckMeasures
-from core.calibration.checks.positions import PositionCheck
-from core.calibration.choice.screening import DroppedView
-from core.calibration.choice.structure import Structure
-from core.calibration.fit.lens_form import LensName
-from core.calibration.inputs import CalibrationOptions, Moves, NominalCamera
-from core.calibration.uncertainty import VolumeUncertainty
 from core.cameras.camera import TEN_PARAMETER_NAMES, RigidTransform
 from core.cameras.stereo import StereoPair
 from core.names import CAMERAS, CameraName, Cause
+
+if TYPE_CHECKING:  # who measures reads a calibration's names, and needs nothing that fits one
+    from core.calibration.checks.measures import CheckMeasures
+    from core.calibration.checks.positions import PositionCheck
+    from core.calibration.choice.screening import DroppedView
+    from core.calibration.choice.structure import Structure
+    from core.calibration.fit.lens_form import LensName
+    from core.calibration.inputs import CalibrationOptions, Moves, NominalCamera
+    from core.calibration.uncertainty import VolumeUncertainty
 
 #: parameters of a pair with the paper's lens and a given aspect ratio, the usual order of a covariance
 COVARIANCE_NAMES = tuple(f"{camera}.{name}" for camera in CAMERAS for name in TEN_PARAMETER_NAMES)

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy import fft  # scipy's gives the same numbers and is slow to load
 from numpy.typing import NDArray
-from scipy import fft
 
 from core.arrays import Float, Float32
 from core.matching.blur import Blur
@@ -160,7 +160,7 @@ def _floor(spectra: Float) -> float:
     White noise is level there, texture still decreases: the decrease between two rings is extrapolated as texture.
     """
     side = spectra.shape[1]
-    frequency = np.minimum.outer(np.abs(np.fft.fftfreq(side)), np.fft.rfftfreq(side)) * 2.0
+    frequency = np.minimum.outer(np.abs(fft.fftfreq(side)), fft.rfftfreq(side)) * 2.0
     inner = np.median(spectra[:, (frequency > _RINGS[0]) & (frequency <= _RINGS[1])].mean(axis=1))
     outer = np.median(spectra[:, frequency > _RINGS[1]].mean(axis=1))
     return float(max(outer - max(inner - _LEVEL * outer, 0.0) / (_FALL - 1.0), 0.0))
@@ -181,11 +181,12 @@ def _interpolation_error(side: int, order: int) -> Float:
         images = [passed(w + 2.0 * np.pi * m) ** 2 for m in (-2, -1, 1, 2)]
         return np.asarray((1.0 - passed(w)) ** 2 + np.sum(images, axis=0))
 
-    k: Float = 2.0 * np.pi * np.asarray(np.fft.fftfreq(side), dtype=np.float64)
+    k: Float = 2.0 * np.pi * np.asarray(fft.fftfreq(side), dtype=np.float64)
     return np.asarray(along(k)[:, None] + along(np.abs(k[: side // 2 + 1]))[None, :])
 
 
 def _lags(spectrum: Float) -> Float:
     """Autocorrelation (side, side) of a spectrum over lags, cyclic."""
     side = spectrum.shape[0]
-    return np.asarray(fft.irfft2(spectrum, s=(side, side)))
+    # divided once, by all pixels: not by the rows and then by the columns, which would round twice
+    return np.asarray(fft.irfft2(spectrum, s=(side, side), norm="forward") * (1.0 / side**2))

@@ -6,7 +6,6 @@ storage's own tools take them (for S3: ``AWS_*`` variables, ``~/.aws``, a machin
 
 from __future__ import annotations
 
-import asyncio
 import re
 import shutil
 from collections.abc import Sequence
@@ -142,7 +141,7 @@ def _problem(option: str, key: str, error: Exception) -> ImageError:
             remedy="Give credentials that may read it, for S3 by AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or a "
             "profile in ~/.aws.",
         )
-    cut = isinstance(error, asyncio.IncompleteReadError | EOFError) or "Payload" in type(error).__name__
+    cut = isinstance(error, EOFError) or "Payload" in type(error).__name__
     return ImageError(
         f"{option}: {key} could not be read{' to its end' if cut else ''} ({type(error).__name__}: {error}).",
         code="object_cut" if cut else "object_unreadable",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import tomllib
 from importlib import metadata
 from pathlib import Path
 
@@ -14,5 +13,7 @@ def software_version() -> str:
     try:
         return metadata.version("stereorig")
     except metadata.PackageNotFoundError:
+        import tomllib  # loaded where it is used
+
         project = Path(__file__).resolve().parents[2] / "pyproject.toml"
         return str(tomllib.loads(project.read_text())["project"]["version"])

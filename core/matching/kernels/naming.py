@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from llvmlite.binding import parse_assembly, parse_bitcode
 from numba import njit
 
 from core.compiling import ask_elsewhere
@@ -35,7 +36,8 @@ ENTRIES: dict[tuple[str, str], Any] = {}
 def entry(function: Callable[..., Any], *, makes_arrays: bool = False) -> Any:
     """Compile a function that Python calls, and keep it on disk.
 
-    One that makes its work space itself ``makes_arrays``; what it calls in its loops must not.
+    One that makes its work space itself ``makes_arrays``; what it calls in its loops must not. No kernel may call it:
+    on disk is its machine code alone.
 
     What another version of the program left there may name classes of arguments that no longer exist; numba would then
     fail at every call. Such an entry is emptied here.
@@ -50,6 +52,7 @@ def entry(function: Callable[..., Any], *, makes_arrays: bool = False) -> Any:
             made._cache.disable()
     if made._cache._enabled:
         _load_what_another_process_compiles(made)
+        _keep_machine_code_alone(made)
     ENTRIES[function.__module__, function.__qualname__] = made
     return made
 
@@ -66,6 +69,20 @@ def _load_what_another_process_compiles(made: Any) -> None:
         return load(arguments, target) if found is None and ask_elsewhere(made, arguments) else found
 
     made._cache.load_overload = load_or_ask
+
+
+def _keep_machine_code_alone(made: Any) -> None:
+    """Leave out of a kernel's file what it would be built into others from: reading that took most of the loading."""
+    reduce = made._cache._impl.reduce
+
+    def reduce_more(compiled: Any) -> Any:
+        (name, kind, (machine_code, code)), *more = reduce(compiled)
+        module = parse_bitcode(code)
+        defined = [v.name for v in (*module.functions, *module.global_variables) if not v.is_declaration]
+        names = parse_assembly("\n".join(f'@"{one}" = global i8 0' for one in defined))
+        return ((name, kind, (machine_code, names.as_bitcode())), *more)
+
+    made._cache._impl.reduce = reduce_more
 
 
 def stamp_of(sources: Iterable[Path]) -> int:

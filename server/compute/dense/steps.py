@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from core.cameras.stereo import StereoPair
-from core.dense.field import dense_motion, dense_shape
 from core.errors import InputError
 from core.field.points.dense_record import METHOD
 from core.field.points.images import MeasureImage
@@ -108,6 +107,8 @@ class DenseSteps:
         self._done[n] = DenseStep(field=found, reason=reason, seconds=round(time.perf_counter() - began, 3))
 
     def _of(self, shape: Field, result: Field, images: Sequence[MeasureImage], grid: PointGrid) -> Field:
+        from core.dense.field import dense_motion, dense_shape  # slow to load, and few measurements need it
+
         assert self.step_px is not None
         if self._shape is None or self._shape[0] is not shape:
             self._shape = shape, dense_shape(self.pair, images[:2], shape, grid, self.options, step_px=self.step_px)

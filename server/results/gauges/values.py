@@ -25,10 +25,11 @@ from server.formats.gauges.readings import (
     Numbers,
     PointReading,
 )
+from server.formats.results.budgets import STRAIN_NAMES
 from server.results.gauges.differences import Kept
 from server.results.gauges.numbers import finite, number, plain
 from server.results.gauges.request import LineGauge
-from server.results.gauges.variables import STRAIN_NAMES, Variables, component_of
+from server.results.gauges.variables import Variables, component_of
 
 _EXTENSOMETER_UNITS = {"length0_mm": "mm", "length_mm": "mm", "elongation_mm": "mm", "strain": "1", "true_strain": "1"}
 

@@ -19,12 +19,11 @@ from core.strain import surface_strain
 from core.strain.mean import MeanStrainVariance, mean_strain_variance
 from core.strain.result import StrainField
 from server.base.errors import NotFoundError
+from server.formats.results.budgets import STRAIN_NAMES
 from server.formats.results.derived import DERIVED, MAGNITUDE, magnitude
 from server.formats.results.layout import COVARIANCE_NAMES, field_variable
 from server.formats.results.strain import read_strain
 from server.results.reader import Variable, read_variable
-
-STRAIN_NAMES = ("exx", "eyy", "exy")
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from core.errors import InputError
 from core.settings import AnalysisSettings
+from server.formats.results.budgets import STRAIN_NAMES
 from server.formats.results.layout import COVARIANCE_NAMES
-from server.results.gauges.request import GaugeRequest
-from server.results.gauges.variables import STRAIN_NAMES
+
+if TYPE_CHECKING:  # a measurement's start needs no gauges' models
+    from server.results.gauges.request import GaugeRequest
 
 _OF_DISPLACEMENT = frozenset({*COVARIANCE_NAMES[3:], *STRAIN_NAMES})
 
