@@ -148,22 +148,31 @@ def motion_geometry(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, G: ArrayLi
     R = pair.cam1.cam_from_sys.rotation
     ray = pair.cam1.rays_cam(xy_px).xyz_mm
     uvw = ((G[..., :, 0] - ray) / w[..., :1]) @ R
-    basis = np.zeros_like(G)
-    basis[..., 0] = ray
-    basis[..., 0, 1] = basis[..., 1, 2] = 1.0
-    slopes = w[..., None, 1:] / w[..., None, :1]
-    # rows of R^T: tangents in the system frame, (N, 3, 2), both in units of 1 / w0
-    before = R.T @ (basis[..., 1:] - basis[..., :1] * slopes)
-    after = R.T @ (G[..., 1:] - G[..., :1] * slopes)
+    slopes = w[:, 1:].T / w[:, 0]
+    # tangents in the system frame, (N, 3, 2), both in units of 1 / w0
+    before = _tangents(R, ray.T, np.eye(3, 2)[..., None], slopes)
+    now = np.ascontiguousarray(np.moveaxis(G, 0, -1))
+    after = _tangents(R, now[:, 0], now[:, 1:], slopes)
     frame = tangent_frames(_plane(ray, w) @ R)
     coordinates = np.swapaxes(frame[..., :2], -1, -2) @ before
     gradient = after @ _inverse2(coordinates)  # (N, 3, 2): tangent coordinates -> deformed tangents
-    right = _root2(np.swapaxes(gradient, -1, -2) @ gradient)
+    # by a copy: a product with its own transpose goes another way, of three times the cost
+    right = _root2(np.swapaxes(gradient, -1, -2) @ gradient.copy())
     axes = gradient @ _inverse2(right)
     turned = np.concatenate([axes, np.cross(axes[..., 0], axes[..., 1])[..., None]], axis=-1)
-    rotation = turned @ np.swapaxes(frame, -1, -2)
+    rotation = turned @ np.ascontiguousarray(np.swapaxes(frame, -1, -2))
     stretch = np.stack([right[..., 0, 0] - 1.0, right[..., 1, 1] - 1.0, right[..., 0, 1]], axis=-1)
     return MotionGeometry(uvw_mm=uvw, rotation_rad=_rotation_vectors(rotation), stretch=stretch)
+
+
+def _tangents(R: Float, place: Float, columns: Float, slopes: Float) -> Float:
+    """(N, 3, 2) in the system frame, of columns (3, 2, N) less those along the ray to ``place`` (3, N).
+
+    One component of all points after another: loops over two numbers cost more than the numbers.
+    """
+    tangents = columns - place[:, None] * slopes
+    turned = (R.T @ tangents.reshape(3, -1)).reshape(tangents.shape)
+    return np.ascontiguousarray(np.moveaxis(turned, -1, 0))
 
 
 def covariance_xyz(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, covariance: ArrayLike) -> Float:
@@ -184,7 +193,7 @@ def covariance_xyzuvw(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, G: Array
     J[..., :3, 0] = _xyz_jacobian(pair, xy_px, w)
     J[..., 3:, 0] = -((G[..., :, 0] - ray) / w[..., :1] ** 2) @ R
     J[..., 3:, 1:] = R.T / w[..., :1, None]
-    return np.asarray(J @ np.asarray(covariance)[..., :4, :4] @ np.swapaxes(J, -1, -2))
+    return np.asarray(J @ np.asarray(covariance)[..., :4, :4] @ np.ascontiguousarray(np.swapaxes(J, -1, -2)))
 
 
 def _xyz_jacobian(pair: StereoPair, xy_px: ArrayLike, w: Float) -> Float:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from core.arrays import Bool, Float
+from core.robust import median
 
 SIGMAS_OF_QUARTER, SIGMAS_OF_TENTH = 0.6745, 1.2816  # below the middle of a normal distribution
 _REACH_SUBSETS, _MIN_REACH, _MAX_REACH = 1.5, 3, 24
@@ -53,14 +54,20 @@ def least_about(values: Float, ok: Bool, shape: tuple[int, int], reach: int, *, 
     counted[::every, ::every] = True
     shares = (0.25, 0.1)
     quarter, tenth = _block_quantiles(
-        values, ok & counted.ravel(), shape, reach, otherwise=np.quantile(values[ok], shares).tolist(), quantiles=shares
+        values, ok & counted.ravel(), shape, reach, otherwise=lambda: np.quantile(values[ok], shares), quantiles=shares
     )
     scatter = np.maximum((quarter - tenth) / (SIGMAS_OF_TENTH - SIGMAS_OF_QUARTER), 0.0)
     return quarter + SIGMAS_OF_QUARTER * scatter, scatter
 
 
 def block_medians(
-    values: Float, known: Bool, shape: tuple[int, int], reach: int, *, otherwise: float, quantile: float = 0.5
+    values: Float,
+    known: Bool,
+    shape: tuple[int, int],
+    reach: int,
+    *,
+    otherwise: float | None = None,
+    quantile: float = 0.5,
 ) -> Float:
     """Return (n,) the median of the known values about each point; ``otherwise`` where there are too few.
 
@@ -73,11 +80,18 @@ def block_medians(
     reach
         Points; the median is that of a block ``reach`` points wide and of as many about it.
     otherwise
-        Value where fewer than a dozen are known.
+        Value where fewer than a dozen are known; None: the median of all that are known.
     quantile
         Another one than the median.
     """
-    return _block_quantiles(values, known, shape, reach, otherwise=[otherwise], quantiles=(quantile,))[0]
+    return _block_quantiles(
+        values,
+        known,
+        shape,
+        reach,
+        otherwise=lambda: [median(values[known]) if otherwise is None else otherwise],
+        quantiles=(quantile,),
+    )[0]
 
 
 def _block_quantiles(
@@ -86,7 +100,7 @@ def _block_quantiles(
     shape: tuple[int, int],
     reach: int,
     *,
-    otherwise: Sequence[float],
+    otherwise: Callable[[], Sequence[float] | Float],
     quantiles: tuple[float, ...],
 ) -> list[Float]:
     """Several quantiles of the same blocks, each with its value where there are too few."""
@@ -109,8 +123,9 @@ def _block_quantiles(
     r, c = blocks
     count = after[:r, :c] - left[:r, :c] - above[:r, :c] + total[first]
     enough = count >= _FEW
+    unknowns = [0.0] * len(quantiles) if enough.all() else otherwise()
     found = []
-    for quantile, unknown in zip(quantiles, otherwise, strict=True):
+    for quantile, unknown in zip(quantiles, unknowns, strict=True):
         at = quantile * (np.maximum(count, 1) - 1)
         low = np.floor(at).astype(int)
         share = at - low

@@ -18,9 +18,9 @@ from scipy.spatial import cKDTree
 from core.arrays import Bool, Float
 from core.field.checks.block_median import block_medians, reach_of, spacing_of
 from core.field.checks.groups import Indices, connected, neighbour_pairs
-from core.field.checks.local_surface import predict_from_neighbours
+from core.field.checks.local_surface import Prediction, predict_from_neighbours
 from core.field.region.visibility import Visibility
-from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight
+from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight, median
 
 STEEPEST = 0.003
 """px of offset a px of the image that a misfit changes by: a pixel at the corner of a lens of 5th degree."""
@@ -99,7 +99,7 @@ def _off(
     width = subset_px / spacing
     reach = reach_of(subset_px, spacing)
     e = np.where(ok, offset_px, 0.0)
-    e -= np.where(ok, np.median(e[ok]), 0.0)
+    e -= np.where(ok, median(e[ok]), 0.0)
     sigma = np.where(ok, np.maximum(sigma_px, _TINY_PX), 1.0)
     slope_px = STEEPEST * reach * spacing
     bend_px = 0.5 * slope_px * reach * spacing / _BENDING_PX
@@ -108,14 +108,14 @@ def _off(
         return {"slope_precision": (usual_px / slope_px) ** 2, "bend_precision": (usual_px / bend_px) ** 2}
 
     # groups without a jump between neighbours, but for what the surface of all changes by from one to the other
-    reported = float(np.median(sigma[ok]))
+    reported = median(sigma[ok])
     at_first = predict_from_neighbours(
         e.reshape(shape), _precision(sigma, reported, ok).reshape(shape), reach, **prior(reported)
     )
     level = e - at_first.value.ravel()
     first, second = neighbour_pairs(ok, shape, visibility)
     jump, noise = np.abs(level[first] - level[second]), np.hypot(sigma[first], sigma[second])
-    noisier = max(1.0, MAD_TO_SIGMA * float(np.median(jump / noise))) if len(jump) else 1.0
+    noisier = max(1.0, MAD_TO_SIGMA * median(jump / noise)) if len(jump) else 1.0
     sigma, usual = noisier * sigma, noisier * reported
     linked = jump <= limits.sigmas * noisier * noise + limits.floor_px
     group = connected(len(ok), first[linked], second[linked])
@@ -127,7 +127,10 @@ def _off(
     scatter = np.ones(len(ok))
     for g in np.flatnonzero(large):
         own = group == g
-        value, spread = _surface(e, sigma, np.where(own, precision, 0.0), shape, reach, usual, prior(usual))
+        same = noisier == 1.0 and own[ok].all()  # as that of all at first
+        value, spread = _surface(
+            e, sigma, np.where(own, precision, 0.0), shape, reach, usual, prior(usual), at_first if same else None
+        )
         judged = ok & (own | (~large[group] & (spread < variance)))
         predicted[judged], variance[judged] = value[judged], spread[judged]
     supported = ok & (variance < _SUPPORT)
@@ -147,12 +150,25 @@ def _precision(sigma: Float, usual: float, ok: Bool) -> Float:
 
 
 def _surface(
-    e: Float, sigma: Float, precision: Float, shape: tuple[int, int], reach: int, usual: float, prior: dict[str, float]
+    e: Float,
+    sigma: Float,
+    precision: Float,
+    shape: tuple[int, int],
+    reach: int,
+    usual: float,
+    prior: dict[str, float],
+    first: Prediction | None,
 ) -> tuple[Float, Float]:
-    """Robust surface of a group's points: value (n,), and its variance over ``usual`` squared."""
+    """Robust surface of a group's points: value (n,), and its variance over ``usual`` squared.
+
+    ``first`` is what their neighbours predict while none is off, where it is known.
+    """
     weights = precision
     for sweep in range(_SWEEPS):
-        found = predict_from_neighbours(e.reshape(shape), weights.reshape(shape), reach, **prior)
+        if sweep > 0 or first is None:
+            found = predict_from_neighbours(e.reshape(shape), weights.reshape(shape), reach, **prior)
+        else:
+            found = first
         value, variance = found.value.ravel(), found.variance.ravel()
         if sweep == _SWEEPS - 1:
             break

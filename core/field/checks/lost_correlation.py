@@ -83,9 +83,9 @@ def lost_correlation(
     counted = range(1) if points.zncc.shape[1] == 1 else range(1, points.zncc.shape[1])
     for k in counted:
         loss = np.where(ok, np.maximum(1.0 - points.zncc[:, k], _LEAST), 1.0)
-        alike = block_medians(loss, ok, shape, reach, otherwise=float(np.median(loss[ok])))
+        alike = block_medians(loss, ok, shape, reach)
         energy = loss * texture
-        noise = block_medians(energy, ok, shape, reach, otherwise=float(np.median(energy[ok])))
+        noise = block_medians(energy, ok, shape, reach)
         level = np.maximum(alike, noise / texture)
         excess = np.log(loss / level)
         scatter = MAD_TO_SIGMA * block_medians(np.abs(excess), ok, shape, reach, otherwise=np.inf)
@@ -110,7 +110,7 @@ def lost_correlation(
         view = np.zeros_like(points.zncc)
         view[valid] = _excess_blur(points, pair, rays, valid) ** 2
         # what the points about a point lose to the view is in what they lose
-        about = [block_medians(v, ok, shape, reach, otherwise=float(np.median(v[ok]))) for v in view.T]
+        about = [block_medians(v, ok, shape, reach) for v in view.T]
         lost = _LOST_TO_VIEW * np.maximum(view - np.stack(about, axis=1), 0.0)
         bad[suspect] = (1.0 - points.zncc[suspect] > expected[suspect] + lost[suspect]).any(axis=1)
     return bad

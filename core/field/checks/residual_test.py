@@ -122,7 +122,8 @@ def residual_test(
     else:
         unusual[:] = True
     usual, alone = ok[~unusual], ok[unusual]
-    _scale(points, usual, correction / np.where(correction > 1.0, _shared_texture(points, usual), 1.0))
+    if (correction != 1.0).any():
+        _scale(points, usual, correction / np.where(correction > 1.0, _shared_texture(points, usual), 1.0))
     rejected = 0
     if (correction[:-1] > 1.0).any():
         _as_observed(fitter, points, usual, xy_px, shape)

@@ -22,7 +22,7 @@ from core.field.points.fitter import PointFits
 from core.field.points.scales import depth_per_px, px_per_ray
 from core.field.region.neighbours import N_QUANTITIES, compare_with_neighbours, sorting_network
 from core.field.region.visibility import Visibility
-from core.robust import MAD_TO_SIGMA
+from core.robust import MAD_TO_SIGMA, median
 from core.settings import DEFAULT_MAX_SIGMA_PX
 from core.status import PointStatus
 from core.threads import run_ranges
@@ -242,7 +242,7 @@ def _check_neighbours(
         d = np.abs(difference[used, q])
         if len(d) == 0:
             continue
-        sigma = MAD_TO_SIGMA * float(np.median(d))
+        sigma = MAD_TO_SIGMA * median(d)
         limit = options.neighbour_sigmas * np.hypot(sigma, MAD_TO_SIGMA * spread[used, q]) + options.neighbour_floor_px
         bad[np.flatnonzero(used)[d > limit]] = True
     if not few:

@@ -18,7 +18,7 @@ from core.field.points.fitter import FitsPoints, PointFits
 from core.field.points.starts import move_matrix, move_w
 from core.field.region.visibility import Visibility
 from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
-from core.robust import MAD_TO_SIGMA
+from core.robust import MAD_TO_SIGMA, median
 
 _OFFSETS = np.array([(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)])  # k and k ^ 2 are opposite
 _ALL_AT_ONCE = 512
@@ -190,6 +190,6 @@ def grow(
 def min_parent_zncc(quality: Float) -> float:
     """Smallest correlation of a point whose values start a neighbour: not far below the field's own."""
     valid = quality[quality > 0.0]
-    middle = float(np.median(valid))
-    sigma = MAD_TO_SIGMA * float(np.median(np.abs(valid - middle)))
+    middle = median(valid)
+    sigma = MAD_TO_SIGMA * median(np.abs(valid - middle))
     return middle - max(0.15, 8.0 * sigma)

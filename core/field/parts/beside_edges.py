@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from core.arrays import Bool, Float
 from core.field.points.fitter import Fitter, PointFits
 from core.field.points.scales import depth_per_px, px_per_ray
-from core.robust import MAD_TO_SIGMA, spread_indices
+from core.robust import MAD_TO_SIGMA, median, spread_indices
 
 _FLOOR_PX = 0.05
 _SIGMAS = 8.0
@@ -61,8 +61,8 @@ def beside_edges(fitter: Fitter, points: PointFits, shape: tuple[int, int], rays
                 known = known[np.isfinite(known)]
                 if len(known) < _MIN_PAIRS:
                     continue
-                middle = float(np.median(known))
-                sigma = MAD_TO_SIGMA * float(np.median(np.abs(known - middle)))
+                middle = median(known)
+                sigma = MAD_TO_SIGMA * median(np.abs(known - middle))
                 with np.errstate(invalid="ignore"):
                     r, c = np.nonzero(np.abs(off - middle) > _FLOOR_PX + _SIGMAS * sigma)
                 flagged[r + (dr + 1) // 2, c + max(-dc, 0) + dc // 2] = 1
