@@ -22,7 +22,7 @@ SEIDEL = 0.0
 OPENCV = 1.0
 N_KERNEL_PARAMETERS = 15
 _NEWTON_STEPS = 30
-#: coordinates of arrays that are kept with what they were inverted to: smaller ones are inverted at once
+#: coordinates of arrays from which on they are kept apart from smaller ones, and beyond which none is kept
 _FEW, _MANY = 500, 100_000
 _BISECTIONS = 30  # to 1e-9 of the branch; Newton's method does the rest
 
@@ -261,13 +261,12 @@ class OpenCVLens:
             radial + y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x,
         )
 
-    def _newton_step(self, n: Float, d: Float) -> tuple[Float, Float]:
-        """Step x, y by which normalised points distort into ``d``, to first order."""
-        x, y = n[..., 0], n[..., 1]
+    def _newton_step(self, x: Float, y: Float, to_x: Float, to_y: Float) -> tuple[Float, Float]:
+        """Step x, y by which normalised points distort into ``to_x, to_y``, to first order."""
         r2 = x * x + y * y
         radial = self._radial(r2)
         xd, yd = self._shifted(x, y, r2, radial)
-        off_x, off_y = xd - d[..., 0], yd - d[..., 1]
+        off_x, off_y = xd - to_x, yd - to_y
         xx, xy, yy = self._jacobian(x, y, r2, radial)
         det = xx * yy - xy * xy
         return (yy * off_x - xy * off_y) / det, (xx * off_y - xy * off_x) / det
@@ -303,9 +302,9 @@ class OpenCVLens:
     def normalised_from_image(self, xy_px: ArrayLike) -> MappedPoints:
         """Invert by Newton's method; not valid where it does not return to the pixel within 1e-9."""
         xy = np.asarray(xy_px, dtype=np.float64)
-        if _FEW <= xy.size <= _MANY:
-            return _inverted(self, xy.shape, xy.tobytes())
-        return self._normalised_from_image(xy)
+        if xy.size > _MANY:
+            return self._normalised_from_image(xy)
+        return (_inverted_few if xy.size < _FEW else _inverted)(self, xy.shape, xy.tobytes())
 
     def _normalised_from_image(self, xy: Float) -> MappedPoints:
         yd = (xy[..., 1] - self.cy_px) / self.fy_px
@@ -313,16 +312,20 @@ class OpenCVLens:
         r_max = np.sqrt(self._r2_max)
         with np.errstate(all="ignore"):  # points that diverge are marked invalid below
             # a quotient may level off or rise to a pole, where Newton's method from d itself would leave the branch
-            n = self._radially_undistorted(d) if self.is_rational else d.copy()
+            start = self._radially_undistorted(d) if self.is_rational else d
+            to_x, to_y = (np.ascontiguousarray(d[..., k]) for k in (0, 1))
+            x, y = start[..., 0], start[..., 1]
             for _ in range(_NEWTON_STEPS):
-                step_x, step_y = self._newton_step(n, d)
-                n = n - np.stack([step_x, step_y], axis=-1)
+                step_x, step_y = self._newton_step(x, y, to_x, to_y)
+                x, y = x - step_x, y - step_y
                 if np.isfinite(r_max):  # keep Newton on the branch that contains the centre
-                    r = np.hypot(n[..., 0], n[..., 1])
+                    r = np.hypot(x, y)
                     if (r > r_max).any():
-                        n = n * np.where(r > r_max, 0.999 * r_max / r, 1.0)[..., None]
+                        back = np.where(r > r_max, 0.999 * r_max / r, 1.0)
+                        x, y = x * back, y * back
                 if not np.any(np.maximum(np.abs(step_x), np.abs(step_y)) > 1e-14):
                     break
+            n = np.stack([x, y], axis=-1)
             error = np.abs(self._distorted(n) - d).max(axis=-1) * max(abs(self.fx_px), abs(self.fy_px))
             valid = error < 1e-9 * np.maximum(1.0, np.abs(xy).max(axis=-1))
         return MappedPoints(np.where(valid[..., None], n, np.nan), valid)
@@ -382,12 +385,14 @@ class OpenCVLens:
         )
 
 
-@lru_cache(maxsize=8)
-def _inverted(lens: OpenCVLens, shape: tuple[int, ...], pixels: bytes) -> MappedPoints:
-    """Invert a lens at pixels that were asked for lately: every step of a sequence asks a dozen times for the same."""
+def _inverted_at(lens: OpenCVLens, shape: tuple[int, ...], pixels: bytes) -> MappedPoints:
     found = lens._normalised_from_image(np.frombuffer(pixels).reshape(shape))
     found.xy.flags.writeable = found.valid.flags.writeable = False
     return found
+
+
+# pixels that were asked for lately: every step of a sequence asks a dozen times for the same, growth twice for each wave
+_inverted, _inverted_few = lru_cache(maxsize=8)(_inverted_at), lru_cache(maxsize=4)(_inverted_at)
 
 
 def _smallest_positive_root(coefficients: list[float]) -> float:

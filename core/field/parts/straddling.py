@@ -140,7 +140,7 @@ def _usual_factors(fitter: Fitter, points: PointFits, xy_px: Float, least: float
     """
     ok = np.flatnonzero(points.ok)
     found, visible = subset_residuals(fitter, points, ok[spread_indices(len(ok), _USUAL)], xy_px)
-    pulls = _pulls(fitter, found[-2:], visible)
+    pulls = _pulls(fitter, found, visible)
     # edges pull at many points: those that are changed least are the measure
     quarter, tenth = np.log(np.quantile([pull.significance for pull in pulls], (0.25, 0.1), axis=1))
     scatter = np.maximum((quarter - tenth) / (SIGMAS_OF_TENTH - SIGMAS_OF_QUARTER), _SCATTER_OF_WHITE)
@@ -154,9 +154,8 @@ def _pulled(
 ) -> Bool:
     """Return (m,) True where a part of the subset is off by too much; what others change goes into the covariance."""
     least = np.where(edges, _EDGE_SIGMAS, _PART_SIGMAS)
-    found, visible = subset_residuals(fitter, points, index, xy_px)
     # a motion's reference pair was compared in its shape: it counts where something has changed since
-    pulls = _pulls(fitter, found[-2:], visible)
+    pulls = _pulls(fitter, *subset_residuals(fitter, points, index, xy_px))
     unit = _unit_px(fitter, points, index, rays)
     covariance = points.covariance[index]
     bad = np.zeros(len(index), bool)
@@ -174,7 +173,7 @@ def _pulled(
         shift = np.take_along_axis(pull.shift_px[:, direction], pull.part[:, direction, None], axis=1)[:, 0]
         if len(pulls) == 2 and unknown == 3:  # what camera 2 shows at both times is the shape's
             some = np.flatnonzero(sure > 1.0)
-            before = _pulls(fitter, [SubsetResiduals(*(values[some] for values in found[0]))], visible[some])[0]
+            before = _pulls(fitter, *subset_residuals(fitter, points, index[some], xy_px, slice(1)))[0]
             shift[some] -= before.shift_px[np.arange(len(some)), direction, pull.part[some, direction]]
         far = np.abs(shift) > _FAR_SIGMAS * sd
         shift *= np.sqrt(np.maximum(1.0 - 1.0 / np.maximum(sure, 1.0) ** 2, 0.0))

@@ -38,7 +38,7 @@ class SubsetResiduals(NamedTuple):
 
 
 def subset_residuals(
-    fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float
+    fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, comparisons: slice = slice(-2, None)
 ) -> tuple[list[SubsetResiduals], Bool]:
     """Return the residuals of the points ``index`` in each comparison, and (m, s, s) True where a pixel counts.
 
@@ -50,6 +50,8 @@ def subset_residuals(
         (m,) points that have results.
     xy_px
         (n, 2) px of camera 1, of all points.
+    comparisons
+        Which of them: all of a shape, and those of a motion in time, where others are not asked for.
     """
     pair, half = fitter.pair, fitter.options.subset_px // 2
     at, w = xy_px[index], points.w[index]
@@ -75,7 +77,7 @@ def subset_residuals(
     gradient = np.stack([g[y, x].astype(np.float64) for g in fitter.ref1.gradients], axis=-1)
     between = _between(half)
     out = []
-    for image, lens, p, second in views:
+    for image, lens, p, second in views[comparisons]:
         px = lens.image_from_normalised(p[..., :2] / p[..., 2:]).xy
         if second:
             px = px + shift[:, None]
