@@ -96,7 +96,13 @@ class PointFits:
     @property
     def quality(self) -> Float:
         """(n,) the worst comparison's correlation, -1 where there is none."""
-        return np.where(self.ok, np.nan_to_num(self.zncc, nan=-1.0).min(axis=1), -1.0)
+        return np.where(self.ok, np.nan_to_num(self.worst_zncc, nan=-1.0), -1.0)
+
+    @property
+    def worst_zncc(self) -> Float:
+        """(n,) the worst comparison's correlation, NaN where one is not known."""
+        # of columns: along rows of three numbers it takes twenty times as long
+        return np.asarray(np.ascontiguousarray(self.zncc.T).min(axis=0))
 
     def put(self, index: NDArray[np.intp], other: PointFits) -> None:
         """Write ``other``'s points to the indices ``index``; what is kept of rejected ones stays until they are ok."""
@@ -115,7 +121,7 @@ class PointFits:
     def take(self, index: NDArray[np.intp]) -> PointFits:
         """Return a copy of the points ``index``."""
         arrays: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        part: dict[str, Any] = {name: None if a is None else a[index].copy() for name, a in arrays.items()}
+        part: dict[str, Any] = {name: None if a is None else a[index] for name, a in arrays.items()}
         return PointFits(**part)
 
     def reject(self, which: Bool, status: PointStatus) -> None:
@@ -237,7 +243,7 @@ class Fitter:
         if self.keep_rejected:
             fits.keep_rejected()
         with np.errstate(invalid="ignore"):
-            low = fits.ok & ~(fits.zncc.min(axis=1) >= self.min_zncc)
+            low = fits.ok & ~(fits.worst_zncc >= self.min_zncc)
             fits.reject(low, PointStatus.LOW_CORRELATION)
             off = fits.ok & ~(np.abs(fits.epipolar_px) <= MAX_EPIPOLAR_PX)
             fits.reject(off, PointStatus.EPIPOLAR_MISMATCH)

@@ -132,11 +132,12 @@ def spread(xy_px: Float, usable: Bool, support_px: Float) -> list[NDArray[np.int
     """
     index = np.flatnonzero(usable)
     count = float(np.clip(len(index) / _POINTS_PER_SEED, _MIN_SEEDS, _MAX_SEEDS))
-    span = np.maximum(np.ptp(xy_px[index], axis=0), 1.0)
+    at = xy_px[index].T.copy()  # x of all points, then y
+    span = np.maximum(np.ptp(at, axis=1), 1.0)
     # cells by area of usable points, so that thin regions and regions with holes get their share
     cell = np.sqrt(np.prod(span) / count * max(len(index), 1) / max(len(usable), 1))
-    position = np.floor((xy_px[index] - xy_px[index].min(axis=0)) / max(cell, 1.0)).astype(np.int64)
-    key = position[:, 0] * 1_000_003 + position[:, 1]
+    column, row = np.floor((at - at.min(axis=1, keepdims=True)) / max(cell, 1.0)).astype(np.int64)
+    key = column * 1_000_003 + row
     order = np.lexsort((support_px[index], key))
     sorted_key = key[order]
     first = np.searchsorted(sorted_key, sorted_key, side="left")
