@@ -22,7 +22,7 @@ SEIDEL = 0.0
 OPENCV = 1.0
 N_KERNEL_PARAMETERS = 15
 _NEWTON_STEPS = 30
-#: coordinates of arrays from which on they are kept apart from smaller ones, and beyond which none is kept
+#: coordinates of arrays from which on they are kept apart from smaller ones, and beyond which they are not kept
 _FEW, _MANY = 500, 100_000
 _BISECTIONS = 30  # to 1e-9 of the branch; Newton's method does the rest
 
@@ -302,7 +302,7 @@ class OpenCVLens:
     def normalised_from_image(self, xy_px: ArrayLike) -> MappedPoints:
         """Invert by Newton's method; not valid where it does not return to the pixel within 1e-9."""
         xy = np.asarray(xy_px, dtype=np.float64)
-        if xy.size > _MANY:
+        if xy.ndim == 1 or xy.size > _MANY:
             return self._normalised_from_image(xy)
         return (_inverted_few if xy.size < _FEW else _inverted)(self, xy.shape, xy.tobytes())
 
@@ -313,7 +313,7 @@ class OpenCVLens:
         with np.errstate(all="ignore"):  # points that diverge are marked invalid below
             # a quotient may level off or rise to a pole, where Newton's method from d itself would leave the branch
             start = self._radially_undistorted(d) if self.is_rational else d
-            to_x, to_y = (np.ascontiguousarray(d[..., k]) for k in (0, 1))
+            to_x, to_y = d[..., 0].copy(), d[..., 1].copy()
             x, y = start[..., 0], start[..., 1]
             for _ in range(_NEWTON_STEPS):
                 step_x, step_y = self._newton_step(x, y, to_x, to_y)
@@ -391,7 +391,7 @@ def _inverted_at(lens: OpenCVLens, shape: tuple[int, ...], pixels: bytes) -> Map
     return found
 
 
-# pixels that were asked for lately: every step of a sequence asks a dozen times for the same, growth twice for each wave
+# pixels that were asked for lately: every step of a sequence asks a dozen times for the same, growth twice a wave
 _inverted, _inverted_few = lru_cache(maxsize=8)(_inverted_at), lru_cache(maxsize=4)(_inverted_at)
 
 

@@ -208,13 +208,17 @@ def _plane(ray: Float, w: Float) -> Float:
 
 def tangent_frames(normals: Float) -> Float:
     """Columns: X_sys projected on the patch (Y_sys where the patch is normal to X_sys), its partner, the normal."""
-    n = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
-    steep = np.abs(n[..., 0]) > 0.999
-    axis = np.zeros(n.shape)
-    axis[..., 0], axis[..., 1] = ~steep, steep
-    a = axis - n * np.where(steep, n[..., 1], n[..., 0])[..., None]
-    a = a / np.linalg.norm(a, axis=-1, keepdims=True)
-    return np.stack([a, np.cross(n, a), n], axis=-1)
+    n = _unit(np.ascontiguousarray(np.moveaxis(normals, -1, 0)))  # as in _tangents
+    steep = np.abs(n[0]) > 0.999
+    axis = np.stack([~steep, steep, np.zeros_like(steep)]).astype(np.float64)
+    a = _unit(axis - n * (axis * n).sum(axis=0))
+    frames = np.stack([a, np.cross(n, a, axis=0), n], axis=1)
+    return np.ascontiguousarray(np.moveaxis(frames, (0, 1), (-2, -1)))
+
+
+def _unit(vectors: Float) -> Float:
+    """(3, ...) of length one."""
+    return np.asarray(vectors / np.sqrt((vectors**2).sum(axis=0)))
 
 
 def _inverse2(m: Float) -> Float:

@@ -73,24 +73,24 @@ def beside_edges(fitter: Fitter, points: PointFits, shape: tuple[int, int], rays
 
 
 def _quantities(fitter: Fitter, points: PointFits, rays: Float, valid: NDArray[np.intp]) -> list[tuple[Float, Float]]:
-    """Value and slopes (m, 3) of what must be smooth, and what a pixel of camera 2's or 1's image is of it (m,)."""
-    w = points.w[valid]
-    per_px = depth_per_px(fitter.pair, rays[valid], w[:, 0])
+    """Value and slopes (3, m) of what must be smooth, and what a pixel of camera 2's or 1's image is of it (m,)."""
+    w = points.w[valid, :3].T.copy()
+    per_px = depth_per_px(fitter.pair, rays[valid], w[0])
     if fitter.comparisons == 1:
-        return [(w[:, :3], per_px)]
-    G = points.G[valid]
-    depth = G[:, 2, 0]
+        return [(w, per_px)]
+    G = np.moveaxis(points.G[valid, :, :3], 0, -1).copy()
+    depth = G[2, 0]
     one_px = 1.0 / px_per_ray(fitter.pair, rays[valid])[:, 0]
-    place = [(G[:, k, :3] - (G[:, k, :1] / depth[:, None]) * G[:, 2, :3]) / depth[:, None] for k in (0, 1)]
+    place = [(G[k] - (G[k, 0] / depth) * G[2]) / depth for k in (0, 1)]
     for k in (0, 1):
-        place[k][:, 0] = G[:, k, 0] / depth
-    now = w[:, :3] / depth[:, None] - (w[:, :1] / depth[:, None] ** 2) * G[:, 2, :3]
-    now[:, 0] = w[:, 0] / depth
+        place[k][0] = G[k, 0] / depth
+    now = w / depth - (w[0] / depth**2) * G[2]
+    now[0] = w[0] / depth
     return [(place[0], one_px), (place[1], one_px), (now, per_px / depth)]
 
 
 def _per_px(values: Float, scale: Float, valid: NDArray[np.intp], shape: tuple[int, int]) -> Float:
     """(4, r, c) value, its slopes along x and y, and its scale; NaN where a point has none."""
     out = np.full((4, shape[0] * shape[1]), np.nan)
-    out[:3, valid], out[3, valid] = values.T, scale
+    out[:3, valid], out[3, valid] = values, scale
     return out.reshape(4, *shape)

@@ -95,7 +95,7 @@ def pull_of_parts(found: SubsetResiduals, visible: Bool, degree: int, *, folds: 
     for first in range(0, len(masks), together):
         some = masks[first : first + together]
         kept = np.stack([whole - sums[:, mask].sum(axis=1) for mask in some])
-        left = np.stack([n - counts[:, mask].sum(axis=1) for mask in some])
+        left = n - some.astype(np.float64) @ counts.T
         changes.append(_change(kept, left, ridge, centre, usual))
     if folds:
         changes.append(_change(_with_folds(columns, visible, whole), n, size * np.eye(k + 1), centre, usual))
@@ -173,17 +173,18 @@ def _columns(found: SubsetResiduals, degree: int) -> Float:
 def _sums_of_cells(columns: Float, visible: Bool) -> tuple[Float, Float]:
     """Products (m, cells, q, q) of the columns summed over the cells, and the cells' pixels (m, cells)."""
     m, width, _ = visible.shape
-    table = columns * visible[..., None]
+    table = columns if visible.all() else columns * visible[..., None]
     edges = np.round(np.linspace(0, width, _CELLS + 1)).astype(int)
     q = table.shape[-1]
-    sums, counts = np.empty((m, _CELLS, _CELLS, q, q)), np.empty((m, _CELLS, _CELLS))
+    sums, counts = np.empty((m, _CELLS, _CELLS, q, q)), visible
+    for axis in (1, 2):
+        counts = np.add.reduceat(counts, edges[:-1], axis=axis, dtype=np.int64)
     for i in range(_CELLS):
         for j in range(_CELLS):
             cell = (slice(None), slice(edges[i], edges[i + 1]), slice(edges[j], edges[j + 1]))
             rows = table[cell].reshape(m, -1, q)
             sums[:, i, j] = np.swapaxes(rows, 1, 2) @ rows
-            counts[:, i, j] = visible[cell].sum(axis=(1, 2))
-    return sums.reshape(m, -1, q, q), counts.reshape(m, -1)
+    return sums.reshape(m, -1, q, q), counts.reshape(m, -1).astype(np.float64)
 
 
 def _solved(sums: Float, ridge: Float) -> tuple[Float, Float]:

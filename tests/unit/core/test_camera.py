@@ -246,3 +246,6 @@ def test_a_lens_inverted_again_at_the_same_pixels_gives_the_same_numbers(count: 
     moved = lens.normalised_from_image(xy + 1e-9)
     assert count == 0 or moved.xy.tobytes() != first.xy.tobytes()
     np.testing.assert_allclose(lens.image_from_normalised(moved.xy).xy, xy, atol=1e-7)
+    single = lens.normalised_from_image([640.0, 512.0])
+    assert single.xy.shape == (2,)
+    assert single.valid
