@@ -10,7 +10,6 @@ import json
 import time
 import weakref
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,33 +18,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import FileFormatError, MeasurementError, SeedError
-from core.field.checks.extrapolated import mark_extrapolated
-from core.field.common import CommonParts
 from core.field.points.images import MeasureImage, check_calibrated_size
 from core.field.points.result import Field
 from core.field.region.lay_points import make_grid
 from core.field.seeding.seeds import seeds_of
 from core.field.sequence.joint import agree
 from core.field.settings import MeasureOptions
-from core.matching.slopes import SlopeFilter
 from core.measure import PreviousStep, ReferencePair, Updating
 from core.names import CAMERAS
 from core.progress import CancelToken, Progress
 from core.settings import StoredSettings
 from core.strain import StrainOptions
-from core.systematic.interpolation import SmoothSlopes
-from core.systematic.terms import Systematic, terms_of, with_strain
-from server.compute.camera_watch import CameraWatch
+from core.systematic.terms import with_strain
+from server.compute.beside import StepsBeside
 from server.compute.dense.steps import DenseStep, DenseSteps
-from server.compute.strain import smoothed_step, strain_of_step, summarise_strain
+from server.compute.strain import strain_of_step, summarise_strain
 from server.compute.tiles.folder_crew import FolderCrew
-from server.formats.calibrations.native import covariance_in
 from server.formats.calibrations.recognise import LoadedCalibration
-from server.formats.calibrations.volume import own_px_of, parameter_covariance, rbe_of, volume_of
+from server.formats.calibrations.volume import rbe_of
 from server.formats.files import make_folder, sha256_of, write_bytes
 from server.formats.images import read_image
 from server.formats.noise_json import LoadedNoise
-from server.formats.results.camera_motion import CameraMotion
 from server.formats.results.folder import dense_result
 from server.formats.results.reading import read_measured
 from server.formats.results.starts import starts_file, with_starts, write_starts
@@ -72,14 +65,6 @@ class FinishedStep:
     n: int
     field: Field
     summary: dict[str, Any]
-
-
-@dataclass(frozen=True, eq=False)
-class _Judged:
-    """What is known of a step's cameras, and of the systematic terms of its field."""
-
-    motion: CameraMotion | None
-    terms: Systematic
 
 
 @dataclass(eq=False)
@@ -124,9 +109,6 @@ class SequenceMeasurement:
         self.options = MeasureOptions.of(self.settings)
         self.steps: dict[int, StepImages] = {}
         self._models = (None, None) if self.noise is None else self.noise.models
-        self._volume = volume_of(self.calibration)
-        self._common = CommonParts(self.calibration.pair, parameter_covariance(self.calibration))
-        self._dense_common = CommonParts(self.calibration.pair, self._common.source)
         self._rbe_px = rbe_of(self.calibration)
         self._fields: dict[Path, Field] = {}  # by the file that has it, or will have it
         self._previous: int | None = None
@@ -134,27 +116,16 @@ class SequenceMeasurement:
         self._generation = 0
         self._last_images: tuple[int, Pair] | None = None
         self._sequence: Updating | None = None
-        self._beside = ThreadPoolExecutor(1, thread_name_prefix="stereorig-judge")
-        self._judged: dict[int, Future[_Judged]] = {}
-        self._watched: int | None = None  # the last step that was given to the watch
+        self._watched: int | None = None  # the last step that the cameras' watch was given
         self._dense = DenseSteps(self.calibration.pair, self.options, self.settings.dense_step_px)
-        self._smooth: SmoothSlopes | None = None
-        self._watch = CameraWatch(
-            self.calibration.pair,
-            self.options,
-            self.reference.n,
-            covariance_in(self.calibration.details, name="calibration.json", pair=self.calibration.pair),
-            own_px_of(self.calibration),
-            self.calibration.imported,
-            # where each step becomes the next one's reference, its own are needed anyhow
-            None if self.settings.reference_update == "always" else self._reference_slopes,
-        )
         images = self.read(self.reference)
         sizes = (self.calibration.image_size1_px, self.calibration.image_size2_px)
         for cam, image, size in zip(("cam1", "cam2"), images, sizes, strict=True):
             check_calibrated_size(f"The image of {cam}", image.shape, size)
         self.grid = make_grid(self.settings, self.mask, images[0].shape)
         self.pair = ReferencePair(self.calibration.pair, *images)
+        own = self.pair.image1, self.pair.image2
+        self._beside = StepsBeside(self.calibration, self.settings, self.options, self.reference.n, own)
 
     def go_on(self, generation: int) -> None:
         """Forget fields of steps, and what was begun at them, if their results have been replaced since."""
@@ -232,8 +203,7 @@ class SequenceMeasurement:
                 return self._matched(step.n, images, lambda: self._updating(shape).begin_at(images, against, **more))
             result = self._matched(step.n, images, lambda: self._updating(shape).measure(images, previous_step, **more))
             self._last_images = None if self.settings.reference_update == "never" else (step.n, images)
-        self._judged[step.n] = self._beside.submit(
-            self._judge,
+        self._beside.begin(
             step.n,
             result,
             images or (self.pair.image1, self.pair.image2),
@@ -277,49 +247,21 @@ class SequenceMeasurement:
         path = self.file_of(step.n, earlier)
         return path.exists() and agree(result, read_measured(path))
 
-    def _reference_slopes(self) -> SlopeFilter | None:
-        return self.pair.image1.prepared(self.options.interpolation, None, self.options.blur).slopes
-
     def _unwatched(self, previous: int | None) -> tuple[Field, Pair] | None:
         """Field and images of the step before, where the cameras' watch was not given just these."""
         if previous is None or previous == self.reference.n or (previous == self._watched and not self._from_head):
             return None
         return self._field(previous), self._previous_images(previous)
 
-    def _judge(
-        self,
-        n: int,
-        result: Field,
-        images: Pair,
-        *,
-        shape: Field,
-        previous: int | None,
-        before: tuple[Field, Pair] | None,
-    ) -> _Judged:
-        """Judge cameras and systematic terms of a measured step: beside the measurement of the next one."""
-        motion = self._watch.judge(n, result, images, shape=shape, previous=previous, before=before)
-        return _Judged(motion, self._systematic(result, images))
-
-    def _systematic(self, result: Field, images: Pair) -> Systematic:
-        """Systematic terms of a step's field; ``images`` are the step's."""
-        of_step = images if result.has_motion else ()
-        prepared = [
-            image.prepared(self.options.interpolation, None, self.options.blur)
-            for image in (self.pair.image1, self.pair.image2, *of_step)
-        ]
-        if self._smooth is None:
-            self._smooth = SmoothSlopes.of(prepared[0])
-        return terms_of(result, self.calibration.pair, self._smooth, prepared[1:], subset_px=self.settings.subset_px)
-
     def _matched(self, n: int, images: Pair, measure: Callable[[], Field]) -> Field:
         """Return what is measured; where nothing matches, say so if a camera turned too far."""
         try:
             result = measure()
         except SeedError as error:
-            self._watch.refuse_moved(n, images, error)
+            self._beside.watch.refuse_moved(n, images, error)
             raise
         if not result.valid.any():
-            self._watch.refuse_moved(n, images)
+            self._beside.watch.refuse_moved(n, images)
             one, two = self.steps[n].files
             raise MeasurementError(
                 f"No point of step {n} ({one.name}, {two.name}) could be measured.",
@@ -331,7 +273,7 @@ class SequenceMeasurement:
     def finish(
         self, step: StepImages, result: Field, *, about: Mapping[str, str], in_service: bool, keep_starts: bool = False
     ) -> FinishedStep:
-        """Smooth, mark and strain a measured step, write its file, and summarise it.
+        """Strain a measured step, smoothed and marked meanwhile, write its file, and summarise it.
 
         Parameters
         ----------
@@ -351,11 +293,11 @@ class SequenceMeasurement:
         """
         began = time.perf_counter()
         subset_px = self.settings.subset_px
-        shown = smoothed_step(result, self.settings.smoothing_window, subset_px=subset_px)
-        shown = self._common.of(mark_extrapolated(shown, self._volume))
+        begun = self._beside.take(step.n)
+        shown = begun.shown.result()
         strain = strain_of_step(shown, StrainOptions.of(self.settings.strain), subset_px=subset_px)
         path = self.file_of(step.n)
-        judged = self._judged.pop(step.n).result()
+        judged = begun.judged.result()
         systematic = with_strain(judged.terms, shown, strain, subset_px=subset_px).document()
         about = {**about, "systematic": json.dumps(systematic, sort_keys=True)}
         summary = {
@@ -401,7 +343,7 @@ class SequenceMeasurement:
         """Write the dense field of a step, before the step's own file; return its entry of the summary."""
         if dense.field is None:
             return dense.entry(None, None)
-        shown = self._dense_common.of(mark_extrapolated(dense.field, self._volume))
+        shown = self._beside.show_dense(dense.field)
         path = dense_result(self.file_of(step.n))
         make_folder(path.parent)
         # what sharp texture does to a match is the same; the ordinary patches' own terms are not a dense field's

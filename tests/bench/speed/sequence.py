@@ -48,7 +48,7 @@ STAGES = (
     ("assemble", "core.field.growth.field", "assemble"),
     ("parts of subsets", "core.field.growth.check", "reject_straddling"),
     ("cameras' offsets", "server.compute.camera_watch:CameraWatch", "judge"),
-    ("systematic", "server.compute.sequence", "terms_of"),
+    ("systematic", "server.compute.beside", "terms_of"),
     ("common factor", "core.field.common:CommonParts", "of"),
     ("strain", "server.compute.sequence", "strain_of_step"),
     ("window's bias", "server.compute.sequence", "with_strain"),
