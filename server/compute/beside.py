@@ -1,6 +1,7 @@
 """What is worked out of a measured step while the next one is measured: its field as it is shown.
 
-Either takes a step's field and images alone, and the steps one after another, on a thread of its own.
+Both take a step's field and images alone, and the steps one after another, on a thread of their own: one, since each
+thread keeps memory of its own.
 """
 
 from __future__ import annotations
@@ -85,8 +86,7 @@ class StepsBeside:
             # where each step becomes the next one's reference, its own are needed anyhow
             None if settings.reference_update == "always" else lambda: self._prepared(images[0]).slopes,
         )
-        self._showing = ThreadPoolExecutor(1, thread_name_prefix="stereorig-show")
-        self._judging = ThreadPoolExecutor(1, thread_name_prefix="stereorig-judge")
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="stereorig-beside")
         self._begun: dict[int, Begun] = {}
 
     def begin(
@@ -101,8 +101,8 @@ class StepsBeside:
     ) -> None:
         """Begin with a step that was measured; parameters as of :meth:`CameraWatch.judge`."""
         self._begun[n] = Begun(
-            self._showing.submit(self._show, result),
-            self._judging.submit(self._judge, n, result, images, shape, previous, before),
+            self._thread.submit(self._show, result),
+            self._thread.submit(self._judge, n, result, images, shape, previous, before),
         )
 
     def take(self, n: int) -> Begun:
