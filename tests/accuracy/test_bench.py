@@ -23,6 +23,7 @@ from tests.bench.speed.parts import Parts, measure_parts
 from tests.bench.speed.peers.plan import WARM, own_runs, peer_runs
 from tests.bench.speed.peers.programs import ALDIC, PEERS, PYVALE, Peer, Setting
 from tests.bench.speed.peers.runs import Beside, Outcome, Run, run_peer
+from tests.bench.speed.sequence import run_child
 
 PEERS_FOLDER = Path(layout.__file__).parent / "peers"
 TINY = Request("tiny", "sim_paper", (150, 140), (46, 46, 106, 96), 10, 1)
@@ -225,6 +226,18 @@ def test_costs_and_parts_split_a_point_s_time() -> None:
     assert split["Jacobian, normal equations"] == pytest.approx(0.9)
     assert split["right-hand sides, moves"] == pytest.approx(0.5)
     assert sum(split.values()) == pytest.approx(30.0)
+
+
+def test_what_a_program_takes_is_its_own() -> None:
+    held = np.ones(40_000_000)  # 320 MB here, which a child would have for a moment
+    used = run_child(["-c", "import os, time; time.sleep(0.2); print(len(os.sched_getaffinity(0)))"], threads=1)
+    assert held.nbytes > 3e8
+    assert 5.0 < used.peak_mb < 100.0
+    assert used.wall_s > 0.2
+    assert used.cpu_s < used.wall_s
+    assert used.output.split() == ["1"]
+    with pytest.raises(RuntimeError, match="ended with 3: gone"):
+        run_child(["-c", "print('gone'); raise SystemExit(3)"])
 
 
 def test_a_fit_s_ending_is_judged_beside_full_iteration() -> None:

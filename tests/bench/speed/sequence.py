@@ -70,6 +70,7 @@ BESIDE = (
     "write",
 )
 _CHILD_TIMEOUT_S = 1800
+_LAUNCH = Path(__file__).with_name("launch.py")
 
 
 @dataclass(frozen=True)
@@ -136,20 +137,24 @@ def run_child(arguments: list[str], *, threads: int | None = None, cache: Path |
     environment["PYTHONPYCACHEPREFIX"] = str(Path(tempfile.gettempdir()) / "stereorig-bench-bytecode")
     if cache is not None:
         environment["NUMBA_CACHE_DIR"] = str(cache)
-    start = time.perf_counter()
-    with tempfile.TemporaryFile("w+") as out:
-        process = subprocess.Popen(
-            [sys.executable, *arguments], cwd=ROOT, env=environment, stdout=out, stderr=out, preexec_fn=on_few_cores
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder) / "took.json"
+        launched = subprocess.run(
+            [sys.executable, "-I", "-S", str(_LAUNCH), str(report), sys.executable, *arguments],
+            cwd=ROOT,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            preexec_fn=on_few_cores,
+            timeout=_CHILD_TIMEOUT_S,
+            check=False,
         )
-        _, status, used = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        wall = time.perf_counter() - start
-        out.seek(0)
-        printed = out.read()
-    if process.returncode != 0:
-        raise RuntimeError(f"{arguments} ended with {process.returncode}: {printed[-2000:]}")
-    kilobytes = used.ru_maxrss / (1024 if sys.platform == "darwin" else 1)
-    return Used(wall, used.ru_utime + used.ru_stime, kilobytes / 1000.0, printed)
+        if launched.returncode != 0:
+            raise RuntimeError(f"{arguments} ended with {launched.returncode}: {launched.stdout[-2000:]}")
+        took = json.loads(report.read_text())
+    kilobytes = took["peak"] / (1024 if sys.platform == "darwin" else 1)
+    return Used(took["wall_s"], took["cpu_s"], kilobytes / 1000.0, launched.stdout)
 
 
 # a sequence
