@@ -6,6 +6,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from core.cameras.camera import Camera
+from core.cameras.stereo import StereoPair
+
 
 @njit(cache=True, nogil=True)
 def _cover(image, centres, radii, samples, aperture):
@@ -47,3 +50,20 @@ def discs(
     _cover(cover, centres, radii, samples, aperture_px)
     noise = np.random.default_rng([seed, round(1e4 * (shift_px + 100.0))]).normal(0.0, noise_grey, cover.shape)
     return np.clip(np.rint(40.0 + 170.0 * cover + noise), 0, 255).astype(np.uint8)
+
+
+def cameras_beside(size: int) -> StereoPair:
+    """Two cameras of (size, size) px side by side, square to a plane at 100 mm: camera 2 sees it 6 px further left."""
+    alike = {
+        "phd_px": 1000.0,
+        "cx_px": size / 2.0,
+        "cy_px": size / 2.0,
+        "kappa_per_px2": 0.0,
+        "aspect": 1.0,
+        "alpha_rad": 0.0,
+        "beta_rad": 0.0,
+        "gamma_rad": 0.0,
+        "y0_mm": 0.0,
+        "z0_mm": 100.0,
+    }
+    return StereoPair(Camera.from_paper(**alike, x0_mm=0.0), Camera.from_paper(**alike, x0_mm=-0.6))

@@ -8,8 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from core.cameras.camera import Camera
-from core.cameras.stereo import StereoPair
 from core.field.points.images import MeasureImage
 from core.field.points.patch import PatchChoice
 from core.field.points.result import Field
@@ -22,25 +20,13 @@ from core.systematic.interpolation import SmoothSlopes, interpolation_term
 from core.systematic.patch_order import patch_term
 from core.systematic.strain_window import window_term
 from core.systematic.term import Term
-from tests.support.disc_images import discs
+from tests.support.disc_images import cameras_beside, discs
 from tests.support.matching_scene import Bent, Texture, digitise, paper_pair, render
 from tests.support.strain_fields import make_field, plane
 
 SIZE = 260
-_ALIKE = {
-    "phd_px": 1000.0,
-    "cx_px": 130.0,
-    "cy_px": 130.0,
-    "kappa_per_px2": 0.0,
-    "aspect": 1.0,
-    "alpha_rad": 0.0,
-    "beta_rad": 0.0,
-    "gamma_rad": 0.0,
-    "y0_mm": 0.0,
-    "z0_mm": 100.0,
-}
-#: two cameras side by side before a plane square to both: camera 2's image is camera 1's, shifted
-BESIDE = StereoPair(Camera.from_paper(**_ALIKE, x0_mm=0.0), Camera.from_paper(**_ALIKE, x0_mm=-0.6))
+#: camera 2's image is camera 1's, shifted
+BESIDE = cameras_beside(SIZE)
 
 
 def of_discs(seed: int, phase: float, **drawn: float) -> tuple[float, Term]:

@@ -5,29 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.cameras.camera import Camera
-from core.cameras.stereo import StereoPair
 from core.field.points.images import MeasureImage
 from core.field.region.region import PointGrid
 from core.field.seeding.seeds import Seed
 from core.measure import MeasureOptions, ReferencePair
 from core.orientation.step import step_points
-from tests.support.disc_images import discs
+from tests.support.disc_images import cameras_beside, discs
 
 SIZE, DISPARITY_PX = 200, 6.0
-_ALIKE = {
-    "phd_px": 1000.0,
-    "cx_px": 100.0,
-    "cy_px": 100.0,
-    "kappa_per_px2": 0.0,
-    "aspect": 1.0,
-    "alpha_rad": 0.0,
-    "beta_rad": 0.0,
-    "gamma_rad": 0.0,
-    "y0_mm": 0.0,
-    "z0_mm": 100.0,
-}
-BESIDE = StereoPair(Camera.from_paper(**_ALIKE, x0_mm=0.0), Camera.from_paper(**_ALIKE, x0_mm=-0.6))
+BESIDE = cameras_beside(SIZE)
 
 
 @pytest.mark.parametrize("given", [True, False])
