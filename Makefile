@@ -8,6 +8,8 @@ BIN := $(VENV)/bin
 PROGRAM := $(VENV)/.program
 STAMP := $(VENV)/.installed
 ARAVIS := $(VENV)/.aravis
+PYLON := $(VENV)/.pylon
+STANDA := $(VENV)/.standa
 # what the bench compares with: extras of pyproject.toml, each in .venv-<extra>
 PEERS := bench bench-aldic
 PEER_STAMPS := $(PEERS:%=.venv-%/.installed)
@@ -16,31 +18,34 @@ ARGS ?=
 # only compile the same kernels again
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n > 3 ? 4 : n + 1)))
 
-.PHONY: help wheel demo quick test test-deep serve check check-page kernels bench format accuracy coverage fuzz load years soak openapi reference docs torture powerloss livebench clusterbench pagespeed pagepictures clean
+.PHONY: fuzzreaders help wheel demo quick test test-deep serve check check-page kernels bench format accuracy coverage fuzz load years soak problems docs torture stops powerloss livebench clusterbench pagespeed pagepictures same newest constraints clean
 
 help:
 	@echo "make demo    start the service on the simulated paper rig and run the plate experiment over HTTP"
 	@echo "make quick   the tests that need no service and no device: minutes"
 	@echo "make test    the whole behaviour at normal depth (WORKERS=1: one file at a time)"
 	@echo "make test-deep  the long forms: fuzzing, kills, load, Monte Carlo at full depth"
-	@echo "make   both, in one session, as CI does"
 	@echo "make serve   start the service on the simulated paper rig (ARGS='--config FILE --port N')"
-	@echo "make check   lint, format check, types, import walls, docstrings; lint and types of the page's scripts"
-	@echo "make bench   time everything on this machine, beside pyvale and al-dic-3d, and write docs/explanation/performance.md (ARGS=--quick: a few minutes)"
-	@echo "make clusterbench  a long test on one and two workers, and on 64 simulated ones, and one large step; writes docs/explanation/cluster.md (ARGS='--steps N')"
+	@echo "make check   lint, format check, types, import walls, docstrings, plain English; lint and types of the page's scripts"
+	@echo "make bench   time everything on this machine, beside pyvale and al-dic-3d, and write docs/explanation/performance.md and its tables (ARGS=--quick: a few minutes)"
+	@echo "make clusterbench  a long test on one and two workers, and on 64 simulated ones; writes docs/explanation/cluster.md (ARGS='--steps N')"
 	@echo "make load    ten minutes of captures, readers, slow streams, analyses and stops; writes docs/explanation/reliability.md (ARGS='--minutes N')"
 	@echo "make torture  kill the service 1,000 times at work, look each time that nothing is lost, write docs/explanation/reliability.md (ARGS='--kills N')"
+	@echo "make stops   time stops beside 3,000 requests of any content, under load, and after 50 deaths of each process; write docs/explanation/reliability.md"
+	@echo "make same BASE=<commit>   compare the results of this checkout with those of another commit, bit for bit"
 	@echo "make powerloss  open 100,000 states in which a lost power may leave the data folder, write docs/explanation/reliability.md (ARGS='--states N')"
 	@echo "make years   cost of a start and of answers over the size of the data folder; writes docs/explanation/years.md (ARGS='--sizes TESTS/STEPS ...')"
 	@echo "make soak    an hour of captures, measurement, exports and page: does anything grow? (ARGS='--minutes N --write')"
 	@echo "make fuzz    schema fuzzing of the whole API on a simulated rig (ARGS='--each N --seed S --only OPERATION')"
+	@echo "make fuzzreaders  coverage-guided fuzzing of each reader of foreign files, a process each (ARGS='--executions N --reader NAME')"
 	@echo "make wheel   build the wheel into dist/, with its bill of materials (CycloneDX) inside and beside"
+	@echo "make newest  the tests of make quick with the newest of every package, beyond the upper bounds"
+	@echo "make constraints  write constraints.txt: the tested versions, with checksums, for a release"
 	@echo "make docs    build the site into build/site, offline, and check every link in it"
-	@echo "make openapi write docs/openapi.json, the description of the API, the list of problems and the reference, after a change of either"
-	@echo "make reference  write the pages of docs/reference that are made from the program"
+	@echo "make problems  write server/static/problems.json, the list of errors, after a change of one"
 	@echo "make pagespeed  measure the page in Chromium: first paint, live views, a field of 100,000 points; writes docs/explanation/page_speed.md"
-	@echo "make accuracy   measure every figure of docs/explanation/accuracy again (about twenty minutes)"
-	@echo "make coverage   replicates of the whole chain against its uncertainty: hours, goes on where it was; writes docs/explanation/accuracy/coverage.md (ARGS='--threads N --replicates N --others N --strata WORD' or --page)"
+	@echo "make accuracy   measure the figures of docs/explanation/accuracy.md and its tables again (about twenty minutes)"
+	@echo "make coverage   replicates of the whole chain against its uncertainty: hours, goes on where it was; writes docs/explanation/accuracy/tables/coverage.csv (ARGS='--threads N --replicates N --others N --strata WORD' or --page)"
 
 $(PROGRAM): pyproject.toml
 	@command -v $(PYTHON) >/dev/null || { echo "stereorig needs Python 3.11 or newer. Install it: apt-get install python3 python3-venv"; exit 1; }
@@ -58,7 +63,18 @@ $(ARAVIS): $(PROGRAM)
 		|| echo "No Aravis cameras here: PyGObject could not be built. For them: apt-get install gir1.2-aravis-0.8 aravis-tools libgirepository1.0-dev libcairo2-dev pkg-config gcc python3-dev, then make clean."
 	@touch $@
 
-$(STAMP): $(PROGRAM) $(ARAVIS)
+# 90 MB and for few processors, so it is not part of what everybody must have either
+$(PYLON): $(PROGRAM)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[pylon]' >$(VENV)/pylon.log 2>&1 \
+		|| echo "No Basler cameras through pylon here: pip found no pypylon for this machine (.venv/pylon.log)."
+	@touch $@
+
+$(STANDA): $(PROGRAM)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[standa]' >$(VENV)/standa.log 2>&1 \
+		|| echo "No Standa stages here: pip found no libximc for this machine (.venv/standa.log)."
+	@touch $@
+
+$(STAMP): $(PROGRAM) $(ARAVIS) $(PYLON) $(STANDA)
 	@echo "Adding what the tests and checks need (once) ..."
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,docs]' || { echo "pip could not install the packages of pyproject.toml; its message is above."; exit 1; }
 	@touch $@
@@ -73,15 +89,19 @@ $(KERNELS): $(STAMP) $(shell find core sim server/compute tests/support -name '*
 	@$(BIN)/python -m tests.support.kernels
 	@touch $@
 
-PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+# a worker for each core is enough: threads of the linear algebra that wait for a core spin on it
+PYTEST = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 kernels: $(KERNELS)
 
 quick: $(KERNELS)
 	$(PYTEST) -m 'not deep and not devices' tests/unit tests/contract $(ARGS)
 
+# A test that fails beside others runs once more, alone: it names a defect only if it fails there, too. pytest ends with 1 if
+# tests failed. build/tests.xml keeps each test's duration
 test: $(KERNELS)
-	$(PYTEST) $(ARGS)
+	$(PYTEST) --junitxml=build/tests.xml $(ARGS) || { [ $$? = 1 ] && echo "Running what failed once more, alone ..." \
+		&& $(BIN)/python -m pytest --last-failed --last-failed-no-failures=none $(ARGS); }
 
 test-deep: $(KERNELS)
 	$(PYTEST) -m deep $(ARGS)
@@ -95,6 +115,7 @@ check: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m numpydoc lint $$(git ls-files 'core/*.py' 'drivers/*.py' 'sim/*.py')
+	$(BIN)/python -m tests.support.plain_english
 
 # The page runs as it lies in server/static; Node is for its check alone. Without Node that is said, and fails in CI only.
 PAGE := tests/page/node_modules/.installed
@@ -104,7 +125,8 @@ $(PAGE): tests/page/package.json
 	@touch $@
 
 check: check-page
-check-page: $(if $(shell command -v npm),$(PAGE))
+check-page: $(STAMP) $(if $(shell command -v npm),$(PAGE))
+	@$(BIN)/python -m tests.support.api_description
 	@command -v npm >/dev/null || { echo "The page's scripts are not checked: Node is missing. Install it: apt-get install nodejs npm"; [ "$$CI" != true ]; exit $$?; }; \
 		npm run --prefix tests/page --silent check
 
@@ -126,7 +148,6 @@ livebench: $(STAMP)
 
 clusterbench: $(STAMP)
 	$(BIN)/python -m tests.bench.cluster.bench $(ARGS)
-	$(BIN)/python -m tests.bench.cluster.region
 
 accuracy: $(STAMP)
 	$(BIN)/python -m tests.bench.accuracy.accuracy $(ARGS)
@@ -151,13 +172,11 @@ soak: $(STAMP)
 fuzz: $(STAMP)
 	$(BIN)/python -m tests.support.api_fuzz $(ARGS)
 
-openapi: $(STAMP)
-	$(BIN)/python -m tests.bench.documents.problem_list
-	$(BIN)/python -m tests.bench.documents.openapi $(ARGS)
-	$(BIN)/python -m tests.bench.documents.reference
+fuzzreaders: $(STAMP)
+	$(BIN)/python -m tests.fuzz.readers $(ARGS)
 
-reference: $(STAMP)
-	$(BIN)/python -m tests.bench.documents.reference
+problems: $(STAMP)
+	$(BIN)/python -m tests.bench.documents.problem_list
 
 SPHINX = $(BIN)/python -m sphinx -n -W --keep-going -q -d build/doctrees
 docs: $(STAMP)
@@ -171,6 +190,9 @@ format: $(STAMP)
 powerloss: $(STAMP)
 	$(BIN)/python -m tests.bench.reliability.power_loss --write $(ARGS)
 
+stops: $(STAMP)
+	$(BIN)/python -m tests.bench.reliability.stop_beside --page $(ARGS)
+
 torture: $(STAMP)
 	$(BIN)/python -m tests.bench.reliability.torture --write $(ARGS)
 
@@ -180,6 +202,24 @@ pagespeed: $(STAMP)
 pagepictures: $(STAMP)
 	$(BIN)/python -m tests.bench.page.pictures $(ARGS)
 
+same: $(STAMP)
+	$(BIN)/python -m tests.bench.same $(BASE)
+
+# the newest of everything, beyond the upper bounds too, in an environment of its own. Called by hand, not by CI: no commit is
+# to blame for what others publish
+NEWEST := .venv-newest
+newest:
+	@rm -rf $(NEWEST) && $(PYTHON) -m venv $(NEWEST)
+	@$(PYTHON) tests/bench/documents/constraints.py --unbounded > $(NEWEST)/asked.txt
+	@$(NEWEST)/bin/python -m pip install --quiet --disable-pip-version-check --upgrade -r $(NEWEST)/asked.txt
+	@$(NEWEST)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -e .
+	@echo "Newer than constraints.txt:"; $(NEWEST)/bin/python -m tests.bench.documents.constraints --differences
+	$(NEWEST)/bin/python -m tests.support.kernels
+	$(MAKE) BIN=$(NEWEST)/bin KERNELS= quick
+
+constraints: $(STAMP)
+	$(BIN)/python -m tests.bench.documents.constraints
+
 clean:
-	rm -rf $(VENV) $(PEERS:%=.venv-%) tests/page/node_modules build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .cache
+	rm -rf $(VENV) $(NEWEST) $(PEERS:%=.venv-%) tests/page/node_modules build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import threading
 from collections.abc import Callable, Iterator
+from functools import cache
 from typing import Any
 
 CompileElsewhere = Callable[[str, str, Any], None]
@@ -15,6 +17,18 @@ CompileElsewhere = Callable[[str, str, Any], None]
 
 COMPILING = "compiling kernels, once per machine, about half a minute"
 """Text for the user."""
+
+
+ENTRIES: dict[tuple[str, str], Any] = {}
+"""Kernels that Python calls and that are kept on disk, by module and qualified name."""
+
+_reports: list[Callable[[], None]] = []
+_elsewhere: list[CompileElsewhere] = []
+_asked = threading.local()
+
+
+class CompiledElsewhereError(Exception):
+    """Another process was asked to compile the kernel that was called: call it again inside :func:`compiling_here`."""
 
 
 @contextlib.contextmanager
@@ -26,66 +40,80 @@ def report_compiling(report: Callable[[], None]) -> Iterator[None]:
     report
         Called at most once, on the thread that compiles.
     """
-    from numba.core import event  # slow to load, and needed for any computation
+    _listen()
+    reported = False
 
-    class Listener(event.Listener):
-        reported = False
+    def report_once() -> None:
+        nonlocal reported
+        if not reported:
+            reported = True
+            report()
 
-        def on_start(self, event: Any) -> None:  # noqa: ARG002 - numba's own signature
-            if not self.reported:
-                self.reported = True
-                report()
-
-        def on_end(self, event: Any) -> None:
-            """Do nothing: the end shows in the work's own progress."""
-
-    listener = Listener()
-    event.register("numba:compile", listener)  # type: ignore[no-untyped-call]
-    try:
+    with _entered(_reports, report_once):
         yield
-    finally:
-        event.unregister("numba:compile", listener)  # type: ignore[no-untyped-call]
-
-
-_elsewhere: list[CompileElsewhere] = []
 
 
 @contextlib.contextmanager
 def compile_elsewhere(compile_it: CompileElsewhere) -> Iterator[None]:
     """Have another process compile the kernels that are not on disk inside the block, and load them then.
 
-    In the process that compiles it, a kernel rounds otherwise than where it is loaded from disk.
+    In the process that compiles it, a kernel rounds differently than if it is loaded from disk.
 
     Parameters
     ----------
     compile_it
-        Called on the thread that needs a kernel; where the kernel is not on disk after it, it is compiled here.
+        Called on the thread that needs a kernel; if the kernel is not on disk after the call, it is compiled here.
     """
-    _elsewhere.append(compile_it)
+    _listen()
+    with _entered(_elsewhere, compile_it):
+        yield
+
+
+@contextlib.contextmanager
+def compiling_here() -> Iterator[None]:
+    """Ask no other process inside the block, on this thread."""
+    _asked.before = True
     try:
         yield
     finally:
-        _elsewhere.remove(compile_it)
+        _asked.before = False
 
 
-def ask_elsewhere(dispatcher: Any, arguments: Any) -> bool:
-    """Have a kernel compiled as :func:`compile_elsewhere` says; return False where nothing was said.
+@contextlib.contextmanager
+def _entered(callbacks: list[Any], one: Any) -> Iterator[None]:
+    callbacks.append(one)
+    try:
+        yield
+    finally:
+        callbacks.remove(one)
 
-    Listeners hear of it as of any compilation.
-    """
-    if not _elsewhere:
-        return False
+
+@cache
+def _listen() -> None:
     from numba.core import event  # slow to load, and needed for any computation
 
-    function = dispatcher.py_func
-    heard = {"dispatcher": dispatcher, "args": arguments, "return_type": None}
-    with event.trigger_event("numba:compile", data=heard):
-        _elsewhere[-1](function.__module__, function.__qualname__, arguments)
-    return True
+    class Listener(event.Listener):
+        def on_start(self, event: Any) -> None:
+            _on_compilation(event.data["dispatcher"], event.data["args"])
+
+        def on_end(self, event: Any) -> None:
+            """Do nothing: the end shows in the work's own progress."""
+
+    event.register("numba:compile", Listener())  # type: ignore[no-untyped-call]
+
+
+def _on_compilation(dispatcher: Any, arguments: Any) -> None:
+    """Report that numba is about to compile a function, and ask another process for a kernel that is kept on disk."""
+    for report in _reports.copy():
+        report()
+    name = dispatcher.py_func.__module__, dispatcher.py_func.__qualname__
+    if _elsewhere and name in ENTRIES and not getattr(_asked, "before", False):
+        _elsewhere[-1](*name, arguments)
+        raise CompiledElsewhereError
 
 
 class NotCompiledError(Exception):
-    """A kernel is neither loaded nor on disk, where none may be compiled."""
+    """A kernel is neither loaded nor on disk, and compiling is not allowed here."""
 
 
 def refuse_compiling() -> contextlib.AbstractContextManager[None]:

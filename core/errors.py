@@ -160,7 +160,7 @@ class StateError(StereorigError):
     """The call is right but the moment is wrong."""
 
     code = "wrong_state"
-    remedy = "Wait for what holds the resource, or cancel it."
+    remedy = "Wait for the work that uses the resource, or cancel it."
 
 
 class StorageError(StereorigError):

@@ -1,7 +1,7 @@
-"""Names of a package that are loaded from its modules when they are first used.
+"""Modules that are loaded when they are first used, and names of a package from such modules.
 
-A package that both describes things and works on them is often asked for the description alone, as a calibration's file
-that names its target: what finds targets in images then need not be loaded.
+A package with both descriptions and computations is often needed for the description alone, as a calibration's file
+that names its target: the modules that find targets in images then need not be loaded.
 """
 
 from __future__ import annotations
@@ -9,7 +9,13 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from types import ModuleType
 from typing import Any
+
+
+def load_module(name: str) -> ModuleType:
+    """Load a module whose name a table or another process gives, as of a command or of a kernel."""
+    return importlib.import_module(name)
 
 
 def names_of(
@@ -29,7 +35,7 @@ def names_of(
     def get(name: str) -> Any:
         if name not in lies_in:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(importlib.import_module(lies_in[name]), name)
+        value = getattr(load_module(lies_in[name]), name)
         setattr(sys.modules[package], name, value)
         return value
 

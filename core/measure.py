@@ -1,6 +1,7 @@
 """Shape and displacement of a full field: from images to a checked result.
 
-Entry points of the measurement; their phases are in ``core.field``, the point-level matching in ``core.matching``.
+Entry points of the measurement; their phases are in ``stereorig.core.field``, the point-level matching in
+``stereorig.core.matching``.
 """
 
 from __future__ import annotations
@@ -11,19 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from core.cameras.stereo import StereoPair
-from core.errors import InputError
-from core.field.growth.field import motion_field, shape_field
-from core.field.growth.seed import Seeds
-from core.field.growth.state import Image, prepare
-from core.field.points.crew import Crew
-from core.field.points.images import MeasureImage
-from core.field.points.result import Field
-from core.field.region.region import PointGrid
-from core.field.sequence.reference_steps import PreviousStep, Updating
-from core.field.settings import MeasureOptions
-from core.progress import CancelToken, Progress
-from core.settings import DEFAULT_REFERENCE_UPDATE, ReferenceUpdate
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import InputError
+from stereorig.core.field.growth.field import motion_field, shape_field
+from stereorig.core.field.growth.seed import Seeds
+from stereorig.core.field.growth.state import Image, prepare
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.field.sequence.reference_steps import PreviousStep, Updating
+from stereorig.core.field.settings import MeasureOptions
+from stereorig.core.progress import CancelToken, Progress
+from stereorig.core.settings import DEFAULT_REFERENCE_UPDATE, ReferenceUpdate
 
 __all__ = ["MeasureOptions", "PreviousStep", "ReferencePair", "Updating", "measure_motion", "measure_shape"]
 
@@ -68,14 +68,14 @@ class ReferencePair:
         field_of: Callable[[int], Field],
         first: int = 0,
     ) -> Updating:
-        """Return a measurement of the steps of a sequence in order, with later references where they are needed.
+        """Return a measurement of the steps of a sequence in order, with later references if they are needed.
 
         Parameters
         ----------
         shape, grid, options
             The reference's shape, as for :meth:`motion`.
         reference_update
-            ``never``, ``auto`` or ``always``, see :mod:`core.field.sequence.reference_steps`.
+            ``never``, ``auto`` or ``always``, see :mod:`stereorig.core.field.sequence.reference_steps`.
         images_of, field_of
             Images and field of an earlier step, by its number.
         first
@@ -104,7 +104,6 @@ def measure_shape(
     seeds: Seeds | None = None,
     progress: Progress | None = None,
     cancel: CancelToken | None = None,
-    crew: Crew | None = None,
 ) -> Field:
     """Measure the shape of the surface, section 4.1.
 
@@ -122,8 +121,6 @@ def measure_shape(
         Seed points, (x, y) in camera 1 or ``Seed``; found from feature matches when left out.
     progress, cancel
         Receiver of reports (phase, points done, points in all), and the means to stop.
-    crew
-        Those who may fit tiles of many points; None: nobody.
 
     Returns
     -------
@@ -141,7 +138,7 @@ def measure_shape(
     Cancelled
         If the token is set.
     """
-    inputs = prepare(pair, (image1, image2), None, grid, options, progress=progress, cancel=cancel, crew=crew)
+    inputs = prepare(pair, (image1, image2), None, grid, options, progress=progress, cancel=cancel)
     return shape_field(inputs, seeds)
 
 
@@ -159,7 +156,6 @@ def measure_motion(
     seeds: Seeds | None = None,
     progress: Progress | None = None,
     cancel: CancelToken | None = None,
-    crew: Crew | None = None,
 ) -> Field:
     """Measure the displacement since the reference, section 4.2: three comparisons at once.
 
@@ -177,7 +173,7 @@ def measure_motion(
         The reference's shape on the same grid; measured first when left out. Only its valid points are measured.
     previous
         An earlier step's field on the same grid, to start from.
-    seeds, progress, cancel, crew
+    seeds, progress, cancel
         As in :func:`measure_shape`.
 
     Returns
@@ -198,10 +194,10 @@ def measure_motion(
     )
     if shape is None:
         shape = measure_shape(
-            pair, reference1, reference2, grid, options, seeds=seeds, progress=progress, cancel=cancel, crew=crew
+            pair, reference1, reference2, grid, options, seeds=seeds, progress=progress, cancel=cancel
         )
     images = (reference1, reference2), (cur1, cur2)
-    inputs = prepare(pair, *images, grid, options, progress=progress, cancel=cancel, crew=crew)
+    inputs = prepare(pair, *images, grid, options, progress=progress, cancel=cancel)
     for name, other in (("shape", shape), ("previous", previous)):
         if other is not None and (other.shape != grid.shape or not np.allclose(other.x_px, grid.x_px)):
             raise InputError(

@@ -12,24 +12,65 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.arrays import Bool, Float, Float32
-from core.errors import ImageError, InputError
+from stereorig.core.arrays import Bool, Float, Float32
+from stereorig.core.errors import ImageError, InputError
 
 MAX_SHIFT_PX = 0.1
 """Largest motion from one frame to the next: beyond it the first-order correction does not hold."""
 MAX_EXCESS = 0.25
 """Largest excess of the variance at steep pixels over that at flat ones of the same grey level."""
 
+MAX_TEXTURE = 0.05
+"""Largest share of an even field's variance that is common to pixels two rows and columns apart. Lines and single
+pixels have no such part, but an image of any object has.
+"""
+_SHADING_PX = 12.0  # standard deviation of the smoothing that estimates light and lens
+_DEFECT = 8.0  # robust sd of the pattern from pixel to pixel
+
 _BINS = 48
-_MIN_PIXELS = 400  # of a bin
+_MIN_PIXELS = 400  # pixels of a bin, at least
 _MAX_PIXELS = 600_000  # used in one frame; more do not improve the result
 _OUTLIER = 6.0  # sd of a difference
 _CLIPPED_SD = 3.0  # distance from black and white, in sd, below which a level's noise is cut off
-_CLEAR = 0.25  # of the variance at the lowest level seen
+_CLEAR = 0.25  # share of the variance at the lowest level seen
 _SURE = 4.0  # standard deviations of a significant coefficient
+
+
+@dataclass(frozen=True, eq=False)
+class SensorMap:
+    """Fixed pattern and defects of a sensor, in all its images.
+
+    Attributes
+    ----------
+    pattern
+        (rows, cols) float32 grey levels that the sensor adds: fixed columns, rows and pixels.
+    defects
+        (m,) int64 flat indices of pixels that follow the light no more, or hardly: dead, hot, under dust.
+    """
+
+    pattern: Float32
+    defects: NDArray[np.int64]
+
+    def subtracted_from(self, image: NDArray[Any], name: str = "the image") -> Float32:
+        """Return an image (rows, cols) without the pattern, float32.
+
+        Raises
+        ------
+        ImageError
+            ``image_size_mismatch``.
+        """
+        if image.shape != self.pattern.shape:
+            (rows, cols), (own_rows, own_cols) = image.shape, self.pattern.shape
+            raise ImageError(
+                f"{name} is {cols} x {rows} px, the map of its sensor {own_cols} x {own_rows} px.",
+                code="image_size_mismatch",
+                remedy="Give the map of this camera, with this window of its sensor.",
+            )
+        return np.asarray(image - self.pattern, dtype=np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +98,8 @@ class NoiseModel:
         Largest motion of the image between consecutive frames; corrected to first order.
     excess
         Excess of the variance of steep pixels over flat ones of the same grey level: 0 in a still scene.
+    sensor
+        Fixed pattern and defective pixels, subtracted and left out where images are measured; None: not known.
     """
 
     coefficients: tuple[float, float, float]
@@ -70,6 +113,7 @@ class NoiseModel:
     drift: float = 0.0
     shift_px: float = 0.0
     excess: float = 0.0
+    sensor: SensorMap | None = None
 
     def __post_init__(self) -> None:
         low, high = self.range_grey
@@ -110,6 +154,8 @@ class NoiseModel:
             drift=self.drift,
             shift_px=self.shift_px,
             excess=self.excess,
+            # the fixed pattern is in each frame, and so in their mean
+            sensor=self.sensor and SensorMap(np.float32(scale) * self.sensor.pattern, self.sensor.defects),
         )
 
     def times(self, factor: float) -> NoiseModel:
@@ -199,6 +245,73 @@ def measure_noise(frames: Sequence[ArrayLike], *, full_scale: float | None = Non
     )
 
 
+def measure_pattern(frames: Sequence[ArrayLike]) -> SensorMap:
+    """Measure a sensor's fixed pattern and defective pixels from frames of an even field.
+
+    Parameters
+    ----------
+    frames
+        Two or more images (rows, cols) of one camera, of a diffuser or out of focus, at about the grey levels of the
+        test. A specimen in focus is not suitable: its texture stays in place, as the pattern does.
+
+    Returns
+    -------
+    SensorMap
+        In the frames' grey levels. A pattern no larger than the frames' own noise is not in it.
+
+    Raises
+    ------
+    InputError
+        ``too_few_frames``.
+    ImageError
+        As :func:`measure_noise`; ``frames_not_even`` if the frames show more than an even field.
+    """
+    images = _checked(frames, whole=True)
+    free = _unclipped(images, _full_scale(frames, images))
+    mean: Float = np.mean(images, axis=0, dtype=np.float64)
+    noise = float(np.mean(np.var(np.stack([image[::4] for image in images]), axis=0, ddof=1, dtype=np.float64)))
+    noise /= len(images)
+    rest, bad = _without_shading(mean, ~free), ~free
+    for _ in range(2):  # a defect raises the pixels about it
+        column, row, own = _parts_of(rest, bad)
+        limit = _DEFECT * 1.4826 * float(np.median(np.abs(own[~bad])))
+        bad = ~free | (np.abs(own) > max(limit, 1e-6))
+        rest = _without_shading(mean, bad)
+    column, row, own = _parts_of(rest, bad)
+    own[bad] = 0.0
+    variance = float((own[~bad] ** 2).mean())
+    # an image correlates both ways; lines and pixels do so along their own line at most
+    shared = float(np.mean(own[2:, 2:] * own[:-2, :-2] + own[2:, :-2] * own[:-2, 2:])) / 2.0
+    if shared > MAX_TEXTURE * variance and shared > _SURE * variance / np.sqrt(own.size):
+        raise ImageError(
+            f"the frames show more than an even field: pixels two rows and columns apart share "
+            f"{100 * shared / variance:.0f} % of what is fixed, {100 * MAX_TEXTURE:.0f} % at most is a sensor's own.",
+            code="frames_not_even",
+            remedy="Take them of a diffuser, or far out of focus, at about the grey levels of the test.",
+        )
+    true = max(variance - noise, 0.0) / max(variance, 1e-30)
+    pattern = (column[None, :] + row[:, None] + true * own).astype(np.float32)
+    return SensorMap(pattern, np.flatnonzero(bad).astype(np.int64))
+
+
+def _without_shading(mean: Float, bad: Bool) -> Float:
+    """A mean frame less its slowly varying part; bad pixels have no part in it."""
+    weight = (~bad).astype(np.float64)
+    smooth, share = (
+        cv2.GaussianBlur(values, (0, 0), _SHADING_PX, borderType=cv2.BORDER_REFLECT_101)
+        for values in (mean * weight, weight)
+    )
+    return np.asarray(mean - smooth / np.maximum(share, 1e-6))
+
+
+def _parts_of(rest: Float, bad: Bool) -> tuple[Float, Float, Float]:
+    """Columns (cols,), rows (rows,), and the remainder of single pixels (rows, cols)."""
+    usual = np.ma.masked_array(rest, bad)
+    column = usual.mean(axis=0).filled(0.0)
+    row = (usual - column).mean(axis=1).filled(0.0)
+    return np.asarray(column), np.asarray(row), np.asarray(rest - column[None, :] - row[:, None])
+
+
 def _not_static(cause: str) -> ImageError:
     return ImageError(
         f"the frames do not show a still scene: {cause}.",
@@ -207,7 +320,7 @@ def _not_static(cause: str) -> ImageError:
     )
 
 
-def _checked(frames: Sequence[ArrayLike]) -> list[NDArray[Any]]:
+def _checked(frames: Sequence[ArrayLike], *, whole: bool = False) -> list[NDArray[Any]]:
     images = [np.asarray(frame) for frame in frames]
     if len(images) < 2:
         raise InputError(
@@ -237,7 +350,7 @@ def _checked(frames: Sequence[ArrayLike]) -> list[NDArray[Any]]:
                 code="frames_identical",
                 remedy="Give different frames, not copies of one; a camera without noise needs no model.",
             )
-    rows = rows_looked_at(first)
+    rows = slice(None) if whole else rows_looked_at(first)
     return [image[rows] for image in images]
 
 

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from core.arrays import Bool, Float
+from stereorig.core.arrays import Bool, Float
 
 _TILE_PX = 256
 _MAX_TILES = 64
-_MIN_SHARE = 0.5  # of a tile that must lie in the region
+_MIN_SHARE = 0.5  # share of a tile that must be in the region
 _MIN_PX = 16
 
 
@@ -84,7 +84,7 @@ def pattern_size(image: NDArray[np.generic], inside: Bool | None = None) -> Patt
 
 
 def _covariance(grey: NDArray[np.generic], chosen: Bool) -> tuple[Float, Float, int]:
-    """Sums of products at each shift and their counts, over tiles that lie in the region for the most part."""
+    """Sums of products at each shift and their counts, over tiles that are mostly in the region."""
     starts = [_starts(n) for n in grey.shape]
     corners = [(r, c) for r in starts[0] for c in starts[1]]
     if len(corners) > _MAX_TILES:

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from typing import Protocol
 
-from core.errors import Cancelled
+from stereorig.core.errors import Cancelled
 
 Progress = Callable[[str, int, int], None]
 """Called with (phase, done, total); must return quickly."""
@@ -42,6 +42,6 @@ def no_progress(phase: str, done: int, total: int) -> None:
 
 
 def raise_if_cancelled(cancel: CancelToken | None) -> None:
-    """Raise :class:`core.errors.Cancelled` if the token is set."""
+    """Raise :class:`stereorig.core.errors.Cancelled` if the token is set."""
     if cancel is not None and cancel.cancelled:
         raise Cancelled("the work was cancelled before it was finished.")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
+from stereorig.core.arrays import Float
 
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of normal errors over the median of their absolute values."""
@@ -15,9 +15,9 @@ _GOLDEN_SECTION = 0.6180339887498949
 
 
 def median(values: Float) -> float:
-    """Return the median of numbers (n,); NaN where one of them is.
+    """Return the median of numbers (n,); NaN if one of them is NaN.
 
-    As ``np.median``, which takes several times as long for a thousand numbers.
+    It equals ``np.median``, which takes several times as long for a thousand numbers.
     """
     n = len(values)
     parted = np.partition(values, [(n - 1) // 2, n // 2, n - 1])

@@ -9,13 +9,11 @@ from __future__ import annotations
 from statistics import NormalDist
 from typing import Annotated, Any, Literal, NamedTuple, Self, get_args
 
-from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.config import JsonDict
 from pydantic_core import PydanticCustomError
 
 PatchSetting = Literal["affine", "rigid", "quadratic", "auto"]
-#: earlier names of patches, still accepted
-EARLIER_PATCHES = {"stretch": "affine", "curved": "quadratic"}
 PATCH_SETTINGS: tuple[PatchSetting, ...] = get_args(PatchSetting)
 Interpolation = Literal["cubic", "quintic"]
 INTERPOLATIONS: tuple[Interpolation, ...] = get_args(Interpolation)
@@ -27,17 +25,14 @@ StrainOrder = Literal[1, 2, "auto"]
 STRAIN_ORDERS: tuple[StrainOrder, ...] = get_args(StrainOrder)
 StartFrom = Literal["previous", "reference"]
 SideBySide = Literal["auto", "never"]
-SplitStep = Literal["auto", "always", "never"]
-SPLIT_STEPS: tuple[SplitStep, ...] = get_args(SplitStep)
-DEFAULT_SPLIT_STEP: SplitStep = "auto"
-#: usable points from which a step is split, by what was asked for
-SPLIT_STEP_FROM: dict[SplitStep, float] = {"auto": 20_000, "always": 0, "never": float("inf")}
 Pattern = Literal["surface", "projected"]
 DEFAULT_PATCH: PatchSetting = "auto"
 DEFAULT_INTERPOLATION: Interpolation = "quintic"
 DEFAULT_REFERENCE_UPDATE: ReferenceUpdate = "auto"
-#: half a pixel is five of it
-DEFAULT_MAX_SIGMA_PX = 0.1
+#: the nearest wrong match is a speckle of 3 px or more away, and a match starts to slip to it from half of that: 6 sd
+DEFAULT_MAX_SIGMA_PX = 0.25
+#: of one point among others that are surer: half a pixel is five of it
+SINGLE_MAX_SIGMA_PX = 0.1
 
 
 class Range(NamedTuple):
@@ -69,11 +64,16 @@ DENSE_STEP_PX = Range(1, 20, False, 2)
 PREFILTER_OF_SUBSET = 0.25
 #: beyond it a match is as likely one speckle off
 MAX_SIGMA_PX = 1.0
-#: nobody knows a distribution's tails so far out
+#: the tails of a distribution are not known so far out
 MAX_COVERAGE_FACTOR = 10.0
 MAX_COVERAGE = 0.999999
 MAX_SEEDS = MAX_CUTS = 100
 MAX_CORNERS = 1000
+
+
+def single_sigma_px(max_sigma_px: float) -> float:
+    """Return the limit for a point by itself: the stricter one, unless more than the default was asked for."""
+    return max_sigma_px if max_sigma_px > DEFAULT_MAX_SIGMA_PX else min(max_sigma_px, SINGLE_MAX_SIGMA_PX)
 
 
 def _a_number(value: Any) -> Any:
@@ -83,11 +83,6 @@ def _a_number(value: Any) -> Any:
     if isinstance(value, bool):
         raise ValueError("must be a number, not true or false")
     return value
-
-
-def patch_name(value: Any) -> Any:
-    """Return a patch setting's name of today."""
-    return EARLIER_PATCHES.get(value, value) if isinstance(value, str) else value
 
 
 #: the type keeps null, which every multipleOf holds for, from being excluded
@@ -199,15 +194,12 @@ class StrainSettings(Settings):
 
 
 class AnalysisSettings(Settings):
-    """Settings of a measurement, besides its images and its calibration."""
+    """Settings of a measurement, except its images and its calibration."""
 
     region: Region = Field(description="Where points may lie.")
     subset_px: SubsetPx = SUBSET_PX.default
-    spacing_px: SpacingPx = Field(
-        SPACING_PX.default,
-        validation_alias=AliasChoices("spacing_px", "step_px"),  # the second is its earlier name
-    )
-    patch: Annotated[PatchSetting, BeforeValidator(patch_name)] = Field(
+    spacing_px: SpacingPx = SPACING_PX.default
+    patch: PatchSetting = Field(
         DEFAULT_PATCH,
         description="Patch model: affine and rigid are planes; quadratic has a second-order shape and motion and about "
         "twice the noise; auto takes affine or quadratic, whichever has the smaller total error, shape and motion "
@@ -221,7 +213,9 @@ class AnalysisSettings(Settings):
     max_sigma_px: Annotated[Real, Field(gt=0.0, le=MAX_SIGMA_PX)] = Field(
         DEFAULT_MAX_SIGMA_PX,
         description="Standard deviation of a point's match in any image, in depth too, px, beyond which it is "
-        "rejected: larger keeps what is uncertain, with its standard deviation; smaller keeps what is sure.",
+        "rejected: larger keeps what is uncertain, with its standard deviation; smaller keeps what is sure. Up to the "
+        f"default, a single point that is less sure than the field's usual one is rejected from "
+        f"{SINGLE_MAX_SIGMA_PX:g} px on.",
     )
     keep_rejected: bool = Field(
         False,
@@ -256,14 +250,6 @@ class AnalysisSettings(Settings):
         "after another within 2 % of their standard uncertainty. never, and always with reference_update = always: "
         "one after another.",
     )
-    split_step: SplitStep = Field(
-        DEFAULT_SPLIT_STEP,
-        description="Whether one step is split by region. auto: in a step of "
-        f"{SPLIT_STEP_FROM['auto']:,.0f} usable points or more the field grows over a coarse part of them first, and "
-        "the fits of the others are shared out to workers that have nothing to do and see the data folder; the result "
-        "does not depend on how many there are. always: in smaller steps too. never: one worker grows each field in "
-        "one piece; valid points are the same, values within 2 % of their standard uncertainty, rms.",
-    )
     pattern: Pattern = Field(
         "surface",
         description="What the cameras see. surface: a texture that moves with the surface. projected: light that stays "
@@ -289,7 +275,8 @@ class AnalysisSettings(Settings):
     @model_validator(mode="before")
     @classmethod
     def _shape_alone(cls, given: Any) -> Any:
-        # what is left out is what a projected pattern allows; what is asked for against it is refused with the reason
+        # settings that are left out take the values that a projected pattern allows; a setting against it is refused
+        # with the reason
         if isinstance(given, dict) and given.get("pattern") == "projected":
             return {"strain": None, "reference_update": "never", **given}
         return given
@@ -356,7 +343,7 @@ class StoredSettings(AnalysisSettings):
 
 
 class CoverageFields(BaseModel):
-    """How wide the interval is that is stated beside a value; by default one standard uncertainty."""
+    """Width of the interval that is stated with a value; by default one standard uncertainty."""
 
     k: Annotated[Real, Field(gt=0.0, le=MAX_COVERAGE_FACTOR)] | None = Field(
         None,

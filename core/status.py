@@ -19,6 +19,7 @@ class PointStatus(IntEnum):
     NEIGHBOUR_MISMATCH = 8
     SINGULAR = 9
     EXTRAPOLATED = 10
+    SIGMA_TOO_LARGE = 11
 
 
 STATUS_MEANINGS: dict[PointStatus, str] = {
@@ -28,9 +29,10 @@ STATUS_MEANINGS: dict[PointStatus, str] = {
     PointStatus.OUTSIDE_IMAGE: "the patch leaves one of the images or a lens model's domain",
     PointStatus.LOW_TEXTURE: "too little grey-level gradient for a match",
     PointStatus.NOT_CONVERGED: "the iteration did not settle",
-    PointStatus.LOW_CORRELATION: "a correlation is below its limit, or the residuals show too much scatter",
+    PointStatus.LOW_CORRELATION: "a correlation is below its limit",
     PointStatus.EPIPOLAR_MISMATCH: "camera 2 sees the point off the epipolar line",
     PointStatus.NEIGHBOUR_MISMATCH: "disagrees with its neighbours beyond the expected scatter",
     PointStatus.SINGULAR: "the normal equations cannot be solved",
     PointStatus.EXTRAPOLATED: "measured, but outside the calibrated volume: larger uncertainty",
+    PointStatus.SIGMA_TOO_LARGE: "matched, but with a standard deviation above the limit, in depth too",
 }

@@ -2,11 +2,11 @@
 
 Index and frame conventions, the same for every camera: ``lines = (n_a, n_b)``. Walking along X_sys one crosses the
 ``n_a`` lines of family a; walking along Y_sys, a quarter turn clockwise from it in the image, the ``n_b`` lines of
-family b. In the image X_sys goes right and down and Y_sys left and down where the lines lie at 45 degrees; X_sys goes
-right and Y_sys down where they lie along rows and columns. In general X_sys lies between 23 degrees above the rows and
-67 degrees below, unless the other way is asked for (``core.grid.GridOptions.orientation``). The origin is the centre of
-the full set of lines, Z_sys = 0 is the plane of the grid at the first position. Only inner intersections are used: the
-outermost lines end at their crossings.
+family b. If the lines are at 45 degrees in the image, X_sys goes right and down and Y_sys left and down; if they are
+along rows and columns, X_sys goes right and Y_sys down. In general X_sys is between 23 degrees above the rows and 67
+degrees below, unless the other way is asked for (``stereorig.core.grid.GridOptions.orientation``). The origin is the
+centre of the full set of lines, Z_sys = 0 is the plane of the grid at the first position. Only inner intersections are
+used: the outermost lines end at their crossings.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.errors import TargetError
+from stereorig.core.arrays import Float
+from stereorig.core.errors import TargetError
 
 LINE_GRID: Final = "line_grid"
-"""Kind of a line grid, beside those of :data:`core.boards.board.BOARD_KINDS`."""
+"""Kind of a line grid; the other kinds are :data:`stereorig.core.boards.board.BOARD_KINDS`."""
 _MIN_LINES = 5  # three inner lines each way: the fewest that show a lens's curvature
 
 
@@ -40,11 +41,14 @@ class GridTarget:
     node_tolerance_mm
         The maker's bound on the error of an intersection's position, per axis; 0 for an exact grid.
     pitch_scale_sigma
-        Relative standard deviation of the pitch as a whole; 0 where it is exact.
+        Relative standard deviation of the pitch as a whole; 0: exact; None: ``node_tolerance_mm`` over the size.
     flatness_mm
         Bound on the grid's departure from a plane; None: as ``node_tolerance_mm``. It shows in free poses only.
     dark_lines
         Dark lines on bright ground, or bright lines on dark ground.
+    missing_lines
+        Numbers, from 1, of the lines that the grid lacks: of those crossed walking along X_sys (columns), and along
+        Y_sys (rows).
 
     Raises
     ------
@@ -57,13 +61,21 @@ class GridTarget:
     line_width_mm: float
     node_tolerance_mm: float = 0.0
     dark_lines: bool = True
-    pitch_scale_sigma: float = 0.0
+    pitch_scale_sigma: float | None = None
     flatness_mm: float | None = None
+    missing_lines: tuple[tuple[int, ...], tuple[int, ...]] = ((), ())
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lines", two_whole_numbers("lines", self.lines))
         if min(self.lines) < _MIN_LINES:
             raise invalid(f"a grid needs at least {_MIN_LINES} lines each way, got {list(self.lines)}")
+        columns, rows = (tuple(sorted(set(own))) for own in self.missing_lines)
+        object.__setattr__(self, "missing_lines", (columns, rows))
+        for own, count in zip((columns, rows), self.lines, strict=True):
+            if any(not 1 <= k <= count for k in own) or count - len(own) < _MIN_LINES:
+                raise invalid(
+                    f"missing_lines must be numbers from 1 to {count} that leave {_MIN_LINES} lines, got {list(own)}"
+                )
         check_pitch(self.pitch_mm)
         if not (0.0 < self.line_width_mm < 0.5 * self.pitch_mm):
             raise invalid(
@@ -77,6 +89,15 @@ class GridTarget:
     def inner_shape(self) -> tuple[int, int]:
         """Number of usable intersections along X_sys and along Y_sys."""
         return self.lines[0] - 2, self.lines[1] - 2
+
+    @property
+    def present_lines(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Indices, from 0, of the lines that the grid has, along X_sys and along Y_sys."""
+        return self._present(0), self._present(1)
+
+    def _present(self, axis: int) -> NDArray[np.intp]:
+        missing = np.array(self.missing_lines[axis], dtype=np.intp) - 1
+        return np.setdiff1d(np.arange(self.lines[axis]), missing)
 
     def inner_points_mm(self) -> Float:
         """Return the nominal positions of the inner intersections in the system frame.
@@ -120,9 +141,9 @@ def check_tolerance(node_tolerance_mm: float, pitch_mm: float) -> None:
         )
 
 
-def check_errors(pitch_scale_sigma: float, flatness_mm: float | None) -> None:
-    """Raise ``target_invalid`` for errors of a target that no calibration could stand."""
-    if not (0.0 <= pitch_scale_sigma < 0.1):
+def check_errors(pitch_scale_sigma: float | None, flatness_mm: float | None) -> None:
+    """Raise ``target_invalid`` for errors of a target that are too large for a calibration."""
+    if pitch_scale_sigma is not None and not (0.0 <= pitch_scale_sigma < 0.1):
         raise invalid(f"pitch_scale_sigma must lie between 0 and 0.1, got {pitch_scale_sigma!r}")
     if flatness_mm is not None and not (np.isfinite(flatness_mm) and flatness_mm >= 0.0):
         raise invalid(f"flatness_mm must be positive or 0, got {flatness_mm!r}")

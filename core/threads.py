@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numba
 
-from core.errors import InputError
+from stereorig.core.errors import InputError
 
 kernel_lock = threading.RLock()
 """Held around every call of a numba ``prange`` kernel; reentrant, so a caller may hold it over several."""

@@ -15,7 +15,7 @@ _PROJECT = tomllib.loads((Path(__file__).parent.parent / "pyproject.toml").read_
 project = "stereorig"
 author = "the authors of stereorig"
 version = release = _PROJECT["version"]
-extensions = ["myst_parser"]
+extensions = ["myst_parser", "docs.built"]
 source_suffix = {".md": "markdown"}
 nitpicky = True
 #: formulas between dollar signs, definition lists, a picture in the text's size

@@ -6,23 +6,39 @@ import importlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
-from core.errors import CameraError, StageError
-from drivers.cameras.protocol import CameraOptions, FoundDevice, FrameGrabber
-from drivers.stages.esp301 import ESP301Stage
-from drivers.stages.protocol import AxisOptions
-from drivers.stages.serial_line import FlowControl
-from drivers.stages.serial_stage import SerialStage
-from drivers.stages.smc100 import ConexCCStage, SMC100Stage
+from stereorig.core.errors import CameraError, StageError
+from stereorig.drivers.cameras.genicam.table import Feature
+from stereorig.drivers.cameras.protocol import CameraOptions, FoundDevice, FrameGrabber
+from stereorig.drivers.stages.makers.esp301 import ESP301Stage
+from stereorig.drivers.stages.makers.kinesis import KinesisStage
+from stereorig.drivers.stages.makers.pi import PIStage
+from stereorig.drivers.stages.makers.smc100 import ConexCCStage, SMC100Stage
+from stereorig.drivers.stages.makers.standa import StandaStage
+from stereorig.drivers.stages.makers.xps import XPSStage
+from stereorig.drivers.stages.makers.zaber import ZaberStage
+from stereorig.drivers.stages.protocol import AxisOptions
+from stereorig.drivers.stages.serial_line import FlowControl
+from stereorig.drivers.stages.serial_stage import SerialStage
 
 STAGE_DRIVERS: dict[str, Callable[..., SerialStage]] = {
     "conex-cc": ConexCCStage,
     "esp301": ESP301Stage,
+    "kinesis": KinesisStage,
+    "pi": PIStage,
     "smc100": SMC100Stage,
+    "standa": StandaStage,
+    "xps": XPSStage,
+    "zaber": ZaberStage,
 }
 
 #: driver -> module that has ``make(options) -> FrameGrabber`` and ``discover() -> list[FoundDevice]``
-CAMERA_DRIVERS: dict[str, str] = {"aravis": "drivers.cameras.aravis", "v4l2": "drivers.cameras.v4l2"}
+CAMERA_DRIVERS: dict[str, str] = {
+    "aravis": "stereorig.drivers.cameras.aravis",
+    "pylon": "stereorig.drivers.cameras.pylon",
+    "v4l2": "stereorig.drivers.cameras.v4l2",
+}
 
 
 def make_camera(driver: str, options: CameraOptions) -> FrameGrabber:
@@ -43,6 +59,26 @@ def discover_cameras(driver: str) -> list[FoundDevice]:
     return found
 
 
+def look_at_camera(name: str) -> tuple[dict[str, str], list[Feature]]:
+    """Return maker, model, protocol and description of a GenICam camera, and its features, by Aravis or else by pylon.
+
+    Raises
+    ------
+    CameraError
+        ``camera_lost``, ``driver_missing`` of Aravis; ``camera_busy``.
+    """
+    missed: list[CameraError] = []
+    for driver in ("aravis", "pylon"):
+        try:
+            found: tuple[dict[str, str], list[Feature]] = _camera_driver(driver).look(name)
+            return found
+        except CameraError as error:
+            if error.code not in ("camera_lost", "driver_missing"):
+                raise
+            missed.append(error)
+    raise missed[0]
+
+
 def _camera_driver(driver: str) -> ModuleType:
     if driver not in CAMERA_DRIVERS:
         raise CameraError(
@@ -53,7 +89,7 @@ def _camera_driver(driver: str) -> ModuleType:
     return importlib.import_module(CAMERA_DRIVERS[driver])
 
 
-def open_stage(
+def make_stage(
     driver: str,
     url: str,
     options: Mapping[int, AxisOptions],
@@ -62,8 +98,9 @@ def open_stage(
     flow_control: FlowControl | None = None,
     record: Path | None = None,
     timeout_s: float = 0.5,
+    numbers: Mapping[int, int] | None = None,
 ) -> SerialStage:
-    """Make a stage by the name of its driver and open it.
+    """Make a stage by the name of its driver, not yet opened.
 
     Parameters
     ----------
@@ -72,9 +109,9 @@ def open_stage(
     url
         Serial URL as pyserial takes it.
     options
-        Axis number -> how it is used; for the SMC100 family the axis number is the address on the chain.
+        Axis number -> how it is used.
     baudrate
-        For true serial ports where it is not the driver's usual one (ESP301's USB 921600, SMC100 57600, CONEX-CC
+        For true serial ports that differ from the driver's usual one (ESP301's USB 921600, SMC100 57600, CONEX-CC
         921600).
     flow_control
         Likewise (ESP301 ``hardware``, SMC100 and CONEX-CC ``software``).
@@ -82,11 +119,13 @@ def open_stage(
         File for a transcript of the wire.
     timeout_s
         Longest time of a reply.
+    numbers
+        Axis number -> the controller's own, for the SMC100 family the address on the chain; the same if left out.
 
     Raises
     ------
     StageError
-        ``unknown_driver``, or an error of opening.
+        ``unknown_driver``.
     """
     if driver not in STAGE_DRIVERS:
         raise StageError(
@@ -96,6 +135,11 @@ def open_stage(
         )
     given = {"baudrate": baudrate, "flow_control": flow_control}
     extra = {name: value for name, value in given.items() if value is not None}
-    stage = STAGE_DRIVERS[driver](url, options, record=record, timeout_s=timeout_s, **extra)
+    return STAGE_DRIVERS[driver](url, options, record=record, timeout_s=timeout_s, numbers=numbers, **extra)
+
+
+def open_stage(driver: str, url: str, options: Mapping[int, AxisOptions], **settings: Any) -> SerialStage:
+    """Make a stage and open it; parameters and errors as `make_stage`, and errors of opening."""
+    stage = make_stage(driver, url, options, **settings)
     stage.open()
     return stage

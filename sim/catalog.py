@@ -1,9 +1,9 @@
 """The scenes by name: specimen and load state.
 
 ======  ==================================================  =================================================
-name    what                                                load
+name    specimen                                            load
 ======  ==================================================  =================================================
-grid    the calibration target, whatever its kind           none
+grid    the calibration target, of any kind                 none
 steel   ground steel plate, Ra 1.775 um                     none
 plate   clamped circular plate, Eq. (18)                    pressure, kPa
 panel   centre-cracked panel in tension                     force, kN
@@ -12,13 +12,13 @@ strip   stretched strip                                     strain along the str
 sphere  sphere of 30 mm radius                              share of its motion, as the block's
 ======  ==================================================  =================================================
 
-``line_grid``, ``checkerboard``, ``charuco``, ``circles`` and ``circles_asymmetric`` are targets too: of that kind,
-whatever the rig's own is.
+``line_grid``, ``checkerboard``, ``charuco``, ``circles`` and ``circles_asymmetric`` are targets of that kind,
+independent of the rig's own target.
 
-Specimens lie near Z_sys = 0, centred on the system's origin, x to the right in the images and y down. Every scene takes
-``translation_mm`` and ``rotation_rad`` (a rotation vector about the origin, both in the system frame) as a rigid
-motion on top; for block and sphere the load multiplies it. A target takes ``pose`` or ``hand`` before that, see
-`sim.boards.poses`, and ``smear_mm``, its way during an exposure.
+Specimens are near Z_sys = 0, centred on the system's origin, x to the right in the images and y down. Every scene takes
+``translation_mm`` and ``rotation_rad`` (a rotation vector about the origin, both in the system frame) as a rigid motion
+on top; for block and sphere the load multiplies it. A target takes ``pose`` or ``hand`` before that, see
+`stereorig.sim.boards.poses`, and ``smear_mm``, its way during an exposure.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from core.cameras.camera import RigidTransform
-from core.errors import InputError
-from sim.boards.pattern import BEHIND
-from sim.boards.poses import hand_pose, transform_of
-from sim.boards.target import TARGET_KINDS, SimTarget
-from sim.panel import CrackedPanel
-from sim.plate import CircularPlate
-from sim.rig import SimRig
-from sim.scene import UPRIGHT, Scene
-from sim.steel import PAPER_RA_UM, ground_steel
-from sim.surface import Surface, flat, sphere
-from sim.texture import Texture, speckle
+from stereorig.core.cameras.camera import RigidTransform
+from stereorig.core.errors import InputError
+from stereorig.sim.boards.pattern import BEHIND
+from stereorig.sim.boards.poses import hand_pose, transform_of
+from stereorig.sim.boards.target import TARGET_KINDS, SimTarget
+from stereorig.sim.panel import CrackedPanel
+from stereorig.sim.plate import CircularPlate
+from stereorig.sim.rig import SimRig
+from stereorig.sim.scene import UPRIGHT, Scene
+from stereorig.sim.steel import PAPER_RA_UM, ground_steel
+from stereorig.sim.surface import Surface, flat, sphere
+from stereorig.sim.texture import Texture, speckle
 
 SPECIMENS = ("steel", "plate", "panel", "block", "strip", "sphere")
 SCENE_NAMES = ("grid", *SPECIMENS)
 TARGET_SCENES = ("grid", *TARGET_KINDS)
 BLOCK_TRANSLATION_MM = (0.20, -0.15, 0.25)
 BLOCK_ROTATION_RAD = (0.01, -0.015, 0.03)
-_LAY_RAD = 0.35  # the steel's lay against the vertical
+_LAY_RAD = 0.35  # angle of the steel's lay to the vertical
 _STEEL_SEED, _SPECKLE_SEED = 1, 2  # separate streams of random numbers of one rig
 _BEHIND = 0.04
 _WIDEST_SMEAR_MM = 1e3
@@ -131,7 +131,7 @@ _Motion = tuple[Sequence[float] | None, Sequence[float] | None, float]
 
 
 def target_of(rig: SimRig, name: str, parameters: dict[str, Any]) -> SimTarget:
-    """Return the target of a target's scene with its changes; ValueError where they make none."""
+    """Return the target of a target's scene with its changes; ValueError if they give no valid target."""
     kind = rig.target.kind if name == "grid" else name
     changes = {key: value for key, value in parameters.items() if key not in ("pose", "hand", "smear_mm")}
     if kind == rig.target.kind:
@@ -140,7 +140,7 @@ def target_of(rig: SimRig, name: str, parameters: dict[str, Any]) -> SimTarget:
             larger = {"line_width_mm": rig.target.line_width_mm * share, "marker_mm": rig.target.marker_mm * share}
             changes = larger | changes
         return rig.target.changed(changes)
-    # another kind of target than the rig's own: of about its size, where nothing else is asked for
+    # another kind of target than the rig's own: of about its size, unless a size is asked for
     pitch = float(changes.pop("pitch_mm", rig.target.pitch_mm))
     usual = {
         "kind": kind,

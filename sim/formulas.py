@@ -1,4 +1,4 @@
-"""Compiled formulas of the surfaces, over arrays of material points; see `sim.surface`.
+"""Compiled formulas of the surfaces, over arrays of material points; see `stereorig.sim.surface`.
 
 Every surface kernel writes ``out`` (9, n): position x, y, z and tangents xs, ys, zs, xt, yt, zt of the points (s, t).
 They are plain loops without calls that pass arrays on: such calls take ten times as long as the formulas.
@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numba import njit
 
-from core.arrays import Float
+from stereorig.core.arrays import Float
 
 _SPHERE_REACH_RAD: Final = 1.4  # beyond it a sphere is seen too obliquely for a texture
 
@@ -45,7 +45,7 @@ def meet_bowl(par: Float, pose: Float, nx: Float, ny: Float, s: Float, t: Float)
         dx = pose[0, 0] * nx[i] + pose[1, 0] * ny[i] + pose[2, 0]
         dy = pose[0, 1] * nx[i] + pose[1, 1] * ny[i] + pose[2, 1]
         dz = pose[0, 2] * nx[i] + pose[1, 2] * ny[i] + pose[2, 2]
-        m0 = -oz / dz  # to the plane; the bowl lies a little off it
+        m0 = -oz / dz  # to the plane; the bowl is a little off it
         x0, y0 = ox + m0 * dx, oy + m0 * dy
         f = c * (x0 * x0 + y0 * y0)
         g = 2.0 * c * (x0 * dx + y0 * dy) - dz
@@ -71,7 +71,7 @@ def bowl(par: Float, s: Float, t: Float, out: Float) -> None:
 def newton_step(pose: Float, nx: Float, ny: Float, at: Float, s: Float, t: Float, step: Float) -> float:
     """Move (s, t) by one Newton step from the positions and tangents ``at``; return the longest, NaN excluded.
 
-    A point that lies behind the camera becomes NaN.
+    A point behind the camera becomes NaN.
     """
     longest = 0.0
     for i in range(s.size):
@@ -153,7 +153,7 @@ def height_field(par: Float, coarse: Float, fine: Float, s: Float, t: Float, out
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def circular_plate(par: Float, s: Float, t: Float, out: Float) -> None:
-    """Clamped circular plate, ``par`` = [a, w0, t/2, c1, c3, c5, c7]; see `sim.plate`."""
+    """Clamped circular plate, ``par`` = [a, w0, t/2, c1, c3, c5, c7]; see `stereorig.sim.plate`."""
     w0, half = par[1], par[2]
     inverse = 1.0 / (par[0] * par[0])
     k = w0 * inverse
@@ -174,7 +174,7 @@ def circular_plate(par: Float, s: Float, t: Float, out: Float) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cracked_panel(par: Float, s: Float, t: Float, lip: Float, out: Float) -> None:
-    """Centre-cracked panel; see `sim.panel` for the formulas.
+    """Centre-cracked panel; see `stereorig.sim.panel` for the formulas.
 
     ``par`` = [a, S, 2G, kappa, bow, Lx, Ly, A, lip, lx, ly, c0, peak].
     """
@@ -186,7 +186,7 @@ def cracked_panel(par: Float, s: Float, t: Float, lip: Float, out: Float) -> Non
     for i in range(s.size):
         x, y = s[i], t[i]
         # root = sqrt(z^2 - a^2) with its cut along the crack, continued across it on the lip given
-        zeta = complex(x, y + 0.0)  # no negative zero, whose root lies on the other lip
+        zeta = complex(x, y + 0.0)  # no negative zero, whose root is on the other lip
         root = np.sqrt(zeta - a) * np.sqrt(zeta + a)
         if abs(x) < a and (y < 0.0) == (lip[i] > 0.0):
             root = -root

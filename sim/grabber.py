@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import os
 import queue
 import threading
@@ -14,9 +15,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from core.errors import CameraError
-from core.names import CameraName
-from drivers.cameras.protocol import CameraDescription, CameraSettings, Frame, FrameStatus, Pixels
+from stereorig.core.errors import CameraError
+from stereorig.core.names import CameraName
+from stereorig.drivers.cameras.protocol import CameraDescription, CameraSettings, Frame, FrameStatus, Pixels
 
 _NICE = 5
 
@@ -25,10 +26,12 @@ _NICE = 5
 _SAME_PULSE_S = 1.0
 # Frames that wait to be taken; a real grabber's ring is as short
 _RING = 16
+_FRESH_HZ = 100.0  # above it images come back, which takes less time than fresh noise
+_BEHIND_S = 1.0  # as far as its thread may be late then
 
 
 class Exposer(Protocol):
-    """The world as a simulated camera uses it; `sim.world.SimWorld` is one."""
+    """The world as a simulated camera uses it; `stereorig.sim.world.SimWorld` is one."""
 
     def expose(self, cam: CameraName, *, exposure_ms: float, gain_db: float, rng: np.random.Generator | None) -> Pixels:
         """Return the digitised image of this moment."""
@@ -145,7 +148,7 @@ def _line_of(world: Exposer) -> TriggerLine:
 
 
 class SimFrameGrabber:
-    """A simulated camera; see `drivers.cameras.protocol.FrameGrabber`.
+    """A simulated camera; see `stereorig.drivers.cameras.protocol.FrameGrabber`.
 
     Parameters
     ----------
@@ -158,9 +161,9 @@ class SimFrameGrabber:
     line
         Another trigger line than the world's own.
     seed
-        Of the noise; each camera draws its own.
+        Seed of the noise; each camera draws its own.
     sequence_bits, first_sequence
-        Width of the frame counter and where it starts, to meet its wrap.
+        Width of the frame counter and its first value, to meet its wrap.
     latency_s
         Longest time of rendering: the watchdog must allow for it.
     """
@@ -197,7 +200,7 @@ class SimFrameGrabber:
             trigger_modes=("free", "software", "hardware"),
             exposure_range_ms=(0.01, 1000.0),
             gain_range_db=(0.0, 24.0),
-            frame_rate_range_hz=(0.1, 100.0),
+            frame_rate_range_hz=(0.1, 400.0),
             driver="sim",
             latency_s=latency_s,
             clock="sim",
@@ -236,7 +239,7 @@ class SimFrameGrabber:
         return self._description
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
-        """Set what is not ``None``; refuse all of it when one value cannot be had."""
+        """Set the values that are not ``None``; refuse all of them if one cannot be set."""
         self._check_open()
         here = self._description
         for name, value, allowed in (
@@ -275,7 +278,8 @@ class SimFrameGrabber:
             return
         self._ending = threading.Event()
         self._orders = queue.SimpleQueue()
-        self._frames = queue.Queue(_RING)
+        rate_hz = self._settings.frame_rate_hz or 0.0
+        self._frames = queue.Queue(round(_BEHIND_S * rate_hz) if rate_hz > _FRESH_HZ else _RING)
         self._thread = threading.Thread(target=self._run, name=f"simulated {self._cam}", daemon=True)
         self._thread.start()
         if self._settings.trigger == "hardware":
@@ -351,10 +355,15 @@ class SimFrameGrabber:
                     return
                 pulse, trigger = order, order.number if self._settings.trigger == "software" else None
             else:
-                due = max(due + 1.0 / (self._settings.frame_rate_hz or 10.0), time.monotonic())
+                rate_hz, now = self._settings.frame_rate_hz or 10.0, time.monotonic()
+                if rate_hz <= _FRESH_HZ:
+                    due = max(due + 1.0 / rate_hz, now)
+                else:  # a real camera exposes on time however late its host is
+                    due = max(round(due * rate_hz) + 1, math.ceil((now - _BEHIND_S) * rate_hz)) / rate_hz
                 if ending.wait(max(0.0, due - time.monotonic())):
                     return
-                pulse, trigger = Pulse(next(number), time.monotonic_ns()), None
+                at_ns = time.monotonic_ns() if rate_hz <= _FRESH_HZ else round(1e9 * due)
+                pulse, trigger = Pulse(next(number), at_ns), None
             if not self.faults.gone:
                 self._expose(pulse, trigger, ending, frames)
 
@@ -372,6 +381,7 @@ class SimFrameGrabber:
                 exposure_ms=self._settings.exposure_ms or 10.0,
                 gain_db=self._settings.gain_db or 0.0,
                 rng=self._rng,
+                **({"again": True} if (self._settings.frame_rate_hz or 0.0) > _FRESH_HZ else {}),
             )
         except Exception as error:  # noqa: BLE001  # reported to the thread's owner, whatever it was
             fault = CameraError(f"{self._cam} made no image: {error}", remedy="Check the simulated scene.")

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.surface import PANEL, Surface
+from stereorig.sim.surface import PANEL, Surface
 
 PAPER_LOADS_KN = (4.45, 35.6, 44.5, 48.95)
 _IMPERFECTION = 0.1
@@ -88,7 +88,7 @@ class CrackedPanel:
             raise ValueError(f"the panel's load must be 0 kN or more, got {load_kn}")
         nu = self.poisson
         c0 = 0.45
-        peak = float(np.exp(c0 - 1.0))  # of (c0 + q) exp(-q), at q = 1 - c0
+        peak = float(np.exp(c0 - 1.0))  # maximum of (c0 + q) exp(-q), at q = 1 - c0
         amplitude = self.buckle_at_mm(load_kn)
         return Surface(
             kind=PANEL,

@@ -22,8 +22,8 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import ArrayLike
 
-from core.arrays import Float
-from sim.surface import PLATE, Surface
+from stereorig.core.arrays import Float
+from stereorig.sim.surface import PLATE, Surface
 
 PAPER_PRESSURES_KPA = tuple(round(68.9 * n, 1) for n in range(1, 11))
 
@@ -101,8 +101,8 @@ class CircularPlate:
 
         E_r = u' + (u'^2 + w'^2) / 2,  E_t = u/r + (u/r)^2 / 2.
 
-        u holds bending, and the mid-plane's motion where the deflection is large. The slope's part is no stretch of
-        the material in linear theory, which leaves the mid-plane where it is; the surface that it describes has it.
+        u holds bending, and the mid-plane's motion if the deflection is large. In linear theory, which does not move
+        the mid-plane, the slope's part is no stretch of the material, but the described surface has it.
         """
         q = (np.asarray(r_mm, dtype=np.float64) / self.radius_mm) ** 2
         u_r, u_t = self.bending_strain(r_mm, pressure_kpa)

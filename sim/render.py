@@ -1,14 +1,14 @@
 """The renderer: brightness of each pixel, from formulas alone.
 
 No image is ever warped or interpolated. For every sample point of the sensor, a regular lattice of ``samples`` x
-``samples`` in a pixel, the ray is solved with the deformed surface (`sim.surface`) and the texture's formula is
-evaluated at the material point found.
+``samples`` in a pixel, the ray is solved with the deformed surface (`stereorig.sim.surface`) and the texture's formula
+is evaluated at the material point found.
 
 Pixel and lens blur: a pixel's value is the integral of the radiance over the sensor with the weight box * Gaussian (the
 pixel's square, blurred by the lens). The integral is the sum over the lattice with that weight, normalised, and each
-sample serves all the pixels in whose weight it lies. The lattice sum of a smooth function is spectrally accurate: its
-error is the radiance's content near ``samples`` cycles a pixel, which the textures' soft rims keep below 1e-4 of the
-contrast.
+sample is used by all the pixels whose weight reaches it. The lattice sum of a smooth function is spectrally accurate:
+its error is the radiance's content near ``samples`` cycles a pixel, which the textures' soft rims keep below 1e-4 of
+the contrast.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from numba import njit
 from numpy.typing import ArrayLike
 from scipy.special import erf
 
-from core.arrays import Float
-from core.cameras.camera import Camera, RigidTransform
-from sim.boards.pattern import BOARD
-from sim.optics.lens import flat_lens, normalised
-from sim.optics.ray import rays
-from sim.scene import Scene
-from sim.texture import GRID
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.sim.boards.pattern import BOARD
+from stereorig.sim.optics.lens import flat_lens, normalised
+from stereorig.sim.optics.ray import rays
+from stereorig.sim.scene import Scene
+from stereorig.sim.texture import GRID
 
 _BLUR_REACH: Final = 5.0  # the Gaussian is cut at five sd, where 6e-7 of it is left
 _EDGE_CYCLES: Final = 0.53  # exp(-2 (pi 0.53)^2) = 4e-3, of an edge's own content there, which is 1 / (2 pi cycles)
@@ -47,8 +47,8 @@ class RenderOptions:
     blur_px
         Standard deviation of the lens's Gaussian blur.
     samples
-        Sample points across a pixel; None takes 4, 8 for line grids, whose edges are finer, and for boards what their
-        edges need at the board's distance.
+        Sample points across a pixel; None takes 4, 8 for line grids, whose edges are finer, and for boards as many as
+        their edges need at the board's distance.
     threads
         Threads to use; the kernel holds no lock.
     """
@@ -176,7 +176,7 @@ def pixel_weights(samples: int, blur_px: float) -> Float:
 
 
 def material_points(scene: Scene, camera: Camera, xy_px: ArrayLike) -> tuple[Float, Float]:
-    """Return material points (..., 2) at pixels (..., 2), NaN where there is none, and the crack's lip (...), +-1."""
+    """Return material points (..., 2) at pixels (..., 2), NaN if there is none, and the crack's lip (...), +-1."""
     xy = np.asarray(xy_px, dtype=np.float64)
     n = normalised(camera.lens, xy).xy.reshape(-1, 2)
     s, t, lip = scene.surface.hit(

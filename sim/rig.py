@@ -14,13 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.camera import ELEVEN_PARAMETER_NAMES, POSE_NAMES, Camera, RigidTransform, rotation_from_angles
-from core.errors import InputError
-from core.names import CAMERAS, CameraName
-from sim.boards.target import SimTarget, target_from_tables
-from sim.optics.lens import core_lens, lens_from_table
-from sim.sensor import Lighting, Sensor
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import (
+    ELEVEN_PARAMETER_NAMES,
+    POSE_NAMES,
+    Camera,
+    RigidTransform,
+    rotation_from_angles,
+)
+from stereorig.core.errors import InputError
+from stereorig.core.names import CAMERAS, CameraName
+from stereorig.sim.boards.target import SimTarget, target_from_tables
+from stereorig.sim.optics.lens import core_lens, lens_from_table
+from stereorig.sim.sensor import Lighting, Sensor
 
 STAGE_MOVES = ("cameras", "target", "both_cameras")
 _WARM_STEP_PX = 0.002
@@ -62,7 +68,7 @@ class SimCamera:
     size_px
         Columns and rows.
     sensor, lighting
-        See :mod:`sim.sensor`.
+        See :mod:`stereorig.sim.sensor`.
     exposure_ms
         Exposure at which brightness 1 is full scale.
     stage_axis, stage_sign, stage_zero_mm
@@ -102,16 +108,16 @@ class SimCamera:
 
 @dataclass(frozen=True, kw_only=True)
 class SimStage:
-    """What the stage moves, and how.
+    """Motion of the stage.
 
     Attributes
     ----------
     moves
-        ``cameras``: each its own camera along that camera's axis; ``target``: one axis the target and every other
-        body; ``both_cameras``: one axis the pair of cameras.
+        ``cameras``: each axis moves its own camera along that camera's axis; ``target``: one axis moves the target and
+        every other body; ``both_cameras``: one axis moves the pair of cameras.
     direction
-        (3,) unit vector of a single axis's travel, system frame: where the target goes, or the cameras come from, as
-        the axis takes target and cameras apart.
+        (3,) unit vector of a single axis's travel, system frame: the direction in which the target goes, or from which
+        the cameras come, as the axis moves target and cameras away from each other.
     scale
         True travel over indicated travel.
     """
@@ -138,13 +144,13 @@ class SimRig:
     target
         Its nominal description; the maker's errors follow from the seed.
     seed
-        Of the target's errors, the speckle and the steel's roughness: the same seed is the same laboratory.
+        Seed of the target's errors, the speckle and the steel's roughness: the same seed is the same laboratory.
     speckle_mm
         Mean diameter of the specimens' speckles.
     blur_px
         Lens blur.
     stage
-        What the stage moves.
+        Motion of the stage.
     """
 
     name: str

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from core.cameras.camera import RigidTransform
-from sim.surface import Surface
-from sim.texture import Texture
+from stereorig.core.cameras.camera import RigidTransform
+from stereorig.sim.surface import Surface
+from stereorig.sim.texture import Texture
 
-# bodies are mounted so that their x runs to the right in the images and y down, though the target's lines lie at 45
+# bodies are mounted so that their x runs to the right in the images and y down, though the target's lines are at 45
 # degrees
 UPRIGHT = RigidTransform(
     np.array([[np.sqrt(0.5), np.sqrt(0.5), 0.0], [-np.sqrt(0.5), np.sqrt(0.5), 0.0], [0.0, 0.0, 1.0]]), np.zeros(3)
@@ -24,7 +24,7 @@ class Scene:
     Attributes
     ----------
     name
-        Of the scene.
+        Name of the scene.
     surface
         Shape with its deformation, in the body's frame.
     texture

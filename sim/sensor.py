@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.arrays import Float, Float32
+from stereorig.core.arrays import Float, Float32
 
 
 @dataclass(frozen=True, kw_only=True)

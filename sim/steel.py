@@ -1,11 +1,11 @@
 """The ground steel plate: a random analytic height field with the lay of grinding.
 
-z(s, t) is the sum of two random cubic B-spline surfaces, coarse and fine, whose coefficients are independent
-Gaussian numbers on lattices that are close across the lay (s) and wide along it (t). A B-spline surface with node
-spacing h holds wavelengths from about 3 h up, most of its power near 4 to 6 h:
+z(s, t) is the sum of two random cubic B-spline surfaces, coarse and fine, whose coefficients are independent Gaussian
+numbers on lattices that are close across the lay (s) and wide along it (t). A B-spline surface with node spacing h
+holds wavelengths from about 3 h up, most of its power near 4 to 6 h:
 
-    coarse  h = 0.9 mm across, 4.0 mm along, 95 % of the variance: a subset 0.7 mm wide resolves most of it fine    h =
-    0.25 mm across, 1.5 mm along, 5 %: the marks themselves, which a subset averages away
+    coarse  h = 0.9 mm across, 4.0 mm along, 95 % of the variance: a subset 0.7 mm wide resolves most of it
+    fine    h = 0.25 mm across, 1.5 mm along, 5 %: the marks themselves, which a subset averages away
 
 The whole is scaled so that Ra, the mean departure from the best plane over the central 20 x 20 mm, is exactly as given.
 The lattices repeat after 128 nodes (115 mm across in the coarse one).
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.surface import HEIGHT, Surface
+from stereorig.sim.surface import HEIGHT, Surface
 
 PAPER_RA_UM = 1.775
 COARSE_MM = (0.9, 4.0)

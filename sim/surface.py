@@ -4,8 +4,9 @@ The body's frame has z pointing away from the cameras, like the system frame; a 
 system frame. (s, t) are material coordinates in mm: they identify a material point in all states, and the texture is
 defined in them.
 
-All formulas are closed. The kernels take flat numbers and whole arrays; they come from `sim.plate`, `sim.panel` and
-`sim.steel`. For a ray (nx, ny, 1) in the camera's frame the material point that it meets solves
+All formulas are closed. The kernels take flat numbers and whole arrays; they come from `stereorig.sim.plate`,
+`stereorig.sim.panel` and `stereorig.sim.steel`. For a ray (nx, ny, 1) in the camera's frame the material point that it
+meets solves
 
     X_cam(s, t) - nx Z_cam(s, t) = 0,  Y_cam(s, t) - ny Z_cam(s, t) = 0
 
@@ -21,8 +22,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Float
-from sim import formulas as kernels
+from stereorig.core.arrays import Float
+from stereorig.sim import formulas as kernels
 
 FLAT: Final = 0
 HEIGHT: Final = 1
@@ -46,7 +47,7 @@ class Surface:
     kind
         ``FLAT``, ``HEIGHT``, ``PLATE``, ``PANEL``, ``SPHERE`` or ``BOWL``.
     parameters
-        Numbers of that kind, see `sim.formulas`.
+        Numbers of that kind, see `stereorig.sim.formulas`.
     coarse, fine
         Coefficient tables of a height field.
     """
@@ -66,7 +67,7 @@ class Surface:
         return np.stack([values[..., 3:6], values[..., 6:9]], axis=-1)
 
     def hit(self, pose: Float, nx: Float, ny: Float) -> tuple[Float, Float, Float]:
-        """Return material coordinates s, t and lip (n,) that rays (nx, ny, 1) meet; NaN where they meet nothing.
+        """Return material coordinates s, t and lip (n,) at the rays (nx, ny, 1); NaN for rays that meet nothing.
 
         Parameters
         ----------
@@ -110,7 +111,7 @@ class Surface:
         lip[beyond] = np.where(t[beyond] >= 0.0, 1.0, -1.0)
 
     def _newton(self, pose: Float, nx: Float, ny: Float, s: Float, t: Float, lip: Float) -> None:
-        """Move (s, t) to the rays' intersections with the surface; NaN where that does not converge."""
+        """Move (s, t) to the rays' intersections with the surface; NaN if that does not converge."""
         values = np.empty((9, nx.size))
         step = np.empty(nx.size)
         for _ in range(_STEPS):
@@ -147,7 +148,7 @@ _SMOOTH: Final[dict[int, Callable[[Float, Float, Float, Float], None]]] = {
 
 
 def flat(in_plane: ArrayLike = ((1.0, 0.0), (0.0, 1.0))) -> Surface:
-    """Return a plane, z = 0, whose material points lie at ``in_plane @ (s, t)``."""
+    """Return a plane, z = 0, whose material points are at ``in_plane @ (s, t)``."""
     return Surface(kind=FLAT, parameters=np.asarray(in_plane, dtype=np.float64).reshape(4).copy())
 
 

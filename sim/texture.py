@@ -18,13 +18,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
-from core.arrays import Float
+from stereorig.core.arrays import Float
 
 SPECKLE: Final = 0
 GRID: Final = 1
 DOTS: Final = 2
 # cell width over mean disc diameter at which half of the area is covered, found by counting; see
-# tests/test_sim_texture.py
+# tests/unit/sim/test_sim_scenes.py
 _CELL_PER_DIAMETER: Final = 1.20
 _RADIUS_SPREAD: Final = 0.35  # radii are uniform within +-35 % of the mean
 _NO_NODES: Final = np.zeros((1, 1, 2))
@@ -61,7 +61,7 @@ class Texture:
     finest_mm: float
 
     def paint(self, s_mm: Float, t_mm: Float, out: Float) -> None:
-        """Write the brightness of material points into ``out`` (n,), which stays as it is where they are NaN."""
+        """Write the brightness of material points into ``out`` (n,); NaN points leave their element as it is."""
         if self.kind == SPECKLE:
             _speckle(self.parameters, s_mm, t_mm, out)
         elif self.kind == GRID:
@@ -118,8 +118,7 @@ def line_grid(
     """Return the calibration target: two families of lines through nodes with errors up to the tolerance.
 
     Every node has an independent error, uniform within +-tolerance in s and in t, and lines run straight from node to
-    node. (Uniform +-4 um is the reading of "toleranced to 4 um" that makes the 0.087 px at 33 um/px that is known for
-    it.) Lines end at the outermost crossings; beyond lies bright glass (dark for bright lines).
+    node. (With uniform errors of +-4 um, "toleranced to 4 um" gives the known 0.087 px at 33 um/px.)
 
     Parameters
     ----------
@@ -134,7 +133,7 @@ def line_grid(
     dark_lines
         Dark lines on bright ground, or the other way round.
     seed
-        Of the nodes' errors.
+        Seed of the nodes' errors.
     edge_sd_mm
         Softness of a line's edges (sd of the Gaussian); a twelfth of the line's width by default.
     dark, bright

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Float
-from core.cameras.camera import Camera
-from sim.render import material_points
-from sim.scene import Scene
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import Camera
+from stereorig.sim.render import material_points
+from stereorig.sim.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def subset_planes(
 ) -> SubsetPlane:
     """Fit a plane to the true surface over each subset's pixels.
 
-    A plane is linear in inverse depth over the undistorted image, so that is what is fitted, by least squares over
+    A plane is linear in inverse depth over the undistorted image, so the inverse depth is fitted, by least squares over
     the subset's pixels, as a matching with a plane patch does to first order.
 
     Parameters

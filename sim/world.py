@@ -1,15 +1,15 @@
 """The simulated world: cameras on their stages before a scene, exposed on demand.
 
 It connects grabbers and controllers. It takes the stages' true positions, renders each camera's view from there, and
-adds fresh noise to every exposure. A camera may be knocked (``bump``), and its lens drifts with its exposures where the
-rig file says so. Brightness is kept per camera, scene and position, so that further frames of a
-resting rig need new noise only.
+adds fresh noise to every exposure. A camera may be knocked (``bump``), and its lens drifts with its exposures if the
+rig file has a drift. Brightness is kept per camera, scene and position, so that further frames of a resting rig need
+new noise only.
 """
 
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -17,21 +17,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.arrays import Float32
-from core.cameras.camera import Camera, RigidTransform
-from core.cameras.stereo import StereoPair
-from core.errors import InputError
-from core.names import CAMERAS, CameraName
-from sim.boards.poses import transform_of
-from sim.catalog import make_scene
-from sim.optics.lens import warmed
-from sim.render import RenderOptions, render
-from sim.rig import SimCamera, SimRig
-from sim.scene import Scene
-from sim.truth import Truth, truth_at
+from stereorig.core.arrays import Float32
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import InputError
+from stereorig.core.names import CAMERAS, CameraName
+from stereorig.sim.boards.poses import transform_of
+from stereorig.sim.catalog import make_scene
+from stereorig.sim.optics.lens import warmed
+from stereorig.sim.render import RenderOptions, render
+from stereorig.sim.rig import SimCamera, SimRig
+from stereorig.sim.scene import Scene
+from stereorig.sim.truth import Truth, truth_at
 
 _KEY_MM = 1e-7  # positions closer than this are one: a ten-thousandth of a micrometre
 _CACHE_BYTES = 256 << 20
+_SHOWN = 16  # images of a scene that come back
 _NO_BUMP = (0.0,) * 6
 
 
@@ -76,6 +77,7 @@ class SimWorld:
         self._cameras: dict[CameraName, SimCamera] = {name: rig.camera(name) for name in CAMERAS}
         self._bumps: dict[CameraName, tuple[float, ...]] = {}
         self._exposures = dict.fromkeys(CAMERAS, 0)
+        self._shown: dict[CameraName, tuple[Float32, tuple[float, float], deque[Any]]] = {}
         self._cache: OrderedDict[tuple[Any, ...], Float32] = OrderedDict()
 
     @property
@@ -90,7 +92,7 @@ class SimWorld:
             return self._scene
 
     def set_scene(self, name: str, *, load: float = 0.0, **params: Any) -> None:
-        """Put another scene, or another state of it, before the cameras; see :func:`sim.catalog.make_scene`.
+        """Put another scene, or another state of it, before the cameras; see :func:`stereorig.sim.catalog.make_scene`.
 
         ``bump_cam1`` and ``bump_cam2``, six numbers [rx_deg, ry_deg, rz_deg, x_mm, y_mm, z_mm], knock a camera at the
         same moment, see :meth:`bump`; the next scenes find it so.
@@ -180,11 +182,31 @@ class SimWorld:
         return truth_at(reference, self._rig.cam1.camera, xy_px, now=now)
 
     def expose(
-        self, cam: CameraName, *, exposure_ms: float, gain_db: float = 0.0, rng: np.random.Generator | None
+        self,
+        cam: CameraName,
+        *,
+        exposure_ms: float,
+        gain_db: float = 0.0,
+        rng: np.random.Generator | None,
+        again: bool = False,
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
-        """Return an image of the present scene and stage position; with fresh noise unless ``rng`` is None."""
+        """Return an image of the present scene and stage position; with fresh noise unless ``rng`` is None.
+
+        With ``again``, images of a scene that stays come back in turn, for cameras too fast for fresh noise.
+        """
         brightness, sim = self._brightness(cam)
-        return sim.sensor.expose(brightness, rng, exposure=exposure_ms / sim.exposure_ms, gain_db=gain_db)
+        if not again:
+            return sim.sensor.expose(brightness, rng, exposure=exposure_ms / sim.exposure_ms, gain_db=gain_db)
+        shown, settings, images = self._shown.get(cam, (None, None, deque[Any]()))
+        if shown is not brightness or settings != (exposure_ms, gain_db):
+            images = deque()
+            self._shown[cam] = brightness, (exposure_ms, gain_db), images
+        if len(images) < _SHOWN:
+            images.append(sim.sensor.expose(brightness, rng, exposure=exposure_ms / sim.exposure_ms, gain_db=gain_db))
+        else:
+            images.rotate(-1)
+        newest: NDArray[np.uint8] | NDArray[np.uint16] = images[-1]
+        return newest
 
     def _sim_camera(self, cam: CameraName) -> SimCamera:
         if cam not in self._cameras:

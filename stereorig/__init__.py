@@ -8,8 +8,8 @@
 >>> step.dataset["w_mm"].plot()                                                            # doctest: +SKIP
 
 Lengths are mm in the system frame of the calibration, image coordinates px with pixel centres at integers. A point that
-failed has NaN and a `status`; every value has a standard uncertainty beside it (`sigma_*`, k = 1), and
-``Result.uncertainty_includes`` says what is in it: the calibration's part is missing where its covariance is not known.
+failed has NaN and a `status`; every value has its standard uncertainty (`sigma_*`, k = 1), and
+``Result.uncertainty_includes`` names its parts: the calibration's part is missing if its covariance is not known.
 
 :class:`stereorig.Client` and :class:`stereorig.AsyncClient` drive a running service instead: rig, tests, results.
 """
@@ -20,45 +20,50 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from core.errors import StereorigError
-    from core.gauge.area import AreaStatistics
-    from core.gauge.extensometer import Extensometer
-    from core.gauge.reading import Reading
-    from core.gauge.rigid import RigidMotion
-    from core.settings import AnalysisSettings, Region, StrainSettings
-    from core.status import PointStatus
-    from server.formats.calibrations.recognise import LoadedCalibration as Calibration
-    from server.formats.images import read_image
-    from server.formats.noise_json import LoadedNoise as Noise
-    from server.formats.noise_json import load_noise as read_noise
     from stereorig.calibration import calibrate, read_calibration
     from stereorig.client import AsyncClient, Client
+    from stereorig.core.errors import StereorigError
+    from stereorig.core.gauge.area import AreaStatistics
+    from stereorig.core.gauge.extensometer import Extensometer
+    from stereorig.core.gauge.reading import Reading
+    from stereorig.core.gauge.rigid import RigidMotion
+    from stereorig.core.settings import AnalysisSettings, Region, StrainSettings
+    from stereorig.core.status import PointStatus
     from stereorig.measurement import Measurement
     from stereorig.result import Result, read_result
+    from stereorig.server.evaluations.door import Evaluated, Evaluation, GridValues, Results
+    from stereorig.server.formats.calibrations.recognise import LoadedCalibration as Calibration
+    from stereorig.server.formats.images import read_image
+    from stereorig.server.formats.noise_json import LoadedNoise as Noise
+    from stereorig.server.formats.noise_json import load_noise as read_noise
 
     __version__: str
 
-#: where each name lies; it is imported when it is first used
+#: module of each name; it is imported when the name is first used
 _LIES_IN = {
-    "AnalysisSettings": "core.settings",
-    "AreaStatistics": "core.gauge.area",
+    "AnalysisSettings": "stereorig.core.settings",
+    "AreaStatistics": "stereorig.core.gauge.area",
     "AsyncClient": "stereorig.client",
-    "Calibration": "server.formats.calibrations.recognise:LoadedCalibration",
+    "Calibration": "stereorig.server.formats.calibrations.recognise:LoadedCalibration",
     "Client": "stereorig.client",
-    "Extensometer": "core.gauge.extensometer",
+    "Evaluated": "stereorig.server.evaluations.door",
+    "Evaluation": "stereorig.server.evaluations.door",
+    "Extensometer": "stereorig.core.gauge.extensometer",
+    "GridValues": "stereorig.server.evaluations.door",
     "Measurement": "stereorig.measurement",
-    "Noise": "server.formats.noise_json:LoadedNoise",
-    "PointStatus": "core.status",
-    "Reading": "core.gauge.reading",
-    "Region": "core.settings",
+    "Noise": "stereorig.server.formats.noise_json:LoadedNoise",
+    "PointStatus": "stereorig.core.status",
+    "Reading": "stereorig.core.gauge.reading",
+    "Region": "stereorig.core.settings",
     "Result": "stereorig.result",
-    "RigidMotion": "core.gauge.rigid",
-    "StereorigError": "core.errors",
-    "StrainSettings": "core.settings",
+    "Results": "stereorig.server.evaluations.door",
+    "RigidMotion": "stereorig.core.gauge.rigid",
+    "StereorigError": "stereorig.core.errors",
+    "StrainSettings": "stereorig.core.settings",
     "calibrate": "stereorig.calibration",
     "read_calibration": "stereorig.calibration",
-    "read_image": "server.formats.images",
-    "read_noise": "server.formats.noise_json:load_noise",
+    "read_image": "stereorig.server.formats.images",
+    "read_noise": "stereorig.server.formats.noise_json:load_noise",
     "read_result": "stereorig.result",
 }
 
@@ -68,13 +73,17 @@ __all__ = [
     "AsyncClient",
     "Calibration",
     "Client",
+    "Evaluated",
+    "Evaluation",
     "Extensometer",
+    "GridValues",
     "Measurement",
     "Noise",
     "PointStatus",
     "Reading",
     "Region",
     "Result",
+    "Results",
     "RigidMotion",
     "StereorigError",
     "StrainSettings",
@@ -89,7 +98,7 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        from server.formats.version import software_version
+        from stereorig.server.formats.version import software_version
 
         value: Any = software_version()
     elif name in _LIES_IN:

@@ -6,30 +6,33 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from core.grid import Localiser
-from server.formats.calibrations.from_folder import calibrate_folder
-from server.formats.calibrations.recognise import LoadedCalibration, load_calibration, parse_calibration
+from stereorig.core.grid import Localiser
+from stereorig.server.formats.calibrations.from_folder import calibrate_folder
+from stereorig.server.formats.calibrations.recognise import LoadedCalibration, load_calibration, parse_calibration
 
 
-def read_calibration(path: str | Path) -> LoadedCalibration:
+def read_calibration(path: str | Path, *, unit: str | None = None) -> LoadedCalibration:
     """Read a calibration: ``calibration.json``, DICe's XML or text, OpenCV's YAML, and more.
 
     Parameters
     ----------
     path
         The file; its form is recognised by its content.
+    unit
+        Unit of length of another program's file: ``um``, ``mm``, ``cm``, ``m``, ``in``, or a size such as ``25 mm``;
+        None: millimetres, or as an import states.
 
     Returns
     -------
     Calibration
-        The cameras as ``pair``; what a ``calibration.json`` holds beside them as ``record``.
+        The cameras as ``pair``; the other contents of a ``calibration.json`` as ``record``.
 
     Raises
     ------
     StereorigError
         ``file_missing``, ``calibration_unreadable``, ``calibration_invalid`` or ``calibration_unsupported``.
     """
-    return load_calibration(path)
+    return load_calibration(path, unit=unit)
 
 
 def calibrate(
@@ -50,11 +53,11 @@ def calibrate(
         pose, as ``cam2_005.tif``.
     target, rig
         TOML files: the target (``kind``, ``pitch_mm``, ``lines`` or ``size`` ...); the nominal cameras, and in
-        ``[calibration]`` what moves and the lens model.
+        ``[calibration]`` the moving part and the lens model.
     hold_out_mm
         Travels, or numbers of free poses, that are left out of the fit, to check it with.
     localiser
-        How intersections are found: ``profile`` or the paper's (``paper``).
+        Method for the intersections: ``profile`` or the paper's (``paper``).
     out
         Write ``calibration.json`` there.
 

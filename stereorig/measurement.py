@@ -9,23 +9,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import InputError
-from core.field.checks.extrapolated import mark_extrapolated
-from core.field.common import with_common_parts
-from core.field.points.images import MeasureImage, check_calibrated_size
-from core.field.points.result import Field
-from core.field.region.lay_points import make_grid
-from core.field.seeding.seeds import seeds_of
-from core.field.sequence.reference_steps import PreviousStep
-from core.field.settings import MeasureOptions
-from core.field.smoothed import smoothed_displacement
-from core.measure import ReferencePair
-from core.settings import AnalysisSettings
-from core.strain import StrainOptions, surface_strain
-from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
-from server.formats.calibrations.volume import parameter_covariance, volume_of
-from server.formats.noise_json import LoadedNoise
+from stereorig.core.errors import InputError
+from stereorig.core.field.checks.extrapolated import mark_extrapolated
+from stereorig.core.field.common import with_common_parts
+from stereorig.core.field.points.images import MeasureImage, check_calibrated_size
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.lay_points import make_grid
+from stereorig.core.field.seeding.seeds import seeds_of
+from stereorig.core.field.sequence.reference_steps import PreviousStep
+from stereorig.core.field.settings import MeasureOptions
+from stereorig.core.field.smoothed import smoothed_displacement
+from stereorig.core.measure import ReferencePair
+from stereorig.core.settings import AnalysisSettings
+from stereorig.core.strain import StrainOptions, surface_strain
+from stereorig.core.systematic.sensor_pull import fixed_lines
 from stereorig.result import Result
+from stereorig.server.formats.calibrations.recognise import LoadedCalibration, load_calibration
+from stereorig.server.formats.calibrations.volume import parameter_covariance, volume_of
+from stereorig.server.formats.noise_json import LoadedNoise
 
 Image = NDArray[np.generic]
 
@@ -44,7 +45,7 @@ class Measurement:
     roi
         Rectangle x0, y0, x1, y1 in camera 1's reference image, px; short for ``region={"rectangle": roi}``.
     mask
-        (rows, cols) True where points may lie.
+        (rows, cols) True at allowed pixels.
     noise
         Noise models of the cameras.
 
@@ -94,7 +95,7 @@ class Measurement:
     def displacement(self, image1: Image, image2: Image) -> Result:
         """Measure the next step: the displacement since the reference, three comparisons at once.
 
-        Start values come from the step measured before. Where the first reference no longer matches, a later step takes
+        Start values come from the step measured before. If the first reference no longer matches, a later step takes
         its part (``reference_update``), for which the images of all steps are kept; displacements stay totals.
 
         Parameters
@@ -114,7 +115,10 @@ class Measurement:
         field = self._steps.measure(images, previous, seeds=seeds_of(self.settings))
         self._images.append((image1, image2) if self.settings.reference_update != "never" else (shape.x_px,) * 2)
         self._fields.append(field)
-        return self._result(n, field)
+        kind, blur = self._options.interpolation, self._options.blur
+        first, now = (image.prepared(kind, None, blur) for image in (self._reference.image1, images[0]))
+        lines = fixed_lines(field, self.calibration.pair, first, now, subset_px=self.settings.subset_px)
+        return self._result(n, field, None if lines is None else lines.pull_mm)
 
     @cached_property
     def _shape(self) -> Field:
@@ -140,13 +144,13 @@ class Measurement:
         )
         return one, two
 
-    def _result(self, n: int, measured: Field) -> Result:
+    def _result(self, n: int, measured: Field, pull: NDArray[np.float64] | None = None) -> Result:
         settings = self.settings
         field, strain = measured, None
         if settings.smoothing_window and field.has_motion:
             field = smoothed_displacement(field, settings.smoothing_window, subset_px=settings.subset_px)
         field = mark_extrapolated(field, volume_of(self.calibration))
-        field = with_common_parts(field, parameter_covariance(self.calibration), self.calibration.pair)
+        field = with_common_parts(field, parameter_covariance(self.calibration), self.calibration.pair, pull)
         options = StrainOptions.of(settings.strain)
         if options is not None and field.has_motion:
             strain = surface_strain(field, options, subset_px=settings.subset_px)

@@ -10,29 +10,29 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Bool, Float
-from core.errors import InputError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels
-from core.gauge.area import AreaStatistics, area_statistics, points_within
-from core.gauge.extensometer import Extensometer, extensometer
-from core.gauge.rigid import RigidMotion, rigid_motion, without_rigid_motion
-from core.settings import AnalysisSettings, StrainSettings
-from core.strain import StrainField, StrainOptions, surface_strain
-from core.strain.mean import mean_strain_variance
-from server.formats.results.dataset import as_dataset
-from server.formats.results.layout import COVARIANCE_NAMES, field_variable
-from server.formats.results.reading import read_field, read_head
-from server.formats.results.settings import stored_settings
-from server.formats.results.strain import read_strain
-from server.formats.results.uncertainty import Included
-from server.formats.results.writing import Provenance, write_field
-from server.formats.version import software_version
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.errors import InputError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.gauge.area import AreaStatistics, area_statistics, points_within
+from stereorig.core.gauge.extensometer import Extensometer, extensometer
+from stereorig.core.gauge.rigid import RigidMotion, rigid_motion, without_rigid_motion
+from stereorig.core.settings import AnalysisSettings, StrainSettings
+from stereorig.core.strain import StrainField, StrainOptions, surface_strain
+from stereorig.core.strain.mean import mean_strain_variance
+from stereorig.server.formats.results.dataset import as_dataset
+from stereorig.server.formats.results.layout import COVARIANCE_NAMES, stored_settings
+from stereorig.server.formats.results.reading import read_field, read_head
+from stereorig.server.formats.results.strain import read_strain
+from stereorig.server.formats.results.uncertainty import Included
+from stereorig.server.formats.results.variables import STRAIN_NAMES, values_of
+from stereorig.server.formats.results.writing import Provenance, write_field
+from stereorig.server.formats.version import software_version
 
 if TYPE_CHECKING:
     import xarray
 
-_STRAIN, _POSITION = ("exx", "eyy", "exy"), ("x_mm", "y_mm", "z_mm")
+_POSITION = ("x_mm", "y_mm", "z_mm")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +44,13 @@ class Result:
     field
         Every array: ``xyz_mm`` (r, c, 3), ``uvw_mm`` (r, c, 3) or None, ``covariance``, ``zncc``, ``status`` ...
     strain
-        ``strain`` (r, c, 3) of exx, eyy, exy with ``covariance``; None for a shape, or where it was switched off.
+        ``strain`` (r, c, 3) of exx, eyy, exy with ``covariance``; None for a shape, or if it was switched off.
     settings
-        What it was measured with.
+        Settings of the measurement.
     step
         Number of the load step, 0 = the reference.
     frame
-        ``target`` or ``camera1``: what the system frame is.
+        Meaning of the system frame: ``target`` or ``camera1``.
     """
 
     field: Field
@@ -73,7 +73,7 @@ class Result:
         InputError
             ``field_missing`` for a name that the result does not have.
         """
-        values = self._values(name)
+        values = values_of(self.field, self.strain, name)
         if values is None:
             raise InputError(
                 f"The result has no variable {name}.", code="field_missing", remedy="Ask for one that `dataset` lists."
@@ -134,7 +134,7 @@ class Result:
 
     @property
     def uncertainty_includes(self) -> str:
-        """What every standard uncertainty (``sigma``, k = 1) includes; says where the calibration is not included."""
+        """Sentence that names the parts of every standard uncertainty (``sigma``, k = 1), or a missing one."""
         return Included.of_field(self.field).text
 
     def area(self, name: str, polygon_px: ArrayLike | None = None) -> AreaStatistics:
@@ -157,15 +157,15 @@ class Result:
                 np.sqrt(np.maximum(field.covariance[..., k, k], 0.0)),
                 inside,
                 shared=shared.positions if k < len(_POSITION) else shared,
-                # what all points share does not shrink in a mean
+                # the points' common error does not shrink in a mean
                 common=None if field.common is None else field.common[..., k, :],
                 sigma_reference=None if frozen is None else np.sqrt(np.maximum(frozen[..., k, k], 0.0)),
             )
         found = area_statistics(field, values, None, inside, shared=shared)
-        if name not in _STRAIN or self.strain is None or not found.count:
+        if name not in STRAIN_NAMES or self.strain is None or not found.count:
             return found
         of = mean_strain_variance(self.field, self.strain.options, inside, subset_px=self.strain.subset_px)
-        return found.with_mean_variance(*of.of(_STRAIN.index(name)))
+        return found.with_mean_variance(*of.of(STRAIN_NAMES.index(name)))
 
     @cached_property
     def _shared(self) -> SharedPixels:
@@ -188,18 +188,6 @@ class Result:
         if strain_settings is not None:
             settings = settings.model_copy(update={"strain": strain_settings})
         return Result(field, strain, settings, self.step, self.frame, self.calibration_sha256)
-
-    def _values(self, name: str) -> Float | None:
-        found = field_variable(self.field, name)
-        if found is not None:
-            return found[0]
-        sigma = name.startswith("sigma_")
-        of = name.removeprefix("sigma_")
-        if sigma and of.endswith("_mm") and of[:-3] in (names := "xyzuvw"[: self.field.covariance.shape[-1]]):
-            return np.asarray(self.field.sigma_mm[..., names.index(of[:-3])])
-        if self.strain is not None and of in _STRAIN:
-            return np.asarray((self.strain.sigma if sigma else self.strain.strain)[..., _STRAIN.index(of)])
-        return None
 
 
 def read_result(path: str | Path) -> Result:

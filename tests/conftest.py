@@ -11,19 +11,23 @@ from __future__ import annotations
 import os
 import re
 import signal
-from collections.abc import Iterator
+import subprocess
+import sys
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.support.container import unmount_leftovers
+from tests.support.patience import busy
 from tests.support.requirements import ROOT, missing
 
 if TYPE_CHECKING:  # most tests need neither
     import httpx
     from playwright.sync_api import Browser
 
-    from server.workflows.service import Service
+    from stereorig.server.workflows.service import Service
     from tests.support.page_bench import Watched
 
 pytest.register_assert_rewrite("tests.support.page_bench")  # its assertions print what they found
@@ -54,6 +58,12 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_configure() -> None:
+    """Free the temporary folders of killed runs, which pytest deletes at the end of this one."""
+    if "PYTEST_XDIST_WORKER" not in os.environ and os.geteuid() == 0:
+        unmount_leftovers()
+
+
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Of the deep tier, do not load the nine files in ten that have none of its tests: every worker would."""
     if config.option.markexpr == "deep" and collection_path.match("test_*.py"):
@@ -80,6 +90,26 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         normal = item.get_closest_marker("normal_depth")
         if normal is not None and item.callspec.id not in normal.args:  # type: ignore[attr-defined]
             item.add_marker("deep")
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Compile the kernels before the first long test of a service: a child that compiles for minutes is no failure."""
+    if "PYTEST_XDIST_WORKER" in os.environ or session.config.option.collectonly:
+        return  # `make test-deep` has them compiled
+    tiers = {item.path.relative_to(TESTS).parts[0] for item in session.items if item.get_closest_marker("deep")}
+    if tiers & {"crash", "service"}:
+        subprocess.run([sys.executable, "-m", "tests.support.kernels"], cwd=ROOT, check=True)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Let a test take longer the busier the machine is: its limit is for one that hangs, not for a slow one."""
+    marker = item.get_closest_marker("timeout")
+    seconds = float(marker.args[0] if marker is not None and marker.args else item.config.getini("timeout"))
+    patience = busy() * (4.0 if item.get_closest_marker("deep") else 1.0)
+    if patience > 1.0:
+        item.add_marker(pytest.mark.timeout(seconds * patience), append=False)
+    return (yield)
 
 
 @pytest.fixture(scope="session")
@@ -113,14 +143,14 @@ def worker_with_its_first_task(request: pytest.FixtureRequest) -> Iterator[None]
     tier = request.path.relative_to(TESTS).parts[0]
     with pytest.MonkeyPatch.context() as patch:
         if tier in LAZY_WORKER and request.node.get_closest_marker("warm_worker") is None:
-            patch.setattr("server.worker.embedded.ComputeWorker.start", lambda _: None)
+            patch.setattr("stereorig.server.worker.embedded.ComputeWorker.start", lambda _: None)
         yield
 
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     """The service on the tiny rig, with an empty data folder of its own."""
-    from server.workflows.service import Service
+    from stereorig.server.workflows.service import Service
     from tests.support.service_rig import tiny_config
 
     made = Service(tiny_config(), tmp_path_factory.mktemp("service") / "data").start()

@@ -2,14 +2,14 @@
 
 from typing import TYPE_CHECKING
 
-from core.lazy import names_of
+from stereorig.core.lazy import names_of
 
 if TYPE_CHECKING:
-    from core.boards.board import BOARD_KINDS, DEFAULT_DICTIONARY, BoardKind, BoardTarget
-    from core.boards.detect import detect_board, find_board
-    from core.boards.eccentricity import dot_centre_offset_px
-    from core.boards.targets import detect_target, find_target
-    from core.boards.view import BoardView
+    from stereorig.core.boards.board import BOARD_KINDS, DEFAULT_DICTIONARY, BoardKind, BoardTarget
+    from stereorig.core.boards.detect import detect_board, find_board
+    from stereorig.core.boards.eccentricity import dot_centre_offset_px
+    from stereorig.core.boards.targets import detect_target, find_target
+    from stereorig.core.boards.view import BoardView
 
 __all__ = [
     "BOARD_KINDS",

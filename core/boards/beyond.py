@@ -1,20 +1,20 @@
-"""Whether a checkerboard goes on beyond the corners that were found: it then has more than were declared."""
+"""Test for corners of a checkerboard outside those found: the board then has more corners than were declared."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from core.arrays import Float, Float32
-from core.boards.refine import sample
+from stereorig.core.arrays import Float, Float32
+from stereorig.core.boards.refine import sample
 
-_OF_INNER = 0.75  # of the inner corners' contrast; at a board's own rim, on a light margin, half of it is left
-_MOST = 0.7  # of a side's places that must show a corner
+_OF_INNER = 0.75  # share of the inner corners' contrast; at a board's own rim, on a light margin, half of it is left
+_MOST = 0.7  # share of a side's places that must show a corner
 _LEAST_PLACES = 3
-_REACH = (0.2, 0.28)  # of a square, along both edges: where its light and dark are looked at
+_REACH = (0.2, 0.28)  # parts of a square along both edges at which the light and dark are sampled
 
 
-def goes_on_beyond(grey: Float32, corners_px: Float) -> bool:
-    """Return True if corners of the same board lie one square beyond the outermost ones on some side.
+def extends_beyond(grey: Float32, corners_px: Float) -> bool:
+    """Return True if the image shows corners of the same board one square outside the outermost ones on some side.
 
     Parameters
     ----------

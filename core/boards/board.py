@@ -1,4 +1,4 @@
-"""Calibration boards beside the line grid: checkerboards, ChArUco boards and grids of dots.
+"""Calibration boards other than the line grid: checkerboards, ChArUco boards and grids of dots.
 
 Index and frame: a board has ``size = (columns, rows)`` inner corners or dots. X runs along a row, Y down the columns as
 the board is printed, Z away from its viewer; the origin is the centre of the field of points.
@@ -12,9 +12,9 @@ from typing import Literal, get_args
 import cv2
 import numpy as np
 
-from core.arrays import Float
-from core.errors import TargetError
-from core.target import check_errors, check_pitch, check_tolerance, invalid, two_whole_numbers
+from stereorig.core.arrays import Float
+from stereorig.core.errors import TargetError
+from stereorig.core.target import check_errors, check_pitch, check_tolerance, invalid, two_whole_numbers
 
 BoardKind = Literal["checkerboard", "charuco", "circles", "circles_asymmetric"]
 BOARD_KINDS: tuple[BoardKind, ...] = get_args(BoardKind)
@@ -35,15 +35,15 @@ class BoardTarget:
         (columns, rows) of inner corners, or dots a row and rows of dots.
     pitch_mm
         Side of a square, or distance of neighbouring dots; of an asymmetric grid, distance of neighbouring rows: dots
-        of one row lie two pitches apart.
+        of one row are two pitches apart.
     node_tolerance_mm
         The maker's bound on the error of a corner's or dot's position, per axis; 0 for an exact board.
     marker_mm, dictionary
         ChArUco: side of a marker, and the name of its dictionary.
     dot_diameter_mm
-        Diameter of a dot where it is known; None: it is measured in the images.
+        Diameter of a dot; None if it is not known: it is then measured in the images.
     pitch_scale_sigma
-        Relative standard deviation of the pitch as a whole; 0 where it is exact.
+        Relative standard deviation of the pitch as a whole; 0: exact; None: ``node_tolerance_mm`` over the size.
     flatness_mm
         Bound on the board's departure from a plane; None: as ``node_tolerance_mm``. It shows in free poses only.
 
@@ -60,7 +60,7 @@ class BoardTarget:
     marker_mm: float | None = None
     dictionary: str = DEFAULT_DICTIONARY
     dot_diameter_mm: float | None = None
-    pitch_scale_sigma: float = 0.0
+    pitch_scale_sigma: float | None = None
     flatness_mm: float | None = None
 
     def __post_init__(self) -> None:
@@ -102,7 +102,7 @@ def dictionary_id(name: str) -> int:
     Raises
     ------
     TargetError
-        Code ``target_invalid`` where there is none of that name.
+        Code ``target_invalid`` if OpenCV has no dictionary of that name.
     """
     value = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
     if not isinstance(value, int):

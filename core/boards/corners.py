@@ -8,16 +8,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float, Float32
-from core.boards.board import BoardTarget, dictionary_id
-from core.boards.pictures import COARSE_SIDE_PX, FINE_SIDE_PX, Pictures, full_scale
-from core.boards.refine import sample
+from stereorig.core.arrays import Float, Float32
+from stereorig.core.boards.beyond import extends_beyond
+from stereorig.core.boards.board import BoardTarget, dictionary_id
+from stereorig.core.boards.pictures import COARSE_SIDE_PX, FINE_SIDE_PX, Pictures, full_scale
+from stereorig.core.boards.refine import sample
 
 _LEAST_SEEN = 4
+_SEED = 3  # corners a side from which any checkerboard is grown
+# range of a board's mean level between its dark and its light, at any blur; of the squares that a search finds in a
+# blurred line grid, seen at 45 degrees, the mean is nearer to the ground's: 0.55 and more, with bright lines 0.45 and
+# less (grids of 5 to 15 lines)
+_BALANCED = (0.44, 0.54)
 
 
 def find_checkerboard(pictures: Pictures, size: tuple[int, int], *, coarsely: bool = False) -> Float | None:
-    """Return coarse corners (columns, rows, 2) of a whole board, None where it is not found.
+    """Return coarse corners (columns, rows, 2) of a whole board, None if none is found.
 
     ``coarsely``: on the smallest picture only.
     """
@@ -31,7 +37,7 @@ def find_checkerboard(pictures: Pictures, size: tuple[int, int], *, coarsely: bo
 
 
 def search_checkerboard(pictures: Pictures, size: tuple[int, int]) -> Float | None:
-    """Search longer, where :func:`find_checkerboard` found nothing."""
+    """Search longer, after :func:`find_checkerboard` found nothing."""
     for picture, factor in pictures.scales(2):
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
         found, corners = cv2.findChessboardCornersSB(picture, size, flags=flags)
@@ -50,20 +56,24 @@ def any_checkerboard(pictures: Pictures) -> Float | None:
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
     picture, factor = pictures.reduced(COARSE_SIDE_PX)
     try:
-        found, corners, meta = cv2.findChessboardCornersSBWithMeta(picture, (3, 3), flags)
+        found, corners, meta = cv2.findChessboardCornersSBWithMeta(picture, (_SEED, _SEED), flags)
     except cv2.error:
         return None
     if not found or meta is None:
         return None
     rows, columns = (int(n) for n in np.asarray(meta).shape[:2])
+    if max(rows, columns) == _SEED:  # which the search, that draws lots, finds by chance in a line grid now and then
+        return None
     grid = _arranged(np.asarray(corners), (columns, rows), factor)
-    if not _alternates(pictures.grey, grid):
+    if not (_alternates(pictures.grey, grid) and _BALANCED[0] < _balance(pictures.grey, grid) < _BALANCED[1]):
+        return None
+    if extends_beyond(pictures.grey, grid):  # a rectangle out of a line grid's diamond
         return None
     return grid if columns >= rows else np.swapaxes(grid, 0, 1)
 
 
 def find_charuco(pictures: Pictures, target: BoardTarget, *, coarsely: bool = False) -> Float | None:
-    """Return coarse corners (columns, rows, 2), NaN where hidden; None where fewer than four are seen.
+    """Return coarse corners (columns, rows, 2), NaN where hidden; None if fewer than four are seen.
 
     ``coarsely``: on the smallest picture only, if it shows any.
     """
@@ -83,7 +93,7 @@ def find_charuco(pictures: Pictures, target: BoardTarget, *, coarsely: bool = Fa
 
 
 def _charuco(picture: NDArray[Any], factor: float, target: BoardTarget, known: Float | None) -> Float | None:
-    """Return the corners seen in one picture where they are more than those known, else these."""
+    """Return the corners seen in one picture if they are more than those known, else the known ones."""
     dictionary = cv2.aruco.getPredefinedDictionary(dictionary_id(target.dictionary))
     columns, rows = target.size
     seen = 0 if known is None else int(np.isfinite(known[..., 0]).sum())
@@ -106,7 +116,7 @@ def _charuco(picture: NDArray[Any], factor: float, target: BoardTarget, known: F
 
 
 def dark_at_start(grey: Float32, xy_px: Float) -> bool:
-    """Return True where the square beyond corner [0, 0], diagonally outside, is darker than its neighbour."""
+    """Return True if the square beyond corner [0, 0], diagonally outside, is darker than its neighbour."""
     ex, ey = xy_px[1, 0] - xy_px[0, 0], xy_px[0, 1] - xy_px[0, 0]
     nine = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), axis=-1).reshape(-1, 2)
     outside = sample(grey, xy_px[0, 0] - 0.35 * (ex + ey) + nine).mean()
@@ -115,7 +125,7 @@ def dark_at_start(grey: Float32, xy_px: Float) -> bool:
 
 
 def squares_hold_markers(grey: Float32, xy_px: Float) -> bool:
-    """Return True where the light squares between corners (columns, rows, 2) of a board hold dark parts."""
+    """Return True if the light squares between corners (columns, rows, 2) of a board hold dark parts."""
     one, other = _squares(grey, xy_px)
     light, dark = (one, other) if _lightness(one) > _lightness(other) else (other, one)
     middle = 0.5 * (np.median(dark) + np.percentile(light, 90))
@@ -123,16 +133,23 @@ def squares_hold_markers(grey: Float32, xy_px: Float) -> bool:
 
 
 def _alternates(grey: Float32, xy_px: Float) -> bool:
-    """Return True where the squares between corners are light and dark in turn, as the cells of a line grid are not."""
+    """Return True if the squares between corners are light and dark in turn, as the cells of a line grid are not."""
     one, other = _squares(grey, xy_px)
     low, high = np.percentile(np.concatenate([one.ravel(), other.ravel()]), [5.0, 95.0])
     return abs(_lightness(one) - _lightness(other)) > 0.4 * float(high - low)
 
 
-def _squares(grey: Float32, xy_px: Float) -> tuple[Float, Float]:
-    """Grey levels (n, 81) within the squares of either colour."""
+def _balance(grey: Float32, xy_px: Float) -> float:
+    """Return the mean level between corners, from 0 (middle of dark squares) to 1 (middle of light ones)."""
+    one, other = _squares(grey, xy_px, rim=1.0 / 18.0)
+    middles = [float(np.median(squares[:, squares.shape[1] // 2])) for squares in (one, other)]
+    return float((0.5 * (one.mean() + other.mean()) - min(middles)) / max(abs(middles[0] - middles[1]), 1e-9))
+
+
+def _squares(grey: Float32, xy_px: Float, rim: float = 0.25) -> tuple[Float, Float]:
+    """Grey levels (n, 81) within the squares of either colour, but for a rim of this part of a square."""
     c00, c10, c01, c11 = xy_px[:-1, :-1], xy_px[1:, :-1], xy_px[:-1, 1:], xy_px[1:, 1:]
-    s, t = (v.ravel()[:, None, None, None] for v in np.meshgrid(np.linspace(0.25, 0.75, 9), np.linspace(0.25, 0.75, 9)))
+    s, t = (v.ravel()[:, None, None, None] for v in np.meshgrid(*2 * (np.linspace(rim, 1.0 - rim, 9),)))
     places = (1 - s) * (1 - t) * c00 + s * (1 - t) * c10 + (1 - s) * t * c01 + s * t * c11
     inside = np.moveaxis(sample(grey, places), 0, -1)
     first = (np.add.outer(np.arange(inside.shape[0]), np.arange(inside.shape[1])) % 2) == 0

@@ -1,17 +1,17 @@
-"""Detection of a board in one image: coarse search, then the fit of every point, and the cause where it fails."""
+"""Detection of a board in one image: coarse search, fit of every point, and the cause if it fails."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float, Float32
-from core.boards.beyond import goes_on_beyond
-from core.boards.board import BoardTarget
-from core.boards.corners import (
+from stereorig.core.arrays import Bool, Float, Float32
+from stereorig.core.boards.beyond import extends_beyond
+from stereorig.core.boards.board import BoardTarget
+from stereorig.core.boards.corners import (
     any_checkerboard,
     dark_at_start,
     find_charuco,
@@ -19,20 +19,20 @@ from core.boards.corners import (
     search_checkerboard,
     squares_hold_markers,
 )
-from core.boards.dots import DotSearch, find_dots
-from core.boards.naming import declared_text, other_target, shown_target
-from core.boards.pictures import Pictures
-from core.boards.refine import Refined, refine_corners, refine_dots
-from core.boards.view import BoardView, neighbour_distances_px
-from core.errors import TargetError
-from core.grid.threshold import checked_image
+from stereorig.core.boards.dots import DotSearch, Marks, find_dots
+from stereorig.core.boards.naming import declared_text, other_target, shown_target
+from stereorig.core.boards.pictures import Pictures
+from stereorig.core.boards.refine import Refined, refine_corners, refine_dots
+from stereorig.core.boards.view import BoardView, neighbour_distances_px
+from stereorig.core.errors import TargetError
+from stereorig.core.grid.threshold import checked_image
 
 _LEAST_CHARUCO = 8
 _LEAST_PITCH_PX = 8.0
 _LEAST_LATTICE = 16  # dots in rows and columns, to speak of a grid of another size
-_WIDEST_BLUR = 0.22  # of the distance of neighbouring points; beyond, edges run into each other
-_LARGEST_SIGMA_PX = 0.5  # a point located no better tells a calibration nothing
-_IRREGULAR = 0.35  # of a step, by which neighbouring steps of one board may differ
+_WIDEST_BLUR = 0.22  # share of the distance of neighbouring points; at a larger blur edges run into each other
+_LARGEST_SIGMA_PX = 0.5  # a point with a larger uncertainty has no value for a calibration
+_IRREGULAR = 0.35  # share of a step, by which neighbouring steps of one board may differ
 _SHOW_WHOLE = "Show the whole board, evenly lit and in focus; check size and kind of the target's description."
 
 
@@ -46,7 +46,7 @@ class _Coarse:
     marks: tuple[tuple[int, int], ...] = ()
 
 
-def detect_board(image: NDArray[Any], target: BoardTarget) -> BoardView:
+def detect_board(image: NDArray[Any], target: BoardTarget, *, marks: Marks = ()) -> BoardView:
     """Find a board's points with no start values but its description.
 
     Parameters
@@ -55,13 +55,16 @@ def detect_board(image: NDArray[Any], target: BoardTarget) -> BoardView:
         (rows, columns) gray image, any unsigned or float type.
     target
         The board.
+    marks
+        (column, row) of a dot grid's three orientation marks, as :class:`BoardView` has them: with these a part of the
+        grid that shows them is found, too.
 
     Returns
     -------
     BoardView
         Points in pixels. Indices follow the board: the colours of a checkerboard with an odd sum of columns and rows, a
         ChArUco board's markers, a grid's orientation marks, the rows of an asymmetric grid with an odd number of them.
-        Where a board looks the same turned by half a turn (or a quarter, with as many columns as rows), X is what lies
+        If a board looks the same turned by half a turn (or a quarter, with as many columns as rows), X is the direction
         nearest to the image's rows, to the right.
 
     Raises
@@ -71,17 +74,26 @@ def detect_board(image: NDArray[Any], target: BoardTarget) -> BoardView:
     TargetError
         ``target_not_found``; ``target_other``: the image shows another target; ``target_size``: another number of
         points; ``target_too_small``; ``target_partly_seen``: the board leaves the image, or too few of its points can
-        be located; ``target_blurred``: no point can be located to half a pixel; ``target_irregular``: markers that lie
-        on no such board; ``image_mirrored``: an asymmetric grid seen in a mirror.
+        be located; ``target_blurred``: no point can be located to half a pixel; ``target_irregular``: the markers do
+        not fit such a board; ``image_mirrored``: an asymmetric grid seen in a mirror.
     """
     pictures = Pictures(checked_image(image))
-    coarse = _find(pictures, target)
+    coarse = _find(pictures, target, marks=marks)
     if coarse.moments is not None:
         fit = refine_dots(pictures.grey, coarse.xy_px, coarse.moments, target, coarse.hollow)
     else:
         fit = refine_corners(pictures.grey, coarse.xy_px, target)
+    with np.errstate(invalid="ignore"):
+        # a dot cut by the border may have its centre outside, and the visible part of its rim determines it poorly
+        inside = np.asarray(((fit.xy_px > -0.5) & (fit.xy_px < np.array(pictures.size_px) - 0.5)).all(axis=-1))
+    fit = replace(
+        fit,
+        xy_px=np.where(inside[..., None], fit.xy_px, np.nan),
+        covariance_px2=np.where(inside[..., None, None], fit.covariance_px2, np.nan),
+        ellipse=None if fit.ellipse is None else np.where(inside[..., None, None], fit.ellipse, np.nan),
+    )
     sigma = np.sqrt(0.5 * np.trace(fit.covariance_px2, axis1=-2, axis2=-1))
-    _check(fit, sigma, coarse.xy_px, target)
+    _check(fit, sigma, coarse.xy_px, target, partly=bool(marks))
     radius = None
     if fit.ellipse is not None:
         with np.errstate(invalid="ignore"):
@@ -118,15 +130,15 @@ def find_board(image: NDArray[Any], target: BoardTarget) -> Float:
     Raises
     ------
     ImageError, TargetError
-        As :func:`detect_board`, but for what only the fit of the points shows; a search that finds nothing does not go
-        on to name what is seen.
+        As :func:`detect_board`, except those that only the fit of the points raises; a search that finds nothing does
+        not look for another target in the image.
     """
     return _find(Pictures(checked_image(image)), target, coarsely=True).xy_px
 
 
-def _find(pictures: Pictures, target: BoardTarget, *, coarsely: bool = False) -> _Coarse:
+def _find(pictures: Pictures, target: BoardTarget, *, coarsely: bool = False, marks: Marks = ()) -> _Coarse:
     if target.kind in ("circles", "circles_asymmetric"):
-        search = find_dots(pictures, target, coarsely=coarsely)
+        search = find_dots(pictures, target, coarsely=coarsely, marks=marks)
         if search.found is None:
             raise _nothing(target) if coarsely else _no_dots(pictures, target, search)
         dots = search.found
@@ -153,19 +165,19 @@ def _find(pictures: Pictures, target: BoardTarget, *, coarsely: bool = False) ->
             code="target_other",
             remedy="Correct kind in the target's description, or use the target declared.",
         )
-    if goes_on_beyond(pictures.grey, corners):
+    if extends_beyond(pictures.grey, corners):
         raise _larger(pictures, target)
     return _Coarse(corners.reshape(-1, 2)[_upright(corners, pictures.grey)])
 
 
 def _larger(pictures: Pictures, target: BoardTarget) -> TargetError:
-    """Return the error for a checkerboard that has more corners than declared, with their number where it is sure."""
+    """Return the error for a checkerboard that has more corners than declared, with their number if it is sure."""
     seen = any_checkerboard(pictures)
     size = "" if seen is None else f" of {seen.shape[0]} x {seen.shape[1]} inner corners"
     if seen is not None and sorted(seen.shape[:2]) == sorted(target.size):
         size = ""
     return TargetError(
-        f"The image shows a checkerboard{size} that goes on beyond the {target.size[0]} x {target.size[1]} inner "
+        f"The image shows a checkerboard{size} that extends beyond the {target.size[0]} x {target.size[1]} inner "
         "corners declared.",
         code="target_size",
         remedy="Correct size in the target's description: it counts inner corners.",
@@ -173,8 +185,8 @@ def _larger(pictures: Pictures, target: BoardTarget) -> TargetError:
     )
 
 
-def _check(fit: Refined, sigma: Float, coarse_px: Float, target: BoardTarget) -> None:
-    """Raise an error where too little of a board can be located, or not well enough."""
+def _check(fit: Refined, sigma: Float, coarse_px: Float, target: BoardTarget, *, partly: bool) -> None:
+    """Raise an error if too little of a board can be located, or not well enough."""
     name = declared_text(target)
     pitch = float(np.nanmedian(neighbour_distances_px(coarse_px, target)))
     if pitch < _LEAST_PITCH_PX:
@@ -192,7 +204,7 @@ def _check(fit: Refined, sigma: Float, coarse_px: Float, target: BoardTarget) ->
             blur_px=fit.blur_px,
         )
     found = np.isfinite(fit.xy_px).all(axis=-1)
-    least = _LEAST_CHARUCO if target.kind == "charuco" else int(0.5 * found.size)
+    least = _LEAST_CHARUCO if target.kind == "charuco" or partly else int(0.5 * found.size)
     if found.sum() < least:
         raise TargetError(
             f"Only {int(found.sum())} of {found.size} points of the {name} can be located.",
@@ -212,7 +224,7 @@ def _check(fit: Refined, sigma: Float, coarse_px: Float, target: BoardTarget) ->
 
 
 def _check_markers(corners: Float, target: BoardTarget) -> None:
-    """Raise an error for corners whose numbers lie in no regular order: a board of another size or dictionary."""
+    """Raise an error for corners whose numbers are in no regular order: a board of another size or dictionary."""
     bends = []
     for axis in (0, 1):
         step = np.diff(corners, axis=axis)
@@ -291,7 +303,7 @@ def _other_size(
 
 
 def _reaches_border(outline_px: Float, counts: tuple[int, int], size_px: tuple[int, int]) -> bool:
-    """Return True where one more row of points would lie at the image's border or beyond."""
+    """Return True if one more row of points would be at the image's border or outside."""
     low, high = outline_px.min(axis=0), outline_px.max(axis=0)
     step = np.sqrt(np.prod(high - low) / max(float((counts[0] - 1) * (counts[1] - 1)), 1.0))
     return bool((low - 1.3 * step < 0.0).any() or (high + 1.3 * step > np.array(size_px) - 1.0).any())
@@ -302,9 +314,9 @@ def _nothing(target: BoardTarget) -> TargetError:
 
 
 def _upright(points: Float, grey: Float32) -> NDArray[np.intp]:
-    """Index a checkerboard's corners as its own colours do; where these do not tell, as the image does.
+    """Number a checkerboard's corners by its colours, or by the image's axes if the colours are symmetric.
 
-    Returns the (columns, rows) numbers of the points, counted as they lie in ``points`` (columns, rows, 2).
+    Returns the (columns, rows) numbers of the points, counted in the order of ``points`` (columns, rows, 2).
     """
     size = points.shape[:2]
     flat = points.reshape(-1, 2)
@@ -313,7 +325,7 @@ def _upright(points: Float, grey: Float32) -> NDArray[np.intp]:
     if ex[0] * ey[1] - ex[1] * ey[0] < 0.0:
         order = order[:, ::-1]
     if size[0] == size[1]:
-        # a square board may be indexed in four ways; X is what lies nearest to the rows
+        # a square board may be numbered in four ways; X is the direction nearest to the rows
         for _ in range(3):
             ex, _ey = _sides(flat[order])
             if ex[0] >= abs(ex[1]) - 1e-9:

@@ -8,23 +8,24 @@ step, until they fill the rectangle described.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from core.arrays import Bool, Float
-from core.boards.board import BoardTarget
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.boards.board import BoardTarget
 
 Numbers = NDArray[np.intp]
 
-_NEAR = 0.3  # of the shorter step, between a neighbour and its prediction
+_NEAR = 0.3  # share of the shorter step, between a neighbour and its prediction
 _LEAST_CROSSING = 0.5  # sine of the angle of the first two steps
 _LEAST_DOTS = 9
 _SEEDS = 12
 _LEAST_FILL = 0.9
-_EDGE_FILL = 0.4  # of a first or last row or column that belongs to the grid
+_EDGE_FILL = 0.4  # least share of filled places in a first or last row or column of the grid
 _BASES = tuple(
     np.array(m) for m in ([[1, 0], [0, 1]], [[1, 1], [0, 1]], [[1, -1], [0, 1]], [[1, 0], [1, 1]], [[1, 0], [-1, 1]])
 )
@@ -126,14 +127,14 @@ def _first_steps(centres: Float, tree: cKDTree, seed: int) -> Float | None:
 
 @dataclass(frozen=True)
 class Arranged:
-    """A lattice laid into the rectangle of a description, in every right-handed way that fits.
+    """A lattice assigned to the rows and columns of a description, in every right-handed way that fits.
 
     Attributes
     ----------
     ways
-        Of each, (columns, rows) indices of the blobs, -1 where one is missing.
+        (columns, rows) indices of the blobs for each way, -1 for a missing blob.
     mirrored
-        True where only a mirrored picture of the grid fits.
+        True if only a mirrored picture of the grid fits.
     counts
         Columns and rows that the lattice itself spans.
     fill
@@ -147,7 +148,7 @@ class Arranged:
 
 
 def arrange(lattice: DotLattice, target: BoardTarget) -> Arranged:
-    """Lay a lattice into the rectangle of a description."""
+    """Assign the dots of a lattice to the rows and columns of a description."""
     asymmetric = target.kind == "circles_asymmetric"
     ways: list[Numbers] = []
     mirrored = False
@@ -178,8 +179,16 @@ def arrange(lattice: DotLattice, target: BoardTarget) -> Arranged:
     return Arranged(tuple(ways), mirrored and not ways, counts, fullest)
 
 
+def turned_numbers(lattice: DotLattice) -> Iterator[Numbers]:
+    """Yield a lattice's numbers (n, 2), from zero, in every right-handed way of counting them."""
+    for basis in _BASES:
+        for turn in range(4):
+            numbers = lattice.number @ basis @ np.linalg.matrix_power(_TURN, turn)
+            yield numbers - numbers.min(axis=0)
+
+
 def _trimmed(numbers: Numbers, member: Numbers, asymmetric: bool) -> tuple[Numbers, Numbers]:
-    """Leave out first and last rows and columns of few dots: other blobs that lie where the lattice goes on."""
+    """Remove first and last rows and columns of few dots: other blobs that happen to fit the lattice."""
     while True:
         numbers = numbers - numbers.min(axis=0)
         span = numbers.max(axis=0) + 1

@@ -1,8 +1,8 @@
 """Dots in an image: round outlines of about one size, laid into the grid described, and the dots that mark its axes.
 
-A hollow dot is found by its outer rim like any other. Where exactly three dots are hollow, or larger than their
-neighbours, and lie in an L along the grid's axes, they are its orientation marks: X points from the mark at the L's
-corner towards the mark in its row, and of a grid with as many columns as rows Y towards the mark in its column.
+A hollow dot is found by its outer rim like any other. If exactly three dots are hollow, or larger than their
+neighbours, and form an L along the grid's axes, they are its orientation marks: X points from the mark at the L's
+corner towards the mark in its row, and in a grid with as many columns as rows Y points towards the mark in its column.
 """
 
 from __future__ import annotations
@@ -15,19 +15,29 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float
-from core.boards.board import BoardTarget
-from core.boards.dot_lattice import Arranged, Numbers, arrange, grow, missing_positions
-from core.boards.pictures import Pictures, full_scale
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.boards.board import BoardTarget
+from stereorig.core.boards.dot_lattice import (
+    Arranged,
+    DotLattice,
+    Numbers,
+    arrange,
+    grow,
+    missing_positions,
+    turned_numbers,
+)
+from stereorig.core.boards.pictures import Pictures, full_scale
 
 _MIN_AREA_PX = 12
-_ROUND = 0.12  # largest share of an outline's area that may lie outside its own ellipse, or lack in it
+_ROUND = 0.12  # largest share of an outline's area outside its own ellipse, or missing in it
 _ROUGH, _ROUGH_PX = 0.035, 0.16  # unroundness of an outline, and that by its pixels, over half of its mean radius
 _FLATTEST = 0.04  # least ratio of the second moments' eigenvalues: tilts up to 78 degrees
 _SIZES = 1.8  # ratio of lengths within which dots are of one size, marks among them
 _LARGER = 1.2  # ratio of lengths of a larger mark to its neighbours
-_HOLLOW = 0.5  # of the contrast across the rim, by which the middle of a hollow dot departs from its ring
-_BLOCKS = (0.05, 0.15, 0.0)  # of the image's longer side; 0: one threshold for the whole image
+_HOLLOW = 0.5  # share of the contrast across the rim, by which the middle of a hollow dot departs from its ring
+_INSIDE = 0.9  # share of a part's dots that must be on the grid described: the others are dirt
+Marks = tuple[tuple[int, int], ...]  # (column, row) of three dots, the L's corner first; empty without
+_BLOCKS = (0.05, 0.15, 0.0)  # share of the image's longer side; 0: one threshold for the whole image
 
 
 @dataclass(frozen=True)
@@ -50,7 +60,7 @@ class FoundDots:
     hollow
         (columns, rows).
     marks
-        The three orientation marks' (column, row), the corner's first; empty where there are none.
+        The three orientation marks' (column, row), the corner's first; empty without marks.
     """
 
     centres: Float
@@ -61,18 +71,18 @@ class FoundDots:
 
 @dataclass(frozen=True)
 class DotSearch:
-    """What a search for a grid of dots came to.
+    """Result of a search for a grid of dots.
 
     Attributes
     ----------
     found
-        The grid described; None where there is none.
+        The grid described; None if it was not found.
     counts
         Columns and rows of the largest lattice of dots seen, (0, 0) without any.
     outline_px
         (n, 2) its dots.
     mirrored
-        True where only the mirror image of the grid described fits.
+        True if only the mirror image of the grid described fits.
     """
 
     found: FoundDots | None
@@ -81,8 +91,8 @@ class DotSearch:
     mirrored: bool
 
 
-def find_dots(pictures: Pictures, target: BoardTarget, *, coarsely: bool = False) -> DotSearch:
-    """Find a grid of dots; ``coarsely``: on the smallest picture only."""
+def find_dots(pictures: Pictures, target: BoardTarget, *, coarsely: bool = False, marks: Marks = ()) -> DotSearch:
+    """Find a grid of dots; ``coarsely``: on the smallest picture only; ``marks``: its orientation marks' positions."""
     best = DotSearch(None, (0, 0), np.zeros((0, 2)), False)
     for picture, scale in pictures.scales(1 if coarsely else 3):
         for dark in (True, False):
@@ -92,8 +102,8 @@ def find_dots(pictures: Pictures, target: BoardTarget, *, coarsely: bool = False
                 if lattice is None:
                     continue
                 arranged = arrange(lattice, target)
-                if arranged.ways:
-                    found = _chosen(blobs, arranged, target)
+                found = _chosen(blobs, arranged, target) if arranged.ways else _by_marks(blobs, lattice, target, marks)
+                if found is not None:
                     return DotSearch(found, arranged.counts, blobs.centres[lattice.member], False)
                 if len(lattice.member) > len(best.outline_px):
                     outline = blobs.centres[lattice.member]
@@ -178,7 +188,7 @@ def _level(picture: NDArray[Any], centres: Float, moments: Float, radius: float)
 
 
 def _chosen(blobs: Blobs, arranged: Arranged, target: BoardTarget) -> FoundDots:
-    """Take the way of laying the grid that its marks ask for, else the one that stands upright in the image."""
+    """Choose the arrangement of the grid that its marks determine, else the one that is upright in the image."""
     best: tuple[tuple[float, float], Numbers, tuple[tuple[int, int], ...]] | None = None
     for way in arranged.ways:
         centres = missing_positions(blobs.centres, way, target)
@@ -203,8 +213,36 @@ def _chosen(blobs: Blobs, arranged: Arranged, target: BoardTarget) -> FoundDots:
     return FoundDots(missing_positions(blobs.centres, way, target), moments, hollow, marks)
 
 
+def _by_marks(blobs: Blobs, lattice: DotLattice, target: BoardTarget, known: Marks) -> FoundDots | None:
+    """Arrange a part of the grid by its three marks, whose places on the grid are known."""
+    if not known or target.kind != "circles":
+        return None
+    for numbers in turned_numbers(lattice):
+        way = np.full(numbers.max(axis=0) + 1, -1, dtype=np.intp)
+        way[numbers[:, 0], numbers[:, 1]] = lattice.member
+        seen = np.array(_marks(blobs, way))
+        if not len(seen):
+            continue
+        at = numbers + (np.array(known[0]) - seen[0])
+        if {tuple(p) for p in seen + (np.array(known[0]) - seen[0])} != set(known):
+            continue
+        inside = ((at >= 0) & (at < np.array(target.size))).all(axis=1)
+        if inside.sum() < _INSIDE * len(at):
+            continue
+        way = np.full(target.size, -1, dtype=np.intp)
+        way[at[inside, 0], at[inside, 1]] = lattice.member[inside]
+        index, there = np.maximum(way, 0), way >= 0
+        return FoundDots(
+            np.where(there[..., None], blobs.centres[index], np.nan),
+            np.where(there[..., None, None], blobs.moments[index], np.median(blobs.moments[lattice.member], axis=0)),
+            there & blobs.hollow[index],
+            known,
+        )
+    return None
+
+
 def _marks(blobs: Blobs, way: Numbers) -> tuple[tuple[int, int], ...]:
-    """Return the three marks (column, row), the L's corner first; nothing where they are not three in an L."""
+    """Return the three marks (column, row), the L's corner first; empty if they are not three in an L."""
     index = np.maximum(way, 0)
     hollow = (way >= 0) & blobs.hollow[index]
     size = np.where(way >= 0, np.linalg.det(blobs.moments[index]) ** 0.25, np.nan)
@@ -218,6 +256,7 @@ def _marks(blobs: Blobs, way: Numbers) -> tuple[tuple[int, int], ...]:
             if (i, j) != (0, 0)
         ]
     )
+    around[:, np.isnan(around).all(axis=0)] = np.inf
     larger = (way >= 0) & (size > _LARGER * np.nanmedian(around, axis=0))
     for marked in (hollow, larger):
         places = np.argwhere(marked)

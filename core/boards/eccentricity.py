@@ -10,25 +10,25 @@ from collections.abc import Callable
 
 import numpy as np
 
-from core.arrays import Float
+from stereorig.core.arrays import Float
 
 _SAMPLES = 64
 _ROUNDS = 4
 
 
 def dot_centre_offset_px(project: Callable[[Float], Float], points_mm: Float, radius_mm: float) -> Float:
-    """Return how far the localiser's centre of each dot lies from the image of its true centre.
+    """Return the distance of the localiser's centre of each dot from the image of its true centre.
 
     The outline is drawn on the board, carried into the image, and an ellipse is fitted to it with all parts of the rim
-    weighing alike, as the rim's pixels do in :func:`core.boards.refine.refine_dots`.
+    weighing alike, as the rim's pixels do in :func:`stereorig.core.boards.refine.refine_dots`.
 
     Parameters
     ----------
     project
         From points (..., 3) of the board, mm, to their image (..., 2), px.
     points_mm
-        (..., 2) centres of the dots on the board, or (..., 3) of a board that is not flat; each dot lies parallel to
-        the plane Z = 0.
+        (..., 2) centres of the dots on the board, or (..., 3) for a board that is not flat; each dot is parallel to the
+        plane Z = 0.
     radius_mm
         Radius of the dots.
 

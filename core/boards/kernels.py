@@ -1,10 +1,11 @@
 """Least-squares fit of one small picture a point: crossed edges of a checkerboard, or the rim of a dot.
 
 Corner: ``I = B + G d + A E(u, v)`` with u and v the distances to two edges that the lens bends by a known amount, and E
-the mean of sgn(u) sgn(v) under a Gaussian of standard deviation s: erf(u / (sqrt 2 s)) erf(v / (sqrt 2 s)) where the
-edges are perpendicular, and for edges at an angle, whose distances are correlated by r = cos of it, Plackett's integral
-of the bivariate normal density over r more. On a ChArUco board the white squares hold markers, whose dark border begins
-at a known distance from both edges. Dot: ``I = B + G d + A (1 - E(rho)) / 2`` with the distance rho to an ellipse.
+the mean of sgn(u) sgn(v) under a Gaussian of standard deviation s: erf(u / (sqrt 2 s)) erf(v / (sqrt 2 s)) for
+perpendicular edges, and for edges at an angle, whose distances are correlated by r = cos of it, Plackett's integral of
+the bivariate normal density over r is added. On a ChArUco board the white squares hold markers, whose dark border
+begins at a known distance from both edges. Dot: ``I = B + G d + A (1 - E(rho)) / 2`` with the distance rho to an
+ellipse.
 
 d is the distance from the point, so that a slope of the lighting moves no point. But for this slope all terms are even
 about the point and its position is odd: another blur, or markers a little larger than described, move no point either.
@@ -17,8 +18,8 @@ from math import cos, erf, exp, hypot, sin, sqrt
 import numpy as np
 from numba import njit
 
-from core.arrays import Float, Float32
-from core.grid.profile import solve_cholesky
+from stereorig.core.arrays import Float, Float32
+from stereorig.core.grid.profile import solve_cholesky
 
 CORNER, DOT = 0, 1
 # by kind: x, y; angles of the two edges | three of the ellipse's inverse square root matrix; then ground, amplitude,
@@ -134,7 +135,7 @@ def _dot(p: Float, g: Float, x: float, y: float, J: Float) -> float:
 
 @njit(cache=True, nogil=True)
 def _used(kind: int, p: Float, g: Float, x: float, y: float) -> bool:
-    """Return True for a pixel that the model holds for, and that tells of the point or its levels."""
+    """Return True for a pixel in the model's range that depends on the point or its levels."""
     dx, dy = x - p[0], y - p[1]
     if kind == DOT:
         m, n = p[2] * dx + p[3] * dy, p[3] * dx + p[4] * dy

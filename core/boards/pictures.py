@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float, Float32
+from stereorig.core.arrays import Float, Float32
 
 COARSE_SIDE_PX = 1000  # searches are slow on large pictures, and most boards are found at this side
 FINE_SIDE_PX = 2200
@@ -36,7 +36,7 @@ class Pictures:
     def reduced(self, side_px: int) -> tuple[NDArray[np.uint8], float]:
         """Return the picture with a longer side of about ``side_px``, and the image's pixels per pixel of it."""
         if side_px not in self._kept:
-            # whole blocks of pixels, so that the picture's own pixels lie where the factor says
+            # whole blocks of pixels, so that the picture's own pixels are at the factor's positions
             factor = max(round(max(self.size_px) / side_px), 1)
             size = (self.size_px[0] // factor, self.size_px[1] // factor)
             picture = self.grey[: size[1] * factor, : size[0] * factor]

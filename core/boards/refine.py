@@ -1,4 +1,4 @@
-"""Places of corners and dots from coarse ones: which pixels tell of each, and what a fit must show to be believed."""
+"""Places of corners and dots from coarse ones: choice of pixels for each fit, and the conditions on a fit."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float, Float32
-from core.boards.board import BoardTarget
-from core.boards.kernels import CORNER, DOT, N_CORNER, N_DOT, N_GEOMETRY, fit_points
-from core.boards.view import neighbour_distances_px, steps_px
+from stereorig.core.arrays import Bool, Float, Float32
+from stereorig.core.boards.board import BoardTarget
+from stereorig.core.boards.kernels import CORNER, DOT, N_CORNER, N_DOT, N_GEOMETRY, fit_points
+from stereorig.core.boards.view import neighbour_distances_px, steps_px
 
-_REACH = 0.5  # of the distance of neighbouring corners: each pixel tells of one corner only
+_REACH = 0.5  # share of the distance of neighbouring corners: each pixel belongs to one corner only
 _MAX_REACH_PX = 60.0  # beyond, a lens bends an edge by more than a parabola
-_MAX_MOVE = 0.25  # of the distance of neighbouring corners, from the coarse corner
+_MAX_MOVE = 0.25  # share of the distance of neighbouring corners, from the coarse corner
 _LEAST_CROSSING = 0.15  # sine of the angle of the edges
 _FIRST_BLUR_PX = 0.9
 _RIM_BLURS, _RIM_PX = 4.0, 1.5  # about a dot's rim
-_MISFIT = 3.0  # of the other points' residuals
-_MISFIT_SHARE = 0.06  # of the contrast, that a good point's residuals may have
-_LEAST_CONTRAST = 0.25  # of the other points'
+_MISFIT = 3.0  # multiple of the other points' residuals
+_MISFIT_SHARE = 0.06  # share of the contrast, that a good point's residuals may have
+_LEAST_CONTRAST = 0.25  # share of the other points' contrast
 # standard deviation of the ground's slope, as part of the contrast: of any lighting, a px, and about the slope that the
-# neighbours' levels show, a distance of neighbours; a dot alone tells its place and a slope apart poorly
+# neighbours' levels show, a distance of neighbours; a single dot separates its place from a slope poorly
 _FREE_SLOPE, _KNOWN_SLOPE = 0.01, 0.0015
 _PIXEL_VARIANCE = 1.0 / 12.0
-_SETTLED_PX = (0.03, 1e-5)  # of the first fit, and of the second from there
+_SETTLED_PX = (0.03, 1e-5)  # steps at which the first fit ends, and the second that starts from it
 
 
 @dataclass(frozen=True)

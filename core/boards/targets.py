@@ -1,4 +1,4 @@
-"""One way to find whichever target is declared, and the name of another one that an image shows instead."""
+"""Detection of the declared target of any kind, and the name of another target that an image shows instead."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.boards.board import BoardTarget
-from core.boards.detect import detect_board, find_board
-from core.boards.naming import other_target, shown_target
-from core.boards.pictures import Pictures
-from core.boards.view import BoardView
-from core.errors import TargetError
-from core.grid import GridOptions, GridView, Localiser, detect_grid, find_grid
-from core.grid.threshold import checked_image
-from core.target import GridTarget
+from stereorig.core.arrays import Float
+from stereorig.core.boards.board import BoardTarget
+from stereorig.core.boards.detect import detect_board, find_board
+from stereorig.core.boards.naming import other_target, shown_target
+from stereorig.core.boards.pictures import Pictures
+from stereorig.core.boards.view import BoardView
+from stereorig.core.errors import TargetError
+from stereorig.core.grid import GridOptions, GridView, Localiser, detect_grid, find_grid
+from stereorig.core.grid.threshold import checked_image
+from stereorig.core.target import GridTarget
 
 # causes that another target than a line grid gives the search for lines
 _MAY_BE_OTHER = frozenset(
@@ -40,7 +40,7 @@ def detect_target(
     target
         Line grid or board.
     localiser, options
-        Of line grids, see :func:`core.grid.detect_grid`.
+        Options for line grids, see :func:`stereorig.core.grid.detect_grid`.
 
     Returns
     -------
@@ -50,8 +50,8 @@ def detect_target(
     Raises
     ------
     ImageError, TargetError
-        See :func:`core.grid.detect_grid` and :func:`core.boards.detect_board`; ``target_other`` where a line grid is
-        declared and a board is seen, too.
+        See :func:`stereorig.core.grid.detect_grid` and :func:`stereorig.core.boards.detect_board`; ``target_other``
+        also if a line grid is declared and a board is seen.
     """
     if isinstance(target, BoardTarget):
         return detect_board(image, target)
@@ -77,8 +77,8 @@ def find_target(image: NDArray[Any], target: GridTarget | BoardTarget, *, option
     Raises
     ------
     ImageError, TargetError
-        As :func:`detect_target`, but for what only the fit of the points shows, and without the name of another target:
-        where nothing is found, :func:`detect_target` tells why.
+        As :func:`detect_target`, except those that only the fit of the points raises, and without the name of another
+        target: after a search without success, :func:`detect_target` gives the cause.
     """
     if isinstance(target, BoardTarget):
         return find_board(image, target)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Float
-from core.boards.board import BoardTarget
+from stereorig.core.arrays import Float
+from stereorig.core.boards.board import BoardTarget
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,9 +19,9 @@ class BoardView:
     target
         The description it was found by.
     xy_px
-        (columns, rows, 2) corners, or centres of the dots' ellipses as imaged, NaN where one was not found. A circle's
-        image is an ellipse whose centre is not the image of the circle's, see
-        :func:`core.boards.eccentricity.dot_centre_offset_px`.
+        (columns, rows, 2) corners, or centres of the dots' ellipses as imaged, NaN for points that were not found. A
+        circle's image is an ellipse whose centre is not the image of the circle's, see
+        :func:`stereorig.core.boards.eccentricity.dot_centre_offset_px`.
     sigma_px
         (columns, rows) standard deviation per axis, from the image's own noise and edges; NaN where not found.
     radius_px
@@ -40,7 +40,7 @@ class BoardView:
     contrast, noise
         Grey levels: median step at an edge, and standard deviation about the fitted picture.
     marks
-        (column, row) of the three dots that mark the axes, the corner's first; empty where there are none.
+        (column, row) of the three dots that mark the axes, the corner's first; empty without marks.
     """
 
     target: BoardTarget
@@ -87,7 +87,7 @@ def measured_dot_radius_mm(xy_px: Float, radius_px: Float, target: BoardTarget) 
         The board.
     """
     ex, ey = steps_px(xy_px, 0), steps_px(xy_px, 1)
-    # of an asymmetric grid two dots of a row lie two pitches apart; that rows are shifted changes no area
+    # dots in a row of an asymmetric grid are two pitches apart; the rows' shift changes no area
     cell_mm2 = target.pitch_mm**2 * (2.0 if target.kind == "circles_asymmetric" else 1.0)
     px_per_mm = np.sqrt(np.abs(ex[..., 0] * ey[..., 1] - ex[..., 1] * ey[..., 0]) / cell_mm2)
     return float(np.nanmedian(radius_px / px_per_mm))
@@ -100,7 +100,8 @@ def steps_px(xy_px: Float, axis: int) -> Float:
 
 def neighbour_distances_px(xy_px: Float, target: BoardTarget) -> Float:
     """Return (columns, rows) mean distance to the neighbours one pitch away, NaN without any."""
-    # of a row, and of two rows; dots of an asymmetric grid's row lie two pitches apart, those of two rows diagonally
+    # distances in a row, and between two rows; dots in a row of an asymmetric grid are two pitches apart, across rows
+    # the distance is diagonal
     pitches = (2.0, float(np.sqrt(2.0))) if target.kind == "circles_asymmetric" else (1.0, 1.0)
     distances = []
     for axis, per_step in enumerate(pitches):

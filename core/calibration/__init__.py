@@ -2,23 +2,23 @@
 
 from typing import TYPE_CHECKING
 
-from core.lazy import names_of
+from stereorig.core.lazy import names_of
 
 if TYPE_CHECKING:
-    from core.calibration.checks.distance import DistanceCheck, check_known_distance
-    from core.calibration.checks.measures import CheckMeasures, Measures, measure_points
-    from core.calibration.inputs import (
+    from stereorig.core.calibration.checks.distance import DistanceCheck, check_known_distance
+    from stereorig.core.calibration.checks.measures import CheckMeasures, Measures, measure_points
+    from stereorig.core.calibration.inputs import (
         AnyTarget,
         CalibrationOptions,
         CalibrationView,
-        NominalCamera,
+        NominalValues,
         TargetLike,
         inner_nodes_mm,
     )
-    from core.calibration.prepare import predict_uncertainty
-    from core.calibration.result import COVARIANCE_NAMES, CalibrationResult, CheckDone, Verdict, ViewResult
-    from core.calibration.solve import calibrate
-    from core.calibration.uncertainty import VolumeUncertainty, volume_uncertainty
+    from stereorig.core.calibration.prepare import predict_uncertainty
+    from stereorig.core.calibration.result import COVARIANCE_NAMES, CalibrationResult, CheckDone, Verdict, ViewResult
+    from stereorig.core.calibration.solve import calibrate
+    from stereorig.core.calibration.uncertainty import VolumeUncertainty, volume_uncertainty
 
 __all__ = [
     "COVARIANCE_NAMES",
@@ -30,7 +30,7 @@ __all__ = [
     "CheckMeasures",
     "DistanceCheck",
     "Measures",
-    "NominalCamera",
+    "NominalValues",
     "TargetLike",
     "Verdict",
     "ViewResult",
@@ -52,7 +52,7 @@ __getattr__, __dir__ = names_of(
             "AnyTarget",
             "CalibrationOptions",
             "CalibrationView",
-            "NominalCamera",
+            "NominalValues",
             "TargetLike",
             "inner_nodes_mm",
         ),

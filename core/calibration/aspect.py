@@ -1,8 +1,7 @@
 """The aspect ratio lambda as its own measurement, section 3.2.2.
 
-With the optical axis normal to the grid and lines at about 45 degrees, both diagonals of a square block of
-intersections have one physical length; one runs along the columns, the other along the rows. lambda is the ratio of
-their extents in the image, |dY_img| over |dX_img|, whatever the grid's rotation in its plane.
+If the optical axis is normal to the grid and the lines are at about 45 degrees, both diagonals of a square block of
+intersections have one physical length; one runs along the columns, the other along the rows.
 
 Effect of tilt: a grid turned by a small angle tau about the rows shows its columns shorter by tau^2 / 2 (1 degree:
 1.5e-4), one turned about the columns makes lambda too large by as much. The diagonals do not show it. The refinement
@@ -18,14 +17,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Float
-from core.cameras.camera import ELEVEN_PARAMETER_NAMES, Camera
-from core.errors import CalibrationInputError
-from core.grid.view import GridView
-from core.target import GridTarget
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import ELEVEN_PARAMETER_NAMES, Camera
+from stereorig.core.errors import CalibrationInputError
+from stereorig.core.grid.view import GridView
+from stereorig.core.target import GridTarget
 
 _BLOCK = 5
-_CENTRE_PRIOR = 0.04  # of the image's width: the image centre is never far from the middle, and has little effect
+_CENTRE_PRIOR = 0.04  # share of the image's width: the image centre is never far from the middle, and has little effect
 _KAPPA_PRIOR = 0.1  # kappa r^2 at the image's corner
 _SIGMA_FLOOR_PX = 1e-4
 _MIN_MOVED = 3
@@ -39,7 +38,7 @@ class AspectResult:
     Attributes
     ----------
     aspect, sigma
-        The best value and its standard deviation: the refined one where there is one, else the first.
+        The best value and its standard deviation: the refined one if there is one, else the first.
     first_estimate, first_estimate_sigma
         Mean over blocks and images of the diagonals' ratio; standard deviation of the images' means over the root of
         their number.

@@ -1,7 +1,7 @@
-"""The aspect ratio from images of the grid alone, section 3.2.2, refused where they do not show it.
+"""The aspect ratio from images of the grid alone, section 3.2.2, with an error for images that do not show it.
 
 The measure needs the lines at about 45 degrees and the optical axis along the grid's normal: a tilt tau changes lambda
-by tau^2 / 2 at most. Perspective shows the tilt; it gives an angle where the stand-off is known.
+by tau^2 / 2 at most. Perspective shows the tilt; it gives an angle if the stand-off is known.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.calibration.aspect import AspectResult, measure_aspect
-from core.calibration.grid_normality import grid_perspective
-from core.errors import CalibrationInputError
-from core.grid.view import GridView
+from stereorig.core.calibration.aspect import AspectResult, measure_aspect
+from stereorig.core.calibration.grid_normality import grid_perspective
+from stereorig.core.errors import CalibrationInputError
+from stereorig.core.grid.view import GridView
 
 MAX_TILT_RAD = float(np.radians(1.0))  # lambda is off by 1.5e-4
 _MAX_OFF_DIAGONAL_RAD = float(np.radians(20.0))
@@ -34,8 +34,8 @@ class AspectMeasurement:
     images
         Number of images.
     tilt_rad, tilt_sigma_rad
-        Largest angle between grid and image plane, and its standard deviation; an upper bound where the stand-off was
-        not given.
+        Largest angle between grid and image plane, and its standard deviation; an upper bound if the stand-off was not
+        given.
     tilt_effect
         The most by which tilts so large change the aspect ratio.
     standoff_known
@@ -64,8 +64,8 @@ def measure_aspect_normal(
     views
         The grid in one camera's images, moved about in its plane between them; the paper takes twenty.
     standoff_mm
-        Distance of the camera from the grid, good to a few tens of percent. Without it, that of the longest lens in use
-        is taken, which sees the same perspective at the largest tilt.
+        Distance of the camera from the grid, good to a few tens of percent. Without it, the stand-off of the longest
+        lens in use is taken, which sees the same perspective at the largest tilt.
     names
         Names of the views in messages.
 
@@ -88,7 +88,7 @@ def measure_aspect_normal(
     perspective = grid_perspective(views)
     standoff = _longest_standoff_mm(views) if standoff_mm is None else standoff_mm
     tilt, tilt_sigma = perspective.tilt_rad(standoff)
-    # of random errors the largest of many is large; each image's is compared with its own
+    # the largest of many random errors is large, so each image's tilt is compared with its own uncertainty
     excess = tilt - _SIGMAS * tilt_sigma
     worst = int(np.argmax(excess))
     shown = f"{np.degrees(tilt[worst]):.2f} +- {np.degrees(tilt_sigma[worst]):.2f} degrees"

@@ -8,23 +8,23 @@ from typing import Literal
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.fit.layout import State, camera_of, camera_seeing
-from core.calibration.fit.named import named_by_cause, named_covariance, parameter_names
-from core.calibration.inputs import (
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.fit.layout import State, camera_of, camera_seeing
+from stereorig.core.calibration.fit.named import named_by_cause, named_covariance, parameter_names
+from stereorig.core.calibration.inputs import (
     AnyTarget,
     BoardLike,
     CalibrationOptions,
     CalibrationView,
-    NominalCamera,
+    NominalValues,
     extent_mm,
     nodes_of,
 )
-from core.calibration.prepare import EXPECTED_NOISE_PX, covariance_at, covariance_parts_at, problem_of
-from core.calibration.uncertainty import VolumeUncertainty, point_derivatives, volume_uncertainty
-from core.cameras.stereo import StereoPair
-from core.errors import CalibrationInputError
-from core.names import CAMERAS, Cause
+from stereorig.core.calibration.prepare import EXPECTED_NOISE_PX, covariance_at, covariance_parts_at, problem_of
+from stereorig.core.calibration.uncertainty import VolumeUncertainty, point_derivatives, volume_uncertainty
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import CalibrationInputError
+from stereorig.core.names import CAMERAS, Cause
 
 LineModel = Literal["straight", "parabola", "local"]
 _PER_LINE = {"straight": 2, "parabola": 3}
@@ -43,9 +43,9 @@ class Expectation:
     points_mm, sigma_mm
         (9, 3) the middle of the volume, then its corners, and the standard deviation of X, Y, Z there.
     seen
-        Of each camera, the share of the inner intersections in the nominal camera's image at the worst position.
+        For each camera, the share of the inner intersections in the nominal camera's image at the worst position.
     reasons
-        Reasons for which :func:`core.calibration.calibrate` would refuse such views; empty if it would not.
+        Reasons for which :func:`stereorig.core.calibration.calibrate` would refuse such views; empty if it would not.
     pair
         The nominal cameras.
     covariance, by_cause
@@ -65,7 +65,7 @@ class Expectation:
 
 
 def correlation_of_lines(target: AnyTarget, line_model: LineModel | None) -> float:
-    """Observed coordinates per independent one, where intersections come from whole lines (1 where they do not)."""
+    """Observed coordinates per independent one, for intersections computed from whole lines (else 1)."""
     per_line = _PER_LINE.get(line_model or "")
     if per_line is None or isinstance(target, BoardLike):
         return 1.0
@@ -76,7 +76,7 @@ def correlation_of_lines(target: AnyTarget, line_model: LineModel | None) -> flo
 def expect(
     positions_mm: Sequence[float],
     target: AnyTarget,
-    nominals: tuple[NominalCamera, NominalCamera],
+    nominals: tuple[NominalValues, NominalValues],
     options: CalibrationOptions | None = None,
     *,
     noise_px: float = EXPECTED_NOISE_PX,
@@ -93,7 +93,7 @@ def expect(
     positions_mm
         dZ of the fitted positions, the same for both cameras.
     target, nominals, options
-        As for :func:`core.calibration.calibrate`; held-out positions have no effect.
+        As for :func:`stereorig.core.calibration.calibrate`; held-out positions have no effect.
     noise_px
         Standard deviation of an intersection's image coordinate.
     roll_deg
@@ -104,9 +104,9 @@ def expect(
     Raises
     ------
     CalibrationInputError
-        ``calibration_unseen`` where a camera sees too few intersections.
+        ``calibration_unseen`` if a camera sees too few intersections.
     CalibrationError
-        ``calibration_singular`` where the positions determine nothing.
+        ``calibration_singular`` if the positions determine nothing.
     """
     options = options or CalibrationOptions()
     nodes = nodes_of(target)
@@ -148,11 +148,11 @@ def expect(
     covariance = named_covariance(layout, priors, x, unknowns)
     pair = StereoPair(*(camera_of(layout, x, c) for c in range(2)))
     volume = volume_uncertainty(pair, covariance, target, names)
-    # a declared tilt of the stage axis makes the centre uncertain at any travel: only what the travel leaves is judged
-    travel_only = problem_of(views, target, nominals, replace(options, axis_tilt_sigma_rad=0.0))
+    # a declared tilt of the stage axis makes the centre uncertain at any travel: only the travel's effect is judged
+    travel_only = problem_of(views, target, nominals, replace(options, axis_tilt_sigma_rad=0.0, aspect_sigma=0.0))
     held = travel_only.priors(layout)
     travel = named_covariance(layout, held, x, covariance_at(travel_only, layout, state, noise_px=noise_px))
-    centre_px = volume_uncertainty(pair, travel, target, names).centre_px
+    centre_px = volume_uncertainty(pair, travel, target, parameter_names(layout, held)).centre_px
     points = np.concatenate([np.zeros((1, 3)), _corners(volume.points_mm)])
     G = point_derivatives(pair, points, names)
     spread = np.diagonal(G @ covariance @ np.swapaxes(G, 1, 2), axis1=1, axis2=2)
@@ -188,7 +188,7 @@ def _reasons(
             f"{1e3 * options.max_shape_uncertainty * extent_mm(target):.3g} um.",
         ),
         (
-            # of a single stage the direction is unknown, and one with the centre
+            # a single stage's direction is unknown and cannot be separated from the centre
             centre_px if options.moves == "cameras" else 0.0,
             options.max_centre_sigma_px,
             f"An image centre would be uncertain by {centre_px:.3g} px; allowed are "

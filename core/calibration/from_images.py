@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -11,19 +12,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.boards import BoardTarget, BoardView, detect_target
-from core.calibration.choice.screening import DroppedView
-from core.calibration.fit.free_start import MIN_POSES
-from core.calibration.inputs import CalibrationOptions, CalibrationView, NominalCamera, place
-from core.calibration.prepare import check_both, check_hold_out
-from core.calibration.result import CalibrationResult
-from core.calibration.solve import calibrate
-from core.errors import CalibrationInputError, ImageError, StereorigError
-from core.grid import GridOptions, GridView, Localiser
-from core.names import CAMERAS, CameraName
-from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
-from core.target import GridTarget
-from core.threads import run_ranges
+from stereorig.core.boards import BoardTarget, BoardView, detect_board, detect_target
+from stereorig.core.calibration.choice.screening import DroppedView
+from stereorig.core.calibration.fit.free_start import MIN_POSES
+from stereorig.core.calibration.inputs import CalibrationOptions, CalibrationView, NominalValues, check_view, place
+from stereorig.core.calibration.prepare import check_both, check_hold_out
+from stereorig.core.calibration.result import CalibrationResult
+from stereorig.core.calibration.solve import calibrate
+from stereorig.core.errors import CalibrationInputError, ImageError, StereorigError, TargetError
+from stereorig.core.grid import GridOptions, GridView, Localiser
+from stereorig.core.names import CAMERAS, CameraName
+from stereorig.core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
+from stereorig.core.target import GridTarget
+from stereorig.core.threads import run_ranges
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,8 @@ class ImageOfTarget:
     camera
         The camera.
     dz_mm
-        Read-back position of the stage, mm, positive where target and cameras move apart; None for a free pose.
+        Read-back position of the stage, mm, positive if target and cameras move away from each other; None for a free
+        pose.
     pixels
         (rows, columns).
     name
@@ -58,7 +60,7 @@ class ImageOfTarget:
 
 @dataclass(frozen=True)
 class CalibrationFromImages:
-    """The targets detected, in the images' order, None where a free pose's was not; and the calibration from them."""
+    """The targets detected, in the images' order, None for a free pose without one; and the calibration from them."""
 
     grids: tuple[GridView | BoardView | None, ...]
     result: CalibrationResult
@@ -67,7 +69,7 @@ class CalibrationFromImages:
 def calibrate_views(
     images: Sequence[ImageOfTarget],
     target: GridTarget | BoardTarget,
-    nominals: tuple[NominalCamera, NominalCamera],
+    nominals: tuple[NominalValues, NominalValues],
     options: CalibrationOptions | None = None,
     *,
     localiser: Localiser = "profile",
@@ -82,9 +84,9 @@ def calibrate_views(
     images
         Images of both cameras, held-out ones included.
     target, nominals, options
-        See :func:`core.calibration.solve.calibrate`.
+        See :func:`stereorig.core.calibration.solve.calibrate`.
     localiser, grid_options
-        See :func:`core.grid.detect_grid`. Where node corrections are estimated, the profile localiser takes each
+        See :func:`stereorig.core.grid.detect_grid`. If node corrections are estimated, the profile localiser takes each
         intersection from the lines near it: a fit over whole lines smears the nodes' errors into the cameras. On eight
         simulated 4 um grids the shape error was the same (0.40 um against 0.37), but only then was the covariance right
         (errors of the parameters 2 to 3.6 sigma with straight lines, 0.4 to 1.2 with local).
@@ -97,7 +99,7 @@ def calibrate_views(
         The image named cannot be used; ``image_size_mismatch`` where its size is not the rig's. A free pose whose
         target is not found is left out, unless too few remain.
     CalibrationInputError, CalibrationError
-        See :func:`core.calibration.solve.calibrate`.
+        See :func:`stereorig.core.calibration.solve.calibrate`.
     """
     options = options or CalibrationOptions()
     check_both([[i for i in images if i.camera == name] for name in CAMERAS])
@@ -113,6 +115,7 @@ def calibrate_views(
         lambda done: progress("grid", done, total),
         cancel,
     )
+    detected = _found_in_part(images, detected, target)
     found = [None if isinstance(each, StereorigError) else each for each in detected]
     failed = [(i, each) for i, each in zip(images, detected, strict=True) if isinstance(each, StereorigError)]
     for image, error in failed:
@@ -122,11 +125,43 @@ def calibrate_views(
     raise_if_cancelled(cancel)
     progress("calibration", len(images), total)
     radius_mm = _dot_radius_mm(target, found)
-    views = [view_of(image, grid, radius_mm) for image, grid in zip(images, found, strict=True) if grid is not None]
-    result = calibrate(views, target, nominals, options)
+    views: list[CalibrationView] = []
+    for image, grid in zip(images, found, strict=True):
+        if grid is None:
+            continue
+        view = view_of(image, grid, radius_mm)
+        try:
+            check_view(view, target, nominals[CAMERAS.index(image.camera)])
+        except CalibrationInputError as error:
+            if image.frame is None:
+                raise
+            failed.append((image, error))  # if one of many poses cannot be used, the others still can
+            continue
+        views.append(view)
+    seen, shown = {v.frame for v in views}, {i.frame for i in images}
+    kept = tuple(k for k in options.held_out_frames if k in seen or k not in shown)
+    result = calibrate(views, target, nominals, replace(options, held_out_frames=kept))
     lost = tuple(DroppedView(i.label, i.camera, int(i.frame or 0), error.cause) for i, error in failed)
     progress("calibration", total, total)
     return CalibrationFromImages(tuple(found), replace(result, dropped=(*lost, *result.dropped)))
+
+
+def _found_in_part(
+    images: Sequence[ImageOfTarget],
+    detected: list[GridView | BoardView | StereorigError],
+    target: GridTarget | BoardTarget,
+) -> list[GridView | BoardView | StereorigError]:
+    """Look again for dots in free poses that show a part of the grid, by the marks of the views that show it whole."""
+    marks = [each.marks for each in detected if isinstance(each, BoardView) and each.marks]
+    if not isinstance(target, BoardTarget) or not marks:
+        return detected
+    usual = max(marks, key=marks.count)
+    out = list(detected)
+    for k, image in enumerate(images):
+        if isinstance(detected[k], TargetError) and image.frame is not None:
+            with contextlib.suppress(StereorigError):  # its first cause stays
+                out[k] = detect_board(image.pixels, target, marks=usual)
+    return out
 
 
 def _detect_all(
@@ -135,10 +170,10 @@ def _detect_all(
     progress: Callable[[int], None],
     cancel: CancelToken | None,
 ) -> list[GridView | BoardView | StereorigError]:
-    """Find the target in all images, on all threads; where it is not found, the error."""
+    """Find the target in all images, on all threads; for an image without it return the error."""
     out: list[GridView | BoardView | StereorigError | None] = [None] * len(images)
     done = count(1)
-    telling = threading.Lock()
+    reporting = threading.Lock()
     progress(0)
 
     def work(first: int, last: int) -> None:
@@ -148,7 +183,7 @@ def _detect_all(
                 out[k] = detect(images[k].pixels)
             except StereorigError as error:
                 out[k] = error
-            with telling:
+            with reporting:
                 progress(next(done))
 
     run_ranges(work, len(images), 1)
@@ -158,7 +193,7 @@ def _detect_all(
 def grid_options_for(
     target: GridTarget | BoardTarget, options: CalibrationOptions, localiser: Localiser, given: GridOptions
 ) -> GridOptions:
-    """Return the options of a line grid's detection for a calibration; those given where they say more."""
+    """Return the options of a line grid's detection for a calibration; the given ones take precedence."""
     estimated = target.node_tolerance_mm > 0.0 and options.estimate_nodes is not False
     if localiser == "profile" and given.line_model is None and estimated and isinstance(target, GridTarget):
         return replace(given, line_model="local")
@@ -176,7 +211,7 @@ def _check_enough(
     found: Sequence[GridView | BoardView | None],
     failed: Sequence[tuple[ImageOfTarget, StereorigError]],
 ) -> None:
-    """Raise the commonest cause where the target is found in too few free poses."""
+    """Raise the commonest cause if the target is found in too few free poses."""
     if not failed or any(i.frame is None for i in images):
         return
     seen = [{i.frame for i, g in zip(images, found, strict=True) if g is not None and i.camera == n} for n in CAMERAS]
@@ -206,7 +241,7 @@ def _dot_radius_mm(target: GridTarget | BoardTarget, found: Sequence[GridView | 
 
 
 def view_of(image: ImageOfTarget, grid: GridView | BoardView, radius_mm: float | None) -> CalibrationView:
-    """Return what the adjustment takes of a target detected; ``radius_mm`` is that of its dots."""
+    """Return a detected target as the adjustment's input; ``radius_mm`` is the radius of its dots."""
     if isinstance(grid, BoardView):
         return CalibrationView(
             image.camera,
@@ -239,7 +274,7 @@ def _coordinates_per_independent_one(grid: GridView) -> float:
     return max(float(2.0 * n_a * n_b / (per_line * (n_a + n_b))), 1.0)
 
 
-def _check_size(image: ImageOfTarget, nominal: NominalCamera) -> None:
+def _check_size(image: ImageOfTarget, nominal: NominalValues) -> None:
     if image.pixels.ndim != 2:
         raise ImageError(
             f"{image.label} has the shape {image.pixels.shape}, not (rows, columns).",

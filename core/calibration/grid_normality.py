@@ -1,7 +1,8 @@
-"""How far a line grid's plane is turned out of the image plane, from the perspective in its images.
+"""Angle between a line grid's plane and the image plane, from the perspective in its images.
 
-A grid turned by tau shows its far side smaller: its depth varies by tan(tau) / stand-off for every millimetre across
-it. A homography has just these two numbers beside an affine map; a Seidel term takes the lens's distortion away.
+The far side of a grid turned by tau is imaged smaller: its depth varies by tan(tau) / stand-off for every millimetre
+across it. A homography has just these two numbers more than an affine map; a Seidel term accounts for the lens's
+distortion.
 """
 
 from __future__ import annotations
@@ -11,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.expect import correlation_of_lines
-from core.grid.view import GridView
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.expect import correlation_of_lines
+from stereorig.core.grid.view import GridView
 
 _KAPPA_PRIOR = 0.1  # kappa r^2 at the image's corner
 _SIGMA_FLOOR_PX = 1e-4

@@ -8,10 +8,10 @@ from typing import Literal, Protocol, get_args, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Bool, Float
-from core.calibration.fit.lens_form import LensChoice
-from core.errors import CalibrationInputError
-from core.names import CameraName
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.calibration.fit.lens_form import LensChoice
+from stereorig.core.errors import CalibrationInputError
+from stereorig.core.names import CameraName
 
 Moves = Literal["cameras", "target", "both_cameras", "free"]
 MOVES: tuple[Moves, ...] = get_args(Moves)
@@ -21,7 +21,7 @@ _MIN_SPREAD_PX = 5.0  # rms over the narrower direction
 
 @runtime_checkable
 class BoardLike(Protocol):
-    """The part of a board's description that the calibration needs, beside the tolerance."""
+    """The part of a board's description that the calibration needs, in addition to the tolerance."""
 
     @property
     def pitch_mm(self) -> float:
@@ -89,7 +89,7 @@ class LineOffsetsLike(Protocol):
 
 
 @dataclass(frozen=True)
-class NominalCamera:
+class NominalValues:
     """Nominal data of a camera before it is calibrated.
 
     Attributes
@@ -99,10 +99,10 @@ class NominalCamera:
     phd_px
         Pinhole distance, good to a few tens of percent.
     standoff_mm, angle_deg
-        Distance to the target and gamma of Eq. (1), good to a few tens of percent and some degrees. None where not
+        Distance to the target and gamma of Eq. (1), good to a few tens of percent and some degrees. None if not
         known; stage positions need them, free poses do not.
     aspect
-        Rows' scale over columns' scale; measured on its own (section 3.2.2). Held fixed where only a stage moves.
+        Rows' scale over columns' scale; measured on its own (section 3.2.2). Held fixed if only a stage moves.
     """
 
     image_size_px: tuple[int, int]
@@ -122,7 +122,7 @@ class NominalCamera:
         Raises
         ------
         CalibrationInputError
-            ``nominal_missing`` where one of them is not known.
+            ``nominal_missing`` if one of them is not known.
         """
         if self.standoff_mm is None or self.angle_deg is None:
             missing = "standoff_mm" if self.standoff_mm is None else "angle_deg"
@@ -143,24 +143,24 @@ class CalibrationView:
     camera
         The camera's name.
     dz_mm
-        Read-back position of the stage, positive where target and cameras move apart, whoever moves; None for a free
-        pose.
+        Read-back position of the stage, positive if target and cameras move away from each other, whichever moves; None
+        for a free pose.
     xy_px
-        (n_a, n_b, 2) image positions, first axis along X_sys, second along Y_sys; NaN where one was not found.
+        (n_a, n_b, 2) image positions, first axis along X_sys, second along Y_sys; NaN for points that were not found.
     sigma_px
-        Standard deviation per axis reported by the localiser, as a number or (n_a, n_b); None where it reports none.
-        Only ratios matter: the noise level is estimated from the residuals.
+        Standard deviation per axis reported by the localiser, as a number or (n_a, n_b); None if it reports none. Only
+        ratios matter: the noise level is estimated from the residuals.
     name
         Name used in messages (a file name, for instance).
     correlation
         Observed coordinates per independent one. A fit over whole lines gives every intersection on a line the line's
         own error, so that 162 coordinates of 18 straight lines hold no more information than 36 independent ones.
     frame
-        Number of the free pose, the same for both cameras; None where the stage's position says the pose.
+        Number of the free pose, the same for both cameras; None if the stage's position defines the pose.
     offsets
-        Covariance of the intersections along the lines; None where they are independent of each other.
+        Covariance of the intersections along the lines; None if they are independent of each other.
     dot_radius_mm
-        Radius of the target's dots, whose imaged centres lie off the images of their centres; None for corners.
+        Radius of the target's dots, whose imaged centres differ from the images of their centres; None for corners.
     """
 
     camera: CameraName
@@ -209,14 +209,16 @@ class CalibrationOptions:
     Attributes
     ----------
     moves
-        What moves by dZ: ``cameras`` (each along its optical axis, the paper's), ``target`` or ``both_cameras`` (one
-        stage, its direction is an unknown), or ``free``: nothing, the target is shown in any poses.
+        Part of the rig that moves by dZ: ``cameras`` (each along its optical axis, the paper's), ``target`` or
+        ``both_cameras`` (one stage, its direction is an unknown), or ``free``: no stage, the target is shown in any
+        poses.
     lens
         Lens model; ``auto`` takes the simplest whose residuals hold no structure.
     held_out_mm
         Positions left out of the fit and used for the check.
     held_out_frames
-        The same for free poses, by their numbers. Without any, free poses are checked by leaving each out in turn.
+        The same for free poses, by their numbers. Without any of both, positions between the first and the last, or
+        free poses, are left out of the fit in turn for the check.
     hold_out_tolerance_mm
         Largest difference of a read-back position from the value given in ``held_out_mm``.
     centre_sigma_px
@@ -224,12 +226,15 @@ class CalibrationOptions:
         from drifting along the valley.
     axis_tilt_sigma_rad
         Prior on the angle between stage axis and optical axis, per direction. The residuals cannot show it (1 mrad
-        moves cx by 12 px at the same RBE), so it must be declared; it is carried into the covariance. 0 holds the
-        axis fixed. Default 1 mrad, what a careful alignment reaches.
-    stage_scale_sigma, stage_step_sigma_mm
-        Priors on a stage's relative scale error and on the error of each position read back; 0: exact.
+        moves cx by 12 px at the same RBE), so it must be declared; it is carried into the covariance. 0 holds the axis
+        fixed. Default 1 mrad, as a careful alignment reaches.
+    stage_scale_sigma
+        Prior on a stage's relative scale error; 0: exact. Default 1e-4, a screw's lead without a certificate.
+    stage_step_sigma_mm
+        Prior on the error of each position read back; 0: exact.
     aspect_sigma
-        Prior on the aspect ratio; None holds it where only a stage moves and leaves it open where poses are free.
+        Prior on the aspect ratio. None leaves it open for free poses; if only a stage moves it is held, with 1e-4 of it
+        in the covariance unless it is 1 (square pixels). 0: exact.
     estimate_nodes
         True if node corrections are unknowns; None: if the target has a tolerance.
     max_shape_uncertainty
@@ -238,7 +243,7 @@ class CalibrationOptions:
         Largest predicted standard deviation of the image centre, and of the standoff relative to itself. Near the
         target's plane the shape stays good without any travel; these two show if the travel is enough.
     max_iterations
-        Of the adjustment of both cameras.
+        Limit of iterations of the adjustment of both cameras.
     """
 
     moves: Moves = "cameras"
@@ -248,7 +253,7 @@ class CalibrationOptions:
     hold_out_tolerance_mm: float = 0.02
     centre_sigma_px: float = 20.0
     axis_tilt_sigma_rad: float = 1e-3
-    stage_scale_sigma: float = 0.0
+    stage_scale_sigma: float = 1e-4
     stage_step_sigma_mm: float = 0.0
     aspect_sigma: float | None = None
     estimate_nodes: bool | None = None
@@ -261,7 +266,7 @@ class CalibrationOptions:
 def nodes_of(target: AnyTarget) -> Float:
     """Nominal positions (n_a, n_b, 2) of the target's points, mm, origin at the centre, Z = 0.
 
-    Of a line grid the inner intersections: the outermost lines end at their crossings.
+    For a line grid the inner intersections: the outermost lines end at their crossings.
     """
     if isinstance(target, BoardLike):
         return target.points_mm()
@@ -277,12 +282,21 @@ def inner_nodes_mm(target: TargetLike) -> Float:
 
 
 def pitch_scale_sigma(target: AnyTarget) -> float:
-    """Relative standard deviation of the target's pitch; 0 where it is exact."""
-    return float(getattr(target, "pitch_scale_sigma", 0.0))
+    """Relative standard deviation of the target's pitch; if it is not stated, the points' tolerance over its size.
+
+    The tolerance is a bound, whose standard deviation is a root of three less.
+    """
+    stated = getattr(target, "pitch_scale_sigma", None)
+    return target.node_tolerance_mm / float(np.sqrt(3.0)) / extent_mm(target) if stated is None else float(stated)
+
+
+def least_count_sigma_mm(resolution_mm: float | None) -> float:
+    """Standard deviation of a position that is read back to a least count; 0 if none is stated."""
+    return 0.0 if resolution_mm is None else resolution_mm / float(np.sqrt(12.0))
 
 
 def flatness_mm(target: AnyTarget) -> float:
-    """Bound on the target's departure from a plane; that of its points' positions where it is not stated."""
+    """Bound on the target's departure from a plane; if it is not stated, the bound on its points' positions."""
     flatness = getattr(target, "flatness_mm", None)
     return target.node_tolerance_mm if flatness is None else float(flatness)
 
@@ -305,7 +319,7 @@ def is_held_out(dz_mm: float | None, options: CalibrationOptions, frame: int | N
     return any(abs(dz_mm - held) <= options.hold_out_tolerance_mm for held in options.held_out_mm)
 
 
-def check_view(view: CalibrationView, target: AnyTarget, nominal: NominalCamera) -> None:
+def check_view(view: CalibrationView, target: AnyTarget, nominal: NominalValues) -> None:
     """Raise an error for a view whose numbers cannot be used.
 
     Raises

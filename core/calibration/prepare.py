@@ -7,36 +7,36 @@ from dataclasses import replace
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.checks.positions import PositionCheck, check_positions
-from core.calibration.fit.adjust import expected_covariance
-from core.calibration.fit.layout import Layout, State, camera_of
-from core.calibration.fit.named import named_covariance, parameter_names
-from core.calibration.fit.problem import Problem
-from core.calibration.fit.start import start_pose
-from core.calibration.inputs import (
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.checks.positions import PositionCheck, check_positions
+from stereorig.core.calibration.fit.adjust import expected_covariance
+from stereorig.core.calibration.fit.layout import Layout, State, camera_of
+from stereorig.core.calibration.fit.named import named_covariance, parameter_names
+from stereorig.core.calibration.fit.problem import FitData
+from stereorig.core.calibration.fit.start import start_pose
+from stereorig.core.calibration.inputs import (
     AnyTarget,
     CalibrationOptions,
     CalibrationView,
-    NominalCamera,
+    NominalValues,
     check_view,
     flatness_mm,
     is_held_out,
     nodes_of,
     pitch_scale_sigma,
 )
-from core.calibration.uncertainty import VolumeUncertainty, volume_uncertainty
-from core.cameras.stereo import StereoPair
-from core.errors import CalibrationError, CalibrationInputError
-from core.names import CAMERAS, Cause
+from stereorig.core.calibration.uncertainty import VolumeUncertainty, volume_uncertainty
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import CalibrationError, CalibrationInputError
+from stereorig.core.names import CAMERAS, Cause
 
-EXPECTED_NOISE_PX = 0.005  # of a localiser, for predictions before any residual is known
+EXPECTED_NOISE_PX = 0.005  # noise of a localiser, for predictions before any residual is known
 _SAME_POSITION_MM = 1e-6
 
 Views = list[list[CalibrationView]]
 
 
-def sort_views(views: Sequence[CalibrationView], target: AnyTarget, nominals: Sequence[NominalCamera]) -> Views:
+def sort_views(views: Sequence[CalibrationView], target: AnyTarget, nominals: Sequence[NominalValues]) -> Views:
     """Return each camera's views, every one checked: stage positions ascending, then free poses by their numbers.
 
     Raises
@@ -74,7 +74,7 @@ def check_hold_out(positions_mm: Sequence[Sequence[float]], options: Calibration
     Raises
     ------
     CalibrationInputError
-        ``hold_out_unknown`` where a held-out position was not taken, ``hold_out_all`` where no position is left to fit.
+        ``hold_out_unknown`` if a held-out position was not taken, ``hold_out_all`` if no position is left to fit.
     """
     for name, taken in zip(CAMERAS, positions_mm, strict=True):
         for held in options.held_out_mm:
@@ -96,7 +96,7 @@ def check_hold_out(positions_mm: Sequence[Sequence[float]], options: Calibration
 
 
 def check_both(per_camera: Sequence[Sequence[object]]) -> None:
-    """Raise ``view_missing`` where a camera has no view."""
+    """Raise ``view_missing`` if a camera has no view."""
     for name, own in zip(CAMERAS, per_camera, strict=True):
         if not own:
             raise CalibrationInputError(
@@ -116,27 +116,30 @@ def node_sigmas_mm(target: AnyTarget, options: CalibrationOptions, *, free: bool
 
 
 def problem_of(
-    per_camera: Views, target: AnyTarget, nominals: tuple[NominalCamera, NominalCamera], options: CalibrationOptions
-) -> Problem:
+    per_camera: Views, target: AnyTarget, nominals: tuple[NominalValues, NominalValues], options: CalibrationOptions
+) -> FitData:
     """Return the problem of fitting these views."""
     views = tuple(v for own in per_camera for v in own)
     free = any(v.frame is not None for v in views)
     staged = any(v.dz_mm is not None for v in views)
-    return Problem(
+    node_sigma_mm = node_sigmas_mm(target, options, free=free)
+    # without a stage the scale of a target that errs within a tolerance is found with its other errors as a whole
+    as_a_whole = not staged and node_sigma_mm[0] > 0.0 and getattr(target, "pitch_scale_sigma", None) is None
+    return FitData(
         views=views,
         nodes_mm=nodes_of(target),
         nominals=nominals,
         options=options,
         moves=options.moves if staged else "free",
-        node_sigma_mm=node_sigmas_mm(target, options, free=free),
-        pitch_scale_sigma=pitch_scale_sigma(target),
+        node_sigma_mm=node_sigma_mm,
+        pitch_scale_sigma=0.0 if as_a_whole else pitch_scale_sigma(target),
     )
 
 
 def predict_uncertainty(
     views: Sequence[CalibrationView],
     target: AnyTarget,
-    nominals: tuple[NominalCamera, NominalCamera],
+    nominals: tuple[NominalValues, NominalValues],
     options: CalibrationOptions | None = None,
     *,
     noise_px: float = EXPECTED_NOISE_PX,
@@ -146,7 +149,7 @@ def predict_uncertainty(
     Raises
     ------
     CalibrationError
-        Code ``calibration_singular`` where they do not determine the parameters.
+        Code ``calibration_singular`` if they do not determine the parameters.
     """
     options = options or CalibrationOptions()
     fitted = split_hold_out(sort_views(views, target, nominals), options)
@@ -161,7 +164,7 @@ def predict_uncertainty(
     return predict_at(problem, layout, x, target, noise_px=noise_px)
 
 
-def predict_at(problem: Problem, layout: Layout, x: Float, target: AnyTarget, *, noise_px: float) -> VolumeUncertainty:
+def predict_at(problem: FitData, layout: Layout, x: Float, target: AnyTarget, *, noise_px: float) -> VolumeUncertainty:
     """Predict the uncertainty at given values of the unknowns, without any residual."""
     sigma = covariance_at(problem, layout, State(x, {}, np.zeros_like(problem.flat_nodes_mm)), noise_px=noise_px)
     pair = StereoPair(*(camera_of(layout, x, c) for c in range(2)))
@@ -172,7 +175,7 @@ def predict_at(problem: Problem, layout: Layout, x: Float, target: AnyTarget, *,
     return volume_uncertainty(pair, named, target, names)
 
 
-def covariance_at(problem: Problem, layout: Layout, state: State, *, noise_px: float) -> Float:
+def covariance_at(problem: FitData, layout: Layout, state: State, *, noise_px: float) -> Float:
     """Covariance (m, m) of the unknowns at given values, without any residual: the prediction before measuring.
 
     Raises
@@ -184,9 +187,9 @@ def covariance_at(problem: Problem, layout: Layout, state: State, *, noise_px: f
 
 
 def covariance_parts_at(
-    problem: Problem, layout: Layout, state: State, *, noise_px: float
+    problem: FitData, layout: Layout, state: State, *, noise_px: float
 ) -> tuple[Float, dict[Cause, Float]]:
-    """Covariance as :func:`covariance_at`, and its parts: :func:`core.calibration.fit.adjust.expected_covariance`.
+    """Covariance as :func:`covariance_at`, and its parts, as :func:`.fit.adjust.expected_covariance` returns them.
 
     Raises
     ------
@@ -198,7 +201,7 @@ def covariance_parts_at(
 
 
 def compare_positions(
-    per_camera: Views, nodes_mm: Float, nominals: Sequence[NominalCamera], options: CalibrationOptions
+    per_camera: Views, nodes_mm: Float, nominals: Sequence[NominalValues], options: CalibrationOptions
 ) -> tuple[PositionCheck, ...]:
     """Check every camera's stage positions, held-out ones included, against its images; empty without any."""
     staged = [[v for v in own if v.dz_mm is not None] for own in per_camera]
@@ -214,13 +217,13 @@ def predict_or_refuse(
     per_camera: Views,
     fitted: Views,
     target: AnyTarget,
-    nominals: tuple[NominalCamera, NominalCamera],
+    nominals: tuple[NominalValues, NominalValues],
     options: CalibrationOptions,
 ) -> VolumeUncertainty | None:
-    """Predict the uncertainty from the stage's views, and refuse them where it is too large.
+    """Predict the uncertainty from the stage's views, and raise an error if it is too large.
 
-    Free poses cannot be predicted from nominal values, and where there are some the stage's views need not determine
-    everything; None then.
+    Free poses cannot be predicted from nominal values, and together with them the stage's views need not determine
+    everything: with free poses the prediction is None.
 
     Raises
     ------
@@ -230,8 +233,8 @@ def predict_or_refuse(
     if any(v.frame is not None for own in per_camera for v in own):
         return None
     everything = [v for own in per_camera for v in own]
-    # a declared tilt of the stage axis increases the centre's uncertainty at any travel
-    travel_only = replace(options, axis_tilt_sigma_rad=0.0)
+    # a declared tilt of the stage axis, or an aspect ratio, increases the centre's uncertainty at any travel
+    travel_only = replace(options, axis_tilt_sigma_rad=0.0, aspect_sigma=0.0)
     try:
         predicted = predict_uncertainty(everything, target, nominals, travel_only)
         figure = (

@@ -6,43 +6,52 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.checks.agreement import share_of_own_poses
-from core.calibration.checks.measures import CheckMeasures, Measures, mean_of_cameras, measure_points, pooled
-from core.calibration.checks.positions import PositionCheck
-from core.calibration.choice.held_out import HeldOutView, held_out_view
-from core.calibration.choice.lens import Chosen
-from core.calibration.choice.screening import points_mm
-from core.calibration.fit.adjust import Adjustment
-from core.calibration.fit.layout import camera_of, camera_seeing
-from core.calibration.fit.named import named_by_cause, named_covariance, parameter_names
-from core.calibration.fit.unit_vector import direction
-from core.calibration.inputs import AnyTarget, CalibrationOptions, NominalCamera, flatness_mm
-from core.calibration.result import CalibrationResult, LensChosen, StageFound, ViewResult
-from core.calibration.uncertainty import VolumeUncertainty, volume_uncertainty
-from core.calibration.verdict import assess, checks_made
-from core.cameras.stereo import StereoPair
-from core.errors import CalibrationError
-from core.names import CAMERAS
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.checks.agreement import share_of_own_poses
+from stereorig.core.calibration.checks.measures import CheckMeasures, Measures, mean_of_cameras, measure_points, pooled
+from stereorig.core.calibration.checks.positions import PositionCheck
+from stereorig.core.calibration.choice.held_out import HeldOutView, held_out_view
+from stereorig.core.calibration.choice.lens import Chosen
+from stereorig.core.calibration.choice.screening import points_mm
+from stereorig.core.calibration.choice.structure import Structure, image_fields
+from stereorig.core.calibration.fit.adjust import Adjustment
+from stereorig.core.calibration.fit.layout import camera_of, camera_seeing
+from stereorig.core.calibration.fit.named import named_by_cause, named_covariance, named_derivatives, parameter_names
+from stereorig.core.calibration.fit.unit_vector import direction
+from stereorig.core.calibration.inputs import AnyTarget, CalibrationOptions, NominalValues, flatness_mm
+from stereorig.core.calibration.result import CalibrationResult, LensChosen, StageFound, ViewResult
+from stereorig.core.calibration.uncertainty import (
+    VolumeUncertainty,
+    image_derivatives,
+    shape_of,
+    triangulated,
+    volume_uncertainty,
+)
+from stereorig.core.calibration.verdict import assess, checks_made
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import CalibrationError
+from stereorig.core.names import CAMERAS
 
-_PER_POSE = 4  # nodes each way of a free pose that stand for the volume
+_PER_POSE = 4  # nodes each way of a free pose that represent the volume
+_FEW_LOST = 0.05  # share of the points; a lens that has no ray for more of them cannot be the lens of these views
 
 
 def build_result(
     chosen: Chosen,
     target: AnyTarget,
-    nominals: tuple[NominalCamera, NominalCamera],
+    nominals: tuple[NominalValues, NominalValues],
     options: CalibrationOptions,
     *,
     predicted: VolumeUncertainty | None,
     positions: tuple[PositionCheck, ...],
+    remarks: Sequence[str],
 ) -> CalibrationResult:
-    """Evaluate all views, fitted and held out, under the adjusted cameras.
+    """Evaluate all views, fitted and held out, under the adjusted cameras; ``remarks`` are warnings of the verdict.
 
     Raises
     ------
     CalibrationError
-        Code ``calibration_not_finite`` where a number that would be stored is not finite.
+        Code ``calibration_not_finite`` if a number that would be stored is not finite.
     """
     adjustment, problem = chosen.screened.adjustment, chosen.screened.problem
     layout, state = adjustment.layout, adjustment.state
@@ -80,15 +89,16 @@ def build_result(
         held_out=held_out,
         views=results,
         uncertainty=uncertainty,
-        # of a target declared exact, the finding itself speaks
+        # for a target declared exact, the finding itself reports the corrections
         node_corrections_mm=corrections if free_nodes and target.node_tolerance_mm > 0.0 else None,
         node_tolerance_mm=(target.node_tolerance_mm, flatness_mm(target)),
         options=options,
         centres=[(c.lens, n.image_size_px) for c, n in zip((pair.cam1, pair.cam2), nominals, strict=True)],
-        structure=chosen.structure,
+        structure=[(s, _moved_mm(s, adjustment, pair, nominals, uncertainty.points_mm)) for s in chosen.structure],
         dropped=chosen.screened.dropped,
         staged=bool(problem.staged),
         own_poses=share_of_own_poses(results, points, pair),
+        remarks=remarks,
     )
     sigma = np.sqrt(np.maximum(np.diagonal(adjustment.covariance), 0.0))
     return CalibrationResult(
@@ -115,12 +125,39 @@ def build_result(
         uncertainty=uncertainty,
         predicted=predicted,
         positions=positions,
-        checks=checks_made(held_out=held_out, options=options, moves=problem.moves, aspect_estimated=aspect_estimated),
+        checks=checks_made(
+            held_out=held_out,
+            options=options,
+            moves=problem.moves,
+            aspect_estimated=aspect_estimated,
+            aspect_carried=bool(adjustment.priors.carried.any()),
+            stage_over_pitch=chosen.stage_over_pitch,
+        ),
         verdict=verdict,
         nominals=nominals,
         options=options,
         iterations=adjustment.iterations,
     )
+
+
+def _moved_mm(
+    found: Structure, adjustment: Adjustment, pair: StereoPair, nominals: Sequence[NominalValues], points_mm: Float
+) -> Float | None:
+    """Return the change (3 n,) of measured points (n, 3) by leaving a structure out of the fit, without a rigid motion.
+
+    The images show its terms, and the fit made up for them as far as its unknowns can. None if it is not known.
+    """
+    if found.freed is None:
+        return None
+    layout, priors = adjustment.layout, adjustment.priors
+    pulled = named_derivatives(layout, priors, adjustment.state.x) @ found.freed.pulled
+    images = -image_derivatives(pair, points_mm, parameter_names(layout, priors)) @ pulled
+    for c, (name, camera) in enumerate(zip(CAMERAS, (pair.cam1, pair.cam2), strict=True)):
+        if found.camera == name:
+            p = camera.cam_from_sys.apply(points_mm)
+            fields = image_fields(found, camera.lens, p[:, :2] / p[:, 2:], nominals[c].image_size_px)
+            images[:, 2 * c : 2 * c + 2] += fields @ found.freed.values
+    return shape_of(points_mm, triangulated(pair, points_mm, images[..., None]).reshape(-1, 1))[:, 0]
 
 
 def _stage(adjustment: Adjustment) -> StageFound:
@@ -183,7 +220,27 @@ def _measure(h: HeldOutView, points: Float) -> Measures:
     return measure_points(h.camera, points[found], h.xy_px[found])
 
 
+def _seen(views: Sequence[HeldOutView], points: Float) -> list[HeldOutView]:
+    """Return the views without the points that their cameras have no ray or image for, unless these are many.
+
+    Views left out of a fit may have points outside the range of the fitted views, where a wide lens has no more rays.
+    """
+    lost = []
+    for h in views:
+        with np.errstate(invalid="ignore"):
+            known = h.camera.project(points).valid & h.camera.lens.normalised_from_image(h.xy_px).valid
+        lost.append(np.isfinite(h.xy_px).all(axis=1) & ~known)
+    count = sum(int(np.isfinite(h.xy_px).all(axis=1).sum()) for h in views)
+    if sum(int(part.sum()) for part in lost) > _FEW_LOST * count:
+        return list(views)
+    return [
+        h if not part.any() else HeldOutView(h.view, h.camera, np.where(part[:, None], np.nan, h.xy_px))
+        for h, part in zip(views, lost, strict=True)
+    ]
+
+
 def _check(views: Sequence[HeldOutView], points: Float, nominal_points: Float) -> CheckMeasures:
+    views = _seen(views, points)
     own = [[h for h in views if h.view.camera == name] for name in CAMERAS]
 
     def measures(c: int, nodes: Float) -> Measures:

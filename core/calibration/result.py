@@ -7,19 +7,20 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.camera import TEN_PARAMETER_NAMES, RigidTransform
-from core.cameras.stereo import StereoPair
-from core.names import CAMERAS, CameraName, Cause
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import TEN_PARAMETER_NAMES, RigidTransform
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import CalibrationError
+from stereorig.core.names import CAMERAS, CameraName, Cause
 
 if TYPE_CHECKING:  # who measures reads a calibration's names, and needs nothing that fits one
-    from core.calibration.checks.measures import CheckMeasures
-    from core.calibration.checks.positions import PositionCheck
-    from core.calibration.choice.screening import DroppedView
-    from core.calibration.choice.structure import Structure
-    from core.calibration.fit.lens_form import LensName
-    from core.calibration.inputs import CalibrationOptions, Moves, NominalCamera
-    from core.calibration.uncertainty import VolumeUncertainty
+    from stereorig.core.calibration.checks.measures import CheckMeasures
+    from stereorig.core.calibration.checks.positions import PositionCheck
+    from stereorig.core.calibration.choice.screening import DroppedView
+    from stereorig.core.calibration.choice.structure import Structure
+    from stereorig.core.calibration.fit.lens_form import LensName
+    from stereorig.core.calibration.inputs import CalibrationOptions, Moves, NominalValues
+    from stereorig.core.calibration.uncertainty import VolumeUncertainty
 
 #: parameters of a pair with the paper's lens and a given aspect ratio, the usual order of a covariance
 COVARIANCE_NAMES = tuple(f"{camera}.{name}" for camera in CAMERAS for name in TEN_PARAMETER_NAMES)
@@ -65,7 +66,7 @@ class LensChosen:
     reasons
         Why it was taken.
     structure
-        What its residuals hold beyond noise.
+        Structure of its residuals beyond noise.
     """
 
     model: LensName
@@ -75,17 +76,17 @@ class LensChosen:
 
 @dataclass(frozen=True)
 class StageFound:
-    """What the views say of the stage.
+    """Properties of the stage as the views show them.
 
     Attributes
     ----------
     moves
-        What it moves.
+        Part of the rig that it moves.
     direction_sys, direction_sigma_rad
         (3,) unit vector along which a single stage moves the target in the system frame, dZ growing, and the standard
-        deviation of its first two components (2,); None where each camera has its own stage or nothing moves.
+        deviation of its first two components (2,); None if each camera has its own stage or nothing moves.
     scale, scale_sigma
-        (2,) relative error of each axis' travel; zero and zero where it was held.
+        (2,) relative error of each axis' travel; zero and zero if it was held.
     steps
         Positions read back with the error found and its standard deviation, mm: (axis, dZ, error, sigma).
     """
@@ -100,10 +101,20 @@ class StageFound:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Good, warning or failed, with the reasons as text."""
+    """Good, warning or failed, with the reasons as text, and those that fail with the remedy of each."""
 
     level: Level
     reasons: tuple[str, ...]
+    failures: tuple[tuple[str, str], ...] = ()
+
+    def check(self) -> None:
+        """Raise CalibrationError ``calibration_rejected`` with all that fails, if the verdict is failed."""
+        if self.level == "failed":
+            raise CalibrationError(
+                f"The calibration is not usable: {' '.join(text for text, _ in self.failures)}",
+                code="calibration_rejected",
+                remedy=" ".join(dict.fromkeys(remedy for _, remedy in self.failures)),
+            )
 
 
 @dataclass(frozen=True)
@@ -127,14 +138,14 @@ class CalibrationResult:
         Estimated parameters of camera 1, then of camera 2, and their covariance (n, n); with the paper's lens and a
         given aspect ratio :data:`COVARIANCE_NAMES`. Priors are included.
     covariance_by_cause
-        (n, n) parts of it, which add up to it: ``calibration`` of the views' noise, ``stage`` of what was known of
-        steps, scale and tilt, ``target`` of the pitch and the nodes.
+        (n, n) parts of it, which add up to it: ``calibration`` from the views' noise, ``stage`` from the priors of
+        steps, scale and tilt, ``target`` from the priors of the pitch and the nodes.
     lens
         Lens model and why.
     stage
-        What was found of the stage.
+        Properties of the stage as the views show them.
     pitch_scale, pitch_scale_sigma
-        Relative error of the target's pitch; zero and zero where it was held.
+        Relative error of the target's pitch; zero and zero if it was held.
     dropped
         Views left out, with the reasons.
     noise_px
@@ -142,18 +153,18 @@ class CalibrationResult:
     redundancy
         (2,) observations beyond the unknowns, per camera.
     axis_tilt_rad, axis_tilt_sigma_rad
-        (2, 2) camera by direction; zero where the axis was held.
+        (2, 2) camera by direction; zero if the axis was held.
     node_corrections_mm, node_sigma_mm
-        (n_a, n_b, 2), with free poses (n_a, n_b, 3): estimated departures of the nodes from the nominal target; None
-        where it was held.
+        (n_a, n_b, 2), with free poses (n_a, n_b, 3): estimated departures of the nodes from the nominal target; None if
+        the nodes were held.
     fitted, held_out
-        The paper's measures; ``held_out`` is None where no position was left out.
+        The paper's measures; ``held_out`` is None if no position was left out.
     views
         Residuals per view, cameras in order, positions ascending.
     uncertainty
         Predicted uncertainty in the target's volume.
     predicted
-        The same as it was predicted before the fit, from nominal values; None where the poses were free.
+        The same as it was predicted before the fit, from nominal values; None with free poses.
     positions
         Declared against seen positions, per camera; empty without stage positions.
     checks
@@ -185,7 +196,7 @@ class CalibrationResult:
     positions: tuple[PositionCheck, ...]
     checks: tuple[CheckDone, ...]
     verdict: Verdict
-    nominals: tuple[NominalCamera, NominalCamera]
+    nominals: tuple[NominalValues, NominalValues]
     options: CalibrationOptions
     iterations: int
 

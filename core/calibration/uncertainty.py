@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.inputs import AnyTarget, extent_mm, half_sides_mm
-from core.cameras.stereo import StereoPair
-from core.names import CAMERAS
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.inputs import AnyTarget, extent_mm, half_sides_mm
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.names import CAMERAS
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class VolumeUncertainty:
 def image_derivatives(pair: StereoPair, points_mm: Float, names: Sequence[str]) -> Float:
     """Return d(images in both cameras, x1 y1 x2 y2) / d(parameters by name), (n, 4, len(names)).
 
-    ``names`` are those of a calibration's covariance: ``cam1.`` or ``cam2.`` and a name of the camera's parameters.
+    ``names`` are names as in a calibration's covariance: ``cam1.`` or ``cam2.`` and a name of the camera's parameters.
     """
     B = np.zeros((len(points_mm), 4, len(names)))
     for c, (prefix, camera) in enumerate(zip(CAMERAS, (pair.cam1, pair.cam2), strict=True)):
@@ -67,13 +67,35 @@ def image_derivatives(pair: StereoPair, points_mm: Float, names: Sequence[str]) 
 
 
 def point_derivatives(pair: StereoPair, points_mm: Float, names: Sequence[str]) -> Float:
-    """Return d(triangulated point) / d(parameters by name) at fixed image points, (n, 3, len(names)).
+    """Return d(triangulated point) / d(parameters by name) at fixed image points, (n, 3, len(names))."""
+    return -triangulated(pair, points_mm, image_derivatives(pair, points_mm, names))
 
-    Least-squares triangulation: with A = d(images)/d(point), the point moves by -(A'A)^-1 A' B.
+
+def triangulated(pair: StereoPair, points_mm: Float, images_px: Float) -> Float:
+    """Return the shifts (n, 3, q) of points (n, 3) by shifts (n, 4, q) of their images in both cameras.
+
+    Least-squares triangulation: with A = d(images)/d(point), images moved by B move the point by (A'A)^-1 A' B.
     """
     A = np.concatenate([pair.cam1.point_jacobian(points_mm), pair.cam2.point_jacobian(points_mm)], axis=-2)
     At = np.swapaxes(A, 1, 2)
-    return np.asarray(-np.linalg.solve(At @ A, At @ image_derivatives(pair, points_mm, names)))
+    return np.asarray(np.linalg.solve(At @ A, At @ images_px))
+
+
+def _motions(points_mm: Float) -> Float:
+    """Return displacements (3 n, 7) of points (n, 3): three shifts, three turns, one scale."""
+    arm = points_mm - points_mm.mean(axis=0)
+    motions = np.zeros((len(arm), 3, 7))
+    motions[:, range(3), range(3)] = 1.0
+    for axis in range(3):
+        motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], arm)
+    motions[:, :, 6] = arm
+    return motions.reshape(-1, 7)
+
+
+def shape_of(points_mm: Float, moved: Float) -> Float:
+    """Return displacements (3 n, q) of points (n, 3) without the common rigid motion."""
+    rigid = _motions(points_mm)[:, :6]
+    return np.asarray(moved - rigid @ np.linalg.lstsq(rigid, moved, rcond=None)[0])
 
 
 def volume_points_mm(target: AnyTarget) -> Float:
@@ -89,24 +111,17 @@ def volume_uncertainty(
 ) -> VolumeUncertainty:
     """Propagate the covariance of both cameras' parameters, by name, to points in the calibrated volume.
 
-    ``points_mm`` (n, 3) are the points; without them those of :func:`volume_points_mm`.
+    ``points_mm`` (n, 3) are the points; by default the points from :func:`volume_points_mm`.
     """
     points = volume_points_mm(target) if points_mm is None else points_mm
     G = point_derivatives(pair, points, names)
     cov = G @ covariance @ np.swapaxes(G, 1, 2)
     sigma = np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2), 0.0))
     middle = points.mean(axis=0)
-    motions = np.zeros((len(points), 3, 7))  # three shifts, three turns, one scale
-    motions[:, range(3), range(3)] = 1.0
-    for axis in range(3):
-        motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], points - middle)
-    motions[:, :, 6] = points - middle
-    design = motions.reshape(-1, 7)
     flat = G.reshape(-1, G.shape[2])
-    rigid = design[:, :6]
-    shape = flat - rigid @ np.linalg.lstsq(rigid, flat, rcond=None)[0]
+    shape = shape_of(points, flat)
     shape_variance = float(np.einsum("ip,pq,iq->", shape, covariance, shape, optimize=True)) / len(flat)
-    scale_row = np.linalg.lstsq(design, flat, rcond=None)[0][6]
+    scale_row = np.linalg.lstsq(_motions(points), flat, rcond=None)[0][6]
     shape_rms = float(np.sqrt(max(shape_variance, 0.0)))
     by_name = dict(zip(names, np.sqrt(np.maximum(np.diagonal(covariance), 0.0)).tolist(), strict=True))
     depths = {n: c.cam_from_sys.translation_mm[2] for n, c in zip(CAMERAS, (pair.cam1, pair.cam2), strict=True)}

@@ -6,27 +6,36 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.checks.agreement import DISAGREE_SHARE
-from core.calibration.checks.measures import CheckMeasures, focal_lengths_px
-from core.calibration.choice.screening import DroppedView
-from core.calibration.choice.structure import Structure
-from core.calibration.inputs import CalibrationOptions, Moves
-from core.calibration.result import CheckDone, Level, Verdict, ViewResult
-from core.calibration.uncertainty import VolumeUncertainty
-from core.cameras.lens import LensModel
-from core.names import CAMERAS
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.checks.agreement import DISAGREE_SHARE
+from stereorig.core.calibration.checks.lenses import lens_faults
+from stereorig.core.calibration.checks.measures import CheckMeasures, focal_lengths_px
+from stereorig.core.calibration.choice.contradictions import FAILED_LEVEL
+from stereorig.core.calibration.choice.declared import DECLARED, SCALE, SCALE_GROUPS
+from stereorig.core.calibration.choice.screening import DroppedView
+from stereorig.core.calibration.choice.structure import Structure
+from stereorig.core.calibration.fit.layout import ASPECT_SIGMA
+from stereorig.core.calibration.inputs import CalibrationOptions, Moves
+from stereorig.core.calibration.result import CheckDone, Level, Verdict, ViewResult
+from stereorig.core.calibration.uncertainty import VolumeUncertainty
+from stereorig.core.cameras.lens import LensModel
+from stereorig.core.names import CAMERAS
 
 GOOD_RBE_PX, USABLE_RBE_PX = 0.1, 0.3
+_LIMIT_PX: dict[Level, float] = {"warning": GOOD_RBE_PX, "failed": USABLE_RBE_PX}
 #: lenses sit within some per cent of the sensor's centre; a share of the image's diagonal
 CENTRE_SHARE = 0.15
-#: of the fitted RBE: structure of less than this moves the shape by less than the noise does
+#: of the fitted RBE: errors of the target's points of less than this are hidden by the noise
 STRUCTURE_SHARE = 0.2
 #: of a view's RBE; a mean residual of more is no scatter
 MOVED_SHARE = 0.6
 #: of all views; with more of them left out something is wrong with the way they were taken
-DROPPED_SHARE = 1.0 / 3.0
+DROPPED_SHARE = 0.4
 _ORDER: tuple[Level, Level, Level] = ("good", "warning", "failed")
+_AT_REST = "Take the views again, sharp, with cameras, stage and target at rest; check the target's description."
+_MORE_VIEWS = "Take more views, farther apart."
+_ANOTHER_LENS = "Show the target over the whole image, or ask for a simpler lens."
+_MEASURE = "Measure the target's pitch and the stage's travel, and declare both and the aspect ratio as they are."
 
 
 def worst(a: Level, b: Level) -> Level:
@@ -51,104 +60,137 @@ def assess(
     node_tolerance_mm: tuple[float, float],
     options: CalibrationOptions,
     centres: Sequence[tuple[LensModel, tuple[int, int]]] = (),
-    structure: Sequence[Structure] = (),
+    structure: Sequence[tuple[Structure, Float | None]] = (),
     dropped: Sequence[DroppedView] = (),
     staged: bool = True,
     own_poses: float = 0.0,
+    remarks: Sequence[str] = (),
 ) -> Verdict:
     """Assess a calibration.
 
     By the held-out RBE of each camera, the predicted uncertainty, the node corrections, structure left in the residuals
-    and views that were dropped. ``own_poses``: see :func:`core.calibration.checks.agreement.share_of_own_poses`.
+    and views that were dropped; what passes is a reason of a good verdict only. ``structure`` pairs each structure with
+    its shift of measured points, (3 n,) mm without a rigid motion, or None. ``own_poses``: see
+    :func:`stereorig.core.calibration.checks.agreement.share_of_own_poses`. ``remarks`` are further warnings.
     """
     level: Level = "good"
-    reasons: list[str] = []
-    if held_out is None:
-        level = "warning"
-        reasons.append(
-            f"No {'position' if staged else 'pose'} was held out, so that nothing independent confirms the "
-            f"calibration; fitted RBE {fitted.mean.rbe_px:.4f} px."
-        )
-        measures, word = fitted, "Fitted"
-    else:
-        measures, word = held_out, "Held-out"
-    for name, part in zip(CAMERAS, measures.per_camera, strict=True):
-        this = band(part.rbe_px)
+    passed: list[str] = []
+    found: list[tuple[Level, str, str]] = []
+
+    def note(this: Level, text: str, remedy: str = "") -> None:
+        nonlocal level
         level = worst(level, this)
-        limit = GOOD_RBE_PX if this in ("good", "warning") else USABLE_RBE_PX
-        relation = "within" if this == "good" else "above"
-        reasons.append(f"{word} RBE of {name} {part.rbe_px:.4f} px is {relation} {limit:g} px.")
-    if held_out is not None and (fitted_level := band(max(p.rbe_px for p in fitted.per_camera))) != "good":
-        level = worst(level, fitted_level)
-        reasons.append(f"Fitted RBE {fitted.mean.rbe_px:.4f} px is above {GOOD_RBE_PX:g} px.")
+        found.append((this, text, remedy))
+
+    if held_out is None:
+        note(
+            "warning",
+            f"No {'position' if staged else 'pose'} was held out, and there are too few to leave any out, so that "
+            f"nothing independent confirms the calibration; fitted RBE {fitted.mean.rbe_px:.4f} px.",
+        )
+    for word, measures in (("Held-out", held_out), ("Fitted", fitted)):
+        for name, part in zip(CAMERAS, measures.per_camera if measures is not None else (), strict=False):
+            if (this := band(part.rbe_px)) != "good":
+                note(this, f"{word} RBE of {name} {part.rbe_px:.4f} px is above {_LIMIT_PX[this]:g} px.", _AT_REST)
+            elif measures is held_out:
+                passed.append(f"{word} RBE of {name} {part.rbe_px:.4f} px is within {GOOD_RBE_PX:g} px.")
     typical = float(np.median([v.rbe_px for v in views]))
     ranked = sorted(views, key=lambda v: -v.rbe_px)
     bad = [v for v in ranked[:3] if v.rbe_px > max(2.0 * typical, 0.02) or v.rbe_px > GOOD_RBE_PX]
     if bad:
-        reasons.append("Worst views: " + ", ".join(f"{v.name} {v.rbe_px:.3f} px" for v in bad) + ".")
-        level = worst(level, band(bad[0].rbe_px))
-        # the points of a view that a bump moved are off together; those of a blurred or wrongly found one are not
+        this = band(bad[0].rbe_px)
+        if not staged and this == "failed":
+            # free poses are many: the RBE of all of them, held out and fitted, shows if one spoils the others
+            this = "warning"
+        broken = f" (a view's limit is {_LIMIT_PX[this]:g} px)" if this != "good" else ""
+        note(this, "Worst views: " + ", ".join(f"{v.name} {v.rbe_px:.3f} px" for v in bad) + f"{broken}.", _AT_REST)
+        # the points of a view that a bump moved are displaced together; in a blurred or wrongly found view they are not
         together = [v for v in bad if _shift_px(v) > MOVED_SHARE * v.rbe_px]
         if staged and together:
-            reasons.append(
+            note(
+                this,
                 f"All points of {', '.join(v.name for v in together)} are off the same way: a camera, the stage or the "
-                "target moved there."
+                "target moved there.",
+                _AT_REST,
             )
     if level != "good" and own_poses > DISAGREE_SHARE:
-        reasons.append(
+        note(
+            level,
             f"The cameras disagree about where the target was: {100.0 * own_poses:.0f} % of the squared residuals of "
             "free poses would be gone if each camera had poses of its own. A camera moved between the views, or images "
-            "of one number do not show one pose."
+            "of one number do not show one pose.",
+            _AT_REST,
         )
     if not uncertainty.relative_shape <= options.max_shape_uncertainty:
-        level = "failed"
-        reasons.append(
+        note(
+            "failed",
             f"Predicted shape uncertainty {1e3 * uncertainty.shape_rms_mm:.2f} um is above "
-            f"{1e3 * uncertainty.shape_rms_mm / uncertainty.relative_shape * options.max_shape_uncertainty:.2f} um."
+            f"{1e3 * uncertainty.shape_rms_mm / uncertainty.relative_shape * options.max_shape_uncertainty:.2f} um.",
+            _MORE_VIEWS,
         )
     if node_corrections_mm is not None:
         correction_mm = float(np.abs(node_corrections_mm[..., :2]).max())
         # a bound is a bound; half as much again leaves room for the estimate's own noise
         if correction_mm > 1.5 * node_tolerance_mm[0]:
-            level = worst(level, "warning")
-            reasons.append(
+            note(
+                "warning",
                 f"Node corrections reach {1e3 * correction_mm:.1f} um against a tolerance of "
-                f"{1e3 * node_tolerance_mm[0]:.1f} um: the target, its tolerance or the aspect ratio may be wrong."
+                f"{1e3 * node_tolerance_mm[0]:.1f} um: the target, its tolerance or the aspect ratio may be wrong.",
             )
         bent_mm = float(np.abs(node_corrections_mm[..., 2:]).max(initial=0.0))
         if bent_mm > 1.5 * node_tolerance_mm[1]:
-            level = worst(level, "warning")
-            reasons.append(
+            note(
+                "warning",
                 f"The target departs from a plane by {1e3 * bent_mm:.0f} um, declared are "
-                f"{1e3 * node_tolerance_mm[1]:.0f} um: it was corrected, but it may bend differently from view to view."
+                f"{1e3 * node_tolerance_mm[1]:.0f} um: it was corrected, but it may bend otherwise in each view.",
             )
     for name, (lens, size) in zip(CAMERAS, centres, strict=False):
         cx, cy = lens.kernel_parameters()[4:6]
         off = float(np.hypot(cx - 0.5 * (size[0] - 1), cy - 0.5 * (size[1] - 1)))
         if off > CENTRE_SHARE * np.hypot(*size):
             # an axis off the optical axis moves the principal point by phd * angle, and no residual shows it
-            level = worst(level, "warning")
             suspect = (
                 f"its stage may travel {1e3 * off / focal_lengths_px(lens)[0]:.0f} mrad off the optical axis, or "
                 if staged
                 else ""
             )
-            reasons.append(
+            note(
+                "warning",
                 f"The principal point of {name} lies {off:.0f} px from the image's centre: {suspect}the image is a "
-                "part of the sensor's."
+                "part of the sensor's.",
             )
-    for found in structure:
-        # a misfit that the noise hides does not mislead; its uncertainty holds it
-        if found.rms_px > STRUCTURE_SHARE * min(p.rbe_px for p in fitted.per_camera):
-            level = worst(level, "warning")
-            reasons.append(found.text)
+    for name, (lens, size) in zip(CAMERAS, centres, strict=False):
+        faults, folded = lens_faults(lens, size)
+        if faults:
+            text = f"{name} has a lens that no lens is: {', and '.join(faults)}."
+            note("failed" if folded else "warning", text, _ANOTHER_LENS)
+    moves = [moved for _, moved in structure if moved is not None]
+    together_mm = _rms(np.sum(moves, axis=0)) if moves else 0.0
+    least_mm = min(uncertainty.shape_rms_mm, max((_rms(m) for m in moves), default=0.0))
+    for one, moved in structure:
+        if one.name in DECLARED:
+            off = abs(one.terms.get(SCALE, (np.inf, 0.0))[0])
+            certain = one.probability < FAILED_LEVEL and off > options.max_shape_uncertainty
+            note("failed" if one.name in SCALE_GROUPS and certain else "warning", one.text, _MEASURE)
+        elif moved is None:
+            if one.rms_px > STRUCTURE_SHARE * min(p.rbe_px for p in fitted.per_camera):
+                note("warning", one.text)
+        # a misfit that moves points by less than is reported does not mislead
+        elif together_mm > uncertainty.shape_rms_mm and _rms(moved) >= least_mm:
+            note("warning", f"{one.text} The shape is off by {1e3 * together_mm:.2g} um for it.")
     if dropped:
-        names = ", ".join(view.name for view in dropped)
-        reasons.append(f"Left out of the fit: {names}.")
+        note("good", f"Left out of the fit: {', '.join(view.name for view in dropped)}.")
         if len(dropped) > DROPPED_SHARE * (len(views) + len(dropped)):
-            level = worst(level, "warning")
-            reasons.append(f"{len(dropped)} of {len(views) + len(dropped)} views had to be left out.")
-    return Verdict(level, tuple(reasons))
+            note("warning", f"{len(dropped)} of {len(views) + len(dropped)} views had to be left out.")
+    for text in remarks:
+        note("warning", text)
+    reasons = (*(passed if level == "good" else ()), *(text for _, text, _ in found))
+    return Verdict(level, reasons, tuple((text, remedy) for this, text, remedy in found if this == "failed"))
+
+
+def _rms(moved_mm: Float) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(moved_mm**2)))
 
 
 def _shift_px(view: ViewResult) -> float:
@@ -157,11 +199,17 @@ def _shift_px(view: ViewResult) -> float:
 
 
 def checks_made(
-    *, held_out: CheckMeasures | None, options: CalibrationOptions, moves: Moves, aspect_estimated: bool
+    *,
+    held_out: CheckMeasures | None,
+    options: CalibrationOptions,
+    moves: Moves,
+    aspect_estimated: bool,
+    aspect_carried: bool,
+    stage_over_pitch: tuple[float, float] | None,
 ) -> tuple[CheckDone, ...]:
-    """Return the checks made and not made: a wrong scale or a tilted axis does not show in residuals."""
+    """Return the checks made and not made: a wrong scale or a tilted axis does not always show in residuals."""
     staged = moves != "free"
-    checks = [_held_out_done(held_out, staged=staged)]
+    checks = [_held_out_done(held_out, staged=staged, in_turn=not options.held_out_mm)]
     if staged:
         checks += [
             CheckDone(
@@ -169,11 +217,24 @@ def checks_made(
             ),
             CheckDone("angles", True, "The viewing angles agree with the nominal ones and between the cameras."),
         ]
+    if stage_over_pitch is not None:
+        off, sigma = stage_over_pitch
+        text = f"By the pitch, the stage travels {100.0 * off:+.2f} +- {100.0 * sigma:.2f} % farther than it reads."
+        seen = sigma < options.max_shape_uncertainty
+        if not seen:
+            text += (
+                f" A pitch or a stage that is wrong by up to {300.0 * sigma:.2g} % would not show in these views, and "
+                "the reported error takes both as declared: measure a known distance with both cameras."
+            )
+        checks.append(CheckDone("scales", seen, text))
     checks.append(
         CheckDone(
             "known_distance",
             False,
-            "A wrong pitch cannot be seen in the residuals: measure a known distance with both cameras.",
+            "A pitch that is wrong by less than the stage shows, or by as much as the stage, leaves no residual: "
+            "measure a known distance with both cameras."
+            if staged
+            else "Free poses have no millimetre but the pitch's: measure a known distance with both cameras.",
         )
     )
     tilt = options.axis_tilt_sigma_rad
@@ -189,17 +250,20 @@ def checks_made(
     if aspect_estimated:
         checks.append(CheckDone("aspect", True, "The aspect ratio was found from the free poses."))
     else:
-        checks.append(CheckDone("aspect", False, "The aspect ratio was taken as given."))
+        text = "The aspect ratio was taken as given"
+        if aspect_carried:
+            text += f"; {ASPECT_SIGMA:g} of it are in the covariance"
+        checks.append(CheckDone("aspect", False, f"{text}."))
     return tuple(checks)
 
 
-def _held_out_done(held_out: CheckMeasures | None, *, staged: bool) -> CheckDone:
+def _held_out_done(held_out: CheckMeasures | None, *, staged: bool, in_turn: bool) -> CheckDone:
     if held_out is None:
         return CheckDone("held_out", False, f"No {'position' if staged else 'pose'} was held out.")
     parts = []
     where = sorted({round(p, 3) for c in held_out.positions_mm for p in c})
     if where:
-        parts.append(f"positions {where} mm")
+        parts.append(f"positions {where} mm{', each left out in turn' if in_turn else ''}")
     frames = sorted({k for c in held_out.frames for k in c})
     if frames:
         parts.append(f"{len(frames)} poses, fitted without them")

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Bool, Float
-from core.cameras.camera import Camera, RigidTransform
-from core.cameras.stereo import StereoPair
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.core.cameras.stereo import StereoPair
 
 _MIN_POINTS = 8
-_BEYOND = 0.1  # of the depths of free poses: what the volume goes on before and behind them
+_BEYOND = 0.1  # share of the depths of free poses by which the volume extends in front of and behind them
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +132,7 @@ def _on_plane(nodes_mm: ArrayLike) -> Float:
 
 
 def _seen(camera: Camera, points: Float, size: tuple[int, int]) -> Float:
-    """Camera coordinates of the points that lie in the image."""
+    """Camera coordinates of the points that are in the image."""
     image = camera.project(points)
     inside = image.valid & (image.xy >= 0.0).all(axis=-1) & (image.xy <= np.array(size) - 1.0).all(axis=-1)
     return np.asarray(camera.cam_from_sys.apply(points)[inside])

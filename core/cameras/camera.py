@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Bool, Float
-from core.cameras.lens import LensModel, MappedPoints, SeidelLens
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.lens import LensModel, MappedPoints, SeidelLens
 
 POSE_NAMES = ("alpha_rad", "beta_rad", "gamma_rad", "x0_mm", "y0_mm", "z0_mm")
 TEN_PARAMETER_NAMES = ("phd_px", "cx_px", "cy_px", "kappa_per_px2", *POSE_NAMES)
@@ -30,7 +30,7 @@ class SpacePoints(NamedTuple):
 
 @dataclass(frozen=True)
 class RigidTransform:
-    """``x_b = rotation x_a + translation_mm``; named ``b_from_a`` where it is used.
+    """``x_b = rotation x_a + translation_mm``; a variable of this type is named ``b_from_a``.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Conversion of lens models: exact where they share their terms, else the best fit and its residual."""
+"""Conversion of lens models: exact for models with the same terms, else the best fit and its residual."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.lens import LensModel, OpenCVLens, SeidelLens
-from core.errors import CalibrationError
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.lens import LensModel, OpenCVLens, SeidelLens
+from stereorig.core.errors import CalibrationError
 
 _ACROSS = 41  # positions across the image, each way
 _STEPS = 30

@@ -16,13 +16,14 @@ from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Bool, Float
+from stereorig.core.arrays import Bool, Float
 
 SEIDEL = 0.0
 OPENCV = 1.0
 N_KERNEL_PARAMETERS = 15
 _NEWTON_STEPS = 30
-#: coordinates of arrays from which on they are kept apart from smaller ones, and beyond which they are not kept
+#: number of coordinates of an array from which on its inversion is cached separately from smaller ones, and above which
+#: it is not cached
 _FEW, _MANY = 500, 100_000
 _BISECTIONS = 30  # to 1e-9 of the branch; Newton's method does the rest
 
@@ -77,7 +78,7 @@ class LensModel(Protocol):
 
         ``[kind, fx, fy, skew, cx, cy, d0, d1, d2, d3, d4, r2_max, d5, d6, d7]`` with kind 0 = Seidel (d0 = kappa phd^2,
         the other d zero) or 1 = OpenCV (d = k1 k2 p1 p2 k3, k4 k5 k6), and r2_max the largest normalised radius squared
-        inside the domain.
+        inside the domain. :class:`stereorig.core.cameras.opencv_full.OpenCVFullLens` adds nine.
         """
         ...
 
@@ -248,16 +249,17 @@ class OpenCVLens:
         x, y = n[..., 0], n[..., 1]
         r2 = x * x + y * y
         jac = np.empty((*n.shape[:-1], 2, 2))
-        jac[..., 0, 0], jac[..., 0, 1], jac[..., 1, 1] = self._jacobian(x, y, r2, self._radial(r2))
-        jac[..., 1, 0] = jac[..., 0, 1]
+        jac[..., 0, 0], jac[..., 0, 1], jac[..., 1, 0], jac[..., 1, 1] = self._jacobian(x, y, r2, self._radial(r2))
         return jac
 
-    def _jacobian(self, x: Float, y: Float, r2: Float, radial: Float) -> tuple[Float, Float, Float]:
-        """Derivatives of the distortion: x by x, x by y and y by x, y by y."""
+    def _jacobian(self, x: Float, y: Float, r2: Float, radial: Float) -> tuple[Float, Float, Float, Float]:
+        """Derivatives of the distortion: x by x, x by y, y by x, y by y."""
         slope = self._radial_slope(r2, radial)
+        mixed = x * y * slope + 2.0 * self.p1 * x + 2.0 * self.p2 * y
         return (
             radial + x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x,
-            x * y * slope + 2.0 * self.p1 * x + 2.0 * self.p2 * y,
+            mixed,
+            mixed,
             radial + y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x,
         )
 
@@ -267,9 +269,9 @@ class OpenCVLens:
         radial = self._radial(r2)
         xd, yd = self._shifted(x, y, r2, radial)
         off_x, off_y = xd - to_x, yd - to_y
-        xx, xy, yy = self._jacobian(x, y, r2, radial)
-        det = xx * yy - xy * xy
-        return (yy * off_x - xy * off_y) / det, (xx * off_y - xy * off_x) / det
+        xx, xy, yx, yy = self._jacobian(x, y, r2, radial)
+        det = xx * yy - xy * yx
+        return (yy * off_x - xy * off_y) / det, (xx * off_y - yx * off_x) / det
 
     def _image(self, d: Float) -> Float:
         return np.stack(
@@ -300,15 +302,18 @@ class OpenCVLens:
         return MappedPoints(self._image(self._distorted(np.where(valid[..., None], n, np.nan))), valid)
 
     def normalised_from_image(self, xy_px: ArrayLike) -> MappedPoints:
-        """Invert by Newton's method; not valid where it does not return to the pixel within 1e-9."""
+        """Invert by Newton's method; a result whose image differs from the pixel by more than 1e-9 is not valid."""
         xy = np.asarray(xy_px, dtype=np.float64)
         if xy.ndim == 1 or xy.size > _MANY:
             return self._normalised_from_image(xy)
         return (_inverted_few if xy.size < _FEW else _inverted)(self, xy.shape, xy.tobytes())
 
-    def _normalised_from_image(self, xy: Float) -> MappedPoints:
+    def _distorted_from_image(self, xy: Float) -> Float:
         yd = (xy[..., 1] - self.cy_px) / self.fy_px
-        d = np.stack([(xy[..., 0] - self.cx_px - self.skew_px * yd) / self.fx_px, yd], axis=-1)
+        return np.stack([(xy[..., 0] - self.cx_px - self.skew_px * yd) / self.fx_px, yd], axis=-1)
+
+    def _normalised_from_image(self, xy: Float) -> MappedPoints:
+        d = self._distorted_from_image(xy)
         r_max = np.sqrt(self._r2_max)
         with np.errstate(all="ignore"):  # points that diverge are marked invalid below
             # a quotient may level off or rise to a pole, where Newton's method from d itself would leave the branch
@@ -332,7 +337,9 @@ class OpenCVLens:
 
     def image_jacobian(self, xy_norm: ArrayLike) -> Float:
         """Differentiate the distortion and the pixel map."""
-        jac = self._distorted_jacobian(np.asarray(xy_norm, dtype=np.float64))
+        return self._in_pixels(self._distorted_jacobian(np.asarray(xy_norm, dtype=np.float64)))
+
+    def _in_pixels(self, jac: Float) -> Float:
         out = np.empty_like(jac)
         out[..., 0, :] = self.fx_px * jac[..., 0, :] + self.skew_px * jac[..., 1, :]
         out[..., 1, :] = self.fy_px * jac[..., 1, :]
@@ -341,26 +348,33 @@ class OpenCVLens:
     def parameter_jacobian(self, xy_norm: ArrayLike) -> Float:
         """Differentiate with respect to fx, fy, cx, cy, skew, k1, k2, p1, p2, k3, k4, k5, k6."""
         n = np.asarray(xy_norm, dtype=np.float64)
-        x, y = n[..., 0], n[..., 1]
-        r2 = x * x + y * y
-        d = self._distorted(n)
-        jac = np.zeros((*n.shape[:-1], 2, len(self.parameter_names)))
+        return self._by_parameters(self._distorted(n), self._by_terms(n))
+
+    def _by_parameters(self, d: Float, terms: list[tuple[int, Float, Float]]) -> Float:
+        """Derivatives of the pixels over the parameters, from sensor points and their derivatives over other terms."""
+        jac = np.zeros((*d.shape[:-1], 2, len(self.parameter_names)))
         jac[..., 0, 0] = d[..., 0]
         jac[..., 1, 1] = d[..., 1]
         jac[..., 0, 2] = 1.0
         jac[..., 1, 3] = 1.0
         jac[..., 0, 4] = d[..., 1]
-        # the radial factor is N / D: its derivatives are those of N over D, and -N / D times those of D over D
+        for column, dx, dy in terms:
+            jac[..., 0, column] = self.fx_px * dx + self.skew_px * dy
+            jac[..., 1, column] = self.fy_px * dy
+        return jac
+
+    def _by_terms(self, n: Float) -> list[tuple[int, Float, Float]]:
+        """Derivatives of the distorted point x and y over each term, with its column."""
+        x, y = n[..., 0], n[..., 1]
+        r2 = x * x + y * y
+        # the radial factor is N / D: its derivatives are N's over D, minus N / D times D's over D
         bottom = self._denominator(r2) if self.is_rational else np.ones_like(r2)
         radial = self._radial(r2)
         terms = [(7, 2.0 * x * y, r2 + 2.0 * y * y), (8, r2 + 2.0 * x * x, 2.0 * x * y)]
         for power, over, under in ((1, 5, 10), (2, 6, 11), (3, 9, 12)):
             dx, dy = x * r2**power / bottom, y * r2**power / bottom
             terms += [(over, dx, dy), (under, -radial * dx, -radial * dy)]
-        for column, dx, dy in terms:
-            jac[..., 0, column] = self.fx_px * dx + self.skew_px * dy
-            jac[..., 1, column] = self.fy_px * dy
-        return jac
+        return terms
 
     def kernel_parameters(self) -> Float:
         """Flat form, see :class:`LensModel`."""

@@ -8,14 +8,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.arrays import Bool, Float
-from core.cameras.camera import Camera, RigidTransform, SpacePoints, project_cam
-from core.errors import InputError
-from core.names import CAMERAS
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.camera import Camera, RigidTransform, SpacePoints, project_cam
+from stereorig.core.errors import InputError
+from stereorig.core.names import CAMERAS
 
 Rays = tuple[SpacePoints, SpacePoints]
 """Rays (n, 3) of matched points in both cameras' own frames."""
-_ROUNDING = 1e-12  # of the cameras' distances from the origin: what composed poses leave of a zero
+_ROUNDING = 1e-12  # share of the cameras' distances from the origin: composed poses leave so much of a zero
 
 
 def some_rays(rays: Rays, which: NDArray[np.int64] | Bool) -> Rays:

@@ -1,1 +1,1 @@
-"""Verification of a measuring system: errors against known motions and lengths, a verdict, and what is suspect."""
+"""Verification of a measuring system: errors against known motions and lengths, a verdict, and probable causes."""

@@ -1,4 +1,4 @@
-"""The verdict of a verification: every comparison judged, what is lacking, what is suspect."""
+"""The verdict of a verification: every comparison judged, missing evidence, and probable causes."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from core.certify.comparison import Group, Judged, Outcome, coverage_factor, judged, worst_of
-from core.certify.comparisons import comparisons_of
-from core.certify.evidence import Evidence
-from core.certify.extensometer_class import ExtensometerClass, extensometer_class, is_coarser
-from core.certify.limits import CertificateLimits
-from core.certify.noise_floor import FloorRow, noise_floor
-from core.certify.scales import Scales, scales_of
-from core.certify.suspects import Suspect, suspects_of
+from stereorig.core.certify.comparison import Group, Judged, Outcome, coverage_factor, judged, worst_of
+from stereorig.core.certify.comparisons import comparisons_of
+from stereorig.core.certify.evidence import Evidence
+from stereorig.core.certify.extensometer_class import ExtensometerClass, extensometer_class, is_coarser
+from stereorig.core.certify.limits import CertificateLimits
+from stereorig.core.certify.noise_floor import FloorRow, noise_floor
+from stereorig.core.certify.scales import Scales, scales_of
+from stereorig.core.certify.suspects import Suspect, suspects_of
 
 ReasonCode = Literal[
     "error_beyond_limit",
@@ -39,16 +39,16 @@ _UNITS = {"mm": (1e3, "um"), "rad": (1e3, "mrad"), "1": (1e6, "microstrain")}
 
 @dataclass(frozen=True)
 class Reason:
-    """Why a verdict is not ``pass``.
+    """A reason for a verdict other than ``pass``.
 
     Attributes
     ----------
     outcome
-        What it makes the verdict at least.
+        The lowest verdict that this reason allows: ``conditional`` or ``fail``.
     code
         Stable name.
     text, remedy
-        The reason with its figures, and what to do.
+        The reason with its figures, and the remedy.
     """
 
     outcome: Outcome
@@ -58,17 +58,17 @@ class Reason:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class CertificateVerdict:
     """Outcome of a verification.
 
     Attributes
     ----------
     outcome
-        ``pass``, ``conditional`` (usable within what the reasons say) or ``fail``.
+        ``pass``, ``conditional`` (usable within the limits that the reasons state) or ``fail``.
     k
         Coverage factor of the comparisons.
     reasons, suspects
-        Why it is no pass, and what is suspect.
+        Reasons for a verdict other than ``pass``, and probable causes.
     floor, judged, scales, extensometer
         The tables.
     """
@@ -91,7 +91,7 @@ class Verdict:
         return max(self.of_group(group), key=lambda one: abs(one.comparison.error), default=None)
 
 
-def certify(evidence: Evidence, limits: CertificateLimits) -> Verdict:
+def certify(evidence: Evidence, limits: CertificateLimits) -> CertificateVerdict:
     """Judge a verification procedure.
 
     The probability of a false fail is shared by thirds between the comparisons, each by itself, the scale errors and
@@ -113,7 +113,7 @@ def certify(evidence: Evidence, limits: CertificateLimits) -> Verdict:
         *_lacking(evidence, limits),
     )
     outcome = worst_of([reason.outcome for reason in reasons])
-    return Verdict(outcome, k, reasons, suspects, floor, found, scales, extensometer)
+    return CertificateVerdict(outcome, k, reasons, suspects, floor, found, scales, extensometer)
 
 
 def text_of(value: float, unit: str) -> str:
@@ -172,7 +172,7 @@ def _of_suspects(suspects: Sequence[Suspect], limits: CertificateLimits) -> Iter
         elif suspect.code != "noise":
             by_length = suspect.code in ("calibration_scale", "known_length")
             limit = limits.length_mpe_um if by_length else limits.displacement_mpe_um
-            # a limit says which errors matter, and each is held against it
+            # a limit defines the errors that matter, and each is compared with it
             outcome: Outcome = "fail" if limit is None else "conditional"
             yield Reason(outcome, "common_error", suspect.text, suspect.remedy)
 

@@ -1,4 +1,4 @@
-"""One error beside its uncertainty and its limit, and how all of them are judged together."""
+"""One error, its uncertainty and its limit, and the joint judgement of all errors."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Comparison:
     Attributes
     ----------
     group, name
-        What was compared, and where.
+        The kind of comparison, and its place.
     n
-        The step; None of a length that is of none.
+        The step; None for a length that belongs to no step.
     measured, known
         In the unit; the error is their difference.
     u
@@ -29,7 +29,7 @@ class Comparison:
     unit
         ``mm``, ``rad`` or ``1``.
     limit
-        Maximum permissible error; None where none was stated.
+        Maximum permissible error; None if none was stated.
     """
 
     group: Group
@@ -72,7 +72,7 @@ def worst_of(outcomes: Sequence[Outcome]) -> Outcome:
 
 
 def coverage_factor(count: int, false_alarm: float) -> float:
-    """Return k for which, of so many independent normal errors, one lies beyond k u with this probability (Sidak)."""
+    """Return k such that, with this probability, one of so many independent normal errors exceeds k u (Sidak)."""
     each = 1.0 - (1.0 - false_alarm) ** (1.0 / max(count, 1))
     return NormalDist().inv_cdf(1.0 - 0.5 * each)
 

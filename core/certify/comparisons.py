@@ -6,18 +6,18 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from core.arrays import Float
-from core.certify.comparison import Comparison
-from core.certify.evidence import Evidence, KnownLength, MovedStep, StaticStep
-from core.certify.limits import CertificateLimits
-from core.certify.measured import Measured
+from stereorig.core.arrays import Float
+from stereorig.core.certify.comparison import Comparison
+from stereorig.core.certify.evidence import CheckedLength, Evidence, MovedStep, StaticStep
+from stereorig.core.certify.limits import CertificateLimits
+from stereorig.core.certify.measured import Measured
 
 _AXES = ("X", "Y", "Z")
 _STRAINS = ("exx", "eyy", "exy")
 
 
 def comparisons_of(evidence: Evidence, limits: CertificateLimits) -> tuple[Comparison, ...]:
-    """Return every comparison, those of static pairs first."""
+    """Return every comparison, static pairs first."""
     found: list[Comparison] = []
     for step in evidence.static:
         found += _static(step, limits)
@@ -34,7 +34,7 @@ def way_covariance(step: MovedStep) -> Float:
 
 
 def direction_of(step: MovedStep) -> Float:
-    """(3,) unit vector along the measured translation; X where there is none."""
+    """(3,) unit vector along the measured translation; X for a zero translation."""
     way = step.motion.value[3:]
     size = float(np.linalg.norm(way))
     return np.asarray(way / size if size > 0.0 else np.array([1.0, 0.0, 0.0]))
@@ -88,7 +88,7 @@ def _strains(strain: Measured, of: str, n: int, limits: CertificateLimits) -> It
         yield Comparison("strain", f"{name} of {of}", n, value, 0.0, u, "1", limit)
 
 
-def _length(one: KnownLength, limits: CertificateLimits) -> Comparison:
+def _length(one: CheckedLength, limits: CertificateLimits) -> Comparison:
     u = float(np.hypot(one.measured.sigma[0], one.sigma_mm))
     limit = limits.length_mpe_mm(one.known_mm)
     return Comparison("length", one.name, None, float(one.measured.value[0]), one.known_mm, u, "mm", limit)

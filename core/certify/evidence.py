@@ -1,12 +1,12 @@
-"""What a verification procedure has measured, beside what is known of it."""
+"""Measurements of a verification procedure, and the known values."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from core.arrays import Float
-from core.certify.measured import Measured
+from stereorig.core.arrays import Float
+from stereorig.core.certify.measured import Measured
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class StaticStep:
     n
         Its number.
     time_s
-        Seconds since the reference; None where it is not known.
+        Seconds since the reference; None if it is not known.
     motion
         (6,) small rotation (rad) and translation (mm) of the field.
     scatter
@@ -66,7 +66,7 @@ class MovedStep:
     n, time_s, motion, strain
         As of :class:`StaticStep`.
     translation_mm
-        (3,) the known way since the reference, system frame; None where its direction is not known.
+        (3,) the known way since the reference, system frame; None if its direction is not known.
     distance_mm
         The known length of the way, of unknown direction.
     sigma_mm
@@ -96,7 +96,7 @@ class MovedStep:
 
 
 @dataclass(frozen=True, eq=False)
-class KnownLength:
+class CheckedLength:
     """A length that is known from elsewhere, as it was measured at one place.
 
     Attributes
@@ -120,7 +120,7 @@ class KnownLength:
 
 @dataclass(frozen=True)
 class ExtensometerPoint:
-    """The virtual extensometer beside the reference extensometer in one step.
+    """The virtual extensometer and the reference extensometer in one step.
 
     Attributes
     ----------
@@ -150,7 +150,7 @@ class ExtensometerRun:
     static_mm
         Elongations read while nothing moved; they give the resolution.
     gauge_length_mm, known_gauge_length_mm
-        As measured, and as stated; None where it was not stated.
+        As measured, and as stated; None if it was not stated.
     """
 
     points: tuple[ExtensometerPoint, ...]
@@ -161,7 +161,7 @@ class ExtensometerRun:
 
 @dataclass(frozen=True)
 class CameraOffset:
-    """What a step's epipolar offsets say: see :class:`core.orientation.OffsetFinding`."""
+    """Result of a step's epipolar offsets: see :class:`stereorig.core.orientation.OffsetFinding`."""
 
     n: int
     against: str
@@ -173,17 +173,17 @@ class CameraOffset:
 
 @dataclass(frozen=True)
 class Evidence:
-    """All of a procedure.
+    """All evidence of a procedure.
 
     Attributes
     ----------
     static, moved, lengths, extensometer, cameras
-        Its parts; empty or None where they were left out.
+        Its parts; empty or None if they were left out.
     """
 
     static: tuple[StaticStep, ...] = ()
     moved: tuple[MovedStep, ...] = ()
-    lengths: tuple[KnownLength, ...] = ()
+    lengths: tuple[CheckedLength, ...] = ()
     extensometer: ExtensometerRun | None = None
     cameras: tuple[CameraOffset, ...] = ()
 

@@ -1,7 +1,7 @@
 """The class of a virtual extensometer, by the limits of ISO 9513.
 
-A class holds where every reading's error, the resolution and the gauge length lie within its limits. Of the relative
-and the absolute limit the larger one counts. The reference's expanded uncertainty (k = 2) is to be a third of the
+A class is reached if every reading's error, the resolution and the gauge length are within its limits. The larger of
+the relative and the absolute limit counts. The reference's expanded uncertainty (k = 2) is to be a third of the
 permitted error at most.
 
 The limits are those commonly quoted of ISO 9513:2012. Errors follow one rule, published for class 0.5: c percent, and
@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.certify.evidence import ExtensometerPoint, ExtensometerRun
-from core.certify.limits import ClassName
+from stereorig.core.certify.evidence import ExtensometerPoint, ExtensometerRun
+from stereorig.core.certify.limits import ClassName
 
 READINGS = 10
 """Readings of a series at least."""
@@ -65,7 +65,7 @@ CLASSES = (
 
 @dataclass(frozen=True)
 class ExtensometerRow:
-    """One reading beside the reference's.
+    """One reading compared with the reference's.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class ExtensometerRow:
     true_mm, indicated_mm, error_mm
         Elongations, and the indicated less the true one.
     relative
-        Error over the true elongation; None of no elongation.
+        Error over the true elongation; None for zero elongation.
     u_mm
         Standard uncertainty of the error, of both.
     best
@@ -97,19 +97,19 @@ class ExtensometerClass:
     Attributes
     ----------
     reached
-        Finest class that all holds for; None: none.
+        Finest class whose conditions are all met; None: none.
     rows
         The readings.
     resolution_mm
-        Half the range of the elongations read while nothing moved; None of less than two.
+        Half the range of the elongations read while nothing moved; None with fewer than two.
     gauge_length_error
-        Relative; None where the gauge length was not stated.
+        Relative; None if the gauge length was not stated.
     reference_fit
         Finest class that the reference is good enough for; None: none.
     within_uncertainty
-        True if every error lies within its expanded uncertainty, k = 2.
+        True if every error is within its expanded uncertainty, k = 2.
     notes
-        What the class rests on too little of.
+        Evidence that is too thin for the class.
     """
 
     reached: ClassName | None

@@ -1,4 +1,4 @@
-"""What a certificate asks of a measuring system, and how surely it judges."""
+"""Requirements of a certificate on a measuring system, and the certainty of its judgement."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from core.settings import Real, Settings, Whole
+from stereorig.core.settings import Real, Settings, Whole
 
 Above = Annotated[Real, Field(gt=0.0, le=1e9)]
 NotNegative = Annotated[Real, Field(ge=0.0, le=1e9)]
@@ -17,7 +17,7 @@ class CertificateLimits(Settings):
     """Maximum permissible errors, and the extent that a certificate needs.
 
     An error with a limit passes within it; beyond its own expanded uncertainty it is then a condition. An error without
-    a limit must lie within its expanded uncertainty.
+    a limit must be within its expanded uncertainty.
     """
 
     false_alarm: Annotated[Real, Field(gt=0.0, le=0.1)] = Field(
@@ -48,7 +48,7 @@ class CertificateLimits(Settings):
     rotations: Annotated[Whole, Field(ge=0, le=1000)] = Field(1, description="Rotations that are needed.")
 
     def length_mpe_mm(self, length_mm: float) -> float | None:
-        """Return the maximum permissible error of a length; None where none is stated."""
+        """Return the maximum permissible error of a length; None if none is stated."""
         if self.length_mpe_um is None:
             return None
         return 1e-3 * self.length_mpe_um + 1e-6 * self.length_mpe_um_per_m * length_mm

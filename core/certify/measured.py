@@ -8,10 +8,10 @@ from functools import reduce
 
 import numpy as np
 
-from core.arrays import Float
-from core.common.factor import Causes, joined
-from core.gauge.rigid import RigidMotion
-from core.strain.mean import MeanStrainVariance
+from stereorig.core.arrays import Float
+from stereorig.core.common.factor import Causes, joined
+from stereorig.core.gauge.rigid import RigidMotion
+from stereorig.core.strain.mean import MeanStrainVariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,11 +25,11 @@ class Measured:
     new
         (m, m) covariance of the noise that is new at the step.
     reference
-        (m, m) of the reference pair's noise, the same in all steps of a test; zero where it is not told apart.
+        (m, m) of the reference pair's noise, the same in all steps of a test; zero if it is not known separately.
     common
-        (m, k) common factor of the calibration; None where that is not known.
+        (m, k) common factor of the calibration; None if that is not known.
     causes
-        Of its columns.
+        Causes of the factor's columns.
     """
 
     value: Float
@@ -97,15 +97,15 @@ def _root(covariance: Float) -> Float:
 
 
 def _factor(parts: Sequence[Measured]) -> Float | None:
-    """(sum of m, q): the common factors with one set of columns; zero rows where one is not known."""
-    told = [(p.causes or Causes.untold(p.common.shape[1])) for p in parts if p.common is not None]
-    if not told:
+    """(sum of m, q): the common factors with one set of columns; zero rows for an unknown one."""
+    known = [(p.causes or Causes.unseparated(p.common.shape[1])) for p in parts if p.common is not None]
+    if not known:
         return None
-    both = reduce(joined, told)
+    both = reduce(joined, known)
     rows = []
     for part in parts:
         if part.common is None:
             rows.append(np.zeros((len(part.value), len(both.columns))))
         else:
-            rows.append((part.causes or Causes.untold(part.common.shape[1])).aligned(part.common, both))
+            rows.append((part.causes or Causes.unseparated(part.common.shape[1])).aligned(part.common, both))
     return np.concatenate(rows)

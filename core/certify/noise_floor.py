@@ -1,4 +1,4 @@
-"""The noise floor: bias and scatter of every quantity in static pairs, beside the uncertainty that is stated."""
+"""The noise floor: bias and scatter of every quantity in static pairs, compared with the stated uncertainty."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
-from core.certify.comparison import Outcome
-from core.certify.evidence import Scatter, StaticStep
+from stereorig.core.certify.comparison import Outcome
+from stereorig.core.certify.evidence import Scatter, StaticStep
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class FloorRow:
     points, steps
         Their numbers.
     outcome
-        ``conditional`` where the interval lies above 1, ``fail`` where it lies above the limit.
+        ``conditional`` if the interval is above 1, ``fail`` if it is above the limit.
     """
 
     name: str
@@ -101,15 +101,15 @@ def _row(name: str, found: Sequence[Scatter], ratio_limit: float, tail: float) -
 def independent_values(points: int, spacing: float, width: float) -> float:
     """Return the number of independent values among points of a grid whose windows overlap.
 
-    Two windows of this width, so far apart, share a triangle's part of their pixels along each axis; the variance of a
-    sum of squares grows by the sum of these correlations squared.
+    Two windows of this width at this distance share a triangular part of their pixels along each axis; the variance of
+    a sum of squares grows by the sum of these correlations squared.
 
     Parameters
     ----------
     points
         Number of points.
     spacing, width
-        Of the grid and of the windows, in one unit.
+        Spacing of the grid and width of the windows, in one unit.
     """
     reach = int(np.ceil(width / spacing))
     along = 1.0 + 2.0 * sum((1.0 - k * spacing / width) ** 2 for k in range(1, reach))

@@ -1,8 +1,9 @@
-"""Scale errors and drift, by generalised least squares over all steps and lengths with what they share.
+"""Scale errors and drift, by generalised least squares over all steps and lengths with their common errors.
 
 A step's error is y = d - t = S t + v tau + noise, with the scale errors S in the plane and in depth, the drift v and
-the time tau since the reference. The errors' covariance is that of :func:`core.certify.measured.joint_covariance` and
-of the known ways, so that the calibration's own stated uncertainty is in every estimate's.
+the time tau since the reference. The errors' covariance is the sum of
+:func:`stereorig.core.certify.measured.joint_covariance` and the covariance of the known ways, so that the calibration's
+own stated uncertainty is in every estimate's.
 """
 
 from __future__ import annotations
@@ -12,16 +13,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Float
-from core.certify.comparisons import direction_of
-from core.certify.evidence import Evidence, KnownLength, MovedStep, StaticStep
-from core.certify.measured import joint_covariance
+from stereorig.core.arrays import Float
+from stereorig.core.certify.comparisons import direction_of
+from stereorig.core.certify.evidence import CheckedLength, Evidence, MovedStep, StaticStep
+from stereorig.core.certify.measured import joint_covariance
 
 _NOTHING = 1e-12
 
 
 @dataclass(frozen=True)
-class Estimate:
+class Estimated:
     """A number with its standard uncertainty.
 
     Attributes
@@ -38,41 +39,41 @@ class Estimate:
         """The value over its standard uncertainty; NaN without one."""
         return abs(self.value) / self.u if self.u > 0.0 else float("nan")
 
-    def less(self, other: Estimate) -> Estimate:
+    def less(self, other: Estimated) -> Estimated:
         """Return the difference from one that is independent."""
-        return Estimate(self.value - other.value, float(np.hypot(self.u, other.u)))
+        return Estimated(self.value - other.value, float(np.hypot(self.u, other.u)))
 
 
 @dataclass(frozen=True)
 class Scales:
-    """Scale errors and drift; None where the procedure does not show them.
+    """Scale errors and drift; None if the procedure does not show them.
 
     Attributes
     ----------
     length
-        Of the known lengths: measured over known, less one.
+        From the known lengths: measured over known, less one.
     in_plane, in_depth
-        Of the known ways, along X and Y and along Z.
+        From the known ways, along X and Y and along Z.
     drift_mm
         Along X, Y, Z, from the reference to the last step.
     duration_s
         Time from the reference to the last step.
     """
 
-    length: Estimate | None = None
-    in_plane: Estimate | None = None
-    in_depth: Estimate | None = None
-    drift_mm: tuple[Estimate, Estimate, Estimate] | None = None
+    length: Estimated | None = None
+    in_plane: Estimated | None = None
+    in_depth: Estimated | None = None
+    drift_mm: tuple[Estimated, Estimated, Estimated] | None = None
     duration_s: float | None = None
 
 
 def scales_of(evidence: Evidence) -> Scales:
-    """Return what the errors of all steps together say."""
+    """Return the estimates from the errors of all steps together."""
     in_plane, in_depth, drift, duration = _of_ways([*evidence.static, *evidence.translations])
     return Scales(_of_lengths(evidence.lengths), in_plane, in_depth, drift, duration)
 
 
-def _of_lengths(lengths: Sequence[KnownLength]) -> Estimate | None:
+def _of_lengths(lengths: Sequence[CheckedLength]) -> Estimated | None:
     if not lengths:
         return None
     known = np.array([one.known_mm for one in lengths])
@@ -87,7 +88,7 @@ def _of_lengths(lengths: Sequence[KnownLength]) -> Estimate | None:
 
 def _of_ways(
     steps: Sequence[StaticStep | MovedStep],
-) -> tuple[Estimate | None, Estimate | None, tuple[Estimate, Estimate, Estimate] | None, float | None]:
+) -> tuple[Estimated | None, Estimated | None, tuple[Estimated, Estimated, Estimated] | None, float | None]:
     if not steps:
         return None, None, None, None
     rows, errors, ways = [], [], np.zeros((0, 0))
@@ -100,8 +101,8 @@ def _of_ways(
         A, row, error, covariance = _step(step, share)
         rows.append(row)
         errors.append(error)
-        ways = _beside(ways, covariance)
-        take = _beside(take, np.concatenate([np.zeros((len(A), 3)), A], axis=1))
+        ways = _block_diagonal(ways, covariance)
+        take = _block_diagonal(take, np.concatenate([np.zeros((len(A), 3)), A], axis=1))
     scale = [np.zeros(len(e)) for e in errors]
     for k, step in enumerate(steps):
         if isinstance(step, MovedStep):
@@ -136,7 +137,7 @@ def _step(step: StaticStep | MovedStep, share: float) -> tuple[Float, Float, Flo
     return along, row, error, np.array([[step.sigma_mm**2]])
 
 
-def _beside(one: Float, other: Float) -> Float:
+def _block_diagonal(one: Float, other: Float) -> Float:
     """Return the block diagonal of two matrices."""
     out = np.zeros((one.shape[0] + other.shape[0], one.shape[1] + other.shape[1]))
     out[: one.shape[0], : one.shape[1]] = one
@@ -144,10 +145,10 @@ def _beside(one: Float, other: Float) -> Float:
     return out
 
 
-def _solved(design: Float, error: Float, covariance: Float) -> list[Estimate | None]:
+def _solved(design: Float, error: Float, covariance: Float) -> list[Estimated | None]:
     """Return the unknowns' estimates; None of those that no row holds."""
     held = np.flatnonzero(np.abs(design).max(axis=0) > _NOTHING)
-    found: list[Estimate | None] = [None] * design.shape[1]
+    found: list[Estimated | None] = [None] * design.shape[1]
     if not held.size or not np.isfinite(covariance).all():
         return found
     A = design[:, held]
@@ -156,5 +157,5 @@ def _solved(design: Float, error: Float, covariance: Float) -> list[Estimate | N
     inverse = np.linalg.pinv(A.T @ weight @ A, hermitian=True)
     value = inverse @ (A.T @ weight @ error)
     for k, column in enumerate(held):
-        found[column] = Estimate(float(value[k]), float(np.sqrt(inverse[k, k])))
+        found[column] = Estimated(float(value[k]), float(np.sqrt(inverse[k, k])))
     return found

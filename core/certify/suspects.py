@@ -1,4 +1,4 @@
-"""What an error common to many comparisons points to: the calibration's scale, the stage, a camera, warmth."""
+"""Probable causes of an error common to many comparisons: the calibration's scale, the stage, a camera, warmth."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from core.certify.comparison import coverage_factor
-from core.certify.evidence import CameraOffset, Evidence
-from core.certify.noise_floor import FloorRow
-from core.certify.scales import Estimate, Scales
+from stereorig.core.certify.comparison import coverage_factor
+from stereorig.core.certify.evidence import CameraOffset, Evidence
+from stereorig.core.certify.noise_floor import FloorRow
+from stereorig.core.certify.scales import Estimated, Scales
 
 SuspectCode = Literal["camera_moved", "calibration_scale", "known_length", "stage_scale", "drift", "noise"]
 _ESTIMATES = 6  # three scales and three drifts are looked at
@@ -24,9 +24,9 @@ class Suspect:
     code
         Stable name.
     text
-        What is suspect, with the figures.
+        The cause, with the figures.
     remedy
-        How to find out, and what to do.
+        The check that shows it, and the remedy.
     """
 
     code: SuspectCode
@@ -37,9 +37,9 @@ class Suspect:
 def suspects_of(
     evidence: Evidence, scales: Scales, floor: Sequence[FloorRow], *, false_alarm: float
 ) -> tuple[Suspect, ...]:
-    """Return what is suspect, the most probable cause first.
+    """Return the probable causes, the most probable one first.
 
-    A camera that moved explains wrong scales and apparent motions, so that these are then not listed beside it.
+    A camera that moved explains wrong scales and apparent motions, so that these are then not listed.
     """
     k = coverage_factor(_ESTIMATES, false_alarm)
     noisy = [row for row in floor if row.outcome != "pass"]
@@ -50,12 +50,12 @@ def suspects_of(
     return (*_scale_suspects(scales, k), *_drift(scales, k), *noise)
 
 
-def sure(estimate: Estimate | None, k: float) -> bool:
+def sure(estimate: Estimated | None, k: float) -> bool:
     """Return True for an estimate farther from zero than k standard uncertainties."""
     return estimate is not None and estimate.sigmas > k
 
 
-def percent(estimate: Estimate, k: float) -> str:
+def percent(estimate: Estimated, k: float) -> str:
     """Return a relative error with its expanded uncertainty as text."""
     return f"{100.0 * estimate.value:+.3f} % (U {100.0 * k * estimate.u:.3f} %, k = {k:.2g})"
 
@@ -65,7 +65,7 @@ def _scale_suspects(scales: Scales, k: float) -> tuple[Suspect, ...]:
     ways = [one for one in (scales.in_plane, scales.in_depth) if one is not None]
     wrong = [one for one in ways if sure(one, k)]
     if length is not None and sure(length, k):
-        # of both explanations the nearer one: ways are off as lengths are, or not at all
+        # the nearer one of both explanations: known ways have the same scale error as lengths, or none
         best = min(ways, key=lambda one: one.u, default=None)
         follows = best is not None and abs(best.value - length.value) < abs(best.value)
         if best is not None and not follows and not wrong:
@@ -80,7 +80,7 @@ def _scale_suspects(scales: Scales, k: float) -> tuple[Suspect, ...]:
     return (_stage(scales, k),)
 
 
-def _calibration(scale: Estimate, k: float, *, beside: bool, alone: bool) -> Suspect:
+def _calibration(scale: Estimated, k: float, *, beside: bool, alone: bool) -> Suspect:
     ways = "; displacements are off by the same share" if beside else ""
     other = ", or the stated length of the artefact" if alone else ""
     return Suspect(
@@ -92,7 +92,7 @@ def _calibration(scale: Estimate, k: float, *, beside: bool, alone: bool) -> Sus
     )
 
 
-def _known_length(length: Estimate, k: float) -> Suspect:
+def _known_length(length: Estimated, k: float) -> Suspect:
     return Suspect(
         "known_length",
         f"The stated length of the artefact: it is measured {percent(length, k)} off, while known ways are measured "

@@ -1,1 +1,1 @@
-"""What all points of a result share of its uncertainty: the calibration's part, carried to any quantity."""
+"""Uncertainty that all points of a result share: the calibration's part, propagated to any quantity."""

@@ -1,4 +1,4 @@
-"""The budget of a quantity's uncertainty: how much of it comes from where."""
+"""The budget of a quantity's uncertainty: its parts by source."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Float
-from core.common.factor import Causes, joined
-from core.names import BUDGET, BudgetName
+from stereorig.core.arrays import Float
+from stereorig.core.common.factor import Causes, joined
+from stereorig.core.names import ALL_PARTS, BudgetName
 
 CALIBRATION_UNKNOWN = "calibration not included"
 CAUSES_UNTOLD = "stage and target are in calibration, not told apart"
@@ -18,7 +18,7 @@ REFERENCE_UNTOLD = "reference is in matching, not told apart"
 
 @dataclass(frozen=True)
 class Budget:
-    """Standard uncertainties (k = 1) of one quantity by where they come from; None where that is not known.
+    """Standard uncertainties (k = 1) of one quantity by their source; None for a source that is not known.
 
     Their squares add up to the square of the whole. A step's difference from another of the test has no ``reference``.
 
@@ -27,14 +27,17 @@ class Budget:
     matching
         Noise of the quantity's points that is new at each step.
     reference
-        Noise of the reference pair, the same in all steps of a test; None: not told apart, in ``matching``.
+        Noise of the reference pair, the same in all steps of a test; None if it is not known separately and is
+        contained in ``matching``.
     calibration
-        Noise of the calibration's views, and everything of a calibration whose causes are not told apart; None: not
-        known, and not included.
+        Noise of the calibration's views, and the whole part of a calibration whose causes are not known separately;
+        None if it is not known and not included.
     stage
-        What was known of the stage's steps, scale and tilt; None: in ``calibration``.
+        Uncertainty of the stage's steps, scale and tilt; None if ``calibration`` contains it.
     target
-        What was known of the target's pitch and nodes; None: in ``calibration``.
+        Uncertainty of the target's pitch and nodes; None if ``calibration`` contains it.
+    sensor
+        Pull of camera 1's fixed pattern; None if no pattern was found.
     """
 
     matching: float | None = None
@@ -42,10 +45,11 @@ class Budget:
     calibration: float | None = None
     stage: float | None = None
     target: float | None = None
+    sensor: float | None = None
 
     @property
     def sigma(self) -> float:
-        """The whole; NaN where nothing is known."""
+        """Root of the sum of all parts' squares; NaN if no part is known."""
         known = list(self.document().values())
         return float(np.sqrt(np.sum(np.square(known)))) if known else float("nan")
 
@@ -56,15 +60,15 @@ class Budget:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What is not told apart, and what is not included."""
+        """Sentences that name the parts which are not known separately or not included."""
         out = [] if self.reference is not None else [REFERENCE_UNTOLD]
         if self.calibration is None:
             return (*out, CALIBRATION_UNKNOWN)
         return tuple(out if self.stage is not None else [*out, CAUSES_UNTOLD])
 
     def document(self) -> dict[str, float]:
-        """Return what is known by name, in the order of :data:`core.names.BUDGET`."""
-        values = {name: getattr(self, name) for name in BUDGET}
+        """Return the known parts by name, in the order of :data:`stereorig.core.names.ALL_PARTS`."""
+        values = {name: getattr(self, name) for name in ALL_PARTS}
         return {name: float(value) for name, value in values.items() if value is not None and math.isfinite(value)}
 
     def scaled(self, factor: float) -> Budget:
@@ -83,11 +87,11 @@ def budget_of(own: float, frozen: float | None, row: Float | None, causes: Cause
     own
         Variance from the points' own noise.
     frozen
-        The reference pair's part of it; None where it is not told apart.
+        The reference pair's part of it; None if it is not known separately.
     row
-        (k,) the quantity's common factor; None where it is not known.
+        (k,) the quantity's common factor; None if it is not known.
     causes
-        Of its columns; None: all of the calibration.
+        Causes of the factor's columns; None: all columns count as the calibration's.
     """
     if not np.isfinite(own):
         return UNKNOWN
@@ -96,8 +100,8 @@ def budget_of(own: float, frozen: float | None, row: Float | None, causes: Cause
     if frozen is not None:
         parts["reference"] = float(np.sqrt(min(max(frozen, 0.0), max(own, 0.0))))
     if row is not None:
-        told = Causes.untold(len(row)) if causes is None else causes
-        parts |= {name: float(np.sqrt(square)) for name, square in told.squares(row).items()}
+        known = Causes.unseparated(len(row)) if causes is None else causes
+        parts |= {name: float(np.sqrt(square)) for name, square in known.squares(row).items()}
     return Budget(**parts)
 
 
@@ -106,21 +110,21 @@ def budget_of_difference(
 ) -> Budget:
     """Return the budget of the difference of one quantity in two steps of a test.
 
-    What the steps share cancels: the reference pair's noise, and the common factor where it is the same. The variance
-    is that of both steps' new noise, and of ``F_b - F_a``.
+    Errors that both steps share cancel: the reference pair's noise, and the common factor as far as it is the same. The
+    variance is the sum of both steps' new noise and of the square of ``F_b - F_a``.
 
     Parameters
     ----------
     a, b
         The budgets in both steps.
     row_a, row_b
-        (k,) the quantity's common factors of one calibration; None where they are not known.
+        (k,) the quantity's common factors of one calibration; None if they are not known.
     causes_a, causes_b
-        Of their columns; None: all of the calibration.
+        Causes of the factors' columns; None: all columns count as the calibration's.
 
     Notes
     -----
-    Where the reference pair's noise is not told apart it counts as new in both steps, which is more than there is.
+    If the reference pair's noise is not known separately, it counts as new in both steps, which overestimates it.
     """
     if a.matching is None or b.matching is None:
         return UNKNOWN
@@ -128,8 +132,8 @@ def budget_of_difference(
     told_apart = a.reference is not None and b.reference is not None
     if row_a is None or row_b is None:
         return budget_of(own, 0.0 if told_apart else None, None, None)
-    one = Causes.untold(len(row_a)) if causes_a is None else causes_a
-    two = Causes.untold(len(row_b)) if causes_b is None else causes_b
+    one = Causes.unseparated(len(row_a)) if causes_a is None else causes_a
+    two = Causes.unseparated(len(row_b)) if causes_b is None else causes_b
     both = joined(one, two)
     return budget_of(own, 0.0 if told_apart else None, two.aligned(row_b, one) - one.aligned(row_a, two), both)
 
@@ -146,7 +150,7 @@ def budgets_through(
     own, frozen
         (n, n) covariance of the others from the points' own noise, and the reference pair's part of it.
     common, causes
-        (n, k) their common factor, and the causes of its columns; None where it is not known.
+        (n, k) common factor of the others, and the causes of its columns; None if it is not known.
     """
     variance = np.einsum("mi,ij,mj->m", slope, own, slope)
     at_reference = None if frozen is None else np.einsum("mi,ij,mj->m", slope, frozen, slope)

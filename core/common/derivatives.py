@@ -1,8 +1,8 @@
 """Derivatives of measured positions and displacements over the cameras' parameters, at the same images.
 
-A measured point is what the estimator makes of the matches: it stays on camera 1's ray of its pixel, its image in
-camera 2 may lie off that of the ray by an offset across the epipolar line, and the same offset is taken out of camera
-2's current image. All three comparisons determine it, weighted as the matching weighs them: two of them share the
+The estimator computes a point from the matches so that it stays on camera 1's ray of its pixel; its image in camera 2
+may be off the ray's image by an offset across the epipolar line, and the same offset is subtracted from camera 2's
+current image. All three comparisons determine it, weighted as the matching weighs them: two of them share the
 reference's noise.
 """
 
@@ -15,16 +15,16 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float
-from core.cameras.camera import Camera
-from core.cameras.stereo import StereoPair
-from core.common.estimates import estimates
-from core.names import CAMERAS
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.common.estimates import estimates
+from stereorig.core.names import CAMERAS
 
 #: of the comparisons camera 2 at t0, camera 1 and camera 2 at t: the inverse of noise I plus the reference's in all
 WEIGHTS = np.eye(3) - 0.25
 _AT_ONCE = 1024
-_FIRM = 1e-12  # of the variance
+_FIRM = 1e-12  # share of the variance
 Index = slice | Bool | NDArray[np.int64]
 _NOISE = np.kron(np.eye(3) + 1.0, np.eye(2))
 
@@ -55,7 +55,7 @@ def measured_derivatives(
 
 @dataclass(frozen=True, eq=False)
 class ReferenceView:
-    """How both cameras see n points at the reference: the same in all steps of a test.
+    """The geometry of n points at the reference in both cameras: the same in all steps of a test.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class ReferenceView:
     along, across
         (n, 2) unit vectors along and across the epipolar line in camera 2.
     px_per_mm
-        (n,) what a mm along the ray is there.
+        (n,) shift of camera 2's image for 1 mm along the ray, px/mm.
     """
 
     pair: StereoPair
@@ -84,7 +84,7 @@ class ReferenceView:
 
     @staticmethod
     def of(pair: StereoPair, points_mm: Float) -> ReferenceView:
-        """Return that of points."""
+        """Return the view of points."""
         A1, A2 = pair.cam1.point_jacobian(points_mm), pair.cam2.point_jacobian(points_mm)
         ray = points_mm - pair.cam1.centre_sys_mm
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
@@ -96,14 +96,14 @@ class ReferenceView:
         )
 
     def keep(self) -> None:
-        """Make what all steps need of the points, once; parts of them have it then too."""
+        """Compute the derivatives that all steps need, once; views from :meth:`at` contain their part of them."""
         _ = self.by_image, self.by_parameters, self.across_normalised
 
     def at(self, some: Index) -> ReferenceView:
-        """Return that of some of the points, with what is known of them."""
+        """Return the view of some of the points, with the derivatives that are already computed."""
         names = ("ray", "by_point1", "by_point2", "along", "across", "px_per_mm")
         part = ReferenceView(self.pair, self.points_mm[some], *(getattr(self, name)[some] for name in names))
-        for name in ("beside", "seen", "by_image", "across_normalised"):
+        for name in ("off_ray", "seen", "by_image", "across_normalised"):
             if name in self.__dict__:
                 part.__dict__[name] = self.__dict__[name][some]
         if "by_parameters" in self.__dict__:
@@ -111,15 +111,15 @@ class ReferenceView:
         return part
 
     @cached_property
-    def beside(self) -> Float:
-        """(n, 3, 2) of the points over camera 1's predicted images: these put them beside the ray."""
+    def off_ray(self) -> Float:
+        """(n, 3, 2) derivative of the points over camera 1's predicted images, which shifts them off the ray."""
         return -pseudoinverse(self.by_point1)
 
     @cached_property
     def seen(self) -> Float:
-        """(n, 2, 4) of camera 2's image over the predicted images of both, points being put beside the ray."""
+        """(n, 2, 4) derivative of camera 2's image over both cameras' predicted images, points shifted off the ray."""
         eye = np.broadcast_to(np.eye(2), (len(self.ray), 2, 2))
-        return np.concatenate([self.by_point2 @ self.beside, eye], axis=2)
+        return np.concatenate([self.by_point2 @ self.off_ray, eye], axis=2)
 
     @cached_property
     def by_image(self) -> Float:
@@ -129,7 +129,7 @@ class ReferenceView:
         """
         depth = -(self.along[:, None, :] @ self.seen) / self.px_per_mm[:, None, None]
         out = self.ray[..., None] * depth
-        out[..., :2] += self.beside
+        out[..., :2] += self.off_ray
         return np.asarray(out)
 
     @cached_property
@@ -156,7 +156,7 @@ class ReferenceView:
 
 @dataclass(frozen=True, eq=False)
 class Estimator:
-    """The measurement's estimator about n points: what it makes of small shifts of the images.
+    """The measurement's estimator linearised about n points: its derivatives over small shifts of the images.
 
     Attributes
     ----------
@@ -192,7 +192,7 @@ class Estimator:
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         by_match, by_image = estimates(
             (seen.ray, seen.along, seen.across, seen.px_per_mm),
-            (seen.beside, seen.seen, seen.by_image, seen.across_normalised),
+            (seen.off_ray, seen.seen, seen.by_image, seen.across_normalised),
             now,
             (pair.cam1.cam_from_sys.rotation, pair.cam2.cam_from_sys.rotation),
             ray,
@@ -214,7 +214,7 @@ class Estimator:
         )
         before = [by_parameters[some] for by_parameters in self.reference.by_parameters]
         out = np.empty((n, m, directions.shape[1]))
-        for first in range(0, n, _AT_ONCE):  # what stays in the processor's cache
+        for first in range(0, n, _AT_ONCE):  # points whose arrays stay in the processor's cache
             part = slice(first, first + _AT_ONCE)
             rows, parts = by_image[part], []
             for c in range(2):
@@ -228,8 +228,9 @@ class Estimator:
     def new_noise(self, own: Float) -> Float:
         """Return the part (n, 3, 3) of the noise of U, V, W that is new at t, of its covariance (n, 3, 3).
 
-        ``own`` is its lower triangle L, L L' the covariance. All else is the reference pair's noise, in all steps
-        alike: the reference subset's is in all three comparisons, that of camera 2's match at t0 in the first.
+        ``own`` is its lower triangle L, L L' the covariance. The rest is the reference pair's noise, which is alike in
+        all steps: the reference subset's noise is in all three comparisons, the noise of camera 2's match at t0 in the
+        first.
         """
         assert self.by_match is not None
         every = self.by_match @ _NOISE @ np.swapaxes(self.by_match, 1, 2)

@@ -1,9 +1,10 @@
-"""What the three comparisons make of a point, compiled: shifts of the images into X, Y, Z, U, V, W.
+"""Estimator of a point from the three comparisons, compiled: shifts of the images into X, Y, Z, U, V, W.
 
 Five of the six equations give the offset across the epipolar line (camera 2 at t0), the depth along camera 1's ray, and
-the position at t from both images there. The sixth is a condition: camera 2's image at t lies off its epipolar line by
-what it did at t0. What it is off besides is noise, and is taken out together with what noise goes along with it: the
-comparisons share the reference's, so that their noise is one each plus one in all.
+the position at t from both images there. The sixth is a condition: camera 2's image at t is off its epipolar line by
+the same offset as at t0. Any further offset is noise. It is removed together with the noise that correlates with it:
+all three comparisons contain the reference's noise, so that their covariance is the unit matrix plus one in all
+elements.
 """
 
 from __future__ import annotations
@@ -12,8 +13,8 @@ import math
 
 import numpy as np
 
-from core.arrays import Float
-from core.matching.kernels.naming import entry_with_arrays, inner
+from stereorig.core.arrays import Float
+from stereorig.core.matching.kernels.naming import entry_with_arrays, inner
 
 
 @inner
@@ -60,7 +61,7 @@ def _estimates(reference, kept, by1, by2, R1, R2, rays, depth2, by_match, whole)
         length = q[2]
         ax, ay = q[0] / length, q[1] / length  # along the epipolar line; across it is (-ay, ax)
         last = by2.shape[2] - 3
-        for i in range(2):  # the lens's slopes times the depth's inverse stand in the pose's shift
+        for i in range(2):  # the pose's shift holds the lens's slopes times the depth's inverse
             carried[i] = depth2[n] * (by2[n, i, last] * normalised0[n, 0] + by2[n, i, last + 1] * normalised0[n, 1])
         e_along = (ax * carried[0] + ay * carried[1]) / length
         e_across = ax * carried[1] - ay * carried[0]
@@ -105,11 +106,11 @@ def estimates(
     Parameters
     ----------
     reference
-        At the reference, as of :class:`core.common.derivatives.ReferenceView`: (n, 3) ``ray``, (n, 2) ``along`` and
-        ``across``, (n,) ``px_per_mm``.
+        At the reference, as of :class:`stereorig.core.common.derivatives.ReferenceView`: (n, 3) ``ray``, (n, 2)
+        ``along`` and ``across``, (n,) ``px_per_mm``.
     kept
-        (n, 3, 2) ``beside``, (n, 2, 4) ``seen``, (n, 3, 4) ``by_image`` of it, and (n, 2) the unit offset across the
-        epipolar line as a shift of camera 2's normalised image.
+        (n, 3, 2) ``off_ray``, (n, 2, 4) ``seen``, (n, 3, 4) ``by_image`` of the reference view, and (n, 2) the unit
+        offset across the epipolar line as a shift of camera 2's normalised image.
     by_parameters
         (n, 2, p) of either camera's image of the current positions over its parameters, the pose's shift last.
     rotations

@@ -1,9 +1,9 @@
 """The common factor of a field: a few columns that all its points share, for unit causes.
 
-The covariance of points i and j is that of their own matching, where they share pixels, plus F_i F_j'. Pushed through
-the weights of a mean, a distance or a strain and then squared, F does not shrink when points are averaged and cancels
-where it must. A column is the same unit cause in all steps and tests of one calibration, so that F_b - F_a of two steps
-is what their difference has.
+The covariance of points i and j is the covariance of their matching, if they share pixels, plus F_i F_j'. F is
+propagated through the weights of a mean, a distance or a strain and then squared, so that it does not shrink when
+points are averaged, and it cancels in differences of points that share it. A column is the same unit cause in all steps
+and tests of one calibration, so that F_b - F_a is the factor of the difference of two steps.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from typing import Any
 
 import numpy as np
 
-from core.arrays import Float, Float32, Floats
-from core.cameras.stereo import StereoPair
-from core.common.derivatives import Estimator, measured_derivatives
-from core.errors import CalibrationInputError
-from core.names import CAUSES, Cause
+from stereorig.core.arrays import Float, Float32, Floats
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.common.derivatives import Estimator, measured_derivatives
+from stereorig.core.errors import CalibrationInputError
+from stereorig.core.names import ALL_CAUSES, CAUSES, Cause
 
 KEPT = 0.999
 """Share of each point's common variance that the columns hold at least."""
-_NEGATIVE = 1e-9  # of the largest eigenvalue: what rounding leaves of a covariance that is positive
-_SUM = 1e-6  # of two standard deviations: by what parts may miss the covariance
-_NOTHING = 1e-10  # of all variance that a calibration gives points: columns beyond it are rounding
+_NEGATIVE = 1e-9  # share of the largest eigenvalue: rounding makes eigenvalues of a covariance this negative
+_SUM = 1e-6  # share of two standard deviations by which the sum of the parts may differ from the covariance
+_NOTHING = 1e-10  # share of the total variance from the calibration: columns below it are rounding
 FINE = 1 / 128
-"""Of a component's common standard deviation: what a factor is rounded to, to be short in files."""
+"""Share of a component's common standard deviation that a factor is rounded to, so that it is short in files."""
 _SAMPLE = 500  # points by which columns are chosen
 _OWN_FINE = 1 / 1024
-_DEPTHS = (0.97, 1.0, 1.03)  # of the stand-off: points by which columns are ordered
+_DEPTHS = (0.97, 1.0, 1.03)  # multiples of the stand-off: depths of the points by which columns are ordered
 
 
 @dataclass(frozen=True)
@@ -40,34 +40,47 @@ class Causes:
     Attributes
     ----------
     columns
-        Of each column, in the order of :data:`core.names.CAUSES`.
-    told
-        Causes that are told apart; those without a column are zero. ``calibration`` alone holds them all.
+        Cause of each column, in the order of :data:`stereorig.core.names.ALL_CAUSES`.
+    separate
+        Causes whose parts are known separately; a known cause without a column has no variance. ``calibration`` alone
+        means that all columns are the calibration's.
     """
 
     columns: tuple[Cause, ...]
-    told: tuple[Cause, ...] = ("calibration",)
+    separate: tuple[Cause, ...] = ("calibration",)
 
     @staticmethod
-    def untold(count: int) -> Causes:
-        """Return those of columns that nothing is known about."""
+    def unseparated(count: int) -> Causes:
+        """Return the causes of columns without a record: all are ``calibration``."""
         one: Cause = "calibration"
         return Causes((one,) * count)
 
     def squares(self, factor: Floats) -> dict[Cause, Float]:
         """Return by cause the variance (...) of a factor's rows (..., k)."""
         out = {}
-        for cause in self.told:
+        for cause in self.separate:
             first = self.columns.index(cause) if cause in self.columns else 0
             own = factor[..., first : first + self.columns.count(cause)]  # columns are grouped by cause
             out[cause] = np.einsum("...k,...k->...", own, own)
         return out
 
+    @property
+    def with_sensor(self) -> Causes:
+        """The same causes and one more column, for the sensor's pull."""
+        return Causes((*self.columns, "sensor"), (*self.separate, "sensor"))
+
+    def of_calibration(self, factor: Floats) -> Float:
+        """Return the calibration's part (...) of standard deviations with a factor's rows (..., k); NaN without one."""
+        if not any(cause in CAUSES for cause in self.separate):
+            return np.full(factor.shape[:-1], np.nan)
+        own = factor[..., : len(self.columns) - self.columns.count("sensor")]
+        return np.asarray(np.linalg.norm(own, axis=-1))
+
     def aligned(self, factor: Float, other: Causes) -> Float:
-        """Return a factor (..., k) with the columns of both, zero where it has none: (..., q), see :func:`joined`."""
+        """Return a factor (..., k) as (..., q) with the columns of both, zero in columns that it does not have."""
         out = np.zeros((*factor.shape[:-1], len(joined(self, other).columns)))
         at = 0
-        for cause in CAUSES:
+        for cause in ALL_CAUSES:
             own = [k for k, name in enumerate(self.columns) if name == cause]
             out[..., at : at + len(own)] = factor[..., own]
             at += max(len(own), other.columns.count(cause))
@@ -76,9 +89,11 @@ class Causes:
 
 def joined(one: Causes, other: Causes) -> Causes:
     """Return the causes of the columns of two factors of one calibration: the k-th of a cause is the same in both."""
-    counts = {cause: max(one.columns.count(cause), other.columns.count(cause)) for cause in CAUSES}
-    told = tuple(cause for cause in CAUSES if cause in one.told and cause in other.told)
-    return Causes(tuple(cause for cause in CAUSES for _ in range(counts[cause])), told)
+    counts = {cause: max(one.columns.count(cause), other.columns.count(cause)) for cause in ALL_CAUSES}
+    separate = tuple(cause for cause in CAUSES if cause in one.separate and cause in other.separate)
+    if counts["sensor"]:  # a step without it has none of it
+        separate += ("sensor",)
+    return Causes(tuple(cause for cause in ALL_CAUSES for _ in range(counts[cause])), separate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +109,7 @@ class ParameterCovariance:
     covariance
         (p, p), units of the parameters.
     by_cause
-        (p, p) parts that add up to it; None where they are not told apart.
+        (p, p) parts that add up to the covariance; None if the causes are not known separately.
     """
 
     pair: StereoPair
@@ -113,8 +128,8 @@ class ParameterCovariance:
         return self._root(self.covariance, "The covariance")
 
     @property
-    def told(self) -> tuple[Cause, ...]:
-        """The causes that are told apart."""
+    def separate(self) -> tuple[Cause, ...]:
+        """The causes whose parts of the covariance are known separately."""
         if self.by_cause is None:
             return ("calibration",)
         return tuple(cause for cause in CAUSES if cause in self.by_cause)
@@ -125,7 +140,7 @@ class ParameterCovariance:
         Raises
         ------
         CalibrationInputError
-            ``covariance_not_positive`` with the eigenvalue, also of a part; ``covariance_parts_differ`` where the parts
+            ``covariance_not_positive`` with the eigenvalue, also of a part; ``covariance_parts_differ`` if the parts
             do not add up.
         """
         self.root()
@@ -140,8 +155,8 @@ class ParameterCovariance:
                 f"The parts by cause of the covariance of {self.names[i]} and {self.names[j]} add up to "
                 f"{total[i, j]:.6g}, but it is {self.covariance[i, j]:.6g}.",
                 code="covariance_parts_differ",
-                remedy="Calibrate anew, or take covariance_by_cause out of the file; the parts are then not told "
-                "apart.",
+                remedy="Calibrate again, or take covariance_by_cause out of the file; the parts are then not known "
+                "separately.",
             )
         self.roots()
 
@@ -155,11 +170,11 @@ class ParameterCovariance:
         """
         if self.by_cause is None:
             return {"calibration": self.root()}
-        return {c: self._root(self.by_cause[c], f"The part of {c} of the covariance") for c in self.told}
+        return {c: self._root(self.by_cause[c], f"The part of {c} of the covariance") for c in self.separate}
 
     @cached_property
     def columns(self) -> tuple[Float, Causes]:
-        """L (p, q), columns grouped by cause, and their causes: those of a cause from the one that moves points most.
+        """L (p, q), columns grouped by cause, and their causes; each cause's column that moves points most comes first.
 
         Which columns these are depends on the calibration alone.
 
@@ -183,12 +198,12 @@ class ParameterCovariance:
             sign = np.sign((rows @ turned)[np.abs(rows @ turned).argmax(axis=0), range(len(kept))])
             parts.append(turned * np.where(sign == 0.0, 1.0, sign))
             names += [cause] * len(kept)
-        return np.concatenate(parts, axis=1), Causes(tuple(names), self.told)
+        return np.concatenate(parts, axis=1), Causes(tuple(names), self.separate)
 
     @property
     def _scale(self) -> Float:
         sd = np.sqrt(np.maximum(np.diagonal(self.covariance), 0.0))
-        return np.where(sd > 0.0, sd, 1.0)  # px, rad and 1/px^2 beside one another
+        return np.where(sd > 0.0, sd, 1.0)  # px, rad and 1/px^2 in one matrix
 
     def _root(self, covariance: Float, what: str) -> Float:
         scale = self._scale
@@ -197,10 +212,10 @@ class ParameterCovariance:
             raise CalibrationInputError(
                 f"{what} of the cameras' parameters has an eigenvalue of {value[0]:.3g} (of correlations).",
                 code="covariance_not_positive",
-                remedy="Calibrate anew, or take the covariance out of the file; results then do not include it.",
+                remedy="Calibrate again, or take the covariance out of the file; results then do not include it.",
             )
         kept = value > 0.0
-        # a parameter that was held has no part in what rounding leaves
+        # rounding leaves no variance to a parameter that was held fixed
         held = np.diagonal(self.covariance) <= 0.0
         return np.asarray(np.where(held, 0.0, scale)[:, None] * vector[:, kept] * np.sqrt(value[kept]))
 
@@ -215,7 +230,7 @@ class Factor:
         (n, 3, k) of X, Y, Z, or (n, 6, k) of X, Y, Z, U, V, W: mm for unit causes. Rounded so that single precision
         holds it.
     causes
-        Of the columns.
+        Causes of the columns.
     """
 
     values: Float32
@@ -229,13 +244,13 @@ class FactorColumns:
     Attributes
     ----------
     names
-        Of the parameters.
+        Names of the parameters.
     directions
         (len(names), k) of unit causes in them.
     causes
-        Of the columns.
+        Causes of the columns.
     step
-        (3 or 6,) mm: what each component is rounded to.
+        (3 or 6,) step that each component is rounded to, mm.
     """
 
     names: Sequence[str]
@@ -250,11 +265,12 @@ class FactorColumns:
         Parameters
         ----------
         source
-            What is common.
+            Covariance of the cameras' parameters.
         sample
             The estimator at :func:`sample_of` the points: the factor changes slowly from point to point.
         own_mm
-            (3,) or (6,) typical standard deviations of the points' own; what is far below them is rounded away.
+            (3,) or (6,) typical standard deviations of the points' own noise; values far below them are rounded to
+            zero.
 
         Raises
         ------
@@ -264,7 +280,7 @@ class FactorColumns:
         L, causes = source.columns
         kept = fewest_columns(sample.through(source.names, L), causes)
         directions = L[:, kept]
-        found = Causes(tuple(causes.columns[k] for k in kept), causes.told)
+        found = Causes(tuple(causes.columns[k] for k in kept), causes.separate)
         step = _rounding(sample.through(source.names, directions), own_mm, FINE)
         return FactorColumns(source.names, directions, found, step)
 
@@ -288,13 +304,13 @@ def factor_of(
     Parameters
     ----------
     source
-        What is common.
+        Covariance of the cameras' parameters.
     points_mm
         (n, 3) points at the reference, system frame, all finite.
     displaced_mm
         (n, 3) their current positions.
     own_mm
-        (3,) or (6,) typical standard deviations of the points' own; what is far below them is rounded away.
+        (3,) or (6,) typical standard deviations of the points' own noise; values far below them are rounded to zero.
 
     Raises
     ------
@@ -310,15 +326,15 @@ def factor_of(
 def round_in_place(factor: Floats, sample: Floats, own: Float | None = None, *, fine: float = FINE) -> None:
     """Round a factor (..., m, k) to a small part of each component's standard deviation, as a power of two.
 
-    It stays far below what the points' own noise and the columns left out change, and is the same in memory and in
-    single precision in a file, where smooth columns of few digits take little room.
+    The rounding error is far below the points' own noise and the columns left out. The factor is the same in memory and
+    in single precision in a file, and smooth columns of few digits compress well.
 
     Parameters
     ----------
     factor
         Changed in place.
     sample
-        (n, m, k) :func:`sample_of` its points; nothing is rounded where there are none.
+        (n, m, k) :func:`sample_of` its points; an empty sample leaves the factor as it is.
     own
         (m,) standard deviations of the points' own: rounding never needs to be finer than 1/1024 of them.
     fine
@@ -341,7 +357,7 @@ def _rounding(some: Floats, own: Float | None, fine: float) -> Float:
 def _to_step(factor: Floats, step: Float) -> None:
     """Round a factor (..., m, k) in place to steps (m,): exact in either precision, but for steps that hold nothing."""
     by: Any = step[:, None].astype(factor.dtype)
-    np.multiply(factor, 1.0 / np.where(by > 0.0, by, 1.0), out=factor)  # of a power of two exact
+    np.multiply(factor, 1.0 / np.where(by > 0.0, by, 1.0), out=factor)  # exact, as the factor is a power of two
     np.rint(factor, out=factor)
     np.multiply(factor, by, out=factor)
 
@@ -354,7 +370,7 @@ def common_factor(source: ParameterCovariance, points_mm: Float, displaced_mm: F
 def fewest_columns(factor: Float, causes: Causes, kept: float = KEPT) -> list[int]:
     """Return which columns of a factor (n, m, q) hold at least a share of each component's variance.
 
-    Of each cause they are the first ones.
+    The columns of each cause are returned from its first on, without gaps.
     """
     n, m, q = factor.shape
     square = factor.reshape(n * m, q) ** 2
@@ -362,9 +378,9 @@ def fewest_columns(factor: Float, causes: Causes, kept: float = KEPT) -> list[in
     if n == 0 or not (variance > 0.0).any():
         return []
     square /= np.where(variance > 0.0, variance, 1.0)[:, None]
-    # a column is worth what it or a later one of its cause holds, so that none is left out between
+    # a column counts as much as the largest of it and the later columns of its cause, so that no gap is left between
     worth = square.mean(axis=0)
-    for cause in causes.told:
+    for cause in causes.separate:
         own = [k for k, name in enumerate(causes.columns) if name == cause]
         worth[own] = np.maximum.accumulate(worth[own][::-1])[::-1]
     order = np.argsort(-worth, kind="stable")
@@ -375,7 +391,7 @@ def fewest_columns(factor: Float, causes: Causes, kept: float = KEPT) -> list[in
 
 
 def _typical_rows(pair: StereoPair, names: Sequence[str]) -> Float:
-    """(n, p) derivatives of positions, and of shifts along each axis, over both cameras' view at their stand-off."""
+    """(n, p) derivatives of positions and of shifts along each axis, over both cameras' view at their stand-off."""
     depth = float(pair.cam1.cam_from_sys.translation_mm[2])
     if not depth > 0.0:
         depth = 4.0 * pair.baseline_mm

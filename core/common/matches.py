@@ -1,4 +1,4 @@
-"""What errors of the three comparisons do to a measured point: the estimator's derivative over its matches.
+"""Effect of the three comparisons' errors on a measured point: the estimator's derivative over its matches.
 
 A comparison's error is a shift on the surface, stated in px of camera 1's reference image, in which the subset is laid:
 of camera 2's reference, of camera 1's current and of camera 2's current image. The position comes from the first alone,
@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.stereo import StereoPair
-from core.common.derivatives import WEIGHTS, ReferenceView
-from core.matching.geometry import tangent_frames
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.common.derivatives import WEIGHTS, ReferenceView
+from stereorig.core.matching.geometry import tangent_frames
 
 
 class Matches(NamedTuple):
@@ -28,10 +28,10 @@ class Matches(NamedTuple):
     maps
         (n, k, 2, 2) derivatives of these over camera 1's reference image, along the surface.
     across
-        (n, k, 2) what a unit of the epipolar offset adds to them: zero in camera 1.
+        (n, k, 2) change of these images for a unit of the epipolar offset: zero in camera 1.
     gain
-        (n, 3, 2) of X, Y, Z over the shift of the one comparison, or (n, 6, 6) of X, Y, Z, U, V, W over those of the
-        three, mm per px of camera 1's reference image.
+        (n, 3, 2) derivative of X, Y, Z over the shift of the one comparison, or (n, 6, 6) of X, Y, Z, U, V, W over the
+        shifts of all three, mm per px of camera 1's reference image.
     laid
         (n, 2, 2) mm along the surface's tangents per px of camera 1's reference image.
     """
@@ -50,7 +50,7 @@ def match_gain(
     displaced_mm: Float | None = None,
     tangents_now: Float | None = None,
 ) -> Matches:
-    """Return what shifts of the comparisons do to measured points.
+    """Return the effect of shifts of the comparisons on measured points.
 
     Parameters
     ----------
@@ -63,7 +63,8 @@ def match_gain(
     displaced_mm
         (n, 3) their current positions.
     tangents_now
-        (n, 3, 2) where the tangents of :func:`core.matching.geometry.tangent_frames` have gone; as they were without.
+        (n, 3, 2) current tangents, of :func:`stereorig.core.matching.geometry.tangent_frames` at the reference;
+        unchanged if None.
     """
     n = len(points_mm)
     tangents = tangent_frames(normals_sys)[..., :2]
@@ -73,7 +74,7 @@ def match_gain(
     first = A2 @ tangents @ laid
     back = np.linalg.inv(first)
     depth, sideways = (back @ A2 @ ray[..., None])[..., 0], (back @ across[..., None])[..., 0]
-    solved = np.linalg.inv(np.stack([depth, sideways], axis=-1))  # of depth and offset over the shift
+    solved = np.linalg.inv(np.stack([depth, sideways], axis=-1))  # derivatives of depth and offset over the shift
     alone = ray[..., None] * solved[:, :1]
     image2 = pair.cam2.project(points_mm).xy
     if displaced_mm is None:
@@ -99,15 +100,15 @@ def match_gain(
 
 
 def noise_covariances(gain: Float, laid: Float, variance_px2: float) -> tuple[Float, Float]:
-    """Return the covariance of matched points, apart by the pair of images whose noise makes it, mm^2.
+    """Return the covariance of matched points in two parts, by the pair of images whose noise causes it, mm^2.
 
     Parameters
     ----------
     gain, laid
-        Of :func:`match_gain`.
+        Values of :func:`match_gain`.
     variance_px2
-        Variance that one image's noise gives a shift, mean of both directions' inverse: the pattern is alike in all
-        directions on the surface, so that where a camera sees it foreshortened its gradients are steeper.
+        Variance of a shift from one image's noise, mean of both directions' inverse: the pattern is alike in all
+        directions on the surface, so that a camera that sees it foreshortened sees steeper gradients.
 
     Returns
     -------

@@ -11,26 +11,26 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.stereo import StereoPair
-from core.dense.kernels.finish import AtPoints, Limits, Shape
-from core.dense.prediction import predict
-from core.dense.windows import Windows, finish_windows, measure_windows, node_positions
-from core.errors import InputError
-from core.field.points.dense_record import DenseRecord
-from core.field.points.images import MeasureImage
-from core.field.points.result import Field
-from core.field.region.region import PointGrid
-from core.field.settings import MeasureOptions
-from core.matching.arguments import own
-from core.settings import DENSE_STEP_PX
-from core.status import PointStatus
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.dense.kernels.finish import AtPoints, Limits, Shape
+from stereorig.core.dense.prediction import predict
+from stereorig.core.dense.windows import Windows, finish_windows, measure_windows, node_positions
+from stereorig.core.errors import InputError
+from stereorig.core.field.points.dense_record import DenseRecord
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.field.settings import MeasureOptions
+from stereorig.core.matching.arguments import own
+from stereorig.core.settings import DENSE_STEP_PX, single_sigma_px
+from stereorig.core.status import PointStatus
 
 _SD = 6.0  # robust standard deviations
-_MISFIT = (2.0, 6.0)  # least and largest limit on a residual over that of the points about
+_MISFIT = (2.0, 6.0)  # least and largest limit on a residual, over the residual of the points about it
 _STEP_PX = 0.05  # an increment beyond it and six times the field's median is no small step from the prediction
 _OFFSET_PX = 0.01
-_SAMPLE = 4  # every fourth vector along both axes tells the scatter
+_SAMPLE = 4  # the scatter is estimated from every fourth vector along both axes
 
 
 def dense_shape(
@@ -53,16 +53,16 @@ def dense_shape(
     shape
         The ordinary shape, as it was measured.
     grid, options
-        With which it was measured.
+        Points and settings of the ordinary shape's measurement.
     step_px
-        Distance of vectors; at most that of the ordinary points.
+        Distance of vectors; at most the distance of the ordinary points.
 
     Returns
     -------
     Field
-        Of ``(n - 1) spacing / step + 1`` vectors along each axis, the first on the first ordinary point. Vectors lie
-        between four valid points of one smooth part whose windows meet no cut; elsewhere ``status`` is ``MASKED``.
-        Normals, angles, rotation and stretch are not measured: NaN.
+        Field with ``(n - 1) spacing / step + 1`` vectors along each axis, the first on the first ordinary point.
+        Vectors are between four valid points of one smooth part whose windows meet no cut; elsewhere ``status`` is
+        ``MASKED``. Normals, angles, rotation and stretch are not measured: NaN.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def dense_motion(
     Raises
     ------
     InputError
-        As :func:`dense_shape`; ``dense_needs_first_reference`` where the step was matched against a later reference;
+        As :func:`dense_shape`; ``dense_needs_first_reference`` if the step was matched against a later reference;
         ``grid_mismatch`` for a dense shape of other points.
     """
     if motion.references is not None:
@@ -186,7 +186,8 @@ def _field(
         shape = Shape(np.empty((0, 0), np.int8), none[..., None], none[..., None, None])
     else:
         shape = Shape(np.ascontiguousarray(dense.status), own(dense.xyz_mm), own(dense.covariance))
-    ratio = float(np.nanmedian(points.ratio))
+    known = points.ratio[np.isfinite(points.ratio)]
+    ratio = float(np.median(known)) if known.size else None
     covariance, noise = finish_windows(windows, points, limits, shape)
     valid = found.status == PointStatus.OK
     nothing = np.broadcast_to(np.nan, valid.shape)
@@ -217,14 +218,14 @@ def _field(
 
 
 def _at_points(windows: Windows, ordinary: Field, step: float) -> AtPoints:
-    """What the ordinary points say of the vectors between them; ``step`` is the vectors' over the points' distance."""
+    """Values from the ordinary points for the vectors between them; ``step`` is vectors' over points' distance."""
     found = windows.found
     n = found.values.shape[2]
     nearest = np.ix_(*(
         np.minimum(np.rint(np.arange(nodes) / step).astype(int), vectors - 1)
         for nodes, vectors in zip(ordinary.shape, found.status.shape, strict=True)
     ))  # fmt: skip
-    # the ordinary field's variance over that of the normal equations, of positions and of displacements
+    # ratio of the ordinary field's variance to the normal equations', for positions and for displacements
     diagonal = [k * n - k * (k - 1) // 2 for k in range(n)]
     here = found.covariance[nearest][..., diagonal].astype(np.float64)
     theirs = np.diagonal(ordinary.covariance, axis1=2, axis2=3)
@@ -242,7 +243,7 @@ def _at_points(windows: Windows, ordinary: Field, step: float) -> AtPoints:
 
 
 def _without_gaps(values: Float) -> Float:
-    """Values (r, c, k) with the field's median where there are none, two rows and columns at least."""
+    """Values (r, c, k) with gaps filled by the field's median, at least two rows and columns."""
     known = np.isfinite(values)
     if not known.all():
         values = np.where(known, values, np.nanmedian(values, axis=(0, 1)) if known.any() else np.nan)
@@ -251,7 +252,7 @@ def _without_gaps(values: Float) -> Float:
 
 
 def _limits(windows: Windows, points: AtPoints, options: MeasureOptions) -> Limits:
-    """What a vector must hold, from the field's own scatter and from the ordinary points about it, by a sample."""
+    """Limits for a vector, from the field's own scatter and from the ordinary points about it, by a sample."""
     found = windows.found
     rows, cols = (np.arange(0, size, _SAMPLE) for size in found.status.shape)
     there = np.ix_(rows, cols)
@@ -263,7 +264,7 @@ def _limits(windows: Windows, points: AtPoints, options: MeasureOptions) -> Limi
     moved = found.moved[there]
     return Limits(
         zncc=options.min_zncc,
-        sigma=options.validity.max_sigma_px,
+        sigma=single_sigma_px(options.validity.max_sigma_px),
         moved=_STEP_PX + _SD * float(np.nanmedian(moved)) if np.isfinite(moved).any() else _STEP_PX,
         offset=_OFFSET_PX + _SD * float(_scatter(off)[0]),
         louder=np.exp(np.clip(_SD * _scatter(louder), *np.log(_MISFIT))).astype(np.float64),

@@ -1,9 +1,9 @@
-"""The smooth prediction of a dense field: where each pixel of camera 1's reference is seen in the other images.
+"""The smooth prediction of a dense field: the place of each pixel of camera 1's reference in the other images.
 
 It is made of an ordinary field's own positions: about each point a quadratic of the positions of its window, and
 between points the bicubic polynomial that has the values and slopes of these at its four corners. Windows of points end
-at cuts, at empty points and at jumps, so a prediction belongs to one smooth part of the surface. It goes on beyond the
-outermost points as far as their subsets reach; where two parts would meet there, it ends.
+at cuts, at empty points and at jumps, so a prediction belongs to one smooth part of the surface. It extends past the
+outermost points as far as their subsets reach, and ends at a place that two parts would share.
 """
 
 from __future__ import annotations
@@ -13,19 +13,21 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from core.arrays import Bool, Float
-from core.field.region.cuts import Cuts
-from core.field.region.window import fit_terms, steps_of, ways_cut, window_offsets
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.core.field.region.window import fit_terms, steps_of, ways_cut, window_offsets
 
 _WIDTHS = (1.5, 1.0, 0.7)
-"""Half widths of the windows that quadratics are fitted to, in subsets. The wider has the less noise in its curvature,
-which is all that reaches a vector: its value is measured anew. It is taken if its curvature differs from the narrowest
-one's by less than that one's noise, as the field's rms; and the narrower serve where it does not fit."""
+"""Half widths of the windows that quadratics are fitted to, in subsets. The wider has less noise in its curvature,
+which is the only part that reaches a vector: a vector's value is measured. It is taken if its curvature differs from
+the narrowest one's by less than the narrowest one's noise, as the field's rms; and the narrower serve at points that it
+does not fit.
+"""
 _MIN_HALF = 2  # points; fewer leave nothing to judge a quadratic by
 
 _JUMP_PX, _JUMP_SD = 0.01, 6.0
 _TINY_PX = 2e-4
-_BEYOND_PX = 0.1  # by which what neighbours predict beyond the outermost points may differ
+_BEYOND_PX = 0.1  # largest difference between neighbours' predictions outside the outermost points
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +42,7 @@ class Prediction:
     seen
         (r + 2 rim - 1, c + 2 rim - 1) True between four points with a prediction that continue one another.
     cells
-        (r - 1, c - 1) True where these four are measured points: vectors lie there alone.
+        (r - 1, c - 1) True if these four are measured points: only there are vectors.
     rim
         Points beyond the field on each side.
     """
@@ -61,7 +63,7 @@ def predict(xy_px: Float, positions: Float, measured: Bool, cuts: Cuts | None, *
     positions
         (r, c, m) their image coordinates in other images, px.
     measured
-        (r, c) True where they are valid.
+        (r, c) True at valid points.
     cuts
         Lines that no window crosses.
     subset_px
@@ -87,7 +89,7 @@ def predict(xy_px: Float, positions: Float, measured: Bool, cuts: Cuts | None, *
             fits = whole & (np.abs(found[:, :, 0] - positions) <= tolerance).all(axis=-1)
         layer = np.pad(found, (*wide, (0, 0), (0, 0)), constant_values=np.nan)
         reached = np.pad(fits, rim)
-        for _ in range(half):  # to the rim, where the same quadratic goes on
+        for _ in range(half):  # to the rim, with the same quadratic
             reached = _spread(layer, reached, shown, _JUMP_PX + _JUMP_SD * scatter, inside)
         new = reached & ~known
         coefficients[new] = layer[new]
@@ -163,7 +165,7 @@ def _quadratics(xy_px: Float, positions: Float, measured: Bool, cuts: Cuts | Non
 
 
 def _share_left(half: int, spacing_px: float, subset_px: int) -> float:
-    """What a quadratic leaves of its middle point's noise, as a standard deviation: neighbours share pixels."""
+    """Noise left after a window's quadratic is subtracted, over a point's noise: neighbours share pixels."""
     left = -_weights(half)[0]
     left[0] += 1.0  # the middle comes first
     return _noise_of(left, half, spacing_px, subset_px)
@@ -188,7 +190,7 @@ def _bends(
 ) -> bool:
     """Return True if the curvature of wide windows misses more than the noise of narrow ones' adds to a vector.
 
-    What reaches a vector is the mean of the quadratic's second-order terms over its window. The field's scatter is the
+    A vector is affected by the mean of the quadratic's second-order terms over its window. The field's scatter is the
     noise of one point.
     """
     moment = (subset_px / spacing_px) ** 2 / 12.0
@@ -209,7 +211,7 @@ def _scatter(values: Float) -> Float:
 
 
 def _spread(coefficients: Float, known: Bool, shown: Float, tolerance: Float, where: Bool) -> Bool:
-    """Extend the quadratics, in place, by one point each way, to points ``where``; return where there are some."""
+    """Extend the quadratics, in place, by one point each way, to points ``where``; return the points with one."""
     rows, cols = known.shape
     r, k = np.nonzero(ndimage.binary_dilation(known, np.ones((3, 3), bool)) & ~known & where)
     if len(r) == 0:

@@ -10,20 +10,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float
-from core.cameras.stereo import StereoPair
-from core.dense.kernels import drivers
-from core.dense.kernels.finish import AtPoints, Limits, Shape
-from core.dense.kernels.given import DenseGiven, DenseOut, Lattice
-from core.dense.prediction import Prediction
-from core.field.region.cuts import Cuts
-from core.matching.arguments import flat, lens_of, own, reference_of, setting_of
-from core.matching.image import ImageData
-from core.matching.options import MatchOptions
-from core.status import PointStatus
-from core.threads import run_ranges, threads
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.dense.kernels import drivers
+from stereorig.core.dense.kernels.finish import AtPoints, Limits, Shape
+from stereorig.core.dense.kernels.given import DenseGiven, DenseOut, Lattice
+from stereorig.core.dense.prediction import Prediction
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.core.matching.arguments import flat, lens_of, own, reference_of, setting_of
+from stereorig.core.matching.image import ImageData
+from stereorig.core.matching.options import MatchOptions
+from stereorig.core.status import PointStatus
+from stereorig.core.threads import run_ranges, threads
 
-_CUT_WIDTH_PX = 5  # two pixels on either side: there a spline takes in what lies beyond
+_CUT_WIDTH_PX = 5  # two pixels on either side: there a spline includes the pixels beyond
 _ROWS_AT_ONCE = 128
 _MIN_ROWS = 32
 
@@ -37,7 +37,7 @@ class Windows:
     xy_px
         (r, c, 2) the vectors, in camera 1's reference image.
     found
-        What was found at each.
+        Result at each.
     """
 
     xy_px: Float
@@ -56,7 +56,7 @@ def node_positions(pair: StereoPair, xy_px: Float, state: Float, *, motion: bool
     state
         (r, c, 5) inverse depth, current position over depth, epipolar offset.
     motion
-        False: of camera 2's reference alone; True: of camera 1's and camera 2's current image besides.
+        False: of camera 2's reference alone; True: also of camera 1's and camera 2's current image.
     """
     return _projected(pair, xy_px, state, 3 if motion else 1)[..., : 6 if motion else 2]
 
@@ -102,7 +102,7 @@ def measure_windows(
     prediction
         Made of them.
     options
-        Those of the field's matching.
+        Options of the field's matching.
     step_px
         Distance of vectors.
     cuts, white
@@ -173,14 +173,14 @@ def measure_windows(
 
 
 def _inside(start: float, step: int, count: int, half: int, size: int) -> tuple[int, int]:
-    """First vector along an axis whose window lies in the image, and the one after the last."""
+    """First vector along an axis whose window is inside the image, and the one after the last."""
     middle = np.floor(start + 0.5) + step * np.arange(count)
     inside = np.flatnonzero((middle >= half) & (middle <= size - 1 - half))
     return (int(inside[0]), int(inside[-1]) + 1) if len(inside) else (0, 0)
 
 
 def _blocked(shape: tuple[int, int], cuts: Cuts | None, white: Bool | None) -> NDArray[np.uint8]:
-    """Pixels of camera 1's reference image that do not count: beside a cut, and off the mask's white."""
+    """Pixels of camera 1's reference image that do not count: next to a cut, and off the mask's white."""
     if not cuts and white is None:
         return np.zeros((0, 0), np.uint8)
     out = np.zeros(shape, np.uint8) if white is None else np.where(white, 0, 1).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""What is common in a field's uncertainty: the calibration's part to all points, the reference's noise to all steps."""
+"""Common parts of a field's uncertainty: the calibration's part for all points, the reference's noise for all steps."""
 
 from __future__ import annotations
 
@@ -7,29 +7,30 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float
-from core.cameras.stereo import StereoPair
-from core.common.budget import budget_of
-from core.common.derivatives import Estimator, ReferenceView, lower_root
-from core.common.factor import FactorColumns, ParameterCovariance, sample_of
-from core.field.points.result import Field
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.common.budget import budget_of
+from stereorig.core.common.derivatives import Estimator, ReferenceView, lower_root
+from stereorig.core.common.factor import Causes, FactorColumns, ParameterCovariance, sample_of
+from stereorig.core.field.points.result import Field
 
 _POINTS_AT_ONCE = 4096
-_KEPT_POINTS = 100_000  # of more, what the steps have in common is made anew for each: it is 0.5 kB a point
+# for larger fields the derivatives that all steps share are recomputed in each step: they take 0.5 kB a point
+_KEPT_POINTS = 100_000
 
 
 @dataclass(eq=False)
 class CommonParts:
-    """What is common in the uncertainty of the fields of one test.
+    """Common parts of the uncertainty of the fields of one test.
 
-    What depends on the reference's points alone is kept from field to field.
+    Derivatives that depend on the reference's points alone are kept from field to field.
 
     Attributes
     ----------
     pair
         The cameras.
     source
-        Covariance of their parameters; None where it is not known.
+        Covariance of their parameters; None if it is not known.
     """
 
     pair: StereoPair
@@ -38,18 +39,21 @@ class CommonParts:
     def __post_init__(self) -> None:
         self._known: tuple[NDArray[np.int64], ReferenceView] | None = None
 
-    def of(self, field: Field) -> Field:
-        """Return the field with what is common in its uncertainty, to all its points and to all steps of a test.
+    def of(self, field: Field, pull_mm: Float | None = None) -> Field:
+        """Return the field with the common parts of its uncertainty, for all its points and for all steps of a test.
 
-        It gets the common factor of its points, none where the calibration's covariance is not known, and the part of
-        the displacement's noise that is the first reference pair's. Of what later references added it has nothing: that
-        counts as new in each step, which is more than there is between two steps of one reference.
+        It gets the common factor of its points, none if the calibration's covariance is not known, and the part of the
+        displacement's noise that is the first reference pair's. The part does not include noise that later references
+        added: this counts as new in each step, which overestimates it between two steps of one reference.
 
         Parameters
         ----------
         field
-            In the system frame, as it is shown: smoothed or not. Smoothing reproduces what varies slowly over its
+            In the system frame, as it is shown: smoothed or not. Smoothing reproduces values that vary slowly over its
             window.
+        pull_mm
+            (r, c, 3) shift of U, V, W by a sensor's fixed pattern (:mod:`stereorig.core.systematic.sensor_pull`): one
+            more column. None: no shift. None: nothing.
 
         Raises
         ------
@@ -78,7 +82,7 @@ class CommonParts:
             frozen = np.full((valid.size, 3, 3), np.nan)
         place = np.flatnonzero(valid)
         noise = field.covariance.reshape(valid.size, *field.covariance.shape[2:])
-        for first in range(0, n, _POINTS_AT_ONCE):  # what stays in the processor's cache
+        for first in range(0, n, _POINTS_AT_ONCE):  # points whose arrays stay in the processor's cache
             some = slice(first, min(first + _POINTS_AT_ONCE, n))
             estimator, here = at(some), place[some]
             if common is not None and columns is not None:
@@ -86,12 +90,13 @@ class CommonParts:
             if frozen is not None:
                 share = None if added is None else added.reshape(-1, 3, 3)[here]
                 frozen[here] = _frozen(noise[here, 3:, 3:], estimator, share)
-        return replace(
+        whole = replace(
             field,
             common=None if common is None else common.reshape(*field.shape, *common.shape[1:]),
             causes=None if columns is None else columns.causes,
             frozen=None if frozen is None else frozen.reshape(*field.shape, 3, 3),
         )
+        return whole if pull_mm is None else _with_pull(whole, pull_mm)
 
     def _view(self, points: Float, valid: Bool) -> ReferenceView:
         """The reference's view of a field's valid points: a step's are the reference's own, but for those it lost."""
@@ -107,16 +112,27 @@ class CommonParts:
         return view
 
 
-def with_common_parts(field: Field, source: ParameterCovariance | None, pair: StereoPair) -> Field:
-    """Return one field with what is common in its uncertainty: see :meth:`CommonParts.of`."""
-    return CommonParts(pair, source).of(field)
+def with_common_parts(
+    field: Field, source: ParameterCovariance | None, pair: StereoPair, pull_mm: Float | None = None
+) -> Field:
+    """Return one field with the common parts of its uncertainty: see :meth:`CommonParts.of`."""
+    return CommonParts(pair, source).of(field, pull_mm)
+
+
+def _with_pull(field: Field, pull_mm: Float) -> Field:
+    """Return a motion with one more column in its common factor."""
+    column = np.concatenate([np.where(np.isfinite(pull_mm), 0.0, np.nan), pull_mm], axis=-1)[..., None]
+    known = np.zeros((*field.shape, 6, 0), np.float32) if field.common is None else field.common
+    causes = Causes((), ()) if field.common is None else field.causes or Causes.unseparated(known.shape[-1])
+    return replace(field, common=np.concatenate([known, column.astype(np.float32)], axis=-1), causes=causes.with_sensor)
 
 
 def _frozen(own: Float, at: Estimator, added: Float | None = None) -> Float:
-    """(n, 3, 3) of the covariance of U, V, W what is the reference pair's noise.
+    """(n, 3, 3) part of the covariance of U, V, W that is the reference pair's noise.
 
-    ``added`` (n, 3, 3) is the share that later references added, of :class:`core.field.points.result.References`: the
-    rest is as if the step had been matched against the first one.
+    ``added`` (n, 3, 3) is the share that later references added, of
+    :class:`stereorig.core.field.points.result.References`: the rest is as if the step had been matched against the
+    first one.
     """
     root = lower_root(own)
     if added is None:
@@ -126,13 +142,13 @@ def _frozen(own: Float, at: Estimator, added: Float | None = None) -> Float:
 
 
 def _positive(matrices: Float) -> Float:
-    """Return symmetric matrices (n, 3, 3) without their negative eigenvalues: what a check lowered may leave some."""
+    """Return symmetric matrices (n, 3, 3) without their negative eigenvalues, which a lowered variance may leave."""
     value, vector = np.linalg.eigh(0.5 * (matrices + np.swapaxes(matrices, 1, 2)))
     return np.asarray((vector * np.maximum(value, 0.0)[:, None, :]) @ np.swapaxes(vector, 1, 2))
 
 
 def notes_of(field: Field) -> tuple[str, ...]:
-    """Return what budgets of a field's quantities do not tell apart, and what they do not include."""
-    at_reference = 0.0 if field.tells_reference else None
+    """Return the sources that budgets of a field's quantities do not separate, and those that they do not include."""
+    at_reference = 0.0 if field.knows_reference else None
     row = None if field.common is None else np.zeros(field.common.shape[-1])
     return budget_of(0.0, at_reference, row, field.causes).notes

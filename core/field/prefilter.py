@@ -1,13 +1,13 @@
 """Bounds of the Gaussian prefilter of all images of a measurement.
 
 All images of all steps are blurred alike before gradients and splines are made of them; seeds are searched for in the
-images as they are. The effect of the blur on noise and covariance: ``core.matching.blur``.
+images as they are. The effect of the blur on noise and covariance: ``stereorig.core.matching.blur``.
 """
 
 from __future__ import annotations
 
-from core.errors import InputError
-from core.settings import PREFILTER_OF_SUBSET
+from stereorig.core.errors import InputError
+from stereorig.core.settings import PREFILTER_OF_SUBSET
 
 
 def check_prefilter(prefilter_px: float, subset_px: int) -> None:

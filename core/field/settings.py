@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from core.errors import InputError
-from core.field.checks.validity import ValidityOptions
-from core.field.prefilter import check_prefilter
-from core.field.region.region import check_subset
-from core.matching.blur import Blur
-from core.matching.options import MatchOptions, Patch
-from core.noise import NoiseModel
-from core.settings import (
+from stereorig.core.errors import InputError
+from stereorig.core.field.checks.validity import ValidityOptions
+from stereorig.core.field.prefilter import check_prefilter
+from stereorig.core.field.region.region import check_subset
+from stereorig.core.matching.blur import Blur
+from stereorig.core.matching.options import MatchOptions, Patch
+from stereorig.core.noise import NoiseModel
+from stereorig.core.settings import (
     DEFAULT_INTERPOLATION,
     DEFAULT_PATCH,
-    DEFAULT_SPLIT_STEP,
     PATCH_SETTINGS,
-    SPLIT_STEP_FROM,
     SUBSET_PX,
     AnalysisSettings,
     Interpolation,
     PatchSetting,
+    single_sigma_px,
 )
 
 
@@ -33,10 +32,10 @@ class MeasureOptions:
     subset_px
         Width of the square subset.
     patch
-        ``stretch`` (default) or the paper's ``rigid``: plane patches. ``curved``: second-order surface and
-        displacement, for about twice the noise. ``auto``: plane (stretch) or curved, whichever has the smaller total
-        error on the field; decided separately for shape and motion. A sequence that changed to curved patches keeps
-        them.
+        ``auto`` (default): ``affine`` or ``quadratic``, the one with the smaller total error on the field; decided
+        separately for shape and motion. A sequence that changed to quadratic patches keeps them. ``affine``, or the
+        paper's ``rigid``: plane patches. ``quadratic``: second-order surface and displacement, for about twice the
+        noise.
     interpolation
         ``quintic`` (default), or ``cubic`` for speed: on sharp speckle it adds a bias of a few thousandths of a pixel.
     min_zncc
@@ -47,13 +46,12 @@ class MeasureOptions:
         Standard deviation of a Gaussian that all images are blurred with before they are compared, px; 0: none. At most
         a quarter of the subset. It removes the interpolation bias of sharp texture and increases the random error.
     noise
-        Noise models of camera 1 and camera 2 (:func:`core.noise.measure_noise`): they weigh the pixels and give the
-        covariances. None: noise from the residuals of each match, all pixels alike.
+        Noise models of camera 1 and camera 2 (:func:`stereorig.core.noise.measure_noise`): they weigh the pixels and
+        give the covariances. None: noise from the residuals of each match, all pixels alike.
     keep_rejected
-        Keep, apart, the numbers of points that a check rejects.
-    split_from
-        Usable points from which a field is grown in two passes, see :mod:`core.field.growth.coarse_first`, and its
-        points may be shared out.
+        Keep the numbers of points that a check rejects, in arrays of their own.
+    coarse_from
+        Usable points from which a field is grown in two passes, see :mod:`stereorig.core.field.growth.coarse_first`.
     """
 
     subset_px: int = SUBSET_PX.default
@@ -64,7 +62,7 @@ class MeasureOptions:
     prefilter_px: float = 0.0
     noise: tuple[NoiseModel | None, NoiseModel | None] = (None, None)
     keep_rejected: bool = False
-    split_from: float = SPLIT_STEP_FROM[DEFAULT_SPLIT_STEP]
+    coarse_from: int = 20_000
 
     def __post_init__(self) -> None:
         check_subset(self.subset_px)
@@ -90,7 +88,6 @@ class MeasureOptions:
             noise=noise,
             validity=ValidityOptions(max_sigma_px=settings.max_sigma_px),
             keep_rejected=settings.keep_rejected,
-            split_from=SPLIT_STEP_FROM[settings.split_step],
         )
 
     @property
@@ -105,5 +102,5 @@ class MeasureOptions:
             subset_px=self.subset_px,
             patch=patch,
             interpolation=self.interpolation,
-            max_sigma_px=self.validity.max_sigma_px,
+            max_sigma_px=single_sigma_px(self.validity.max_sigma_px),
         )

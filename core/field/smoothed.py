@@ -11,12 +11,12 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from core.arrays import Bool, Float
-from core.errors import InputError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels, steps_px
-from core.field.points.smoothing_record import Order, Smoothing, check_smoothing, whole_weights
-from core.field.region.window import connected_points, fit_terms, ways_cut, window_offsets
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.errors import InputError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels, steps_px
+from stereorig.core.field.points.smoothing_record import Order, Smoothing, check_smoothing, whole_weights
+from stereorig.core.field.region.window import connected_points, fit_terms, ways_cut, window_offsets
 
 _AT_ONCE = 1024
 _FIRM = 1e-9
@@ -27,9 +27,9 @@ def smoothed_displacement(field: Field, window: int, *, subset_px: float, order:
     """Return the field with its displacement smoothed.
 
     Each valid point takes the value in the middle of a polynomial that is fitted to the displacements of its window by
-    least squares, all points alike. Cuts, holes and edges end a window; where a quadratic over the points left would be
-    noisier than the point itself a plane replaces it, and where that would be too the point keeps its own value.
-    Invalid points stay invalid.
+    least squares, all points alike. Cuts, holes and edges end a window; if a quadratic over the points left would be
+    noisier than the point itself a plane replaces it, and if the plane would be noisier too the point keeps its own
+    value. Invalid points stay invalid.
 
     Parameters
     ----------
@@ -79,15 +79,17 @@ def smoothed_displacement(field: Field, window: int, *, subset_px: float, order:
     rows, cols = np.nonzero(valid & ~whole)
     there = np.pad(valid, half)
     padded = np.pad(held, ((half, half), (half, half), (0, 0))).reshape(-1, held.shape[-1])
-    width, n_raw = there.shape[1], 0
+    width, alone = there.shape[1], np.zeros(field.shape, bool)
     reach = offsets @ np.array([width, 1])
     for first in range(0, len(rows), _AT_ONCE):
         r, k = rows[first : first + _AT_ONCE], cols[first : first + _AT_ONCE]
         here = (r + half) * width + k + half
         seen = connected_points(there, here, None if crossed is None else crossed[r, k], half)
         weights, raw = _reduced_weights(seen, half, order, rho)
-        n_raw += int(raw.sum())
+        alone[r, k] = raw
         found[r, k] = _sums(padded.take(here[:, None] + reach, axis=0), weights, rho)
+    alone |= valid & ~_positive(found[..., 12:].reshape(*field.shape, 3, 3))
+    found[alone] = held[alone]
     uvw, covariance = field.uvw_mm.copy(), field.covariance.copy()
     uvw[valid] = found[valid][:, :3]
     covariance[valid, :3, 3:] = found[valid][:, 3:12].reshape(-1, 3, 3)
@@ -95,7 +97,7 @@ def smoothed_displacement(field: Field, window: int, *, subset_px: float, order:
     covariance[valid, 3:, 3:] = found[valid][:, 12:].reshape(-1, 3, 3)
     resolution_px = (window - 1) * step[0] + subset_px
     mm_per_px = _mm_per_px(field, step)
-    n_whole = int(whole.sum())
+    n_whole, n_raw = int((whole & ~alone).sum()), int(alone.sum())
     record = Smoothing(
         window=window,
         order=order,
@@ -116,6 +118,13 @@ def _held(field: Field) -> Float:
     c = field.covariance
     parts = [field.uvw_mm, c[..., :3, 3:].reshape(*field.shape, 9), c[..., 3:, 3:].reshape(*field.shape, 9)]
     return np.where(field.valid[..., None], np.concatenate(parts, axis=-1), 0.0)
+
+
+def _positive(covariance: Float) -> Bool:
+    """(r, c) True where a sum's covariance is one: among points of very unlike noise the formula may leave none."""
+    C = covariance
+    minor = C[..., 0, 0] * C[..., 1, 1] - C[..., 0, 1] * C[..., 1, 0]
+    return np.asarray((C[..., 0, 0] > 0.0) & (minor > 0.0) & (np.linalg.det(C) > 0.0))
 
 
 def _over_whole(held: Float, window: int, order: int, rho: Float) -> Float:

@@ -8,12 +8,12 @@ from dataclasses import field as dataclass_field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Bool, Float
-from core.common.budget import UNKNOWN, Budget, budgets_through
-from core.errors import MeasurementError, RegionError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels, roots_of
-from core.gauge.sampling import sample
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.common.budget import UNKNOWN, Budget, budgets_through
+from stereorig.core.errors import MeasurementError, RegionError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels, roots_of
+from stereorig.core.gauge.sampling import sample
 
 _STRAIGHT = 1e-6
 _ROUNDS = 20
@@ -45,20 +45,20 @@ class Alignment:
     residual_rms_mm: float
     points: int
     budgets: tuple[Budget, ...] = (UNKNOWN,) * 6
-    """Of the six errors."""
+    """Budgets of the six errors."""
     own_covariance: Float = dataclass_field(default_factory=lambda: np.zeros((6, 6)))
     """(6, 6) the points' own part of it."""
     common: Float | None = None
-    """(6, k) common factor of the six errors; None where the field has none."""
+    """(6, k) common factor of the six errors; None if the field has none."""
 
 
 def align_plane(
     field: Field, *, shared: SharedPixels, chosen: Bool | None = None, x_direction: ArrayLike = (1.0, 0.0, 0.0)
 ) -> Alignment:
-    """Lay the frame into the best-fit plane of the reference shape.
+    """Align the frame with the best-fit plane of the reference shape.
 
-    Z is the plane's normal on the side of the old Z, X the given direction laid into the plane, the origin the mean of
-    the points laid onto the plane. Distances count by their expected noise.
+    Z is the plane's normal on the side of the old Z, X the given direction projected into the plane, the origin the
+    mean of the points projected onto the plane. Distances count by their expected noise.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def align_plane(
 def image_rows(field: Field) -> Float:
     """Return the direction (3,), of length 1, in which the reference shape runs along camera 1's image rows.
 
-    That of the plane that the reference positions follow over the image; of a curved surface a mean.
+    It is the direction of the plane that the reference positions follow over the image; for a curved surface a mean.
 
     Raises
     ------
@@ -173,15 +173,15 @@ def align_given(rotation: ArrayLike, origin_mm: ArrayLike) -> Alignment:
             code="gauge_unusable",
             remedy="Give the new X, Y and Z as rows, in the system frame.",
         )
-    # what is left of the six digits that were written goes
+    # corrects the rounding to the six digits that were written
     u, _, vt = np.linalg.svd(R)
     return Alignment(u @ vt, origin, np.zeros((6, 6)), 0.0, 0)
 
 
 def align_3_2_1(field: Field, positions_px: ArrayLike, *, shared: SharedPixels) -> Alignment:
-    """Lay the frame through six positions of the reference: three on the plane, two on the X axis, one at its origin.
+    """Align the frame by six positions of the reference: three on the plane, two on the X axis, one at its origin.
 
-    Z is the normal of the first three on the side of the old Z; X runs from the fourth to the fifth, laid into the
+    Z is the normal of the first three on the side of the old Z; X runs from the fourth to the fifth, projected into the
     plane; Y = 0 on that line, X = 0 at the sixth, Z = 0 in the plane. A position may be given more than once.
 
     Parameters
@@ -231,7 +231,7 @@ def align_3_2_1(field: Field, positions_px: ArrayLike, *, shared: SharedPixels) 
             moved = x.copy().ravel()
             moved[k] += sign * step
             R2, o2 = three_two_one(moved.reshape(6, 3))
-            turn = R @ R2.T  # of the new axes, along the new axes
+            turn = R @ R2.T  # rotation of the new axes, along the new axes
             ends.append(np.concatenate([[turn[2, 1], turn[0, 2], turn[1, 0]], R @ (o2 - origin)]))
         slope[:, k] = (ends[0] - ends[1]) / (2.0 * step)
     budgets = budgets_through(slope, own, own, shift, field.causes)

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Bool, Float, Floats
-from core.common.factor import Causes
-from core.errors import RegionError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels, steps_px
-from core.field.region.region import PointGrid
-from core.gauge.reading import MISSING, Reading, reading_of
+from stereorig.core.arrays import Bool, Float, Floats
+from stereorig.core.common.factor import Causes
+from stereorig.core.errors import RegionError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels, steps_px
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.gauge.reading import MISSING, Reading, reading_of
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,12 @@ class AreaStatistics:
     points
         Points of the grid in the area, valid or not.
     mean, sd, minimum, maximum, rms
-        Of the values; ``sd`` about the mean, with count - 1. NaN without values.
+        Statistics of the values; ``sd`` about the mean, with count - 1. NaN without values. NaN without values.
     mean_sigma
-        Standard uncertainty of the mean, from the points' noise, their common pixels and their common factor; NaN where
-        it is unknown.
+        Standard uncertainty of the mean, from the points' noise, their common pixels and their common factor; NaN if it
+        is unknown.
     mean_sigma_calibration
-        The common factor's part of it; NaN where that is not known, and then not included.
+        The common factor's part of it; NaN if that is not known and not included.
     mean_reading
         The mean with its budget.
     """
@@ -51,7 +51,7 @@ class AreaStatistics:
     def with_mean_variance(
         self, own: float, frozen: float | None, common: Float | None, causes: Causes | None
     ) -> AreaStatistics:
-        """Return them with another uncertainty of the mean, from what :func:`reading_of` takes."""
+        """Return them with another uncertainty of the mean, from arguments as in :func:`reading_of`."""
         mean = reading_of(self.mean, own, frozen, common, causes)
         return replace(self, mean_sigma=mean.sigma, mean_sigma_calibration=mean.sigma_calibration, mean_reading=mean)
 
@@ -69,7 +69,7 @@ def points_within(field: Field, polygon_px: ArrayLike | None) -> Bool:
     Raises
     ------
     RegionError
-        ``gauge_outside`` if no point of the grid lies within; ``region_unusable`` or ``region_empty`` for no polygon.
+        ``gauge_outside`` if no point of the grid is inside; ``region_unusable`` or ``region_empty`` for no polygon.
     """
     if polygon_px is None:
         return np.ones(field.shape, bool)
@@ -113,7 +113,7 @@ def area_statistics(
     common
         (r, c, k) the variable's common factor, which a mean does not reduce.
     sigma_reference
-        (r, c) the reference pair's part of the own standard deviations; None where it is not told apart.
+        (r, c) the reference pair's part of the own standard deviations; None if it is not known separately.
     """
     used = inside & field.valid & np.isfinite(values)
     v = values[used]

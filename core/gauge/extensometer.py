@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Float
-from core.errors import RegionError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels
-from core.gauge.reading import MISSING, Reading, reading_of
-from core.gauge.sampling import Samples, sample
+from stereorig.core.arrays import Float
+from stereorig.core.errors import RegionError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.gauge.reading import MISSING, Reading, reading_of
+from stereorig.core.gauge.sampling import Samples, sample
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Float
-from core.errors import RegionError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import steps_px
+from stereorig.core.arrays import Float
+from stereorig.core.errors import RegionError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import steps_px
 
 MAX_POSITIONS = 100_000
 

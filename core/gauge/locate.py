@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Float
-from core.errors import RegionError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import steps_px
-from core.gauge.sampling import sample
+from stereorig.core.arrays import Float
+from stereorig.core.errors import RegionError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import steps_px
+from stereorig.core.gauge.sampling import sample
 
 _ROUNDS = 20
 _REFINED = 5  # each round corrects for the bend of a cell in the next digits
 _ON_THE_EDGE = 1e-9
-_SAME = 1e-6  # of a cell: two cells that meet there
+_SAME = 1e-6  # share of a cell: two cells that meet there
 
 
 def positions_from_mm(field: Field, xy_mm: ArrayLike) -> Float:
@@ -30,8 +30,8 @@ def positions_from_mm(field: Field, xy_mm: ArrayLike) -> Float:
     Raises
     ------
     RegionError
-        ``gauge_outside`` where no cell of four valid points contains a position; ``gauge_ambiguous`` where two parts of
-        a surface that folds over do.
+        ``gauge_outside`` if no cell of four valid points contains a position; ``gauge_ambiguous`` if two parts of a
+        surface that folds over do.
     """
     wanted = np.atleast_2d(np.asarray(xy_mm, dtype=np.float64))
     if wanted.ndim != 2 or wanted.shape[1] != 2 or not np.isfinite(wanted).all():
@@ -74,7 +74,7 @@ def positions_from_mm(field: Field, xy_mm: ArrayLike) -> Float:
 
 
 def _refined(field: Field, wanted: Float, xy_px: Float, slopes: Float) -> Float:
-    """Return positions (m, 2) at which :func:`sample` gives the X and Y wanted, from those of straight cells."""
+    """Return positions (m, 2) at which :func:`sample` gives the X and Y wanted, starting from bilinear positions."""
     first, last = np.array([v[[0, -1], [0, -1]] for v in (field.x_px, field.y_px)]).T
     for _ in range(_REFINED):
         off = wanted - sample(field, xy_px).of(field.xyz_mm)[:, :2]
@@ -91,7 +91,7 @@ def _slope(corners: Float, t: Float) -> Float:
 
 
 def _inside(corners: Float, position: Float) -> Float:
-    """Solve bilinear cells (n, 4, 2) for a position by Newton's method; (n, 2) across and down, NaN where it fails."""
+    """Solve bilinear cells (n, 4, 2) for a position by Newton's method; (n, 2) across and down, NaN if it fails."""
     a, b, c, d = (corners[:, k] for k in range(4))
     t = np.full((len(corners), 2), 0.5)
     for _ in range(_ROUNDS):

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from core.arrays import Float
-from core.common.budget import UNKNOWN, Budget, budget_of, budget_of_difference
-from core.common.factor import Causes
-from core.names import CAUSES
+from stereorig.core.arrays import Float
+from stereorig.core.common.budget import UNKNOWN, Budget, budget_of, budget_of_difference
+from stereorig.core.common.factor import Causes
+from stereorig.core.names import CAUSES
 
 
 class Reading(NamedTuple):
@@ -18,17 +18,17 @@ class Reading(NamedTuple):
     Attributes
     ----------
     value
-        NaN where it is missing.
+        NaN if it is missing.
     sigma
-        Standard uncertainty in the value's unit; NaN where it is not known.
+        Standard uncertainty in the value's unit; NaN if it is not known.
     sigma_calibration
-        The common factor's part of it; NaN where that is not known, and then not included.
+        The calibration's part of it; NaN if that is not known and not included.
     budget
-        Where it comes from.
+        Its parts by source.
     common
-        (k,) common factor of the value; None where it is not known.
+        (k,) common factor of the value; None if it is not known.
     causes
-        Of its columns.
+        Causes of the factor's columns.
     """
 
     value: float
@@ -45,23 +45,24 @@ def reading_of(value: float, own: float, frozen: float | None, common: Float | N
     budget = budget_of(own, frozen, common, causes)
     if common is None:
         return Reading(value, sigma, budget=budget)
-    part = float(np.linalg.norm(common))
-    return Reading(value, float(np.hypot(sigma, part)), part, budget, common, causes)
+    known = Causes.unseparated(len(common)) if causes is None else causes
+    whole = float(np.hypot(sigma, np.linalg.norm(common)))
+    return Reading(value, whole, float(known.of_calibration(common)), budget, common, causes)
 
 
 def readings_of(values: Float, own: Float, common: Float | None, causes: Causes | None) -> list[Reading]:
     """Return the readings of numbers (k,) as :func:`reading_of` does, all at once.
 
-    ``own`` (k,) are their own variances, of which the reference's part is not told apart; ``common`` (k, c) their
-    common factors.
+    ``own`` (k,) are their own variances, without a separate reference's part; ``common`` (k, c) their common factors.
     """
     sigma = np.sqrt(np.maximum(own, 0.0))
     if common is None:
         return [Reading(v, s, budget=Budget(matching=s)) for v, s in zip(values.tolist(), sigma.tolist(), strict=True)]
-    told = Causes.untold(common.shape[1]) if causes is None else causes
-    parts = {name: np.sqrt(square).tolist() for name, square in told.squares(common).items()}
-    part = np.linalg.norm(common, axis=1)
-    each = zip(values.tolist(), np.hypot(sigma, part).tolist(), part.tolist(), sigma.tolist(), strict=True)
+    known = Causes.unseparated(common.shape[1]) if causes is None else causes
+    parts = {name: np.sqrt(square).tolist() for name, square in known.squares(common).items()}
+    whole = np.hypot(sigma, np.linalg.norm(common, axis=1))
+    part = known.of_calibration(common)
+    each = zip(values.tolist(), whole.tolist(), part.tolist(), sigma.tolist(), strict=True)
     return [
         Reading(
             value,
@@ -78,7 +79,7 @@ def readings_of(values: Float, own: Float, common: Float | None, causes: Causes 
 def difference(a: Reading, b: Reading) -> Reading:
     """Return b - a, of one quantity in two steps of a test; NaN without either value.
 
-    What both steps share cancels, see :func:`core.common.budget.budget_of_difference`.
+    Errors that both steps share cancel, see :func:`stereorig.core.common.budget.budget_of_difference`.
     """
     budget = budget_of_difference(a.budget, b.budget, a.common, b.common, a.causes, b.causes)
     parts = [square for name, square in budget.document().items() if name in CAUSES]

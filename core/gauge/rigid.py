@@ -1,7 +1,7 @@
 """The rigid motion of a field, and the field without it.
 
 A point X that moved by U is at X + U = c + d + R (X - c) + r. R and d minimise the sum of r^T W r, W the inverse of r's
-covariance; c is the centre of the points used. Where the body deforms, the residual r is more than noise; then r's
+covariance; c is the centre of the points used. If the body deforms, the residual r is more than noise; then r's
 covariance is the noise's plus an isotropic variance that accounts for the residual. Else a body that only stretches
 would be turned until its contraction looks like a tilt, since depth is the noisiest direction. The parameters'
 covariance comes from the points' own, from the pixels that overlapping subsets share, and from their common factor.
@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Bool, Float
-from core.common.budget import Budget, budgets_through
-from core.errors import InputError, MeasurementError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels, roots_of
-from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.common.budget import Budget, budgets_through
+from stereorig.core.errors import InputError, MeasurementError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels, roots_of
+from stereorig.core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight
 
 _MIN_POINTS = 3
 _ROUNDS = 50
@@ -48,7 +48,7 @@ class RigidMotion:
     points
         Number of points with a weight above zero.
     residual_rms_mm
-        Of r over these points, all three components together: deformation and noise.
+        Rms of r over these points, all three components together: deformation and noise.
     noise_ratio
         Root mean square of r in units of its expected noise; 1 for a rigid body with the stated noise.
     """
@@ -66,13 +66,13 @@ class RigidMotion:
     own_covariance: Float
     """(6, 6) of the small rotation that follows R and the translation, without the common part."""
     common: Float | None
-    """(6, k) common factor of the small rotation and the translation; None where the field has none."""
+    """(6, k) common factor of the small rotation and the translation; None if the field has none."""
     sigma_common: Float
     """(6,) the common part's standard deviations, as ``covariance``; NaN where the field has none."""
     budgets: tuple[Budget, ...]
-    """Of the rotation vector's three components (rad) and the translation's (mm)."""
+    """Budgets of the rotation vector's three components (rad) and the translation's (mm)."""
     reference_covariance: Float | None
-    """(6, 6) part of ``own_covariance`` that is the reference pair's noise; None where it is not told apart."""
+    """(6, 6) part of ``own_covariance`` that is the reference pair's noise; None if it is not known separately."""
 
 
 def skew(v: Float) -> Float:

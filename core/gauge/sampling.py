@@ -1,7 +1,7 @@
 """Values between the points of the grid, never over a missing point or a cut.
 
 Between four points along a line a cubic goes through the inner two with the slopes of their neighbours (Keys 1981,
-doi:10.1109/TASSP.1981.1163711); quadratics are reproduced exactly. Where one of the 4 x 4 points about a position is
+doi:10.1109/TASSP.1981.1163711); quadratics are reproduced exactly. If one of the 4 x 4 points about a position is
 missing, its cell's corners alone are used: the error between them is then up to an eighth of the curvature times the
 squared spacing.
 """
@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.arrays import Bool, Float, Floats
-from core.errors import RegionError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels, roots_of, steps_px
-from core.field.region.cuts import crosses
-from core.status import PointStatus
+from stereorig.core.arrays import Bool, Float, Floats
+from stereorig.core.errors import RegionError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels, roots_of, steps_px
+from stereorig.core.field.region.cuts import crosses
+from stereorig.core.status import PointStatus
 
 _ON_A_POINT = 1e-9
 _CUT = "cut"
@@ -64,11 +64,11 @@ class Samples:
         return np.asarray(np.where(weight == 0.0, 0.0, weight * flat).sum(axis=1))
 
     def common(self) -> Float | None:
-        """Return the positions' common factor (m, n, k); None where the field has none."""
+        """Return the positions' common factor (m, n, k); None if the field has none."""
         return None if self.field.common is None else self.of(self.field.common)
 
     def reference_alone(self) -> Samples | None:
-        """Return the samples with the reference pair's noise alone; None where it is not told apart."""
+        """Return the samples with only the reference pair's noise; None if it is not known separately."""
         field = self.field.reference_alone
         return None if field is None else replace(self, field=field)
 
@@ -120,10 +120,9 @@ class Samples:
 def sample(field: Field, xy_px: ArrayLike) -> Samples:
     """Sample a field between its points.
 
-    A position is interpolated from the 4 x 4 points about it, by cubics. Where one of them is invalid, lies beyond a
-    cut or the grid's edge, the four corners of its cell are used, bilinearly; three if the fourth is invalid or lies
-    beyond a cut and the position lies inside their triangle; two or one where it lies on the grid's lines. Else it has
-    no value.
+    A position is interpolated from the 4 x 4 points about it, by cubics. If one of them is invalid, or is beyond a cut
+    or the grid's edge, the four corners of its cell are used, bilinearly; three if the fourth is invalid or beyond a
+    cut and the position is inside their triangle; two or one for a position on the grid's lines. Else it has no value.
 
     Parameters
     ----------
@@ -161,7 +160,7 @@ def sample(field: Field, xy_px: ArrayLike) -> Samples:
     low = np.minimum(np.floor(f).astype(np.int64), np.maximum(last - 1, 0))
     high = np.minimum(low + 1, last)
     t = f - low
-    ox, oy = np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1])  # of the corners
+    ox, oy = np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1])  # column and row offsets of the corners
     index = np.where(oy, high[:, 1:], low[:, 1:]) * cols + np.where(ox, high[:, :1], low[:, :1])
     wide, wide_weight = _by_cubics(field, xy, low, t)
     across, down = np.where(ox, t[:, :1], 1.0 - t[:, :1]), np.where(oy, t[:, 1:], 1.0 - t[:, 1:])
@@ -191,7 +190,7 @@ def sample(field: Field, xy_px: ArrayLike) -> Samples:
 
 
 def _by_cubics(field: Field, xy_px: Float, low: NDArray[np.int64], t: Float) -> tuple[NDArray[np.int64], Float]:
-    """Return (m, 16) flat indices of the points about positions and their weights, NaN where one of them is missing.
+    """Return (m, 16) flat indices of the points about positions and their weights, NaN if one of them is missing.
 
     ``low`` (m, 2) column and row of the cell's first corner, ``t`` (m, 2) position in the cell, 0 to 1.
     """

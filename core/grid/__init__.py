@@ -2,11 +2,19 @@
 
 from typing import TYPE_CHECKING
 
-from core.lazy import names_of
+from stereorig.core.lazy import names_of
 
 if TYPE_CHECKING:
-    from core.grid.detect import detect_grid, find_grid, lines_shown
-    from core.grid.view import GridOptions, GridOverlay, GridView, LineModel, LineOffsets, Localiser, Orientation
+    from stereorig.core.grid.detect import detect_grid, find_grid, lines_shown
+    from stereorig.core.grid.view import (
+        GridOptions,
+        GridOverlay,
+        GridView,
+        LineModel,
+        LineOffsets,
+        Localiser,
+        Orientation,
+    )
 
 __all__ = [
     "GridOptions",

@@ -1,7 +1,7 @@
 """Joining of pieces to whole lines of one family, and their order.
 
-Pieces that lie on each other's prolongation make a line. Lines of one family cross any other line at positions that are
-a projective function of their number, so neighbouring gaps differ little: following the gaps numbers the lines, passes
+Pieces on each other's prolongation form a line. Lines of one family cross any other line at positions that are a
+projective function of their number, so neighbouring gaps differ little: following the gaps numbers the lines, passes
 over a line that is missing and leaves out other structures (scratches, frames, edges).
 """
 
@@ -12,14 +12,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float
-from core.grid.directions import Pieces
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.grid.directions import Pieces
 
 _STEP_CHANGE = 0.22  # neighbouring gaps of a grid differ by at most this part, even at 35 degrees through a wide lens
 _MAX_ROUNDS = 40
 _MAX_LINES = 150
 _MAX_TURN = 0.15  # rad between a piece and its line
-_MIN_SHARE = 0.25  # of the longest line's seen length; shorter ones are clutter
+_MIN_SHARE = 0.25  # share of the longest line's seen length; shorter ones are clutter
+# where lines are broken: two pieces of eleven are no clutter, and a piece of another line is further off than this part
+# of a piece's length
+_BROKEN_SHARE, _BROKEN_OFF = 0.12, 0.25
+_PASSED_OVER, _BROKEN_PASSED_OVER = 1, 3  # neighbouring lines that may be missing
+_MAX_STEP_ERROR = 0.45  # share of a gap, for any number of missing lines
 
 
 @dataclass(frozen=True)
@@ -53,8 +58,11 @@ class CoarseLine:
         return np.asarray(self.centre_px + t[..., None] * self.direction + off[..., None] * normal)
 
 
-def link(pieces: Pieces) -> list[CoarseLine]:
-    """Join pieces that prolong each other: a line grows from its heaviest piece outwards."""
+def link(pieces: Pieces, *, broken: bool = False) -> list[CoarseLine]:
+    """Join pieces that prolong each other: a line grows from its heaviest piece outwards.
+
+    ``broken``: the pieces of one line may be far apart.
+    """
     n = len(pieces)
     if n < 3:
         return []
@@ -63,23 +71,28 @@ def link(pieces: Pieces) -> list[CoarseLine]:
     lines: list[CoarseLine] = []
     for seed in np.argsort(-pieces.weight):
         if free[seed] and len(lines) < _MAX_LINES:
-            members = _grow(pieces, int(seed), free, typical)
+            members = _grow(pieces, np.array([seed]), free, typical)
+            if broken:
+                members = _grow(pieces, members, free, typical, broken=True)
             free[members] = False
             lines.append(_fit(pieces.take(members)))
     longest = max(line.seen_px for line in lines)
-    return [line for line in lines if line.seen_px >= _MIN_SHARE * longest]
+    least = _BROKEN_SHARE if broken else _MIN_SHARE
+    return [line for line in lines if line.seen_px >= least * longest]
 
 
-def _grow(pieces: Pieces, seed: int, free: Bool, typical: float) -> NDArray[np.intp]:
-    members = np.array([seed])
+def _grow(
+    pieces: Pieces, seed: NDArray[np.intp], free: Bool, typical: float, *, broken: bool = False
+) -> NDArray[np.intp]:
+    members, reach, most = (seed, np.inf, _BROKEN_OFF * typical) if broken else (seed, 2.0 * typical, np.inf)
     for _ in range(_MAX_ROUNDS):
         line = _fit(pieces.take(members))
         t, off, turn = _against(line, pieces)
         beyond = np.maximum(np.maximum(t - line.span_px[1], line.span_px[0] - t), 0.0)
         on_line = (
             free
-            & (beyond - 0.5 * pieces.length_px < 2.0 * typical)
-            & (np.abs(off) < 1.2 + 0.07 * beyond)
+            & (beyond - 0.5 * pieces.length_px < reach)
+            & (np.abs(off) < np.minimum(1.2 + 0.07 * beyond, most))
             & (np.abs(turn) < _MAX_TURN)
         )
         on_line[seed] = True
@@ -147,8 +160,13 @@ class Chain:
         return int(self.number[-1]) + 1 if len(self.number) else 0
 
 
-def order(lines: list[CoarseLine], transversal_point: Float, transversal_direction: Float) -> Chain:
-    """Number the lines by their crossings with a transversal, growing along its direction."""
+def order(
+    lines: list[CoarseLine], transversal_point: Float, transversal_direction: Float, *, broken: bool = False
+) -> Chain:
+    """Number the lines by their crossings with a transversal, growing along its direction.
+
+    ``broken``: several neighbouring lines may be missing.
+    """
     if not lines:
         return Chain((), np.zeros(0, dtype=np.intp), ())
     u = np.array([_crossing(line, transversal_point, transversal_direction) for line in lines])
@@ -161,7 +179,7 @@ def order(lines: list[CoarseLine], transversal_point: Float, transversal_directi
         for b in range(a + 1, min(a + 4, n)):
             if u[b] - u[a] < 4.0:  # two halves of one line
                 continue
-            members = _follow(u, a, b)
+            members = _follow(u, a, b, _BROKEN_PASSED_OVER if broken else _PASSED_OVER)
             seen = [ordered[k].seen_px for _, k in members]
             numbers = [i for i, _ in members]
             missing = max(numbers) - min(numbers) + 1 - len(members)
@@ -184,18 +202,18 @@ def _crossing(line: CoarseLine, point: Float, direction: Float) -> float:
     return float(((line.centre_px + line.bend[0] * normal - point) @ normal) / (direction @ normal))
 
 
-def _follow(u: Float, a: int, b: int) -> list[tuple[int, int]]:
-    """Walk both ways from two neighbours; return (number, index) of the lines met, passing over one missing line."""
+def _follow(u: Float, a: int, b: int, passed_over: int) -> list[tuple[int, int]]:
+    """Walk both ways from two neighbours; return (number, index) of the lines met, passing over missing lines."""
     members = [(0, a), (1, b)]
     for sign, start in ((1, b), (-1, a)):
         number = 1 if sign > 0 else 0
         last, step, growth = float(u[start]), float(u[b] - u[a]), 1.0
         missed = 0
-        while missed < 2:
+        while missed <= passed_over:
             guess = last + sign * step * growth
             k = int(np.argmin(np.abs(u - guess)))
             number += sign
-            if abs(u[k] - guess) < _STEP_CHANGE * step * (1 + missed):
+            if abs(u[k] - guess) < min(_STEP_CHANGE * (1 + missed), _MAX_STEP_ERROR) * step:
                 new_step = abs(float(u[k]) - last)
                 # half of the last change is carried on: gaps change smoothly, single ones carry errors
                 growth = 1.0 + 0.5 * float(np.clip(new_step / step - 1.0, -_STEP_CHANGE, _STEP_CHANGE))

@@ -1,8 +1,7 @@
 """The paper's localiser: dark pixels, weighted by their distance from the threshold, and one parabola a line.
 
-"Non-oblique": the parabola is y(x), or x(y) where the line is steeper than 45 degrees, so that least squares is
-linear. Every pixel below the threshold that lies on the line, away from the crossings, is a data point with the
-weight threshold - grey level.
+"Non-oblique": the parabola is y(x), or x(y) for a line steeper than 45 degrees, so that least squares is linear. Every
+pixel below the threshold on the line, away from the crossings, is a data point with the weight threshold - grey level.
 """
 
 from __future__ import annotations
@@ -12,13 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from core.arrays import Bool, Float, Float32
-from core.grid.piece_table import PieceTable
-from core.grid.strip import in_strip, strip_bounds
+from stereorig.core.arrays import Bool, Float, Float32
+from stereorig.core.grid.piece_table import PieceTable
+from stereorig.core.grid.strip import in_strip, strip_bounds
 
-# of the depth, below the ground: nearer to the ground noise rules, further down the few pixels left beat with the
-# lattice;
-# between 0.15 and 0.3 the error on the paper's rig is 0.0043 px an axis, at 0.5 it is 0.007
+# share of the depth, below the ground: nearer to the ground noise rules, further down the few pixels left beat with the
+# lattice; between 0.15 and 0.3 the error on the paper's rig is 0.0043 px an axis, at 0.5 it is 0.007
 THRESHOLD = 0.22
 _BLURS = 4.0
 

@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
-from core.arrays import Bool, Float, Float32
-from core.grid.threshold import LinePicture
+from stereorig.core.arrays import Bool, Float, Float32
+from stereorig.core.grid.threshold import LinePicture
 
 _COHERENCE = 0.5
-_FAMILY_REACH_DEG = 22.0
+FAMILY_REACH_RAD = float(np.radians(22.0))
 _MAX_PIECES = 1500  # a family of 20 lines has 380
 _MAX_PEAKS = 5
-_PEAK_SHARE = 0.08  # of the strongest direction; weaker ones are not half of a grid
+_PEAK_SHARE = 0.08  # share of the strongest direction; weaker ones are not half of a grid
 
 
 @dataclass(frozen=True)
@@ -90,10 +90,12 @@ def directions(picture: LinePicture) -> Directions:
     return Directions(along, usable, tuple(float(np.radians(k + 0.5)) for k in order))
 
 
-def family_pieces(picture: LinePicture, found: Directions, direction_rad: float) -> Pieces:
-    """Collect the pieces that run within 22 degrees of a direction."""
+def family_pieces(
+    picture: LinePicture, found: Directions, direction_rad: float, reach_rad: float = FAMILY_REACH_RAD
+) -> Pieces:
+    """Collect the pieces that run within an angle of a direction."""
     off = np.abs(np.mod(found.angle_rad - direction_rad + 0.5 * np.pi, np.pi) - 0.5 * np.pi)
-    mask = found.usable & (off < np.radians(_FAMILY_REACH_DEG))
+    mask = found.usable & (off < reach_rad)
     n, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8, ltype=cv2.CV_32S)
     y, x = np.nonzero(mask)
     label = labels[y, x]
@@ -115,7 +117,7 @@ def family_pieces(picture: LinePicture, found: Directions, direction_rad: float)
     angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
     # a piece is longer than it is wide, and runs the family's way
     off_piece = np.abs(np.mod(angle - direction_rad + 0.5 * np.pi, np.pi) - 0.5 * np.pi)
-    keep &= (long_var > 4.0 * cross_var) & (off_piece < np.radians(_FAMILY_REACH_DEG))
+    keep &= (long_var > 4.0 * cross_var) & (off_piece < reach_rad)
     which = np.flatnonzero(keep)
     if len(which) > _MAX_PIECES:
         which = which[np.argsort(-sw[which])[:_MAX_PIECES]]

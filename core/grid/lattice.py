@@ -7,31 +7,37 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 
-from core.arrays import Float
-from core.errors import TargetError
-from core.grid.chains import Chain, CoarseLine, link, order
-from core.grid.directions import Directions, family_pieces
-from core.grid.lines.parabolas import meet_parabolas
-from core.grid.threshold import LinePicture
-from core.grid.view import Orientation
+from stereorig.core.arrays import Float
+from stereorig.core.errors import TargetError
+from stereorig.core.grid.chains import Chain, CoarseLine, link, order
+from stereorig.core.grid.directions import FAMILY_REACH_RAD, Directions, family_pieces
+from stereorig.core.grid.lines.parabolas import meet_parabolas
+from stereorig.core.grid.threshold import LinePicture
+from stereorig.core.grid.view import Orientation
 
 _COARSE = ("centre_px", "direction", "bend")
-_MIN_CROSSING_RAD = np.radians(40.0)
+# angles at which two families cross; the narrower ones, of a grid seen at 68 to 80 degrees, only if no others do
+_CROSSINGS_RAD = np.radians([[40.0, 90.0], [20.0, 40.0]])
+_SHOW = (
+    "Show the whole target, clean, evenly lit and in focus, its lines 12 px apart or more: one that is seen obliquely "
+    "has them nearer in one direction."
+)
 _MIN_LINES = 4
 _MIN_SEEN = 0.4
-# upper ends of the quarter of a turn in which X_sys lies. Without a named orientation, grids within 22 degrees of 45
+# upper ends of the quarter of a turn that contains X_sys. Without a named orientation, grids within 22 degrees of 45
 # are indexed as diagonal ones, and grids within 22 degrees of the rows as upright ones
 _HIGHEST_DEG: dict[Orientation | None, float] = {"diagonal": 90.0, "upright": 45.0, None: 67.0}
 _SURELY_UPRIGHT_DEG = 10.0  # within this a grid is not taken for a diagonal one by its counts
-_STRAY_END = 0.1  # of the pitch; an end line that deviates by more is an edge or a frame
+_STRAY_END = 0.1  # share of the pitch; an end line that deviates by more is an edge or a frame
 
 
 @dataclass(frozen=True)
-class Lattice:
+class LineLattice:
     """Numbered lines and their intersections.
 
     Attributes
@@ -58,6 +64,14 @@ class Lattice:
         return self.nodes_px.shape[0], self.nodes_px.shape[1]
 
     @property
+    def tilt_rad(self) -> float:
+        """Angle at which the camera sees the target off its normal, for a narrow view and pixels nearly square."""
+        middle = 0.5 * np.array(self.counts)
+        corner, *ends = apply_homography(self.plane_to_image, middle + np.array([[0.0, 0.0], [1e-3, 0.0], [0.0, 1e-3]]))
+        large, small = np.linalg.svd(np.array(ends) - corner, compute_uv=False)
+        return float(np.arccos(small / large))
+
+    @property
     def pitch_px(self) -> float:
         """Median distance of neighbouring intersections."""
         return pitch_px(self.nodes_px)
@@ -70,35 +84,49 @@ def pitch_px(nodes_px: Float) -> float:
     return float(np.median(np.concatenate([da, db])))
 
 
-def find_lattice(picture: LinePicture, found: Directions) -> Lattice:
+def polylines(nodes_px: Float) -> list[list[float]]:
+    """Return the lattice's lines from end to end, [x0, y0, x1, y1] each, for a picture."""
+    ends = [(line[0], line[-1]) for line in nodes_px] + [(line[0], line[-1]) for line in np.swapaxes(nodes_px, 0, 1)]
+    return [[round(float(v), 1) for v in (*p, *q)] for p, q in ends]
+
+
+def find_lattice(picture: LinePicture, found: Directions, *, broken: bool = False) -> LineLattice:
     """Try the picture's main directions in pairs; return the lattice with the most line seen.
+
+    ``broken``: covers and dirt may hide long parts of lines, and several neighbouring lines.
 
     Raises
     ------
     TargetError
         ``target_not_found`` if no pair of directions has four lines each.
     """
-    best: Lattice | None = None
+    best: LineLattice | None = None
     best_seen = 0.0
     max_counts = (0, 0)
-    for p in range(len(found.peaks_rad)):
-        for q in range(p + 1, len(found.peaks_rad)):
-            angle_rad = abs(found.peaks_rad[p] - found.peaks_rad[q])
-            if min(angle_rad, np.pi - angle_rad) < _MIN_CROSSING_RAD:
+    for low, high in _CROSSINGS_RAD:
+        for p, q in combinations(found.peaks_rad, 2):
+            if not low <= _between(p, q) <= high:
                 continue
-            lattice, seen, counts = _try_pair(picture, found, found.peaks_rad[p], found.peaks_rad[q])
+            lattice, seen, counts = _try_pair(picture, found, p, q, broken)
             max_counts = max(max_counts, counts, key=min)
             if lattice is not None and seen > best_seen:
                 best, best_seen = lattice, seen
-    if best is None:
-        raise not_found(
-            "no grid is seen: nowhere do two sets of parallel lines cross (at best "
-            f"{max_counts[0]} and {max_counts[1]} lines were found)",
-            found_a=max_counts[0],
-            found_b=max_counts[1],
-            clearness=picture.clearness,
-        )
-    return best
+        if best is not None:
+            return best
+    raise not_found(
+        "no grid is seen: nowhere do two sets of parallel lines cross (at best "
+        f"{max_counts[0]} and {max_counts[1]} lines were found)",
+        remedy=_SHOW,
+        found_a=max_counts[0],
+        found_b=max_counts[1],
+        clearness=picture.clearness,
+    )
+
+
+def _between(first_rad: float, second_rad: float) -> float:
+    """Return the angle between two directions of lines."""
+    angle_rad = abs(first_rad - second_rad)
+    return min(angle_rad, np.pi - angle_rad)
 
 
 def not_found(cause: str, **context: Any) -> TargetError:
@@ -107,9 +135,9 @@ def not_found(cause: str, **context: Any) -> TargetError:
 
 
 def _try_pair(
-    picture: LinePicture, found: Directions, first_rad: float, second_rad: float
-) -> tuple[Lattice | None, float, tuple[int, int]]:
-    # X_sys runs right and down: its direction lies in (0, 90) degrees of the image, and family b runs along it
+    picture: LinePicture, found: Directions, first_rad: float, second_rad: float, broken: bool
+) -> tuple[LineLattice | None, float, tuple[int, int]]:
+    # X_sys runs right and down: its direction is in (0, 90) degrees of the image, and family b runs along it
     along_x, along_y = sorted((first_rad, second_rad))
     if along_x > 0.5 * np.pi or along_y < 0.5 * np.pi:
         # both in one quadrant: a lattice near 0 or 90 degrees, or strongly sheared; nearest to 45 degrees is X
@@ -117,8 +145,10 @@ def _try_pair(
         off = [abs(((c - 0.25 * np.pi + 0.5 * np.pi) % np.pi) - 0.5 * np.pi) for c in candidates]
         along_x = candidates[int(np.argmin(off))]
         along_y = candidates[1 - int(np.argmin(off))]
-    pieces_a = family_pieces(picture, found, along_y)
-    pieces_b = family_pieces(picture, found, along_x)
+    angle_rad = _between(first_rad, second_rad)
+    reach = min(FAMILY_REACH_RAD, 0.5 * angle_rad) if angle_rad < _CROSSINGS_RAD[0, 0] else FAMILY_REACH_RAD
+    pieces_a = family_pieces(picture, found, along_y, reach)
+    pieces_b = family_pieces(picture, found, along_x, reach)
     if min(len(pieces_a), len(pieces_b)) < _MIN_LINES:
         return None, 0.0, (0, 0)
     centre = np.median(np.concatenate([pieces_a.centre_px, pieces_b.centre_px]), axis=0)
@@ -130,8 +160,8 @@ def _try_pair(
         x_dir = -x_dir
     if x_dir[0] * y_dir[1] - x_dir[1] * y_dir[0] < 0.0:  # right-handed, y down: clockwise from X to Y
         y_dir = -y_dir
-    chain_a = order(link(pieces_a), centre, x_dir)
-    chain_b = order(link(pieces_b), centre, y_dir)
+    chain_a = order(link(pieces_a, broken=broken), centre, x_dir, broken=broken)
+    chain_b = order(link(pieces_b, broken=broken), centre, y_dir, broken=broken)
     counts = (len(chain_a.lines), len(chain_b.lines))
     if min(counts) < _MIN_LINES:
         return None, 0.0, counts
@@ -146,12 +176,12 @@ def _try_pair(
     return lattice, seen, counts
 
 
-def oriented(lattice: Lattice, orientation: Orientation | None, lines: tuple[int, int]) -> Lattice:
-    """Index a lattice by the quarter of a turn in which its X_sys must lie.
+def oriented(lattice: LineLattice, orientation: Orientation | None, lines: tuple[int, int]) -> LineLattice:
+    """Index a lattice by the quarter of a turn that must contain its X_sys.
 
-    A grid without marks may be indexed in four right-handed ways, and whatever the rule, there is one angle at which it
-    jumps. Without ``orientation`` that is 67 degrees, equal to -23: beyond there, where the counts of a grid of unequal
-    counts fit the other way only, they decide. With rolls on both sides of it two cameras would index differently, and
+    A grid without marks may be indexed in four right-handed ways, and under any rule the index jumps at one angle.
+    Without ``orientation`` this angle is 67 degrees, equal to -23. Below -23 degrees the unequal counts of a grid
+    decide if they fit only the other way. With rolls on both sides of it two cameras would index differently, and
     ``orientation`` must be named.
 
     Parameters
@@ -159,7 +189,7 @@ def oriented(lattice: Lattice, orientation: Orientation | None, lines: tuple[int
     lattice
         Indexed in any right-handed way.
     orientation
-        See :class:`core.grid.view.GridOptions`.
+        See :class:`stereorig.core.grid.view.GridOptions`.
     lines
         Counts of the target.
     """
@@ -174,7 +204,7 @@ def oriented(lattice: Lattice, orientation: Orientation | None, lines: tuple[int
     return turned
 
 
-def _turned(lattice: Lattice, turns: int) -> Lattice:
+def _turned(lattice: LineLattice, turns: int) -> LineLattice:
     """Return the lattice with X_sys turned back by quarter turns: X_sys becomes -Y_sys, Y_sys becomes X_sys."""
     turns %= 4
     if turns == 0:
@@ -186,11 +216,11 @@ def _turned(lattice: Lattice, turns: int) -> Lattice:
         nodes = np.swapaxes(nodes[:, ::-1], 0, 1)
     nodes = np.ascontiguousarray(nodes)
     rotation = lattice_rotation(H, (nodes.shape[0], nodes.shape[1]))
-    return Lattice(nodes, H, rotation, lattice.strays)
+    return LineLattice(nodes, H, rotation, lattice.strays)
 
 
-def _seen_share(lattice: Lattice, chain_a: Chain, chain_b: Chain) -> float:
-    """Median share of the lines' length that was seen; noise makes lines of few pieces that happen to lie in a row."""
+def _seen_share(lattice: LineLattice, chain_a: Chain, chain_b: Chain) -> float:
+    """Median share of the lines' length that was seen; noise forms lines of few pieces that happen to be in a row."""
     a = np.linalg.norm(np.diff(lattice.nodes_px, axis=1), axis=-1).sum(axis=1)[chain_a.number]
     b = np.linalg.norm(np.diff(lattice.nodes_px, axis=0), axis=-1).sum(axis=0)[chain_b.number]
     seen = [line.seen_px for line in (*chain_a.lines, *chain_b.lines)]
@@ -232,14 +262,16 @@ def _known_nodes(chain_a: Chain, chain_b: Chain) -> tuple[Float, Float]:
     return number.reshape(-1, 2), crossings(chain_a.lines, chain_b.lines).reshape(-1, 2)
 
 
-def _lattice(chain_a: Chain, chain_b: Chain) -> Lattice:
+def _lattice(chain_a: Chain, chain_b: Chain) -> LineLattice:
     number, xy = _known_nodes(chain_a, chain_b)
     H = homography(number, xy)
     grid = np.stack(np.meshgrid(np.arange(chain_a.count), np.arange(chain_b.count), indexing="ij"), axis=-1)
     nodes = apply_homography(H, grid.astype(np.float64))
     i, j = number.astype(int).T
     nodes[i, j] = xy
-    return Lattice(nodes, H, lattice_rotation(H, (chain_a.count, chain_b.count)), (*chain_a.strays, *chain_b.strays))
+    return LineLattice(
+        nodes, H, lattice_rotation(H, (chain_a.count, chain_b.count)), (*chain_a.strays, *chain_b.strays)
+    )
 
 
 def lattice_rotation(plane_to_image: Float, counts: tuple[int, int]) -> float:

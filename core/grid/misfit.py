@@ -1,13 +1,13 @@
-"""What the profile leaves in the pixels of all pieces alike, told apart from the noise.
+"""Residual common to all pieces of a family after the profile's fit, separated from the noise.
 
-A lens's blur is no Gaussian: defocus is a disc, stray light has wide skirts, coma leans to one side. What the profile
-P(d) misses of it is the same function f(d) in all pieces of a family, scaled by their contrast. It does not change from
-picture to picture, and so is no noise: taken for noise it makes the claimed variance of a line's offset up to twice the
-scatter. Each piece holds too few pixels to see f; all pieces of a family together show it by averages of their
-residuals over distance. With it, of every piece
+A lens's blur is no Gaussian: defocus is a disc, stray light has wide skirts, coma leans to one side. The difference of
+a line from the profile P(d) is the same function f(d) in all pieces of a family, scaled by their contrast. It does not
+change from picture to picture, and so is no noise: taken for noise it makes the claimed variance of a line's offset up
+to twice the scatter. Each piece holds too few pixels to see f; all pieces of a family together show it by averages of
+their residuals over distance. With it, of every piece
 
-* the offset and slope that f feigns, by where the pixels happen to lie, are taken off;
-* the noise is what is left without f;
+* the apparent offset and slope by f at the pixels' positions are subtracted;
+* the noise is the remainder without f;
 * and that noise, as a function v(d) of the distance, is propagated to the offset. Photons make the ground noisier than
   a dark line, and the offset feels only the edges between.
 """
@@ -21,16 +21,25 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from core.arrays import Bool, Float, Float32
-from core.grid.profile import GUARD_BLURS, MIN_BOX, N_SHAPE, OUT, WIDTH_SEEN, close_normal, model_row, solve_cholesky
-from core.grid.strip import strip_bounds, strip_pixels, strip_reach
+from stereorig.core.arrays import Bool, Float, Float32
+from stereorig.core.grid.profile import (
+    GUARD_BLURS,
+    MIN_BOX,
+    N_SHAPE,
+    OUT,
+    WIDTH_SEEN,
+    close_normal,
+    model_row,
+    solve_cholesky,
+)
+from stereorig.core.grid.strip import strip_bounds, strip_pixels, strip_reach
 
 _PER_PX = 8.0  # bins
 _REACH_PX = 48.0
 _BINS = 2 * int(_REACH_PX * _PER_PX) + 1
 _MIN_COUNT = 8  # pixels in a bin
 _NOISE_SMOOTHING_PX = 0.5
-_LEAST_NOISE = 0.1  # of the mean variance; below, clipped or noise-free pixels would decide
+_LEAST_NOISE = 0.1  # share of the mean variance; below, clipped or noise-free pixels would decide
 
 
 @njit(cache=True, nogil=True)
@@ -72,8 +81,8 @@ def _pool(
 ) -> tuple[Float, Float, Float, Float]:
     """Sums over bins of distance, (2, _BINS): pixels, the part of their noise left by the fit, residuals, squares.
 
-    Residuals are in units of the contrast. A fit follows the noise of the pixels that it depends on, those of the
-    edges, more than that of the others.
+    Residuals are in units of the contrast. A fit follows the noise of the pixels that it depends on, at the edges, more
+    than the others' noise.
     """
     count, free = np.zeros((2, _BINS)), np.zeros((2, _BINS))
     total, squares = np.zeros((2, _BINS)), np.zeros((2, _BINS))
@@ -160,20 +169,20 @@ def without_misfit(
     Parameters
     ----------
     image, pieces
-        As :func:`core.grid.profile.fit_pieces` had them, with no search.
+        As :func:`stereorig.core.grid.profile.fit_pieces` had them, with no search.
     fits
-        (n, :data:`core.grid.profile.OUTPUTS`) its result.
+        (n, :data:`stereorig.core.grid.profile.OUTPUTS`) its result.
     family
         (n,) 0 or 1 of each piece.
     good
         (n,) pieces that show the misfit; the others keep their fit as it is.
     guard_blurs
-        As :func:`core.grid.profile.fit_pieces` had it.
+        As :func:`stereorig.core.grid.profile.fit_pieces` had it.
 
     Returns
     -------
     Float
-        The fits with offset, slope, their covariance, the contrast's variance and the noise ``rms`` anew.
+        The fits with new values of offset, slope, their covariance, the contrast's variance and the noise ``rms``.
     """
     out = fits.copy()
     table = np.ascontiguousarray(pieces, dtype=np.float64)

@@ -8,14 +8,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.grid.lines import LinePoints
-from core.grid.profile import OUT
-from core.grid.strip import IN, INPUTS
-from core.target import GridTarget
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.grid.lattice import apply_homography, homography
+from stereorig.core.grid.lines import LinePoints
+from stereorig.core.grid.profile import OUT
+from stereorig.core.grid.strip import IN, INPUTS
+from stereorig.core.target import GridTarget
 
 _FIRST_BLUR_PX = 0.7
-_SEARCH_SHARE = 0.2  # of the spacing to the next line
+_SEARCH_SHARE = 0.2  # share of the spacing to the next line
 _STRIP_SHARE = 0.45
 
 
@@ -26,7 +27,7 @@ class PieceTable:
     Attributes
     ----------
     rows
-        (n, len(INPUTS)) for :func:`core.grid.profile.fit_pieces`.
+        (n, len(INPUTS)) for :func:`stereorig.core.grid.profile.fit_pieces`.
     family, line, crossing
         (n,) family, number of the line, and number of the crossing at which the piece begins.
     counts
@@ -48,9 +49,29 @@ class PieceTable:
         """Number of the line over both families, (n,)."""
         return self.line + np.where(self.family == 0, 0, self.counts[0])
 
+    def of_lines(self, kept: Kept) -> tuple[PieceTable, NDArray[np.intp]]:
+        """Return the pieces of some lines only, these numbered in turn, and their places in this table."""
+        number = _renumbered(kept, self.counts)
+        line = number[self.line_index()]
+        own = np.flatnonzero(line >= 0)
+        part = PieceTable(self.rows[own], self.family[own], line[own], self.crossing[own], (len(kept[0]), len(kept[1])))
+        return part, own
+
+
+Kept = tuple[NDArray[np.intp], NDArray[np.intp]]
+"""Numbers of the lines of either family that are measured."""
+
+
+def _renumbered(kept: Kept, counts: tuple[int, int]) -> NDArray[np.intp]:
+    """New number of each line within its family, over both families; -1 for those left out."""
+    number = np.full(sum(counts), -1, dtype=np.intp)
+    for start, own in zip((0, counts[0]), kept, strict=True):
+        number[start + own] = np.arange(len(own))
+    return number
+
 
 def piece_table(nodes_px: Float, target: GridTarget, *, blur_px: float | None) -> PieceTable:
-    """Lay the pieces between the intersections (n_a, n_b, 2).
+    """Define the pieces between the intersections (n_a, n_b, 2).
 
     Parameters
     ----------
@@ -135,14 +156,55 @@ class PiecePoints:
     points: LinePoints
     piece: NDArray[np.intp]
 
+    def of_lines(self, kept: Kept, counts: tuple[int, int]) -> PiecePoints:
+        """Return the points on some lines only, numbered and measured along by these lines alone."""
+        if (len(kept[0]), len(kept[1])) == counts:
+            return self
+        p = self.points
+        line = _renumbered(kept, counts)[p.line + np.where(p.family == 0, 0, counts[0])]
+        own = np.flatnonzero(line >= 0)
+        along = np.empty(len(own))
+        for family in (0, 1):
+            mine = p.family[own] == family
+            across = kept[1 - family].astype(np.float64)
+            at = p.along[own][mine]
+            before = np.clip(np.searchsorted(across, at) - 1, 0, len(across) - 2)
+            along[mine] = before + (at - across[before]) / (across[before + 1] - across[before])
+        part = LinePoints(p.xy_px[own], p.normal[own], p.sigma_px[own], p.family[own], line[own], along)
+        return PiecePoints(part, self.piece[own])
 
-def line_points(table: PieceTable, fits: Float) -> PiecePoints:
-    """Turn each fitted piece's offset and slope into two line points with independent errors.
+
+def spread(values: Float, kept: Kept, counts: tuple[int, int]) -> Float:
+    """Place values (len(kept[0]), len(kept[1]), ...) of the lines measured among all, NaN elsewhere."""
+    out = np.full((*counts, *values.shape[2:]), np.nan)
+    out[np.ix_(*kept)] = values
+    return out
+
+
+def filled(nodes_px: Float, kept: Kept, counts: tuple[int, int]) -> Float:
+    """Return all intersections; those that are not measured are at the places that the others determine."""
+    off = spread(nodes_px, kept, counts)
+    known = np.isfinite(off).all(axis=-1)
+    if known.all():
+        return nodes_px
+    every = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1).astype(np.float64)
+    regular = apply_homography(homography(every[known], off[known]), every)
+    off -= regular
+    for lines in (off, off.swapaxes(0, 1)):  # along each line that is measured, then along all of the others
+        for line in lines:
+            own = np.flatnonzero(np.isfinite(line[:, 0]))
+            for k in range(2) if 0 < len(own) < len(line) else ():
+                line[:, k] = np.interp(np.arange(len(line)), own, line[own, k])
+    return regular + off
+
+
+def line_points(table: PieceTable, fits: Float, good: Bool) -> PiecePoints:
+    """Turn each good piece's offset and slope into two line points with independent errors.
 
     The errors of offset and slope make the offset's error smallest at one position; at equal distances on both sides of
     it, where the slope's share equals the offset's own, the two errors are not correlated.
     """
-    piece = np.flatnonzero(fits[:, OUT["ok"]] > 0.0)
+    piece = np.flatnonzero(good)
     f, r = fits[piece], table.rows[piece]
     var0, cov, var1 = f[:, OUT["var_c0"]], f[:, OUT["cov_c01"]], f[:, OUT["var_c1"]]
     at = np.clip(-cov / var1, -r[:, IN["half_length"]], r[:, IN["half_length"]])

@@ -10,8 +10,8 @@ is
 
     I = B + B_t t + B_d d + A P(d - c0 - c1 t)
 
-with distance along the piece t and across it d, from a base parabola. With Gaussian noise, least squares is the maximum
-of the likelihood. P is even, so that width and blur are not correlated with the position c0, c1.
+with distance along the piece t and across it d, from a base parabola. With Gaussian noise, least squares maximises the
+likelihood. P is even, so that width and blur are not correlated with the position c0, c1.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from math import erf, exp, sqrt
 import numpy as np
 from numba import njit
 
-from core.arrays import Float, Float32
-from core.grid.strip import search_across, strip_bounds, strip_pixels, strip_reach
+from stereorig.core.arrays import Float, Float32
+from stereorig.core.grid.strip import search_across, strip_bounds, strip_pixels, strip_reach
 
 # columns of the table of fits
 OUTPUTS = (
@@ -54,8 +54,8 @@ WIDTH_PRIOR = 0.15  # relative standard deviation of the described width
 _MAX_BLUR = 8.0
 _MIN_PIXELS = 20
 _SEARCHED_PIXELS = 500
-_MANY_PIXELS = 2000  # of a piece; a part of them leads all to within a step of their minimum
-_NO_GAIN = 1e-7  # of the sum of squares: hundredths of a standard deviation
+_MANY_PIXELS = 2000  # pixels of a piece; a part of them leads all to within a step of their minimum
+_NO_GAIN = 1e-7  # share of the sum of squares: hundredths of a standard deviation
 MIN_BOX = 0.01  # px; narrower boxes, of lines along the rows or columns, change the profile by 1e-5 of itself
 
 
@@ -95,7 +95,7 @@ def profile_terms(d: float, width: float, blur: float, a: float, b: float) -> tu
 
 @njit(cache=True, nogil=True)
 def solve_cholesky(M: Float, b: Float, x: Float) -> bool:
-    """Solve M x = b by Cholesky, overwriting M; False where M is not positive definite (a saturated or empty piece)."""
+    """Solve M x = b by Cholesky, overwriting M; False if M is not positive definite (a saturated or empty piece)."""
     n = M.shape[0]
     for i in range(n):
         top = M[i, i]
@@ -179,9 +179,9 @@ def _minimise(
     accepted: Float,
     led: bool,
 ) -> float:
-    """Fit ``par`` to every ``every``-th pixel; return the sum of squares, inf where there is no minimum.
+    """Fit ``par`` to every ``every``-th pixel; return the sum of squares, inf without a minimum.
 
-    ``accepted`` becomes the normal matrix at ``par``. ``led``: ``par`` lies near the minimum already.
+    ``accepted`` becomes the normal matrix at ``par``. ``led``: ``par`` is near the minimum already.
     """
     count = (n + every - 1) // every
     N = np.zeros((N_SHAPE, N_SHAPE))
@@ -348,7 +348,7 @@ def fit_pieces(image: Float32, pieces: Float, *, dark_lines: bool, guard_blurs: 
     image
         (rows, columns) float32 grey levels.
     pieces
-        (n, :data:`INPUTS`) base lines, crossings, start values; pixels, and unit vectors.
+        (n, :data:`stereorig.core.grid.strip.INPUTS`) base lines, crossings, start values; pixels, and unit vectors.
     dark_lines
         Sign of the contrast searched for.
     guard_blurs

@@ -1,4 +1,4 @@
-"""The strip of pixels about one piece of a line: which pixels it holds, and where across it the line lies."""
+"""The strip of pixels about one piece of a line: its pixels, and the line's place across it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from math import sqrt
 import numpy as np
 from numba import njit
 
-from core.arrays import Float, Float32
+from stereorig.core.arrays import Float, Float32
 
 # columns of the table of pieces
 INPUTS = (
@@ -48,7 +48,7 @@ def strip_bounds(piece: Float, half_width: float, rows: int, cols: int) -> tuple
 
 @njit(cache=True, nogil=True)
 def in_strip(piece: Float, x: float, y: float, half_width: float, guard: float) -> tuple[bool, float, float]:
-    """Return True if a pixel lies in the piece's strip, away from both crossings, and its t and d."""
+    """Return True for a pixel in the piece's strip, away from both crossings, and its t and d."""
     ex, ey = x - piece[0], y - piece[1]
     t = ex * piece[2] + ey * piece[3]
     d = -ex * piece[3] + ey * piece[2] - piece[5] * t * t

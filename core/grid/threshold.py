@@ -2,7 +2,7 @@
 
 The paper thresholds the image. Here the threshold acts on the depth of a line below its own ground (above it, for
 bright lines): grey-level closing fills every dark structure thinner than its kernel, and the difference is the depth.
-Vignetting, one-sided edges and broad dirt leave no depth, so that one threshold (Otsu's) is enough for the whole image.
+Vignetting, one-sided edges and broad dirt have no depth, so that one threshold (Otsu's) is enough for the whole image.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float, Float32
-from core.errors import ImageError
-from core.target import GridTarget
+from stereorig.core.arrays import Bool, Float, Float32
+from stereorig.core.errors import ImageError
+from stereorig.core.target import GridTarget
 
 _MIN_SIDE_PX = 64
 # a coarse picture of this many pixels on its short side shows every line of a grid worth measuring

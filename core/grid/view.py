@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from core.arrays import Bool, Float
-from core.target import GridTarget
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.target import GridTarget
 
 Localiser = Literal["profile", "paper"]
 LineModel = Literal["straight", "parabola", "local"]
@@ -24,28 +24,29 @@ class GridOptions:
     line_model
         Model of a line through its pieces. ``straight``: all lines are straight but for one common lens distortion,
         found from the lines themselves; it averages the maker's node errors best. ``parabola``: one non-oblique
-        parabola a line, as in the paper. ``local``: each intersection from the pieces beside it only, which keeps the
+        parabola a line, as in the paper. ``local``: each intersection from the pieces next to it only, which keeps the
         node errors visible to an adjustment that solves for them. None takes ``straight`` for the profile localiser,
         ``parabola`` for the paper's.
     saturation
         Grey level at which the sensor saturates; None finds it from the type and the image itself.
     max_bad_fraction
-        Part of all line pieces that dirt or glare may spoil.
+        Part of all line pieces that dirt, glare or a cover may spoil: 66 pieces of an 11 x 11 grid are three for each
+        line, which has two numbers.
     max_bad_on_line
-        Part of one line's pieces that may be spoilt.
+        Part of one line's pieces that may be spoilt; a line of which more is has no intersections.
     orientation
         Which of the four ways of indexing a grid without marks is taken. ``diagonal``: X_sys runs right and down, at
         more than 0 and up to 90 degrees from the rows. ``upright``: X_sys is the direction nearest to the rows, to the
         right, at more than -45 and up to 45 degrees. Between 0 and 45 degrees both are the same. None: X_sys at more
         than -23 and up to 67 degrees, so that small differences of two cameras' rolls change the index nowhere but
         there; a caller that knows how the other camera saw the grid names the orientation. See
-        :func:`core.grid.lattice.oriented`.
+        :func:`stereorig.core.grid.lattice.oriented`.
     """
 
     line_model: LineModel | None = None
     saturation: float | None = None
-    max_bad_fraction: float = 0.15
-    max_bad_on_line: float = 0.4
+    max_bad_fraction: float = 0.7
+    max_bad_on_line: float = 0.7
     orientation: Orientation | None = None
 
 
@@ -92,7 +93,8 @@ class GridView:
     target
         The description it was found by.
     xy_px
-        (n_a - 2, n_b - 2, 2) inner intersections, indexed [i along X_sys, j along Y_sys].
+        (n_a - 2, n_b - 2, 2) inner intersections, indexed [i along X_sys, j along Y_sys]; NaN on a line that is missing
+        or of which too little is seen.
     covariance_px2
         (n_a - 2, n_b - 2, 2, 2) of each intersection, from the image's own noise; without the maker's node errors.
     localiser, line_model
@@ -104,7 +106,7 @@ class GridView:
     contrast
         Grey levels, median depth of a line of full width against its ground.
     background
-        Grey levels, median of the ground beside the lines.
+        Grey levels, median of the ground next to the lines.
     blur_px
         Median standard deviation of lens blur and line edge, without the pixel's own integration.
     line_width_px
@@ -171,7 +173,7 @@ class GridView:
 
 @dataclass(frozen=True)
 class GridOverlay:
-    """Polylines to lay over the image.
+    """Polylines to draw over the image.
 
     Attributes
     ----------

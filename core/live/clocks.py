@@ -7,18 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Float
-from core.errors import InputError, MeasurementError
-from core.robust import MAD_TO_SIGMA
+from stereorig.core.arrays import Float
+from stereorig.core.errors import InputError, MeasurementError
+from stereorig.core.robust import MAD_TO_SIGMA
 
 _MIN_READINGS = 8
 _COARSE = 400  # offsets of the search
 _ROUNDS = 50
-_CONVERGED = 1e-4  # of the standard uncertainty
-_KINK = 1e-9  # of the slopes' power
+_CONVERGED = 1e-4  # share of the standard uncertainty
+_KINK = 1e-9  # share of the slopes' power
 _ABOVE_NOISE = 3.0
-_WIDEST = 1.0 / 16.0  # of the sparse series' time: the longest way over which a slope is taken
-_MAX_U = 0.25  # of the common time: an offset known no better is none
+_WIDEST = 1.0 / 16.0  # share of the sparse series' time: the longest interval over which a slope is taken
+_MAX_U = 0.25  # share of the common time: an offset with a larger uncertainty counts as unknown
 
 
 def value_at(time_s: ArrayLike, values: ArrayLike, at_s: float, max_gap_s: float) -> float:
@@ -31,7 +31,7 @@ def value_at(time_s: ArrayLike, values: ArrayLike, at_s: float, max_gap_s: float
     at_s
         The time asked for.
     max_gap_s
-        Readings further apart are not joined.
+        Readings that are further apart are not joined.
 
     Returns
     -------
@@ -64,7 +64,7 @@ class ClockOffset:
     gain, bias
         The gauge is ``bias + gain channel``.
     correlation
-        Of gauge and channel at the offset.
+        Correlation of gauge and channel at the offset.
     readings
         Pairs that were compared.
     """
@@ -100,12 +100,12 @@ def clock_offset(
     InputError
         ``clock_readings`` for too few readings, or times out of order.
     MeasurementError
-        ``offset_unknown`` where the readings do not determine it.
+        ``offset_unknown`` if the readings do not determine it.
 
     Notes
     -----
-    The uncertainty is that of the linearised fit, with the variance of what is left and its correlation from reading
-    to reading (a first-order autoregression), so that vibrations that only one of them sees count.
+    The uncertainty is the linearised fit's, with the variance of the residuals and their correlation from reading to
+    reading (a first-order autoregression), so that vibrations that only one of them sees count.
     """
     one, two = _series("channel", channel_s, channel), _series("gauge", gauge_s, gauge)
     if not (np.isfinite(within_s) and within_s > 0.0):
@@ -146,14 +146,14 @@ def _interval(t: Float) -> float:
 def _fit(
     dense: tuple[Float, Float], sparse: tuple[Float, Float], within_s: float
 ) -> tuple[float, float, float, float, float, int] | None:
-    """Offset, its u, gain, bias, correlation and number; None where it is not determined."""
+    """Offset, its u, gain, bias, correlation and number; None if it is not determined."""
     step = max(_interval(dense[0]), within_s / _COARSE)
     tried = np.arange(-within_s, within_s + step, step)
     misfits = np.array([_misfit(dense, sparse, offset) for offset in tried])
     if not np.isfinite(misfits).any():
         return None
     begin = float(tried[int(np.nanargmin(misfits))])
-    # slopes over few readings are the noise's where there are many readings a second, over many they miss a knock
+    # with many readings a second, slopes over few readings are noise; slopes over many readings miss a knock
     half, longest = _interval(sparse[0]), float(sparse[0][-1] - sparse[0][0]) * _WIDEST
     while True:
         found = _descended(dense, sparse, begin, half, step, within_s)
@@ -175,7 +175,7 @@ def _descended(
         slope = (np.interp(at + half, *dense) - np.interp(at - half, *dense)) / (2.0 * half)
         gain, bias = _line(x, y)
         left = y - bias - gain * x
-        # what the offset changes beyond gain and bias, of which the readings' own noise is no knowledge
+        # effect of the offset beyond gain and bias; the readings' own noise adds no information
         change = -gain * (slope - np.polyval(_line(x, slope), x))
         power, by_noise = float(change @ change), len(at) * (gain * scatter / half) ** 2 / 2.0
         known = power - by_noise

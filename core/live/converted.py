@@ -1,7 +1,8 @@
 """Followed points from the matcher's numbers: the checks of single points, displacement and covariance, in one pass.
 
-What :class:`core.field.points.fitter.Fitter` and :mod:`core.field.points.assemble` do for a field of any kind takes
-longer than the fit of a frame's thousand points; this is the same for points that were measured in the frame before.
+The general code of :class:`stereorig.core.field.points.fitter.Fitter` and :mod:`stereorig.core.field.points.assemble`
+takes longer than the fit of a frame's thousand points; this does the same for points that were measured in the frame
+before.
 """
 
 from __future__ import annotations
@@ -13,12 +14,12 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from core.arrays import Float
-from core.cameras.stereo import StereoPair
-from core.field.points.fitter import MAX_EPIPOLAR_PX
-from core.field.points.scales import SOURCES, depth_per_px, is_plausible, px_per_ray
-from core.matching.kernels.naming import stamp_of
-from core.status import PointStatus
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.fitter import MAX_EPIPOLAR_PX
+from stereorig.core.field.points.scales import SOURCES, depth_per_px, is_plausible, px_per_ray
+from stereorig.core.matching.kernels.naming import stamp_of
+from stereorig.core.status import PointStatus
 
 _OK = int(PointStatus.OK)
 _LOW_CORRELATION = int(PointStatus.LOW_CORRELATION)
@@ -27,7 +28,7 @@ _NOT_CONVERGED = int(PointStatus.NOT_CONVERGED)
 
 
 class Constant(NamedTuple):
-    """What does not change from frame to frame: n points and the cameras.
+    """Values that do not change from frame to frame, for n points and the cameras.
 
     ``rays`` (n, 3) normalised, ``per_px`` (n,) inverse depth that moves camera 2's image by 1 px, ``scale`` (n,) px of
     camera 1's image per unit of a ray, ``R`` (3, 3) camera 1's rotation from the system, ``centre2`` (3,) mm camera 2
@@ -70,13 +71,13 @@ def _converter(stamp):
         terms
             3 for plane patches, 6 for curved ones.
         out
-            (n, ...) as :func:`core.matching.kernels.motion.n_motion_out` has it.
+            (n, ...) as :func:`stereorig.core.matching.kernels.motion.n_motion_out` has it.
         start_w, start_g
-            (n, terms), (n, 3, terms) what the fit began with.
+            (n, terms), (n, 3, terms) start of the fit.
         ratio
             (n, 6) standard deviations with all checks over a fit's own.
         status
-            (n,) int8, changed: what is not OK stays.
+            (n,) int8, changed in place: a status other than OK stays.
         uvw
             (n, 3) out, mm, system frame.
         covariance

@@ -1,7 +1,7 @@
-"""Frames followed: each point starts from where it was in the frame before, moved on by the field's smooth velocity.
+"""Measurement of frames in sequence: each point starts from its last place, moved on by the field's smooth velocity.
 
-From such a start one step of the fit is enough. What it leaves is a share of the way that it went; points that went
-further, where the motion turned, take another one. How large that share is, is learned from those.
+From such a start one step of the fit is enough. The remaining error is a share of the motion; points that moved
+further, as after a turn of the motion, take another step. The share is learned from these points.
 """
 
 from __future__ import annotations
@@ -11,26 +11,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float
-from core.cameras.stereo import StereoPair
-from core.field.checks.validity import check_neighbours, disagreement_scale
-from core.field.growth.state import SAMPLE_FAR_PX, prepare
-from core.field.points.fitter import PointFits, learned_rate
-from core.field.points.images import MeasureImage, refuse_stale, same_size
-from core.field.points.result import Field
-from core.field.points.starts import Starts, image_positions
-from core.field.region.region import PointGrid
-from core.field.settings import MeasureOptions
-from core.live.converted import Constant, convert
-from core.matching.arguments import flat, given_to_kernels, one_a_thread, run_kernel, setting_of
-from core.matching.image import Box, ImageData, prepare_part
-from core.matching.kernels.drivers import run_points, work_space
-from core.matching.kernels.given import Given
-from core.matching.kernels.motion import n_motion_out
-from core.matching.options import SPLINE_ORDER
-from core.measure import ReferencePair
-from core.status import PointStatus
-from core.threads import run_ranges
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.checks.validity import check_neighbours, disagreement_scale
+from stereorig.core.field.growth.state import SAMPLE_FAR_PX, prepare
+from stereorig.core.field.points.fitter import PointFits, learned_rate
+from stereorig.core.field.points.images import MeasureImage, refuse_stale, same_size
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.starts import Starts, image_positions
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.field.settings import MeasureOptions
+from stereorig.core.live.converted import Constant, convert
+from stereorig.core.matching.arguments import flat, given_to_kernels, one_a_thread, run_kernel, setting_of
+from stereorig.core.matching.image import Box, ImageData, prepare_part
+from stereorig.core.matching.kernels.drivers import run_points, work_space
+from stereorig.core.matching.kernels.given import Given
+from stereorig.core.matching.kernels.motion import n_motion_out
+from stereorig.core.matching.options import SPLINE_ORDER
+from stereorig.core.measure import ReferencePair
+from stereorig.core.status import PointStatus
+from stereorig.core.threads import run_ranges
 
 _SMOOTH_FROM = 24  # points, for a velocity of second order
 _AROUND_PX = 8  # about a subset: its way, its taps, and rounding
@@ -57,7 +57,9 @@ class _Fits:
 
 
 class Follower:
-    """Measures frames at the points that the frame before had. What depends on the reference alone is prepared once.
+    """Measures frames at the points of the frame before.
+
+    Quantities that depend on the reference alone are computed once.
 
     Parameters
     ----------
@@ -67,7 +69,7 @@ class Follower:
     Raises
     ------
     RegionError, ImageError
-        As :func:`core.measure.measure_shape`.
+        As :func:`stereorig.core.measure.measure_shape`.
     """
 
     def __init__(self, reference: ReferencePair, shape: Field, grid: PointGrid, options: MeasureOptions) -> None:
@@ -90,7 +92,7 @@ class Follower:
         self._given: dict[int, Given] = {}
         # kept from frame to frame: the points' partly visible subsets are always the same
         self._spaces = {d: one_a_thread(make, options.subset_px) for d, make in work_space["motion"].items()}
-        self._around: tuple[object, tuple[float, float]] | None = None  # of a patch choice
+        self._around: tuple[object, tuple[float, float]] | None = None  # for one patch choice
         self._smoothing: tuple[Bool | None, Float] = None, np.zeros((0, 0))
         middle, width = self._xy.mean(axis=0), np.maximum(np.ptp(self._xy, axis=0), 1.0)
         x, y = ((self._xy - middle) / width).T
@@ -118,7 +120,7 @@ class Follower:
             The frame before it.
         before
             The frame before that, and the time since the previous one over the time between these two; without it the
-            points start where they were.
+            points start from their last places.
         ratio
             (r, c, 6) standard deviations with all checks over a fit's own.
         rate
@@ -241,7 +243,8 @@ class Follower:
         return found[0], found[1]
 
     def _boxes(self, previous: Field, w: Float, G: Float) -> tuple[Box, Box]:
-        if self._around is None or self._around[0] is not previous.patch:  # anew with each frame that is a step
+        # computed again at each frame that is measured as a step
+        if self._around is None or self._around[0] is not previous.patch:
             self._around = previous.patch, self._reach_px(w, G)
         boxes = []
         for positions, reach, image in zip(

@@ -4,7 +4,7 @@ Each gauge is a function of a few sums L = W V over its points: V (m, 6) holds X
 weights, which stay as long as the same points are valid. With J the function's derivative by L, an error of the points
 changes a reading by ``sum_k v_k . dV_k``, v = J W; its own variance is ``sum_kl v_k S_k rho_kl S_l v_l``, with S the
 roots of the points' covariances and rho the share of pixels that two subsets have in common, and its common factor
-``sum_k v_k F_k``. These are the readings of :mod:`core.gauge`, of which each is made for one field at a time.
+``sum_k v_k F_k``. These are the readings of :mod:`stereorig.core.gauge`, of which each is made for one field at a time.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from numpy.typing import NDArray
 from scipy.sparse import block_diag, csr_array
 from scipy.spatial import cKDTree
 
-from core.arrays import Bool, Float
-from core.errors import RegionError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels, roots_of
-from core.gauge.reading import Reading, readings_of
-from core.gauge.sampling import sample
-from core.settings import StrainTensor
-from core.status import PointStatus
-from core.strain.surface import surface_frames
-from core.strain.tensors import pulls_of, strain_of, strain_slopes
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.errors import RegionError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels, roots_of
+from stereorig.core.gauge.reading import Reading, readings_of
+from stereorig.core.gauge.sampling import sample
+from stereorig.core.settings import StrainTensor
+from stereorig.core.status import PointStatus
+from stereorig.core.strain.surface import surface_frames
+from stereorig.core.strain.tensors import pulls_of, strain_of, strain_slopes
 
 GaugeKind = Literal["point", "extensometer", "area"]
 UNITS: Mapping[GaugeKind, Mapping[str, str]] = {
@@ -40,7 +40,7 @@ UNITS: Mapping[GaugeKind, Mapping[str, str]] = {
 _ENOUGH = 0.5
 _MIN_POINTS = 3
 _STRAIGHT = 1e-6
-_SUMS, _QUANTITIES = 3, 6  # of a gauge, at most
+_SUMS, _QUANTITIES = 3, 6  # largest numbers for a gauge
 _ABOUT = 2  # points on either side of a position that its cubics and their checks use
 
 
@@ -93,15 +93,15 @@ class LiveGauge:
 
 
 @dataclass(frozen=True, eq=False)
-class GaugeReadings:
+class FrameReadings:
     """Readings of a gauge in one frame.
 
     Attributes
     ----------
     values
-        By quantity; empty where ``missing`` says why.
+        Reading by quantity; empty if ``missing`` gives a reason.
     missing
-        Empty, or why there are none: the status of a point that it needs, ``cut``, ``occluded``, ``too_few_points``.
+        Empty, or the reason: the status of a point that it needs, ``cut``, ``occluded``, ``too_few_points``.
     """
 
     values: Mapping[str, Reading]
@@ -191,11 +191,11 @@ class GaugeSet:
         used[self._prepare(now).index] = True
         return used.reshape(now.shape)
 
-    def read(self, now: Field) -> dict[str, GaugeReadings]:
+    def read(self, now: Field) -> dict[str, FrameReadings]:
         """Return the readings of every gauge in a displacement field, by name."""
         assert now.uvw_mm is not None
         joined, n = self._prepare(now), now.status.size
-        found = {gauge.name: GaugeReadings({}, joined.missing.get(gauge.name, "")) for gauge in self.gauges}
+        found = {gauge.name: FrameReadings({}, joined.missing.get(gauge.name, "")) for gauge in self.gauges}
         if not joined.gauges:
             return found
         used, at = joined.index, joined.place
@@ -203,7 +203,7 @@ class GaugeSet:
         sums = joined.sum_of(joined.weight[:, :, None] * values[at][:, None, :])
         normals = joined.sum_of(now.normal_sys.reshape(n, 3)[used][at])
         numbers, slopes = _numbers(joined.gauges, sums, normals)
-        # of each row's point on each quantity of its gauge: (rows, k, 6)
+        # effect of each row's point on each quantity of its gauge: (rows, k, 6)
         v = np.einsum("mkqx,mq->mkx", slopes[joined.gauge_of], joined.weight)
         each = v @ roots_of(now.covariance.reshape(n, 6, 6)[used])[at]
         shared = (joined.correlation @ each.reshape(len(at), -1)).reshape(each.shape)
@@ -215,7 +215,7 @@ class GaugeSet:
             many = len(UNITS[gauge.kind])
             common = None if rows is None else rows[k, :many]
             readings = readings_of(numbers[k, :many], own[k, :many], common, now.causes)
-            found[gauge.name] = GaugeReadings(dict(zip(UNITS[gauge.kind], readings, strict=True)))
+            found[gauge.name] = FrameReadings(dict(zip(UNITS[gauge.kind], readings, strict=True)))
         return found
 
     def _prepare(self, now: Field) -> _Joined:

@@ -1,10 +1,11 @@
 """The measurement of frames as they come, each from the motion of those before it.
 
-A frame is followed (:mod:`core.live.follow`): every point starts from the last frame's values, moved on, and takes one
-step of the fit, and the checks of single points and of neighbours. What takes longer and changes slowly is measured as
-a step of a sequence is (:class:`core.field.sequence.reference_steps.Updating`), with all its checks: the first frame,
-every ``audit_every``-th, a frame whose points were lost, and while some are lost every ``retry_every``-th. What that
-finds of the residuals, the points' standard deviations over those of a fit by itself, holds for the frames that follow.
+A frame is followed (:mod:`stereorig.core.live.follow`): every point starts from the last frame's values, moved on, and
+takes one step of the fit, and the checks of single points and of neighbours. Slower measurements whose results change
+slowly are made as a step of a sequence is (:class:`stereorig.core.field.sequence.reference_steps.Updating`), with all
+its checks: the first frame, every ``audit_every``-th, a frame whose points were lost, and while some are lost every
+``retry_every``-th. The ratio of the points' standard deviations to a single fit's, which such a step finds from the
+residuals, is used for the frames that follow.
 """
 
 from __future__ import annotations
@@ -15,36 +16,37 @@ from typing import Literal
 
 import numpy as np
 
-from core.arrays import Bool, Float
-from core.calibration.volume import CalibratedVolume
-from core.cameras.stereo import StereoPair
-from core.common.factor import ParameterCovariance
-from core.errors import InputError, MeasurementError
-from core.field.checks.extrapolated import mark_extrapolated
-from core.field.common import CommonParts
-from core.field.points.images import MeasureImage
-from core.field.points.result import Field
-from core.field.region.find_visible import with_visibility
-from core.field.region.region import PointGrid
-from core.field.settings import MeasureOptions
-from core.live.follow import Follower
-from core.live.gauges import GaugeReadings, GaugeSet, LiveGauge
-from core.matching.image import ImageData
-from core.measure import PreviousStep, ReferencePair, Updating
-from core.noise import NoiseModel
-from core.settings import DEFAULT_REFERENCE_UPDATE, ReferenceUpdate
-from core.status import PointStatus
-from core.threads import run_ranges
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.calibration.volume import CalibratedVolume
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.common.factor import ParameterCovariance
+from stereorig.core.errors import InputError, MeasurementError
+from stereorig.core.field.checks.extrapolated import mark_extrapolated
+from stereorig.core.field.common import CommonParts
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.find_visible import with_visibility
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.field.seeding.image_faults import unsure_error
+from stereorig.core.field.settings import MeasureOptions
+from stereorig.core.live.follow import Follower
+from stereorig.core.live.gauges import FrameReadings, GaugeSet, LiveGauge
+from stereorig.core.matching.image import ImageData
+from stereorig.core.measure import PreviousStep, ReferencePair, Updating
+from stereorig.core.noise import NoiseModel
+from stereorig.core.settings import DEFAULT_REFERENCE_UPDATE, ReferenceUpdate
+from stereorig.core.status import PointStatus
+from stereorig.core.threads import run_ranges
 
 Image = np.ndarray | ImageData | MeasureImage
 
 _FURTHEST = 3.0  # intervals over which a velocity is trusted
-_MAY_BE_LOST = 0.02  # of the points: a frame that loses more is measured anew, as a step
+_MAY_BE_LOST = 0.02  # share of the points: a frame that loses more is measured again, as a step
 
 
 @dataclass(frozen=True, kw_only=True)
 class LiveOptions:
-    """How a live measurement goes on.
+    """Options of a live measurement.
 
     Attributes
     ----------
@@ -68,30 +70,30 @@ class LiveOptions:
 
 @dataclass(frozen=True, eq=False)
 class LiveFrame:
-    """What one frame showed.
+    """Result of one frame.
 
     Attributes
     ----------
     number
-        Of the measured frame, from 1.
+        Number of the measured frame, from 1.
     how
         ``followed`` from the frames before, or ``step``: measured as a step of a sequence is, with all its checks.
     field
         The points; those outside the calibrated volume are marked, and points that the gauges use have the
         calibration's common factor.
     readings
-        Of each gauge, by name.
+        Readings of each gauge, by name.
     """
 
     number: int
     how: Literal["followed", "step"]
     field: Field
-    readings: Mapping[str, GaugeReadings]
+    readings: Mapping[str, FrameReadings]
 
 
 @dataclass(frozen=True, eq=False)
-class _Kept:
-    """What the next frame starts from."""
+class _LastFrame:
+    """Values that the next frame starts from."""
 
     number: int
     images: tuple[MeasureImage, MeasureImage]
@@ -115,22 +117,22 @@ class LiveMeasurement:
     grid, options
         Points and settings, as of an analysis.
     gauges
-        What is read in each frame.
+        Gauges that are read in each frame.
     live
-        How it goes on.
+        Options of the live measurement.
     reference_update
         As of a sequence; a frame that is matched against a later reference is measured as a step, each time.
     noise
-        Models of both cameras' single frames; those of the reference are in its images.
+        Models of both cameras' single frames; the reference's models are in its images.
     source
-        Covariance of the cameras' parameters, where it is known.
+        Covariance of the cameras' parameters, if it is known.
     volume
-        The calibrated volume, where it is known.
+        The calibrated volume, if it is known.
 
     Raises
     ------
     MeasurementError, RegionError, ImageError
-        As :func:`core.measure.measure_shape`; ``gauge_outside``.
+        As :func:`stereorig.core.measure.measure_shape`; ``gauge_outside``.
     """
 
     reference: ReferencePair
@@ -154,7 +156,7 @@ class LiveMeasurement:
         self._set.shape = self.shape
         self._follower = Follower(self.reference, self.shape, self.grid, self.options)
         self._common = CommonParts(self.pair, self.source)
-        self._kept: _Kept | None = None
+        self._kept: _LastFrame | None = None
         self._earlier: dict[int, tuple[tuple[MeasureImage, MeasureImage], Field]] = {}
         self._count = 0
         self._updating = Updating(
@@ -181,8 +183,8 @@ class LiveMeasurement:
         image1, image2
             (rows, cols) camera 1's and camera 2's image.
         time_s
-            Time of their exposure, by any clock: a frame after skipped ones has moved on further. Where it is not
-            known, frames are taken to be evenly spaced.
+            Time of their exposure, by any clock: a frame after skipped ones has moved on further. If it is not known,
+            frames are assumed to be evenly spaced.
 
         Raises
         ------
@@ -218,7 +220,7 @@ class LiveMeasurement:
 
         run_ranges(prepare_some, 2, 1)
 
-    def _is_due(self, kept: _Kept) -> bool:
+    def _is_due(self, kept: _LastFrame) -> bool:
         """Return True for a frame that is to have all checks, or cannot be followed."""
         if self.reference_update == "always" or self.options.blur is not None:
             return True
@@ -228,9 +230,11 @@ class LiveMeasurement:
         every = min(self.live.retry_every, self.live.audit_every) if lost else self.live.audit_every
         return kept.since_audit + 1 >= every
 
-    def _follow(self, images: tuple[MeasureImage, MeasureImage], kept: _Kept, time_s: float | None) -> _Kept | None:
-        """Measure a frame from those before it; None where points that were there are lost."""
-        # of a step it is found now: the step's own values, which took the longest, need not wait for it
+    def _follow(
+        self, images: tuple[MeasureImage, MeasureImage], kept: _LastFrame, time_s: float | None
+    ) -> _LastFrame | None:
+        """Measure a frame from those before it; None if points that were there are lost."""
+        # for a step the ratio is computed now: the step's own values, which took the longest, need not wait for it
         ratio = self._ratio_of(kept) if kept.ratio is None else kept.ratio
         before = None if kept.before is None else (kept.before, _intervals(kept.before_s, kept.time_s, time_s))
         followed = self._follower.measure(images, kept.field, before, ratio, kept.rate)
@@ -238,7 +242,7 @@ class LiveMeasurement:
             followed = self._follower.measure(images, kept.field, None, ratio, kept.rate)
         if self._lost(kept.field, followed.field):
             return None
-        return _Kept(
+        return _LastFrame(
             number=self._count + 1,
             images=images,
             field=followed.field,
@@ -252,26 +256,36 @@ class LiveMeasurement:
 
     @staticmethod
     def _lost(before: Field, now: Field) -> bool:
-        """Return True where more points are lost than may be in a followed frame."""
+        """Return True if more points are lost than may be in a followed frame."""
         lost = int((before.valid & ~now.valid & (now.status != PointStatus.OUTSIDE_IMAGE)).sum())
         return lost > _MAY_BE_LOST * before.valid.sum() or not now.valid.any()
 
-    def _as_step(self, images: tuple[MeasureImage, MeasureImage], time_s: float | None) -> _Kept:
+    def _as_step(self, images: tuple[MeasureImage, MeasureImage], time_s: float | None) -> _LastFrame:
         """Measure a frame as a step of a sequence is."""
         self._prepare(images)
         kept, number = self._kept, self._count + 1
         previous = None if kept is None else PreviousStep(kept.number, kept.field)
         field = self._updating.measure(images, previous)
         if not field.valid.any():
+            if field.unsure is not None:
+                raise unsure_error(
+                    "the frame",
+                    self.pair,
+                    (self.reference.image1, self.reference.image2),
+                    images,
+                    field.unsure,
+                    subset_px=self.options.subset_px,
+                    region_px=self.grid.extent_px,
+                )
             raise MeasurementError(
                 "No point of the frame could be measured.",
                 code="nothing_measured",
                 remedy="Check that both cameras see the surface, and that nothing hides it.",
             )
-        return _Kept(number, images, field, time_s, None, None, None, None, 0)
+        return _LastFrame(number, images, field, time_s, None, None, None, None, 0)
 
-    def _ratio_of(self, step: _Kept) -> Float:
-        """Return a step's standard deviations over those of a fit by itself (r, c, 6); 1 where there is no point."""
+    def _ratio_of(self, step: _LastFrame) -> Float:
+        """Return a step's standard deviations over those that a single fit states (r, c, 6); 1 at missing points."""
         field = step.field
         ratio = np.ones((*field.shape, 6))
         own = self._follower.measure(step.images, field, None, ratio, None).field
@@ -280,7 +294,7 @@ class LiveMeasurement:
         ratio[there] = np.sqrt(with_checks / alone)
         return ratio
 
-    def _keep(self, frame: _Kept) -> None:
+    def _keep(self, frame: _LastFrame) -> None:
         references = frame.field.references
         there = {frame.number: (frame.images, frame.field)}
         if references is not None:
@@ -302,9 +316,9 @@ class LiveMeasurement:
 
 
 def _intervals(before_s: float | None, last_s: float | None, now_s: float | None) -> float:
-    """Return the time to a frame over that between the two before it, of which no more is known after a while.
+    """Return the time to a frame over the time between the two before it, at most ``_FURTHEST``.
 
-    1 where it is not known.
+    1 if it is not known.
     """
     if before_s is None or last_s is None or now_s is None or not before_s < last_s < now_s:
         return 1.0

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.arrays import Float
-from core.cameras.camera import Camera
-from core.cameras.stereo import StereoPair
-from core.errors import InputError
-from core.matching.image import PAD, ImageData
-from core.matching.kernels.given import ComparedImage, Given, ReferenceImage, Setting
-from core.matching.options import SPLINE_ORDER, MatchOptions
-from core.threads import run_ranges
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import InputError
+from stereorig.core.matching.image import PAD, ImageData
+from stereorig.core.matching.kernels.given import ComparedImage, Given, ReferenceImage, Setting
+from stereorig.core.matching.options import SPLINE_ORDER, MatchOptions
+from stereorig.core.threads import run_ranges
 
 Int = NDArray[np.int32]
 
@@ -179,7 +179,7 @@ def visible_of(visible: VisiblePixels | None, n: int, subset: int) -> tuple[NDAr
 
 
 def reference_of(image: ImageData) -> ReferenceImage:
-    """Return the reference's pixels, gradients and weights; empty where all pixels weigh alike."""
+    """Return the reference's pixels, gradients and weights; empty if all pixels weigh alike."""
     weights = np.empty((0, 0), np.float32) if image.weights is None else image.weights
     return ReferenceImage(image.pixels, *image.gradients, weights)
 

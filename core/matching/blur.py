@@ -19,14 +19,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float, Float32
-from core.errors import InputError
-from core.matching.filters import correlate
+from stereorig.core.arrays import Float, Float32
+from stereorig.core.errors import InputError
+from stereorig.core.matching.filters import correlate
 
 _REACH_SD = 4.0  # the taps beyond hold 6e-5 of the kernel
 _EDGE_SD = 3.0
 _SAMPLES = 7  # along each side of the image
-_BARE = 1e-3  # of the squared gradients: less is no texture
+_BARE = 1e-3  # share of the squared gradients: less is no texture
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Blur:
 
 
 def spread_of(blur: Blur, gradients: tuple[Float32, Float32], subset_px: int) -> Float32:
-    """Return (rows, cols), the ratio of blurred noise's effect to that of white noise of its variance, by subset.
+    """Return (rows, cols), the ratio of blurred noise's effect to the effect of white noise of its variance, by subset.
 
     Parameters
     ----------
@@ -106,9 +106,9 @@ def spread_of(blur: Blur, gradients: tuple[Float32, Float32], subset_px: int) ->
     Notes
     -----
     With S the subset, ``sum_{x, y in S} g(x) g(y) C(x - y)`` is taken as ``sum_{x in S} g(x) (C_S * g)(x)``, where C_S
-    is C times the share of the subset's pixels whose partner lies in the subset too. A displacement estimated from
-    gradients has the covariance ``G^-1 K G^-1``, G the sums of their products and K the same under C; its trace counts
-    against that of ``G^-1``.
+    is C times the share of the subset's pixels whose partner is in the subset too. A displacement estimated from
+    gradients has the covariance ``G^-1 K G^-1``, G the sums of their products and K the same under C; the ratio
+    compares its trace with the trace of ``G^-1``.
     """
     lag = np.arange(len(blur.correlation)) - len(blur.correlation) // 2
     shared = blur.correlation * np.maximum(1.0 - np.abs(lag) / subset_px, 0.0)
@@ -145,8 +145,8 @@ def fitted_share(
 ) -> float:
     """Return the factor on a spread for a patch that is fitted with more unknowns than its displacement.
 
-    Of a few dozen subsets the gradients are projected off the fit's other unknowns (contrast and offset, the patch's
-    slopes, and for curved patches its second order), and their spread summed exactly. The mean of the ratio counts.
+    For a few dozen subsets the gradients are projected off the fit's other unknowns (contrast and offset, the patch's
+    slopes, and for curved patches its second order), and their spread is summed exactly. The mean of the ratio counts.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def fitted_share(
     subset_px, degree
         Width of the subset, and degree of the patch: 1 plane, 2 curved.
     spread
-        Of :func:`spread_of`.
+        Result of :func:`spread_of`.
     """
     rows, cols = pixels.shape
     half = subset_px // 2

@@ -7,13 +7,21 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Bool, Float
-from core.cameras.stereo import StereoPair
-from core.errors import InputError
-from core.matching.arguments import VisiblePixels, degree_of, given_to_kernels, own, points_of, run_kernel, starts_of
-from core.matching.image import ImageData, prepare
-from core.matching.kernels.drivers import cluster_robust_points, cluster_robust_space
-from core.matching.options import MatchOptions
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import InputError
+from stereorig.core.matching.arguments import (
+    VisiblePixels,
+    degree_of,
+    given_to_kernels,
+    own,
+    points_of,
+    run_kernel,
+    starts_of,
+)
+from stereorig.core.matching.image import ImageData, prepare
+from stereorig.core.matching.kernels.drivers import cluster_robust_points, cluster_robust_space
+from stereorig.core.matching.options import MatchOptions
 
 
 def cluster_robust_covariance(
@@ -57,14 +65,14 @@ def cluster_robust_covariances(
     w, G, epipolar_px
         (N, 3 or 6), (N, 3, 3 or 6), (N,) as the fit gave them; G is None for a shape.
     options, visible
-        Those of the fit.
+        Options and visible pixels of the fit.
 
     Returns
     -------
     independent, correlated
         (N, 2, 2) of (w0, epipolar offset), or (N, 5, 5) of (w0, G00, G10, G20, epipolar offset).
     known
-        (N,) False where a point has none: outside an image, or without texture.
+        (N,) False for points without one: outside an image, or without texture.
 
     Raises
     ------
@@ -77,10 +85,11 @@ def cluster_robust_covariances(
     inverses of the normal equations. It holds for residuals of any origin that are correlated over less than a block;
     its own standard deviation at a single point is some 20 % (33 px) or 25 % (21 px) of a variance.
 
-    What an image has lost to blur is the texture's second derivative. Times its first one it is a divergence: its sum
-    over a block is what flows through the block's border, into the next block. Such blocks nearly cancel one another;
-    others, of residuals that are wide, add. So the second covariance has the products of neighbouring blocks too, with
-    triangular weights. It has a fourth of the degrees of freedom, and is meant for means over points.
+    The residual of an image by blur is the texture's second derivative. Multiplied by the first derivative it is a
+    divergence: its sum over a block equals the flow through the block's border, into the next block. Such blocks nearly
+    cancel one another; others, of residuals that are wide, add. So the second covariance has the products of
+    neighbouring blocks too, with triangular weights. It has a fourth of the degrees of freedom, and is meant for means
+    over points.
 
     References
     ----------

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float, Float32
-from core.threads import run_ranges, threads
+from stereorig.core.arrays import Float, Float32
+from stereorig.core.threads import run_ranges, threads
 
 CUT = 1e-8
 """Taps below this share of the largest are left out: less than float32 rounds."""

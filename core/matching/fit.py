@@ -9,10 +9,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.arrays import Float
-from core.cameras.stereo import StereoPair
-from core.errors import ImageError, InputError
-from core.matching.arguments import (
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import ImageError, InputError
+from stereorig.core.matching.arguments import (
     Int,
     VisiblePixels,
     assumed_variance,
@@ -22,12 +22,12 @@ from core.matching.arguments import (
     run_kernel,
     starts_of,
 )
-from core.matching.image import ImageData, prepare
-from core.matching.kernels.drivers import run_points, work_space
-from core.matching.kernels.motion import n_motion_out
-from core.matching.kernels.shape import n_shape_out
-from core.matching.options import MatchOptions
-from core.status import PointStatus
+from stereorig.core.matching.image import ImageData, prepare
+from stereorig.core.matching.kernels.drivers import run_points, work_space
+from stereorig.core.matching.kernels.motion import n_motion_out
+from stereorig.core.matching.kernels.shape import n_shape_out
+from stereorig.core.matching.options import MatchOptions
+from stereorig.core.status import PointStatus
 
 Status = NDArray[np.int8]
 
@@ -40,7 +40,7 @@ class ShapeFit:
     ----------
     w
         (N, 3) inverse depth in camera 1, 1/mm, at the point and its slopes over normalised x and y; for curved patches
-        (N, 6), with the coefficients of x^2, x y and y^2 (offsets from the point) besides.
+        (N, 6), including the coefficients of x^2, x y and y^2 (offsets from the point).
     epipolar_px, epipolar_sigma_px
         (N,) offset of camera 2's image across the epipolar line, sign as ``StereoPair.epipolar_residual_px``.
     zncc
@@ -52,7 +52,7 @@ class ShapeFit:
     iterations, status
         (N,).
     variance
-        (N,) noise variance assumed in the covariance where no model states it.
+        (N,) noise variance assumed in the covariance if no model states it.
     """
 
     w: Float
@@ -82,7 +82,7 @@ class MotionFit:
     covariance
         (N, 5, 5) of (w0, G00, G10, G20, epipolar offset).
     rate
-        (N,) the last step's motion over that of the one before; NaN after a single step.
+        (N,) the last step's motion over the motion of the step before; NaN after a single step.
     """
 
     w: Float

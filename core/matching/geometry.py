@@ -1,6 +1,6 @@
 """Conversion of the matcher's unknowns to lengths and angles, with their covariances.
 
-Camera 1's frame is ``cam1``; results are in the system frame unless a name says otherwise. All arrays run over N
+Camera 1's frame is ``cam1``; results are in the system frame unless a name gives another one. All arrays run over N
 points; NaN in gives NaN out.
 """
 
@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Float
-from core.cameras.stereo import StereoPair
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.stereo import StereoPair
 
 _NEAR_HALF_TURN = -0.99  # cosine, 8 degrees: nearer, the skew part has lost a digit and more
 
@@ -91,7 +91,7 @@ def shape_geometry(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike) -> ShapeGeo
 
 
 def principal_curvatures(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike) -> Float:
-    """Return principal curvatures (N, 2) of the surface, 1/mm, the larger first; positive where it bulges to camera 1.
+    """Return principal curvatures (N, 2) of the surface, 1/mm, the larger first; positive for a bulge to camera 1.
 
     Parameters
     ----------
@@ -141,8 +141,8 @@ def motion_geometry(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, G: ArrayLi
     pair, xy_px, w
         As in :func:`shape_geometry`.
     G
-        (N, 3, 3) or (N, 3, 6), see :class:`core.matching.MotionFit`. Second-order terms have no effect in the middle of
-        the patch, where all of this is reported.
+        (N, 3, 3) or (N, 3, 6), see :class:`stereorig.core.matching.MotionFit`. Second-order terms have no effect in the
+        middle of the patch, where all of this is reported.
     """
     w, G = np.asarray(w, dtype=np.float64)[..., :3], np.asarray(G, dtype=np.float64)[..., :3]
     R = pair.cam1.cam_from_sys.rotation
@@ -237,7 +237,7 @@ def _root2(m: Float) -> Float:
 
 
 def _rotation_vectors(rotation: Float) -> Float:
-    """Axis times angle: from the skew part, and near half a turn, where that vanishes, through the quaternion."""
+    """Axis times angle: from the skew part, or from the quaternion near half a turn (zero skew part)."""
     r = rotation
     skew = np.stack([r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], axis=-1)
     trace = np.trace(r, axis1=-2, axis2=-1)

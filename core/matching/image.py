@@ -14,14 +14,14 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.arrays import Float32
-from core.errors import ImageError, InputError
-from core.matching.blur import Blur, fitted_share, spread_of
-from core.matching.filters import correlate, derivative, in_bands, prefilter
-from core.matching.options import SPLINE_ORDER
-from core.matching.slopes import SlopeFilter, slope_filter
-from core.noise import NoiseModel
-from core.settings import Interpolation
+from stereorig.core.arrays import Float32
+from stereorig.core.errors import ImageError, InputError
+from stereorig.core.matching.blur import Blur, fitted_share, spread_of
+from stereorig.core.matching.filters import correlate, derivative, in_bands, prefilter
+from stereorig.core.matching.options import SPLINE_ORDER
+from stereorig.core.matching.slopes import SlopeFilter, slope_filter
+from stereorig.core.noise import NoiseModel
+from stereorig.core.settings import Interpolation
 
 Box = tuple[int, int, int, int]
 
@@ -47,11 +47,13 @@ class ImageData:
     order
         3 or 5.
     noise
-        The noise model of ``raw``, or None where it is not known.
+        The noise model of ``raw``, or None if it is not known.
     blur
         Blur of ``raw``; None without one.
     unblurred
         (rows, cols) grey levels before the blur; None without one.
+    defects
+        (m,) flat indices of pixels that count in no subset of this image as a reference; None: all count.
     """
 
     coefficients: Float32
@@ -60,6 +62,7 @@ class ImageData:
     noise: NoiseModel | None = None
     blur: Blur | None = None
     unblurred: NDArray[Any] | None = None
+    defects: NDArray[np.int64] | None = None
     _spreads: dict[tuple[int, int], Float32] = field(default_factory=dict, init=False, repr=False)
 
     @property
@@ -74,19 +77,19 @@ class ImageData:
 
     @cached_property
     def noise_variance(self) -> float | None:
-        """Variance of the noise of a pixel of weight 1, grey levels squared, or None where it is not known."""
+        """Variance of the noise of a pixel of weight 1, grey levels squared, or None if it is not known."""
         if self.noise is None:
             return None
         return float(1.0 / np.mean(1.0 / self.noise.variance(self.raw[::_SAMPLE, ::_SAMPLE])))
 
     @cached_property
     def weights(self) -> Float32 | None:
-        """(rows, cols) float32 inverse variance of the pixels' noise, about 1 in the mean; None where all count alike.
+        """(rows, cols) float32 inverse variance of the pixels' noise, about 1 in the mean; None if all count alike.
 
         The weight is taken from neighbouring pixels too, so that a pixel's own noise has little effect on its weight.
         """
         if self.noise is None or self.noise_variance is None:
-            return None
+            return None if self.defects is None else self._without_defects(np.ones(self.shape, np.float32))
         out = np.empty(self.shape, np.float32)
         model, one = self.noise, self.noise_variance
 
@@ -95,7 +98,12 @@ class ImageData:
             return one / model.variance(level)
 
         in_bands(self.raw, 1, weigh, out)
-        return out
+        return self._without_defects(out)
+
+    def _without_defects(self, weights: Float32) -> Float32:
+        if self.defects is not None:
+            weights.ravel()[self.defects] = 0.0
+        return weights
 
     @cached_property
     def slopes(self) -> SlopeFilter | None:
@@ -150,6 +158,7 @@ def prepare(
     interpolation: Interpolation = "quintic",
     noise: NoiseModel | None = None,
     blur: Blur | None = None,
+    defects: NDArray[np.int64] | None = None,
 ) -> ImageData:
     """Find the spline coefficients of an image.
 
@@ -163,6 +172,8 @@ def prepare(
         The camera's noise model; it weighs the pixels, and gives the covariance of a match.
     blur
         A Gaussian that the image is blurred with before anything else; None: no blur.
+    defects
+        Flat indices of pixels that count in no subset, see :mod:`stereorig.core.matching.defects`; None: all count.
 
     Raises
     ------
@@ -194,8 +205,8 @@ def prepare(
     if blur is not None:
         blurred = blur.apply(pixels)
         left = None if noise is None else noise.times(blur.gain)
-        return ImageData(_coefficients(blurred, order), blurred, order, left, blur, pixels)
-    return ImageData(_coefficients(pixels, order), np.array(pixels, order="C"), order, noise)
+        return ImageData(_coefficients(blurred, order), blurred, order, left, blur, pixels, defects)
+    return ImageData(_coefficients(pixels, order), np.array(pixels, order="C"), order, noise, defects=defects)
 
 
 def prepare_part(pixels: NDArray[Any], order: int, noise: NoiseModel | None, box: Box) -> ImageData:
@@ -221,7 +232,7 @@ def prepare_part(pixels: NDArray[Any], order: int, noise: NoiseModel | None, box
 
 
 def coefficients_in(pixels: NDArray[Any], order: int, box: Box) -> Float32:
-    """Return the coefficients of a box of an image, those of the whole image to the last bit."""
+    """Return the coefficients of a box of an image, equal to the whole image's to the last bit."""
     taps = prefilter(order)
     reach = len(taps) // 2
     x0, y0, x1, y1 = box
@@ -242,7 +253,7 @@ def _coefficients(pixels: NDArray[Any], order: int) -> Float32:
 
 
 def mirror_padding(padded: Float32, first: int, last: int) -> None:
-    """Fill the padding beside the image's rows ``first`` to ``last``, and above and below it."""
+    """Fill the padding left and right of the image's rows ``first`` to ``last``, and above and below it."""
     beside = padded[PAD + first : PAD + last]
     inner = beside[:, PAD:-PAD]
     beside[:, :PAD] = inner[:, PAD:0:-1]

@@ -1,4 +1,4 @@
-"""Two odd filters of 7 x 7 taps over an image in one pass, compiled: what a reference's gradients are made with.
+"""Two odd filters of 7 x 7 taps over an image in one pass, compiled: they give a reference's gradients.
 
 OpenCV's plain 2-D filter takes one set of taps at a time and keeps its sums in memory; here each pixel is read once for
 both, and a row's sums stay in the first cache.
@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float32
-from core.matching.kernels.naming import entry
-from core.threads import run_ranges, threads
+from stereorig.core.arrays import Float32
+from stereorig.core.matching.kernels.naming import entry
+from stereorig.core.threads import run_ranges, threads
 
 REACH = 3
 """The filters are 7 x 7; 9 x 9 gains less than 0.05 % of the information."""

@@ -5,29 +5,29 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from core.errors import InputError
-from core.settings import DEFAULT_MAX_SIGMA_PX, SUBSET_PX, Interpolation
+from stereorig.core.errors import InputError
+from stereorig.core.settings import SINGLE_MAX_SIGMA_PX, SUBSET_PX, Interpolation
 
 Patch = Literal["rigid", "affine", "quadratic"]
 PATCHES: tuple[Patch, ...] = get_args(Patch)
 
 FIRST_RATE = 0.1
-"""Convergence rate assumed where nothing is known: what poor images show at worst in nine points of ten."""
+"""Convergence rate assumed for an unknown one: on poor images nine points of ten are at least this fast."""
 
 SPLINE_ORDER: dict[str, int] = {"cubic": 3, "quintic": 5}
 
 
 @dataclass(frozen=True, kw_only=True)
 class MatchOptions:
-    """Options of :func:`core.matching.fit_shape` and :func:`core.matching.fit_motion`.
+    """Options of :func:`stereorig.core.matching.fit_shape` and :func:`stereorig.core.matching.fit_motion`.
 
     Attributes
     ----------
     subset_px
         Width and height of the square subset in camera 1, px.
     patch
-        ``stretch`` (12 unknowns, the default) or ``rigid`` (the paper's 9): a plane that moves; shape is a plane with
-        both. ``curved``: a second-order surface (6 unknowns) with a second-order displacement (18 more).
+        ``affine`` (12 unknowns, the default) or ``rigid`` (the paper's 9): a plane that moves; shape is a plane with
+        both. ``quadratic``: a second-order surface (6 unknowns) with a second-order displacement (18 more).
     interpolation
         Spline that the images were prepared with; ``cubic`` is faster, and biased on sharp speckle.
     max_iterations
@@ -36,8 +36,8 @@ class MatchOptions:
         Motion of the subset's corners that may remain unmade when the iteration stops, px. Its own noise is some ten
         times larger at the default.
     first_rate
-        A step's motion over that of the step before, assumed after a point's first step: where the first moves little,
-        it is the only one. Below 0.9.
+        A step's motion over the motion of the step before, assumed after a point's first step: if the first moves
+        little, it is the only one. Below 0.9. Below 0.9.
     max_sigma_px
         Points whose match has a larger predicted standard deviation, px, in any image and direction have too little
         texture: five times as much, half a pixel, is exceeded once in two million. A texture of stripes fails this test
@@ -52,7 +52,7 @@ class MatchOptions:
     max_iterations: int = 30
     tolerance_px: float = 1e-3
     first_rate: float = FIRST_RATE
-    max_sigma_px: float = DEFAULT_MAX_SIGMA_PX
+    max_sigma_px: float = SINGLE_MAX_SIGMA_PX
     max_step_px: float = 4.0
 
     def __post_init__(self) -> None:

@@ -1,10 +1,10 @@
 """Reference gradients that are best under noise: a Wiener derivative for the image's own texture.
 
 The matcher takes the derivatives of all comparisons from the reference's gradients, and their noise costs random error:
-a tenth and more in coarse texture. Of all linear filters the one that comes closest to the true derivative, ``i k S /
-(S + N)`` for a texture of spectrum S under white noise N, loses least. Its error is uncorrelated with its output, so
-the sum of its squares is also the sensitivity of the sums to a shift: no noise has to be subtracted. It is odd, so its
-noise does not correlate with a pixel's own noise, and no bias follows.
+a tenth and more in coarse texture. The linear filter nearest to the true derivative, ``i k S / (S + N)`` for a texture
+of spectrum S under white noise N, loses least. Its error is uncorrelated with its output, so the sum of its squares is
+also the sensitivity of the sums to a shift: no noise has to be subtracted. It is odd, so its noise does not correlate
+with a pixel's own noise, and no bias follows.
 
 The interpolation error of the spline, near the highest frequencies, is counted as noise too, and with a larger weight:
 it shifts all points by one amount that depends on the sub-pixel phase, and averaging does not remove it.
@@ -19,21 +19,21 @@ import numpy as np
 from numpy import fft  # scipy's gives the same numbers and is slow to load
 from numpy.typing import NDArray
 
-from core.arrays import Float, Float32
-from core.matching.blur import Blur
-from core.matching.filters import derivative
-from core.matching.odd_filters import REACH, filter_both
+from stereorig.core.arrays import Float, Float32
+from stereorig.core.matching.blur import Blur
+from stereorig.core.matching.filters import derivative
+from stereorig.core.matching.odd_filters import REACH, filter_both
 
 _TILE = 128
 _MAX_TILES = 48
-_MIN_POWER = 0.1  # of a strong tile's grey-level variance: tiles below it show no texture
-_RINGS = (0.6, 0.8)  # of the Nyquist frequency, both ways: beyond the second, lenses leave little but noise
+_MIN_POWER = 0.1  # share of a strong tile's grey-level variance: tiles below it show no texture
+_RINGS = (0.6, 0.8)  # shares of the Nyquist frequency, both ways: beyond the second, lenses leave little but noise
 _FALL = 2.0  # by which the sharpest texture's spectrum falls from one ring to the next
 _LEVEL = 1.05  # rings that differ by less show noise alone
-_MAX_NOISE = 0.5  # of the grey levels' variance
+_MAX_NOISE = 0.5  # share of the grey levels' variance
 _INTERPOLATION_COUNTS = 100.0  # reduces the bias in sharp speckle by a third, for 1 % of random error there
-_BLANK = 1e-20  # of the squared grey levels: rounding
-_MIN_NOISE = 1e-6  # of the texture's variance, so that a noise-free image's equations can be solved
+_BLANK = 1e-20  # share of the squared grey levels: rounding
+_MIN_NOISE = 1e-6  # share of the texture's variance, so that a noise-free image's equations can be solved
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class SlopeFilter:
     share
         Share of noise in the filtered gradient's squares over the image's texture.
     noise_variance
-        Of a pixel, grey levels squared, for which the filter was made.
+        Noise variance of a pixel, grey levels squared, for which the filter was made.
     """
 
     along_x: Float
@@ -79,18 +79,19 @@ def slope_filter(
     image
         (rows, cols) grey levels; tiles of it without texture are left out.
     order
-        Of the spline that interpolates the other images, 3 or 5.
+        Order of the spline that interpolates the other images, 3 or 5.
     noise_variance
-        Of a pixel, grey levels squared; from the spectrum's floor when left out. Texture that is sharp enough to reach
-        the floor raises it: the gradients are then slightly worse, and the covariance is not too small.
+        Noise variance of a pixel, grey levels squared; from the spectrum's floor when left out. Texture that is sharp
+        enough to reach the floor raises it: the gradients are then slightly worse, and the covariance is not too small.
     blur, unblurred
         The image's blur, and the image before it: its noise is no longer white, and its spectrum has no floor.
 
     Notes
     -----
     The taps h solve the normal equations ``sum_j (R + E)(i - j) h(j) = (d S)(i)``: R the image's autocorrelation, S the
-    texture's, E that of the interpolation error, d the derivative. That is the quintic spline's: the exact one would
-    amplify aliased frequencies. They are then scaled so that the sum of squares equals the sensitivity.
+    texture's, E the interpolation error's, d the derivative. The derivative is the quintic spline's: the exact one
+    would amplify aliased frequencies. That is the quintic spline's: the exact one would amplify aliased frequencies.
+    They are then scaled so that the sum of squares equals the sensitivity.
     """
     spectra, window = _spectra(image)
     if spectra is None:

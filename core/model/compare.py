@@ -7,22 +7,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Bool, Float
-from core.errors import InputError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels
-from core.gauge.rigid import skew
-from core.model.filtered import ModelField, model_at_points
-from core.model.placement import Placement, no_overlap
-from core.model.regions import Tiles, Verdict, holm, own_covariance_of_means, tiles_of, whitening
-from core.model.result import Compared, CompareOptions, Comparison, ModelStatus
-from core.model.strains import compare_strain
-from core.model.surface import ModelSurface
-from core.significance import chi_square_tail
-from core.strain.options import StrainOptions
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.errors import InputError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.gauge.rigid import skew
+from stereorig.core.model.filtered import ModelField, model_at_points
+from stereorig.core.model.placement import Placement, no_overlap
+from stereorig.core.model.regions import ChiSquare, Tiles, holm, own_covariance_of_means, tiles_of, whitening
+from stereorig.core.model.result import Compared, CompareOptions, ModelComparison, ModelStatus
+from stereorig.core.model.strains import compare_strain
+from stereorig.core.model.surface import ModelSurface
+from stereorig.core.significance import chi_square_tail
+from stereorig.core.strain.options import StrainOptions
 
-_FAR = 0.02  # of the field's size: not on the model
-_NEAR = 0.5  # of the field's size: over the model at another height, not elsewhere
+_FAR = 0.02  # share of the field's size: not on the model
+_NEAR = 0.5  # share of the field's size: over the model at another height, not elsewhere
 _MIN_POINTS = 10
 _MIN_SHARE = 0.05
 _TILES = 8  # across the field
@@ -46,8 +46,8 @@ def compare_with_model(
     subset_px: int,
     options: CompareOptions | None = None,
     strain: StrainOptions | None = None,
-) -> Comparison:
-    """Compare a displacement with that of a model.
+) -> ModelComparison:
+    """Compare a displacement with a model's.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def compare_with_model(
     surface
         The model, in its own frame.
     placement
-        Where it lies in the system frame.
+        The model's placement in the system frame.
     subset_px
         Width of the subset that the field was measured with.
     options
@@ -67,13 +67,13 @@ def compare_with_model(
     Returns
     -------
     Comparison
-        Of all points that lie over the model.
+        Result for all points over the model.
 
     Raises
     ------
     InputError
-        ``comparison_needs_motion`` for a shape; ``model_no_overlap`` where hardly any point lies over the model,
-        ``model_geometry_differs`` where the points over it are far from its surface.
+        ``comparison_needs_motion`` for a shape; ``model_no_overlap`` if hardly any point is over the model,
+        ``model_geometry_differs`` if the points over it are far from its surface.
 
     Notes
     -----
@@ -87,10 +87,13 @@ def compare_with_model(
     covariance from all of this, the load's uncertainty and the systematic size among it. The chi-square of all of them
     falls into one part in proportion to the model's displacement, and the rest: a stiffness that is wrong by little
     would be lost among the regions. The third part is the region that fits worst, by the chi-square of its own three
-    means times the number of regions. The three are judged together, so that a right model is accepted as often as
-    asked at the least, and a region is refuted only where the model is; where strain is compared too, each quantity has
-    half of what may be refuted wrongly. Rigid motion is fitted to the means by generalised least squares,
-    and takes six degrees of freedom.
+    means times the number of regions. The three are judged together, so that a right model is accepted at least as
+    often as asked, and a region is refuted only if the model is; if strain is compared too, each quantity has half of
+    the probability of a wrong refusal. Rigid motion is fitted to the means by generalised least squares, and takes six
+    degrees of freedom.
+
+    A plane model has no displacement along its normal: the difference is taken along its plane, and the rigid motion is
+    a motion in the plane. Strain is along the surface in any case, and is compared as it is.
     """
     options = CompareOptions() if options is None else options
     if field.uvw_mm is None:
@@ -105,31 +108,46 @@ def compare_with_model(
     assert model is not None
     measured, turned = _without_rotation(field, model, over) if options.remove_rigid else (field, np.zeros(3))
     assert measured.uvw_mm is not None
-    difference = _difference(measured, model, found, placement)
+    difference = whole = _difference(measured, model, found, placement)
+    judged, seen, whole_model, left_out = options, measured, model, None
+    if placed.plane:
+        turn, left_out = _into_plane(placement.rotation[:, 2])
+        difference = _Difference(whole.value @ turn.T, turn @ whole.own @ turn.T, turn @ whole.columns)
+        model, seen = model @ turn.T, replace(measured, uvw_mm=measured.uvw_mm @ turn.T)
+        u, v, w = np.sqrt(np.square(turn) @ np.square(options.systematic_mm)).tolist()
+        judged = replace(options, systematic_mm=(u, v, w))
     shared = SharedPixels.of(field, subset_px)
     width = max(_MIN_SUBSETS * subset_px, _extent_px(field, over) / _TILES)
     tiles = tiles_of(field, over, width_px=options.tile_px or width)
     load = options.load_uncertainty * model
-    mean, covariance = _joint(field, tiles, difference, load, shared, options)
+    mean, covariance = _joint(field, tiles, difference, load, shared, judged)
     modes, rigid = None, None
     if options.remove_rigid:
         centre = field.xyz_mm[over].mean(axis=0)
         modes = np.concatenate([-skew(field.xyz_mm - centre), np.broadcast_to(np.eye(3), (*field.shape, 3, 3))], -1)
         modes = np.where(over[..., None, None], modes, 0.0)
-        N = tiles.means(modes).reshape(-1, 6)
+        free = np.eye(6)
+        if placed.plane:  # one turn and two shifts are seen in the plane
+            free = np.zeros((6, 3))
+            free[:3, 0], free[3:, 1:] = placement.rotation[:, 2], turn[turn.any(axis=1)].T
+            modes = turn @ modes @ free
+        N = tiles.means(modes).reshape(-1, modes.shape[-1])
         fitted, left = _fitted(mean, covariance, N)
         mean, covariance = mean - N @ fitted, left
         difference = replace(difference, value=difference.value - modes @ fitted)
-        rigid = fitted + np.concatenate([turned, np.zeros(3)])
+        rigid = free @ fitted + np.concatenate([turned, np.zeros(3)])
     level = (1.0 - options.confidence) / (1 if strain is None else 2)
-    displacement = _judged(measured.uvw_mm, model, difference, load, tiles, mean, covariance, options, level)
-    factor, factor_sigma = _factor(field, tiles, measured, model, difference, shared, options, modes)
+    assert seen.uvw_mm is not None
+    displacement = _judged(seen.uvw_mm, model, difference, load, tiles, mean, covariance, judged, level)
+    if left_out is not None:
+        displacement = _without(displacement, left_out)
+    factor, factor_sigma = _factor(field, tiles, seen, model, difference, shared, judged, modes)
     height = found.distance_mm[over]
     noise = np.einsum("na,nab,nb->n", field.normal_sys[over], field.covariance[over][:, :3, :3], field.normal_sys[over])
     status = np.full(field.shape, np.int8(ModelStatus.NOT_MEASURED))
     status[field.valid] = np.int8(ModelStatus.NO_MODEL)
     status[over] = np.int8(ModelStatus.COMPARED)
-    return Comparison(
+    return ModelComparison(
         options=options,
         status=status,
         placement=placement,
@@ -141,8 +159,8 @@ def compare_with_model(
         else compare_strain(
             measured,
             found.field,
-            difference.own,
-            np.concatenate([difference.columns, load[..., None]], -1),
+            whole.own,
+            np.concatenate([whole.columns, options.load_uncertainty * whole_model[..., None]], -1),
             tiles,
             strain,
             subset_px=subset_px,
@@ -153,6 +171,35 @@ def compare_with_model(
         rigid=rigid,
         shape_rms_mm=float(np.sqrt(np.mean(height**2))),
         shape_ratio=float(np.sqrt(np.mean(height**2 / np.maximum(noise, 1e-18)))),
+        left_out=left_out,
+    )
+
+
+def _into_plane(normal: Float) -> tuple[Float, int]:
+    """Return M (3, 3) and k: M d is d along a plane, in the axes turned into it by the least; row k is zero."""
+    k = int(np.abs(normal).argmax())
+    axis = np.zeros(3)
+    axis[k] = np.sign(normal[k])
+    across = skew(np.cross(normal, axis))
+    turn = np.eye(3) + across + across @ across / (1.0 + normal @ axis)
+    turn[k] = 0.0
+    return turn, k
+
+
+def _without(one: Compared, k: int) -> Compared:
+    """Return a comparison without the numbers of a component that was left out."""
+
+    def unknown(values: Float) -> Float:
+        return np.where(np.arange(3) == k, np.nan, values)
+
+    return replace(
+        one,
+        measured=unknown(one.measured),
+        model=unknown(one.model),
+        difference=unknown(one.difference),
+        sigma=unknown(one.sigma),
+        tile_difference=unknown(one.tile_difference),
+        tile_sigma=unknown(one.tile_sigma),
     )
 
 
@@ -187,7 +234,7 @@ def _extent_px(field: Field, over: Bool) -> float:
 def _without_rotation(field: Field, model: Float, over: Bool) -> tuple[Field, Float]:
     """Return the field turned back by the rotation that best takes the model's deformed shape to the measured one.
 
-    What is left of it is small enough to be linear.
+    The remaining rotation is small enough to be linear.
     """
     assert field.uvw_mm is not None
     x = field.xyz_mm[over]
@@ -232,7 +279,7 @@ def _joint(
 
 
 def _fitted(mean: Float, covariance: Float, modes: Float) -> tuple[Float, Float]:
-    """Amplitudes of modes (3 t, q) by generalised least squares, and the covariance of what is left."""
+    """Amplitudes of modes (3 t, q) by generalised least squares, and the covariance of the remainder."""
     T = whitening(covariance)
     white = T @ modes
     H = np.linalg.inv(white.T @ white)
@@ -251,14 +298,14 @@ def _judged(
     level: float,
 ) -> Compared:
     each = tuple(
-        Verdict.of(mean[3 * k : 3 * k + 3], covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3])
+        ChiSquare.of(mean[3 * k : 3 * k + 3], covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3])
         for k in range(tiles.count)
     )
-    overall = Verdict.of(mean, covariance)
+    overall = ChiSquare.of(mean, covariance)
     scale, pattern = _parts(overall, mean, covariance, tiles.means(np.where(tiles.number[..., None] >= 0, model, 0.0)))
     local = _worst(each)
     parts = [one.probability for one in (scale, pattern, local) if one.degrees]
-    # of independent ones, so many together are beyond the level as often as it says; of these at most as often
+    # of independent parts, so many exceed the level by chance as often as stated; these parts at most as often
     together = 1.0 - (1.0 - min(parts)) ** len(parts) if parts else np.nan
     over = tiles.number >= 0
     variance = np.diagonal(difference.own, axis1=-2, axis2=-1) + (difference.columns**2).sum(axis=-1)
@@ -280,25 +327,25 @@ def _judged(
     )
 
 
-def _worst(each: tuple[Verdict, ...]) -> Verdict:
+def _worst(each: tuple[ChiSquare, ...]) -> ChiSquare:
     """Return the verdict of the region that fits worst, its probability times their number."""
     known = [v for v in each if v.degrees]
     if not known:
-        return Verdict(np.nan, 0, np.nan)
+        return ChiSquare(np.nan, 0, np.nan)
     worst = min(known, key=lambda v: v.probability)
     return replace(worst, probability=min(1.0, worst.probability * len(known)))
 
 
-def _parts(overall: Verdict, mean: Float, covariance: Float, model: Float) -> tuple[Verdict, Verdict]:
-    """Split a chi-square: what is in proportion to the model's means (t, 3), and the rest."""
+def _parts(overall: ChiSquare, mean: Float, covariance: Float, model: Float) -> tuple[ChiSquare, ChiSquare]:
+    """Split a chi-square into the part in proportion to the model's means (t, 3), and the rest."""
     T = whitening(covariance)
     white = T @ model.ravel()
     size = float(white @ white)
     if not size > 0.0:
-        return Verdict(0.0, 0, np.nan), overall
+        return ChiSquare(0.0, 0, np.nan), overall
     along = float(white @ (T @ mean)) ** 2 / size
     rest, degrees = max(overall.chi_square - along, 0.0), overall.degrees - 1
-    return (Verdict(along, 1, chi_square_tail(along, 1)), Verdict(rest, degrees, chi_square_tail(rest, degrees)))
+    return (ChiSquare(along, 1, chi_square_tail(along, 1)), ChiSquare(rest, degrees, chi_square_tail(rest, degrees)))
 
 
 def _factor(
@@ -319,7 +366,7 @@ def _factor(
     if not np.abs(N).max() > 0.0:
         return np.nan, np.nan
     if modes is not None:
-        N = np.concatenate([N, tiles.means(modes).reshape(-1, 6)], axis=1)
+        N = np.concatenate([N, tiles.means(modes).reshape(len(N), -1)], axis=1)
     T = whitening(covariance)
     white = T @ N
     H = np.linalg.pinv(white.T @ white, hermitian=True)  # a model that moves rigidly alone has no factor of its own

@@ -1,8 +1,8 @@
 """A model's displacement as the measurement would see it: through each point's subset, and through the smoothing.
 
 A subset's displacement is the value at its centre of its shape function, fitted by least squares over its pixels. Here
-the same shape function is fitted to the model's displacement over the subset's area on the model's surface. What the
-subset takes from a curved displacement, and what an edge cuts off, is then in both.
+the same shape function is fitted to the model's displacement over the subset's area on the model's surface. The effect
+of the subset on a curved displacement, and of an edge that cuts it, is then in both.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 
-from core.arrays import Bool, Float
-from core.field.points.result import Field
-from core.field.region.cuts import crosses
-from core.field.smoothed import smoothed_displacement
-from core.model.surface import ModelSurface
-from core.status import PointStatus
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.cuts import crosses
+from stereorig.core.field.smoothed import smoothed_displacement
+from stereorig.core.model.surface import ModelSurface
+from stereorig.core.status import PointStatus
 
 _NODES = 4  # along each side of a subset; exact for polynomials up to degree 7
-_MIN_AREA = 0.5  # of a subset's area that must lie on the model
+_MIN_AREA = 0.5  # share of a subset's area that must be on the model
 _AT_ONCE = 4096
 
 
@@ -31,13 +31,13 @@ class ModelField:
     Attributes
     ----------
     field
-        The measured field with the model's displacement in the place of its own; valid where the model has one.
+        The measured field with the model's displacement in place of its own; valid at points where the model has one.
     distance_mm
         (r, c) height of the measured point above the model's surface, along its normal; NaN without.
     gradient
         (r, c, 3, 3) derivative of the model's displacement over the position, along its surface.
     covered
-        (r, c) True for measured points that lie over the model.
+        (r, c) True for measured points over the model.
     """
 
     field: Field
@@ -58,14 +58,14 @@ def model_at_points(field: Field, surface: ModelSurface, *, subset_px: float, fa
     subset_px
         Width of the subset that the field was measured with.
     far_mm
-        A point farther from the surface than this lies over no part of it.
+        A point farther from the surface than this is over no part of it.
 
     Notes
     -----
-    A subset's pixels lie on the plane of the point's neighbours in the grid; each of 4 x 4 Gauss points is laid onto
-    the model. Those beyond its border, or beyond a cut, are left out of the fit, as the pixels of a masked subset are.
-    Patches of the second order take a quadratic, others a plane. Where the measured displacement is smoothed, the
-    model's is by the same window.
+    A subset's pixels are on the plane of the point's neighbours in the grid; each of 4 x 4 Gauss points is projected
+    onto the model. Those beyond its border, or beyond a cut, are left out of the fit, as the pixels of a masked subset
+    are. Patches of the second order take a quadratic, others a plane. If the measured displacement is smoothed, the
+    model's is smoothed with the same window.
     """
     valid = field.valid
     rows, cols = np.nonzero(valid)

@@ -1,4 +1,4 @@
-"""Where a model lies in the system frame: a rigid placement with its uncertainty.
+"""Rigid placement of a model in the system frame, with its uncertainty.
 
 ``x_sys = R x_model + t``. Errors are a small rotation about ``centre_mm`` (rad) and a shift (mm), both along the
 system's axes: a point of the model that was placed at x is placed too far by ``omega x (x - centre) + shift``.
@@ -12,18 +12,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Float
-from core.errors import InputError, MeasurementError, RegionError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels, roots_of
-from core.gauge.align import Alignment, three_two_one
-from core.gauge.rigid import skew
-from core.gauge.sampling import sample
-from core.model.surface import ModelSurface
+from stereorig.core.arrays import Float
+from stereorig.core.errors import InputError, MeasurementError, RegionError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels, roots_of
+from stereorig.core.gauge.align import Alignment, three_two_one
+from stereorig.core.gauge.rigid import skew
+from stereorig.core.gauge.sampling import sample
+from stereorig.core.model.surface import ModelSurface
 
 _ROUNDS = 60
 _SETTLED_MM = 1e-7
-_TOLD = 1e-3  # of the best told direction's sensitivity: below it the shape does not tell a direction
+# share of the best determined direction's sensitivity: a direction below it is not determined by the shape
+_DETERMINED = 1e-3
 _AXES = ("turn about X", "turn about Y", "turn about Z", "shift along X", "shift along Y", "shift along Z")
 
 
@@ -38,17 +39,17 @@ class Placement:
     centre_mm
         (3,) about which errors turn, system frame.
     own
-        (6, 6) covariance of the six errors from the points' own noise, and from what the user stated.
+        (6, 6) covariance of the six errors from the points' own noise, and from the user's statement.
     common
-        (6, k) their common factor, columns as the field's; None where it has none.
+        (6, k) their common factor, columns as the field's; None if the field has none.
     kind
         ``given``, ``3-2-1``, ``markers`` or ``best-fit``.
     points
-        Number of measured points that it was laid through; 0 for one that was given.
+        Number of measured points that it was fitted to; 0 for a given placement.
     residual_rms_mm
-        Of these points.
+        Rms distance of these points.
     held
-        What the shape did not tell and the start of a best fit did, in words.
+        Directions that the shape did not determine and that the start of a best fit did, in words.
     """
 
     rotation: Float
@@ -101,7 +102,7 @@ def place_in_frame(frame: Alignment, model_mm: ArrayLike | None) -> Placement:
     Raises
     ------
     RegionError
-        ``gauge_unusable`` where the model's positions span no frame.
+        ``gauge_unusable`` if the model's positions span no frame.
     """
     R_model, origin = np.eye(3), np.zeros(3)
     if model_mm is not None:
@@ -136,8 +137,8 @@ def place_by_markers(
     shared
         The correlation of neighbouring points.
     sigma_mm
-        Standard uncertainty of each position along each axis beside the measurement's: of finding the marker in the
-        image and on the model.
+        Standard uncertainty of each position along each axis in addition to the measurement's: of finding the marker in
+        the image and on the model.
 
     Raises
     ------
@@ -189,8 +190,9 @@ def place_by_markers(
 def place_by_fit(field: Field, surface: ModelSurface, start: Placement, *, shared: SharedPixels) -> Placement:
     """Move a placed model onto the measured shape: least distances along its normals, weighed by their noise.
 
-    What the shape does not tell, as shifts along a plane, stays as in ``start`` and keeps its uncertainty. Points
-    beyond the model's border, or farther from it than three robust standard deviations of all, take no part.
+    Directions that the shape does not determine, as shifts along a plane, stay as in ``start`` and keep its
+    uncertainty. Points beyond the model's border, or farther from it than three robust standard deviations of all, take
+    no part.
 
     Parameters
     ----------
@@ -199,14 +201,14 @@ def place_by_fit(field: Field, surface: ModelSurface, start: Placement, *, share
     surface
         In the model's frame.
     start
-        Where it lies at first.
+        The placement to start from.
     shared
         The correlation of neighbouring points.
 
     Raises
     ------
     InputError
-        ``model_no_overlap`` where fewer than ten points lie over the model.
+        ``model_no_overlap`` if fewer than ten points are over the model.
     """
     R, t = start.rotation, start.shift_mm
     rows, cols = np.nonzero(field.valid)
@@ -214,7 +216,7 @@ def place_by_fit(field: Field, surface: ModelSurface, start: Placement, *, share
     centre = x.mean(axis=0)
     length = max(float(np.sqrt(np.mean(np.sum((x - centre) ** 2, axis=1)))), 1e-9)
     scale = np.array([length] * 3 + [1.0] * 3)
-    told = np.eye(6)
+    known = np.eye(6)
     for _ in range(_ROUNDS):
         placed = surface.moved(R, t)
         feet = placed.feet(x)
@@ -230,8 +232,8 @@ def place_by_fit(field: Field, surface: ModelSurface, start: Placement, *, share
         A = np.einsum("na,nak->nk", normal, _moves(x, centre)) / scale
         H = (A.T * weight) @ A
         value, vector = np.linalg.eigh(H)
-        told = vector[:, value > _TOLD * value[-1]]
-        gain = told @ np.linalg.solve(told.T @ H @ told, told.T @ (A.T * weight))
+        known = vector[:, value > _DETERMINED * value[-1]]
+        gain = known @ np.linalg.solve(known.T @ H @ known, known.T @ (A.T * weight))
         p = (gain @ r) / scale
         R, t = _turned(R, t, centre, p)
         if np.abs(p * scale).max() < _SETTLED_MM:
@@ -241,8 +243,8 @@ def place_by_fit(field: Field, surface: ModelSurface, start: Placement, *, share
     roots = roots_of(np.where(field.valid[..., None, None], field.covariance[..., :3, :3], 0.0))
     noise = each @ roots
     own = np.einsum("rcij,rckj->ik", noise, shared.positions.summed(field, noise))
-    # about the same centre, and of the start only what the shape leaves open
-    open_ = np.eye(6) - told @ told.T
+    # about the same centre, and from the start only the directions that the shape leaves open
+    open_ = np.eye(6) - known @ known.T
     kept = (open_ * scale) @ _about(start.centre_mm, centre) / scale[:, None]
     own = 0.5 * (own + own.T) + kept @ start.own @ kept.T
     common = None
@@ -257,7 +259,7 @@ def place_by_fit(field: Field, surface: ModelSurface, start: Placement, *, share
 
 
 def no_overlap(field: Field, surface: ModelSurface, over: int) -> InputError:
-    """Return the error for a model that does not lie where the field was measured."""
+    """Return the error for a model outside the measured field."""
     x = field.xyz_mm[field.valid]
     size = float(np.linalg.norm(np.ptp(x, axis=0))) if len(x) else 0.0
     return InputError(

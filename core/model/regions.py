@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from core.arrays import Bool, Float
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels, roots_of, steps_px
-from core.significance import chi_square_tail
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels, roots_of, steps_px
+from stereorig.core.significance import chi_square_tail
 
-_MIN_SHARE = 0.4  # of a tile's points; smaller rests at the rim join a neighbour
-_SMALL = 1e-10  # of the largest eigenvalue: what rounding leaves of a direction without variance
+_MIN_SHARE = 0.4  # share of a tile's points; smaller rests at the rim join a neighbour
+_SMALL = 1e-10  # share of the largest eigenvalue: rounding makes a direction without variance this large
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class Tiles:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ChiSquare:
     """A chi-square and its probability.
 
     Attributes
@@ -54,7 +54,7 @@ class Verdict:
     chi_square, degrees
         The statistic and its degrees of freedom.
     probability
-        Of a larger one, if the model is right; NaN without degrees of freedom.
+        Probability of a larger one, if the model is right; NaN without degrees of freedom.
     """
 
     chi_square: float
@@ -62,15 +62,15 @@ class Verdict:
     probability: float
 
     @staticmethod
-    def of(difference: Float, covariance: Float) -> Verdict:
+    def of(difference: Float, covariance: Float) -> ChiSquare:
         """Return the verdict on a difference (n,) by its covariance (n, n); directions without any do not count."""
         T = whitening(covariance)
         chi, degrees = float(((T @ difference) ** 2).sum()), len(T)
-        return Verdict(chi, degrees, chi_square_tail(chi, degrees))
+        return ChiSquare(chi, degrees, chi_square_tail(chi, degrees))
 
 
 def whitening(covariance: Float) -> Float:
-    """Return T (q, n) with T C T' = 1, q the rank of the covariance C (n, n): T' T is its inverse where it has any."""
+    """Return T (q, n) with T C T' = 1, q the rank of the covariance C (n, n): T' T is its inverse, if it has one."""
     scale = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     scale = np.where(scale > 0.0, scale, 1.0)
     value, vector = np.linalg.eigh(covariance / scale[:, None] / scale)
@@ -119,8 +119,8 @@ def own_covariance_of_means(field: Field, tiles: Tiles, covariance: Float, share
 
     Notes
     -----
-    With S the roots of the points' covariances and rho the correlation, that of tiles s and t is the sum over their
-    points i and j of ``S_i rho_ij S_j / (n_s n_t)``.
+    With S the roots of the points' covariances and rho the correlation, the covariance of tiles s and t is the sum over
+    their points i and j of ``S_i rho_ij S_j / (n_s n_t)``.
     """
     index = np.full(field.shape, -1, np.int64)
     rows, cols = np.nonzero(tiles.number >= 0)

@@ -8,11 +8,11 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float
-from core.errors import InputError
-from core.model.filtered import ModelField
-from core.model.placement import Placement
-from core.model.regions import Tiles, Verdict
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.errors import InputError
+from stereorig.core.model.filtered import ModelField
+from stereorig.core.model.placement import Placement
+from stereorig.core.model.regions import ChiSquare, Tiles
 
 
 class ModelStatus(IntEnum):
@@ -45,8 +45,8 @@ class CompareOptions:
     load_uncertainty
         Relative standard uncertainty of the load (and of all else that the model's displacement is in proportion to).
     systematic_mm
-        Standard size of errors of U, V, W that noise does not hold (interpolation), taken as one value a region; zero
-        where none is known.
+        Standard size of errors of U, V, W that noise does not contain (interpolation), taken as one value a region;
+        zero if none is known.
     far_mm
         Points farther than this from the placed model's surface are not on it; None: a fiftieth of the field's size.
 
@@ -93,7 +93,7 @@ class Compared:
     tile_difference, tile_sigma
         (t, 3) means over the regions and their standard uncertainties.
     verdicts
-        Of each region, from its own three means.
+        Verdict of each region, from its own three means.
     refuted
         (t,) True for regions in which the model is refuted, at the confidence for all regions together (Holm).
     overall
@@ -101,9 +101,9 @@ class Compared:
     accepted
         True if the model is not refuted by the field as a whole.
     scale, pattern, local
-        The parts that are judged: of ``overall`` that in proportion to the model's displacement (one degree of freedom:
-        a stiffness or load that is wrong) and all else, and the region that fits worst. None where the verdict is not
-        made of them.
+        The parts that are judged: the part of ``overall`` in proportion to the model's displacement (one degree of
+        freedom: a stiffness or load that is wrong), the rest of it, and the region that fits worst. None if the verdict
+        is not based on them.
     """
 
     measured: Float
@@ -112,13 +112,13 @@ class Compared:
     sigma: Float
     tile_difference: Float
     tile_sigma: Float
-    verdicts: tuple[Verdict, ...]
+    verdicts: tuple[ChiSquare, ...]
     refuted: Bool
-    overall: Verdict
+    overall: ChiSquare
     accepted: bool
-    scale: Verdict | None = None
-    pattern: Verdict | None = None
-    local: Verdict | None = None
+    scale: ChiSquare | None = None
+    pattern: ChiSquare | None = None
+    local: ChiSquare | None = None
 
     @property
     def z(self) -> Float:
@@ -127,17 +127,17 @@ class Compared:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class ModelComparison:
     """A field compared with a model.
 
     Attributes
     ----------
     options
-        Of the comparison.
+        Options of the comparison.
     status
         (r, c) int8, :class:`ModelStatus`.
     placement
-        Where the model lies.
+        Placement of the model.
     at_points
         The model at the points.
     tiles
@@ -145,13 +145,16 @@ class Comparison:
     displacement
         U, V, W, mm.
     strain
-        exx, eyy, exy by the measurement's own window; None where none was measured.
+        exx, eyy, exy by the measurement's own window; None if none was measured.
     factor, factor_sigma
-        What the model's displacement is to be multiplied by to fit the measured one best, and its standard uncertainty
-        without that of the load; NaN where the model does not move.
+        Best factor from the model's displacement to the measured one, and its standard uncertainty without the load's;
+        NaN if the model does not move.
     rigid
-        (6,) rigid motion that was taken out: turns about X, Y, Z (rad) and shifts of the points' middle (mm); None
-        where none was.
+        (6,) rigid motion that was removed: turns about X, Y, Z (rad) and shifts of the points' middle (mm); None if
+        none was.
+    left_out
+        Number of the displacement's component that a plane model does not have, 0 for U to 2 for W: the other two are
+        along the model's plane, by the smallest turn of the axes into it. None if all three were compared.
     shape_rms_mm, shape_ratio
         Height of the measured points above the model's surface, root mean square, and in units of its noise.
     """
@@ -168,6 +171,7 @@ class Comparison:
     rigid: Float | None
     shape_rms_mm: float
     shape_ratio: float
+    left_out: int | None = None
 
     @property
     def accepted(self) -> bool:

@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from core.arrays import Float
-from core.field.points.result import Field
-from core.model.regions import Tiles, Verdict, holm
-from core.model.result import Compared
-from core.significance import chi_square_tail
-from core.strain.mean import mean_strain_variances
-from core.strain.options import StrainOptions
-from core.strain.result import StrainStatus
-from core.strain.surface import surface_strain
+from stereorig.core.arrays import Float
+from stereorig.core.field.points.result import Field
+from stereorig.core.model.regions import ChiSquare, Tiles, holm
+from stereorig.core.model.result import Compared
+from stereorig.core.significance import chi_square_tail
+from stereorig.core.strain.mean import mean_strain_variances
+from stereorig.core.strain.options import StrainOptions
+from stereorig.core.strain.result import StrainStatus
+from stereorig.core.strain.surface import surface_strain
 
 
 def compare_strain(
@@ -28,12 +28,12 @@ def compare_strain(
     subset_px: int,
     level: float,
 ) -> Compared | None:
-    """Compare the strains of two displacements over the same points; None where no window has enough of them.
+    """Compare the strains of two displacements over the same points; None if no window has enough of them.
 
     Parameters
     ----------
     measured, model
-        The field with its own and with the model's displacement; the model's is valid where both are compared.
+        The field with its own and with the model's displacement; the model's is valid at points that are compared.
     own
         (r, c, 3, 3) covariance of the displacements' difference.
     columns
@@ -41,7 +41,7 @@ def compare_strain(
     tiles
         The regions.
     options
-        Of the measured strain.
+        Options of the measured strain.
     subset_px
         Width of the subset.
     level
@@ -49,9 +49,10 @@ def compare_strain(
 
     Notes
     -----
-    A strain's window is linear in the difference of both displacements, which is small: its uncertainty is the window's
-    of that difference. Means over regions share points and calibration. The verdict of the whole field therefore takes
-    each region's each component by itself, at a level that holds for all of them in any correlation (Holm).
+    A strain's window is linear in the difference of both displacements, which is small: its uncertainty is propagated
+    from that difference with the window's weights. Means over regions share points and calibration. The verdict of the
+    whole field therefore takes each region's each component by itself, at a level that holds for all of them in any
+    correlation (Holm).
     """
     covariance = np.zeros((*measured.shape, 6, 6))
     covariance[..., 3:, 3:] = own
@@ -78,11 +79,11 @@ def compare_strain(
     z2 = (mean / sigma) ** 2
     p = np.array([[chi_square_tail(float(v), 1) if np.isfinite(v) else np.nan for v in row] for row in z2])
     refuted = np.asarray(holm(p.ravel(), level).reshape(p.shape).any(axis=1))
-    # of each region by itself: the least probable of its three components, times three
+    # verdict of each region by itself: the least probable of its three components, times three
     each = tuple(_least(z2[t], p[t]) for t in range(tiles.count))
     known = np.isfinite(p)
     k = int(np.nanargmin(np.where(known, p, 2.0)))
-    overall = Verdict(float(z2.flat[k]), 1, float(min(1.0, p.flat[k] * known.sum())))
+    overall = ChiSquare(float(z2.flat[k]), 1, float(min(1.0, p.flat[k] * known.sum())))
     shown = both[..., None]
     return Compared(
         measured=np.where(shown, a.strain, np.nan),
@@ -98,8 +99,8 @@ def compare_strain(
     )
 
 
-def _least(z2: Float, p: Float) -> Verdict:
+def _least(z2: Float, p: Float) -> ChiSquare:
     if not np.isfinite(p).any():
-        return Verdict(np.nan, 0, np.nan)
+        return ChiSquare(np.nan, 0, np.nan)
     k = int(np.nanargmin(p))
-    return Verdict(float(z2[k]), 1, float(min(1.0, p[k] * np.isfinite(p).sum())))
+    return ChiSquare(float(z2[k]), 1, float(min(1.0, p[k] * np.isfinite(p).sum())))

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from core.arrays import Bool, Float
-from core.errors import InputError
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.errors import InputError
 
 Index = NDArray[np.int64]
 _FIRST = 8  # triangles tried about a point before more are
-_LONG_EDGE = 2.5  # of the spacing about it: an edge over a hole of a cloud of points
-_STACKED = 0.05  # of the spacing: two nodes behind one another
+_LONG_EDGE = 2.5  # multiple of the spacing about it: an edge over a hole of a cloud of points
+_STACKED = 0.05  # share of the spacing: two nodes behind one another
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,11 +28,11 @@ class Feet:
     triangle
         (n,) index of the triangle.
     weight
-        (n, 3) of its corners, sum 1.
+        (n, 3) weights of its corners, sum 1.
     distance_mm
         (n,) from the given point.
     beyond_mm
-        (n,) distance along the surface by which the given point lies beyond its border; 0 above its inside.
+        (n,) distance of the given point outside the surface's border, along the surface; 0 above its inside.
     """
 
     triangle: Index
@@ -55,12 +55,15 @@ class ModelSurface:
         (m, 3) indices of the corners.
     closed
         True for the outside of a solid: triangles then turn so that their normals point outwards.
+    plane
+        True if the displacement along the model's z is not known, and zero here.
     """
 
     nodes_mm: Float
     displacement_mm: Float
     triangles: Index
     closed: bool = False
+    plane: bool = False
 
     def __post_init__(self) -> None:
         """Raise ``model_invalid`` for arrays that disagree, values that are not finite, a surface without area."""
@@ -132,7 +135,8 @@ class ModelSurface:
     def feet(self, points_mm: Float, *, within_mm: float = np.inf) -> Feet:
         """Return the points of the surface next to ``points_mm`` (n, 3).
 
-        A point farther away than ``within_mm`` has one near by, not always the nearest, and lies beyond the border.
+        For a point farther away than ``within_mm`` the result is near, not always the nearest, and the point counts as
+        beyond the border.
         """
         # the triangle whose middle is nearest bounds the distance; one of another may still be nearer
         to_middle, nearest = _nearest(self._middles, points_mm, 1)
@@ -170,7 +174,7 @@ class ModelSurface:
         return Feet(found, weight, to, np.where(away_from_all, to, beyond))
 
     def _on_border(self, triangle: Index, weight: Float) -> Bool:
-        """(n,) True where a foot lies on an edge of one triangle alone."""
+        """(n,) True for feet on an edge that only one triangle has."""
         zero = weight <= 1e-12
         on_edge = zero & self._border[triangle]  # edge k is opposite corner k
         return np.asarray(on_edge.any(axis=1))
@@ -217,7 +221,7 @@ def surface_of_cloud(nodes_mm: Float, displacement_mm: Float, towards: Float) ->
     Raises
     ------
     InputError
-        ``model_invalid`` for fewer than three points or points on one line; ``model_not_a_surface`` where points lie
+        ``model_invalid`` for fewer than three points or points on one line; ``model_not_a_surface`` if points are
         behind one another.
     """
     from scipy.spatial import Delaunay, QhullError  # slow to load, and not every start needs it

@@ -1,17 +1,17 @@
 """A camera that moved: its orientation against the other from offsets across epipolar lines, and its repair."""
 
-from core.orientation.change import changed, changes_between
-from core.orientation.consequence import Consequence, consequence_of
-from core.orientation.estimate import OrientationEstimate, estimate_change
-from core.orientation.finding import OffsetFinding, judge_offsets
-from core.orientation.repair import Repair, RepairLimits, repair_orientation
+from stereorig.core.orientation.change import changed, changes_between
+from stereorig.core.orientation.consequence import Consequence, consequence_of
+from stereorig.core.orientation.estimate import OrientationEstimate, estimate_change
+from stereorig.core.orientation.finding import OffsetJudgement, judge_offsets
+from stereorig.core.orientation.repair import RepairedPair, RepairLimits, repair_orientation
 
 __all__ = [
     "Consequence",
-    "OffsetFinding",
+    "OffsetJudgement",
     "OrientationEstimate",
-    "Repair",
     "RepairLimits",
+    "RepairedPair",
     "changed",
     "changes_between",
     "consequence_of",

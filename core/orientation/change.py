@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Float
-from core.cameras.camera import Camera, RigidTransform
-from core.cameras.stereo import Rays, StereoPair, some_rays
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.core.cameras.stereo import Rays, StereoPair, some_rays
 
 CHANGE_NAMES = ("rotation_x_rad", "rotation_y_rad", "rotation_z_rad", "baseline_forward_rad", "baseline_sideways_rad")
 LEVER = 0.3
@@ -59,7 +59,7 @@ def ends_of(pair: StereoPair, change: Float) -> Ends:
 def offset_slopes(pair: StereoPair, change: Float, rays: Rays, ends: Ends | None = None) -> Float:
     """Return d(epipolar offset of matched points, px) / d(change), (n, 5), at a change of the pair.
 
-    ``rays`` are the points' in both cameras; ``ends`` is :func:`ends_of` of pair and change, where it is known.
+    ``rays`` are the points' rays in both cameras; ``ends`` is :func:`ends_of` of pair and change, if it is known.
     """
     one, two = rays
     jacobian = pair.cam2.lens.image_jacobian(two.xyz_mm[..., :2])
@@ -72,7 +72,7 @@ def offset_slopes(pair: StereoPair, change: Float, rays: Rays, ends: Ends | None
 def point_slopes(pair: StereoPair, rays: Rays, ends: Ends | None = None) -> Float:
     """Return d(triangulated points of the system frame, mm) / d(change), (n, 3, 5).
 
-    ``rays`` are the points' in both cameras; ``ends`` is :func:`ends_of` of the pair at no change, where it is known.
+    ``rays`` are the points' rays in both cameras; ``ends`` is :func:`ends_of` of the pair at no change, if it is known.
     """
     points = ([side.triangulate_rays(*rays).xyz_mm for side in sides] for sides in ends or ends_of(pair, np.zeros(5)))
     return np.stack([(ahead - back) / (2.0 * _STEP_RAD) for ahead, back in points], axis=-1)
@@ -80,16 +80,16 @@ def point_slopes(pair: StereoPair, rays: Rays, ends: Ends | None = None) -> Floa
 
 @dataclass(frozen=True, eq=False)
 class ChangeSlopes:
-    """What a change would do to matched points, made once for all the questions asked about them.
+    """Derivatives of matched points over a change of the pair, computed once for several questions.
 
     Attributes
     ----------
     pair
         The cameras before a change.
     rays
-        The points' in both cameras.
+        The points' rays in both cameras.
     ends
-        :func:`ends_of` of the pair at no change, where it is known.
+        :func:`ends_of` of the pair at no change, if it is known.
     """
 
     pair: StereoPair
@@ -97,7 +97,7 @@ class ChangeSlopes:
     ends: Ends | None = None
 
     def at(self, which: NDArray[np.int64]) -> ChangeSlopes:
-        """Return those of some of the points, by their indices."""
+        """Return the derivatives of some of the points, by their indices."""
         return ChangeSlopes(self.pair, some_rays(self.rays, which), self.ends)
 
     @cached_property

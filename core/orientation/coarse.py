@@ -1,4 +1,4 @@
-"""Coarse relative orientation from feature matches, when points lie tens of pixels off their epipolar lines."""
+"""Coarse relative orientation from feature matches, for points tens of pixels off their epipolar lines."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float
-from core.cameras.stereo import Rays, StereoPair, some_rays
-from core.errors import CalibrationError
-from core.field.points.features import Box, detect, match
-from core.field.points.images import MeasureImage
-from core.field.seeding.search_region import scales
-from core.orientation.change import changed, offset_slopes, plausible_bump
-from core.orientation.estimate import estimate_change
-from core.orientation.matched import MatchedPoints
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.stereo import Rays, StereoPair, some_rays
+from stereorig.core.errors import CalibrationError
+from stereorig.core.field.points.features import Box, detect, match
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.seeding.search_region import scales
+from stereorig.core.orientation.change import changed, offset_slopes, plausible_bump
+from stereorig.core.orientation.estimate import estimate_change
+from stereorig.core.orientation.matched import MatchedPoints
 
 _BUMPS_RAD = (1e-3, 1e-2, 0.05)
 _CLEARLY_MORE = 1.1
@@ -23,7 +23,7 @@ _TRIES = 1000
 _SAMPLE = 6
 _FEATURE_SIGMA_PX = 0.7
 _WIDE_PX = 6.0
-"""Of the first inliers: what is left of a bump of some degrees once it is taken as linear."""
+"""Limit for the first inliers: error that remains if a bump of some degrees is taken as linear."""
 MIN_MATCHES = 24
 
 
@@ -38,10 +38,10 @@ def feature_matches(image1: MeasureImage, image2: MeasureImage, box: Box, step: 
 
 
 def features_off_px(pair: StereoPair, image1: MeasureImage, image2: MeasureImage) -> float | None:
-    """Return how far feature matches that agree with one orientation lie off their epipolar lines, px, their median.
+    """Return the median distance from the epipolar lines, px, of feature matches that agree with one orientation.
 
-    Of reduced images less, by the factor that features are found less well. None where no orientation agrees with
-    enough of them.
+    For reduced images it is divided by the factor by which features are located less well. None if no orientation
+    agrees with enough of them.
     """
     matches, scale = feature_matches(image1, image2, (0, 0, image1.shape[1], image1.shape[0]), 0)
     try:
@@ -68,7 +68,8 @@ def coarse_change(pair: StereoPair, matches: MatchedPoints, *, scale: int = 1) -
         raise _no_match(len(xy1), 0)
     rays = pair.rays(xy1, xy2)
     best: tuple[Float, Bool] | None = None
-    # over a narrow view a wide prior leaves changes far beyond what is linear in them: the smallest that does is taken
+    # over a narrow view a wide prior leads to changes far beyond the linear range: the smallest size with enough
+    # inliers is taken
     for size in _BUMPS_RAD:
         found = _agreeing(pair, rays, np.linalg.inv(plausible_bump(pair)) / size**2, sigma)
         if best is None or found[1].sum() > _CLEARLY_MORE * best[1].sum():
@@ -77,11 +78,11 @@ def coarse_change(pair: StereoPair, matches: MatchedPoints, *, scale: int = 1) -
     change, inliers = best
     if inliers.sum() < MIN_MATCHES:
         raise _no_match(len(xy1), int(inliers.sum()))
-    # wrong matches lie on a line by chance: as many as on any other strip of that width
+    # wrong matches are on a line by chance: as many as on any other strip of that width
     by_chance = len(xy1) * 6.0 * sigma / max(float(np.ptp(xy2[:, 1])), 1.0)
     if inliers.sum() < 3.0 * by_chance:
         raise _no_match(len(xy1), int(inliers.sum()))
-    # what the matches do not determine is as small as what they do
+    # components that the matches do not determine are as small as those that they do
     agreeing = MatchedPoints(xy1[inliers], xy2[inliers], matches.step[finite][inliers])
     return estimate_change(pair, agreeing, start=change).change
 

@@ -7,19 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.stereo import StereoPair
-from core.field.region.trend import smooth_terms
-from core.orientation.change import ChangeSlopes
-from core.orientation.matched import MatchedPoints
-from core.robust import spread_indices
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.region.trend import smooth_terms
+from stereorig.core.orientation.change import ChangeSlopes
+from stereorig.core.orientation.matched import MatchedPoints
+from stereorig.core.robust import spread_indices
 
 _AT_MOST = 2000
 
 
 @dataclass(frozen=True)
 class Consequence:
-    """What a change makes of the points, were it not known; each with its standard deviation.
+    """Error of the points by a change that is not known; each with its standard deviation.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Consequence:
 
 @dataclass(frozen=True, eq=False)
 class Consequences:
-    """What any change makes of points: all of it is linear in the change.
+    """Error of points by any change: all of it is linear in the change.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Consequences:
 
     @staticmethod
     def of(points: ChangeSlopes) -> Consequences | None:
-        """Return those of points by what a change would do to them; None if fewer than ten can be triangulated."""
+        """Return the consequences for points, from their derivatives; None if fewer than ten can be triangulated."""
         count = len(points.rays[0].xyz_mm)
         if count == 0:
             return None
@@ -79,8 +79,9 @@ class Consequences:
         return Consequences(slopes, without_rigid_motion(xyz, slopes), _strain(xyz, slopes))
 
     def by(self, change: Float, covariance: Float) -> Consequence:
-        """Return those of a change (5,) with its covariance (5, 5)."""
-        # of points in a narrow view some changes are known only by the prior: a root that takes rounding below zero
+        """Return the consequence of a change (5,) with its covariance (5, 5)."""
+        # in a narrow view only the prior determines some changes: this root accepts eigenvalues that rounding made
+        # negative
         values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         um = 1e3
@@ -98,14 +99,14 @@ class Consequences:
 
 
 def consequence_of(pair: StereoPair, points: MatchedPoints, change: Float, covariance: Float) -> Consequence | None:
-    """Return what a change makes of points.
+    """Return the error of points by a change.
 
     Parameters
     ----------
     pair, points
         The cameras and the points as matched.
     change, covariance
-        (5,) and (5, 5), :data:`core.orientation.change.CHANGE_NAMES`.
+        (5,) and (5, 5), :data:`stereorig.core.orientation.change.CHANGE_NAMES`.
 
     Returns
     -------

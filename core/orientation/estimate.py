@@ -1,8 +1,8 @@
 """Change of the relative orientation that explains offsets across epipolar lines, with its covariance.
 
-Robust least squares on the offsets, with a prior of the size of the bump itself: over a narrow field the offsets of
-vergence and of the baseline's direction are nearly alike, and both are then taken no larger than what is determined.
-The size comes from the offsets too (MacKay 1992, doi:10.1162/neco.1992.4.3.415).
+Robust least squares on the offsets, with a prior of the bump's own size: over a narrow field the offsets of vergence
+and of the baseline's direction are nearly alike, and the prior keeps their undetermined combination small. The size
+comes from the offsets too (MacKay 1992, doi:10.1162/neco.1992.4.3.415).
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.stereo import StereoPair
-from core.field.region.trend import smooth_terms
-from core.orientation.change import ChangeSlopes, changed, offset_slopes, plausible_bump
-from core.orientation.matched import MatchedPoints
-from core.orientation.noise import SharedNoise, effective_variance, robust_weights
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.region.trend import smooth_terms
+from stereorig.core.orientation.change import ChangeSlopes, changed, offset_slopes, plausible_bump
+from stereorig.core.orientation.matched import MatchedPoints
+from stereorig.core.orientation.noise import SharedNoise, effective_variance, robust_weights
 
 #: smallest and largest bump that the prior takes for plausible, rad
 _SMALLEST_RAD, _LARGEST_RAD = 2e-5, 0.1
@@ -34,7 +34,7 @@ class OrientationEstimate:
     Attributes
     ----------
     change
-        (5,) :data:`core.orientation.change.CHANGE_NAMES`, against the pair given.
+        (5,) :data:`stereorig.core.orientation.change.CHANGE_NAMES`, against the pair given.
     covariance
         (5, 5) from the offsets' noise, their systematic part and the prior.
     response
@@ -80,14 +80,14 @@ def estimate_change(
     points
         Points matched in both images, six or more.
     offset_px
-        (n,) the offsets to explain, small, where they are not the points' own: a difference to an earlier step.
+        (n,) the offsets to explain, small, if they are not the points' own: a difference to an earlier step.
     bump_rad
-        Size of the bump, where it is known; else from the offsets.
+        Size of the bump, if it is known; else from the offsets.
     start
         (5,) a change to start from; none if left out.
     slopes, shared
-        Of these points, where they are known already: :class:`core.orientation.change.ChangeSlopes`, without a start;
-        :class:`core.orientation.noise.SharedNoise`.
+        For these points, if they are known already: :class:`stereorig.core.orientation.change.ChangeSlopes`, without a
+        start; :class:`stereorig.core.orientation.noise.SharedNoise`.
 
     Returns
     -------
@@ -146,7 +146,7 @@ def estimate_change(
 
 
 def orthonormal(terms: Float) -> Float:
-    """Return an orthonormal basis (n, k) of what terms (n, m) span."""
+    """Return an orthonormal basis (n, k) of the space of terms (n, m)."""
     basis, size, _ = np.linalg.svd(terms, full_matrices=False)
     return np.asarray(basis[:, size > _RANK * size[0]])
 

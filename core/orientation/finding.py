@@ -1,4 +1,4 @@
-"""Judgement of offsets across epipolar lines: whether a camera moved, how surely, and what that costs."""
+"""Judgement of offsets across epipolar lines: if a camera moved, with what certainty, and the resulting error."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Any, Literal
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration import COVARIANCE_NAMES
-from core.cameras.stereo import StereoPair
-from core.field.region.trend import smooth_terms
-from core.orientation.consequence import Consequence
-from core.orientation.estimate import estimate_change
-from core.orientation.matched import MatchedPoints
-from core.orientation.offsets import StepOffsets
-from core.significance import f_tail, two_sided_sigmas
+from stereorig.core.arrays import Float
+from stereorig.core.calibration import COVARIANCE_NAMES
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.region.trend import smooth_terms
+from stereorig.core.orientation.consequence import Consequence
+from stereorig.core.orientation.estimate import estimate_change
+from stereorig.core.orientation.matched import MatchedPoints
+from stereorig.core.orientation.offsets import StepOffsets
+from stereorig.core.significance import f_tail, two_sided_sigmas
 
 Against = Literal["calibration", "reference", "last_step"]
 Pattern = Literal["mean", "slope", "curvature"]
@@ -32,34 +32,34 @@ _PARTS: dict[Pattern, slice] = {"mean": slice(0, 1), "slope": slice(1, 3), "curv
 
 
 @dataclass(frozen=True)
-class OffsetFinding:
-    """What the offsets of a step say about the cameras.
+class OffsetJudgement:
+    """Judgement of the cameras from the offsets of a step.
 
     Attributes
     ----------
     against
-        The offsets are held against the calibration's, the reference's or those of the step before.
+        The offsets are compared with the calibration's, the reference's or those in the step before.
     camera_moved
-        None where an error of the calibration's own is possible and not known.
+        None if an error of the calibration's own is possible and not known.
     points
         Number of points.
     offset_mean_px, offset_rms_px
-        Of the smooth part of the offsets, over the points; against a step: of its difference.
+        Mean and rms of the smooth part of the offsets, over the points; against a step: of its difference.
     expected_px
-        Root mean square that noise, systematic errors and the calibration's own uncertainty make of it.
+        Root mean square expected from noise, systematic errors and the calibration's own uncertainty.
     pattern_px
         The root mean squares of its mean, its slope and its curvature over the image, which add up in squares.
     carried_by
         The largest of these.
     chi_square, p_value, sigmas
-        Of the smooth part against what is expected, six terms; the chance of so much, with what the points themselves
-        tell of their noise (few of them tell little); the same in standard deviations of a normal distribution.
+        Test of the smooth part against the expected one, six terms; the probability of as large a value, allowing for
+        the uncertainty of the points' own noise; the same in standard deviations of a normal distribution.
     change_deg, change_sigma_deg
-        :data:`core.orientation.change.CHANGE_NAMES` that explain it.
+        :data:`stereorig.core.orientation.change.CHANGE_NAMES` that explain it.
     determined
-        How many of these five the offsets themselves determine.
+        Number of these five that the offsets themselves determine.
     consequence
-        Of that change; None with too few points.
+        Consequence of that change; None with too few points.
     text
         All of it in a sentence.
     """
@@ -98,7 +98,7 @@ def judge_offsets(
     names: Sequence[str] = COVARIANCE_NAMES,
     own_px: float | None = None,
     imported: bool = False,
-) -> OffsetFinding | None:
+) -> OffsetJudgement | None:
     """Judge the offsets of one step.
 
     Parameters
@@ -106,17 +106,18 @@ def judge_offsets(
     pair
         The calibrated cameras.
     points
-        The step's points as matched; as :class:`core.orientation.offsets.StepOffsets`, with the same parameters'
-        names, where they are judged more than once.
+        The step's points as matched; as :class:`stereorig.core.orientation.offsets.StepOffsets`, with the same
+        parameters' names, if they are judged more than once.
     before
-        Points of the reference or of another step, and their offsets (m,), or the same in one; of the calibration's own
-        error that part cancels then which is the same at both depths.
+        Points of the reference or of another step, and their offsets (m,), or both as
+        :class:`stereorig.core.orientation.offsets.StepOffsets`; the part of the calibration's own error that is the
+        same at both depths then cancels.
     against
-        What the offsets are held against.
+        The offsets' reference: calibration, reference step or the step before.
     covariance, names
         (n, n) of the cameras' parameters, and their names.
     own_px
-        The calibration's own offset at most, where it is known.
+        The calibration's own offset at most, if it is known.
     imported
         True for another program's calibration, whose own error is not known.
 
@@ -154,14 +155,14 @@ def judge_offsets(
     moved: bool | None = p_value < CHANCE and rms > 3.0 * _FLOOR_PX[against]
     if against == "calibration":
         if own_px is not None:
-            # the calibration's residuals bound what its model leaves, whatever its covariance says
+            # the calibration's residuals limit the error of its model, independent of its covariance
             moved, known = moved and rms > own_px, True
         if imported or not known:
             moved = None
     estimate = estimate_change(pair, step.points, offset, slopes=step.change_slopes, shared=step.shared)
     cost = step.consequences
     parts = {name: float(np.sqrt(np.sum(c[part] ** 2))) for name, part in _PARTS.items()}
-    finding = OffsetFinding(
+    finding = OffsetJudgement(
         against=against,
         camera_moved=moved,
         points=len(offset),
@@ -197,7 +198,7 @@ class _Earlier:
 
 
 def _degrees(whole: Float, parts: Sequence[tuple[Float, float]]) -> float:
-    """Degrees of freedom (Welch and Satterthwaite) of a covariance; some parts of it have as many as stand beside."""
+    """Degrees of freedom (Welch and Satterthwaite) of a covariance from its parts' degrees of freedom."""
     return float(np.trace(whole)) ** 2 / sum(float(np.trace(part)) ** 2 / degrees for part, degrees in parts)
 
 
@@ -220,7 +221,7 @@ _SAYS = {
 }
 
 
-def _with_text(finding: OffsetFinding) -> OffsetFinding:
+def _with_text(finding: OffsetJudgement) -> OffsetJudgement:
     text = (
         f"camera 2 sees the points {_SAYS[finding.against]} {finding.offset_rms_px:.3f} px "
         f"({finding.carried_by}; expected {finding.expected_px:.3f} px, {finding.sigmas:.1f} sigma)"
@@ -237,4 +238,4 @@ def _with_text(finding: OffsetFinding) -> OffsetFinding:
             f": {cost.shape_um:.2g} +- {cost.shape_sigma_um:.2g} um in shape, {cost.z_um:.2g} um in Z, "
             f"{cost.strain_microstrain:.2g} +- {cost.strain_sigma_microstrain:.2g} microstrain between before and after"
         )
-    return OffsetFinding(**{**vars(finding), "text": text})
+    return OffsetJudgement(**{**vars(finding), "text": text})

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.cameras.camera import SpacePoints
-from core.cameras.stereo import StereoPair
-from core.field.points.result import Field
-from core.robust import spread_indices
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import SpacePoints
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.result import Field
+from stereorig.core.robust import spread_indices
 
 _STEP_PX = 0.01
 

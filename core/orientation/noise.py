@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from core.arrays import Float
-from core.orientation.matched import MatchedPoints
-from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight, median, spread_indices
+from stereorig.core.arrays import Float
+from stereorig.core.orientation.matched import MatchedPoints
+from stereorig.core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight, median, spread_indices
 
 _BLOCKS = 8
 _FLOOR_PX = 1e-6
-_PAIRED = 2000  # points among which overlaps are counted: more of them tell no more
+_PAIRED = 2000  # points among which overlaps are counted: more add no information
 
 
 def robust_weights(residual_px: Float) -> tuple[Float, float]:
@@ -26,20 +26,20 @@ def robust_weights(residual_px: Float) -> tuple[Float, float]:
 
 @dataclass(frozen=True, eq=False)
 class SharedNoise:
-    """What the noise of matched points has in common with their neighbours'.
+    """Noise that matched points share with their neighbours.
 
     Two subsets share the part of their pixels by which they overlap, and as much of their noise. Over a field of many
-    subsets, sums over blocks show that and any structure besides; where a block is no wider than a subset they do not,
-    and the overlap alone tells.
+    subsets, sums over blocks show that and any other structure; if a block is no wider than a subset they do not, and
+    only the overlap is used.
 
     Attributes
     ----------
     blocks
-        (n,) number of the block that a point lies in: 8 x 8 over each step's points.
+        (n,) number of the block that contains a point: 8 x 8 over each step's points.
     overlap
-        (n, n) sparse, by what part of their pixels the subsets of two points overlap; none with itself.
+        (n, n) sparse, share of their pixels by which the subsets of two points overlap; zero on the diagonal.
     one_of
-        How many points one of those looked at stands for.
+        Number of points that one of the examined points represents.
     """
 
     blocks: NDArray[np.int64]
@@ -51,7 +51,7 @@ class SharedNoise:
         """Look at points of one or several steps."""
         n, width = len(points.xy1_px), points.subset_px
         some = np.arange(n) if n <= _PAIRED else np.unique(spread_indices(n, _PAIRED))
-        # subsets of two steps are as far apart as two subsets that do not overlap
+        # subsets of two steps get the distance of two subsets that do not overlap
         at = np.column_stack([points.xy1_px[some], points.step[some] * (2.0 * width)])
         near = cKDTree(at).query_pairs(width, p=np.inf, output_type="ndarray") if width > 0 else np.empty((0, 2), int)
         one, two = some[near].reshape(-1, 2).T
@@ -80,20 +80,20 @@ def _blocks(points: MatchedPoints) -> NDArray[np.int64]:
 
 
 def effective_variance(design: Float, weights: Float, values: Float, shared: SharedNoise) -> float:
-    """Return the variance that one point has in a fit, px^2: larger than its own where neighbours are not independent.
+    """Return one point's effective variance in a fit, px^2: larger than its own if neighbours are not independent.
 
-    The scores' sums over blocks hold what neighbouring points have in common, from shared pixels or from a structure
-    that the design does not follow: their mean square in the design's own metric replaces the points' variance. That
-    is never less than what the overlap of their subsets makes of it.
+    The scores' sums over blocks contain the common errors of neighbouring points, from shared pixels or from a
+    structure that the design does not follow: their mean square in the design's own metric replaces the points'
+    variance. It is never less than the variance that follows from the overlap of their subsets.
 
     Parameters
     ----------
     design
         (n, k) derivatives of the values.
     weights, values
-        (n,); what the design explains of the values is taken out first.
+        (n,); the part of the values that the design explains is subtracted first.
     shared
-        Of these points.
+        Shared noise of these points.
     """
     root = np.sqrt(weights)
     u, s, _ = np.linalg.svd(design * root[:, None], full_matrices=False)

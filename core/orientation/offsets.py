@@ -1,4 +1,4 @@
-"""Offsets of one step's points across their epipolar lines, and what judgements of them need, each made once."""
+"""Offsets of one step's points across their epipolar lines, with the inputs of their judgement, each computed once."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from functools import cached_property
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration import COVARIANCE_NAMES
-from core.calibration.uncertainty import image_derivatives
-from core.cameras.stereo import Rays, StereoPair
-from core.common.derivatives import pseudoinverse
-from core.field.region.trend import smooth_terms
-from core.orientation.change import ChangeSlopes, Ends
-from core.orientation.consequence import Consequences
-from core.orientation.matched import MatchedPoints, across_line
-from core.orientation.noise import SharedNoise, effective_variance, robust_weights
+from stereorig.core.arrays import Float
+from stereorig.core.calibration import COVARIANCE_NAMES
+from stereorig.core.calibration.uncertainty import image_derivatives
+from stereorig.core.cameras.stereo import Rays, StereoPair
+from stereorig.core.common.derivatives import pseudoinverse
+from stereorig.core.field.region.trend import smooth_terms
+from stereorig.core.orientation.change import ChangeSlopes, Ends
+from stereorig.core.orientation.consequence import Consequences
+from stereorig.core.orientation.matched import MatchedPoints, across_line
+from stereorig.core.orientation.noise import SharedNoise, effective_variance, robust_weights
 
 
 def calibration_slopes(
@@ -26,7 +26,7 @@ def calibration_slopes(
     """Return d(epipolar offset, px) / d(both cameras' parameters by name), (n, len(names)), at matched points.
 
     The point that camera 1 sees stays on its pixel's ray; its image in camera 2 moves off the position that was
-    measured. What moves along the line counts for nothing. ``rays`` are the points', where they are known.
+    measured. Motion along the line does not count. ``rays`` are the points' rays, if they are known.
     """
     rays = pair.rays(points.xy1_px, points.xy2_px) if rays is None else rays
     xyz = pair.triangulate_rays(*rays).xyz_mm
@@ -43,8 +43,8 @@ def calibration_slopes(
 class SmoothOffsets:
     """Smooth part of offsets: coefficients (6,) over orthonormal terms of the image, and their covariance.
 
-    A coefficient is the root mean square that its term contributes over the points. ``degrees`` of freedom stand
-    behind the covariance's size.
+    A coefficient is the root mean square that its term contributes over the points. ``degrees`` is the number of
+    degrees of freedom of the covariance's size.
     """
 
     terms: Float
@@ -56,7 +56,7 @@ class SmoothOffsets:
 
 @dataclass(frozen=True, eq=False)
 class StepOffsets:
-    """Matched points of one step, that several judgements are made of.
+    """Matched points of one step, for several judgements.
 
     Attributes
     ----------
@@ -65,9 +65,9 @@ class StepOffsets:
     names
         The cameras' parameters in the order of their covariance.
     stated_px
-        (n,) the points' offsets where they are not those of their positions.
+        (n,) the points' offsets if they are not those of their positions.
     ends
-        As in :class:`core.orientation.change.ChangeSlopes`.
+        As in :class:`stereorig.core.orientation.change.ChangeSlopes`.
     """
 
     pair: StereoPair
@@ -83,7 +83,7 @@ class StepOffsets:
 
     @cached_property
     def finite(self) -> StepOffsets:
-        """Those of the points that have an offset."""
+        """The points that have an offset."""
         good = np.isfinite(self.offset_px)
         if good.all():
             return self
@@ -102,7 +102,7 @@ class StepOffsets:
 
     @cached_property
     def shared(self) -> SharedNoise:
-        """What the points' noise has in common."""
+        """Noise that the points share."""
         return SharedNoise.of(self.points)
 
     @cached_property
@@ -132,10 +132,10 @@ class StepOffsets:
 
     @cached_property
     def change_slopes(self) -> ChangeSlopes:
-        """What a change of the cameras would do to the points."""
+        """Derivatives of the points over a change of the cameras."""
         return ChangeSlopes(self.pair, self.rays, self.ends)
 
     @cached_property
     def consequences(self) -> Consequences | None:
-        """What any change makes of the points; None with too few."""
+        """Consequences of any change for the points; None with too few."""
         return Consequences.of(self.change_slopes)

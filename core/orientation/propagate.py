@@ -1,4 +1,4 @@
-"""Covariance of a repaired pair's parameters: what the estimate leaves, and what it takes over from the calibration.
+"""Covariance of a repaired pair's parameters: the estimate's own, and the part inherited from the calibration.
 
 Errors of the lenses and of camera 1 change the orientation that the offsets ask for, and the baseline's length is the
 old poses'. So the new pose of camera 2 is a function of all old parameters, and of the estimate's own error.
@@ -10,23 +10,23 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.camera import Camera, RigidTransform, angles_from_rotation
-from core.cameras.stereo import StereoPair
-from core.orientation.change import changed
-from core.orientation.repair import Repair
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import Camera, RigidTransform, angles_from_rotation
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.orientation.change import changed
+from stereorig.core.orientation.repair import RepairedPair
 
 _STEP_RAD = 1e-6
 
 
 def pose_parameters(pair: StereoPair) -> Float:
-    """Return camera 2's pose (6,), :data:`core.cameras.camera.POSE_NAMES`."""
+    """Return camera 2's pose (6,), :data:`stereorig.core.cameras.camera.POSE_NAMES`."""
     pose = pair.cam2.cam_from_sys
     return np.concatenate([angles_from_rotation(pose.rotation), pose.translation_mm])
 
 
 def repaired_covariance(
-    repair: Repair,
+    repair: RepairedPair,
     covariance: Float,
     stepped: Sequence[tuple[StereoPair, StereoPair]],
     steps: Float,
@@ -45,7 +45,7 @@ def repaired_covariance(
     steps
         (k,) half the difference of the two values.
     pose_index
-        Which parameters are camera 2's pose, in the order of :data:`core.cameras.camera.POSE_NAMES`.
+        Which parameters are camera 2's pose, in the order of :data:`stereorig.core.cameras.camera.POSE_NAMES`.
     """
     whole, pose = carried_parameters(repair, stepped, steps, pose_index), list(pose_index)
     out = whole @ covariance @ whole.T
@@ -66,7 +66,7 @@ def repaired_covariance(
 
 
 def carried_parameters(
-    repair: Repair, stepped: Sequence[tuple[StereoPair, StereoPair]], steps: Float, pose_index: Sequence[int]
+    repair: RepairedPair, stepped: Sequence[tuple[StereoPair, StereoPair]], steps: Float, pose_index: Sequence[int]
 ) -> Float:
     """Return the derivatives (k, k) of the parameters after a repair over the old ones; see the arguments above."""
     whole, pose = np.eye(len(steps)), list(pose_index)
@@ -75,7 +75,7 @@ def carried_parameters(
     return whole
 
 
-def _pose_slope(repair: Repair, ahead: StereoPair, back: StereoPair) -> Float:
+def _pose_slope(repair: RepairedPair, ahead: StereoPair, back: StereoPair) -> Float:
     """Difference of camera 2's repaired poses for two old calibrations, to first order."""
     pairs = [_with_relative_pose(repair.pair, old) for old in (ahead, back)]
     offsets = [p.epipolar_residual_px(repair.points.xy1_px, repair.points.xy2_px) for p in pairs]

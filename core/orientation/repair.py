@@ -1,4 +1,4 @@
-"""Relative orientation of the cameras estimated anew from the speckle of some steps.
+"""New estimate of the cameras' relative orientation from the speckle of some steps.
 
 The points do not match with the old orientation if a camera turned by more than a few hundredths of a degree: feature
 matches give a coarse orientation, the correlation at the points the final one, twice.
@@ -11,27 +11,28 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.stereo import StereoPair
-from core.errors import CalibrationError
-from core.field.growth.state import Image
-from core.field.points.images import MeasureImage
-from core.field.region.region import PointGrid
-from core.field.seeding.search_region import box_around
-from core.field.settings import MeasureOptions
-from core.measure import measure_shape
-from core.orientation.change import changed, pinhole_shift
-from core.orientation.coarse import coarse_change, feature_matches
-from core.orientation.consequence import Consequence, consequence_of
-from core.orientation.estimate import OrientationEstimate, estimate_change
-from core.orientation.matched import MatchedPoints, matched_points
-from core.orientation.structure import structure_left_px
-from core.progress import CancelToken, Progress, no_progress
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import CalibrationError
+from stereorig.core.field.growth.state import Image
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.field.seeding.search_region import box_around
+from stereorig.core.field.settings import MeasureOptions
+from stereorig.core.measure import measure_shape
+from stereorig.core.orientation.change import changed, pinhole_shift
+from stereorig.core.orientation.coarse import coarse_change, feature_matches
+from stereorig.core.orientation.consequence import Consequence, consequence_of
+from stereorig.core.orientation.estimate import OrientationEstimate, estimate_change
+from stereorig.core.orientation.matched import MatchedPoints, matched_points
+from stereorig.core.orientation.structure import structure_left_px
+from stereorig.core.progress import CancelToken, Progress, no_progress
 
 _ROUNDS = 2
 _FORWARD_OVER_TURN = 1.5
-"""A turn of camera 1 turns the baseline by as much, one of camera 2 not at all. A lens that is focused anew magnifies,
-which looks like a camera that came nearer without turning."""
+"""A turn of camera 1 turns the baseline by as much, a turn of camera 2 not at all. A refocused lens changes the
+magnification, which looks like a camera that came nearer without turning.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +58,7 @@ class RepairLimits:
 
 
 @dataclass(frozen=True, eq=False)
-class Repair:
+class RepairedPair:
     """A repaired pair.
 
     Attributes
@@ -65,7 +66,7 @@ class Repair:
     pair
         With the new pose of camera 2; camera 1 and the baseline's length are kept.
     change
-        (5,) from the old pair, :data:`core.orientation.change.CHANGE_NAMES`.
+        (5,) from the old pair, :data:`stereorig.core.orientation.change.CHANGE_NAMES`.
     estimate
         The last estimate, about ``pair``, with the covariance and the response to errors of the offsets.
     points
@@ -73,12 +74,12 @@ class Repair:
     before_px, after_px
         Root mean square of the smooth offset, with the old pair and with the new one.
     structure_px
-        Of ``after_px``, what lies beyond noise and is of no orientation.
+        Part of ``after_px`` that is larger than noise and that no orientation explains.
     length_sigma
         Standard uncertainty of the baseline's length from the bump, 1 = 100 %: a pinhole is taken to have shifted along
         the baseline, where the offsets do not show it, as far as it is seen to have shifted across.
     consequence
-        Of the change; its standard deviations are those of the repaired pair.
+        Consequence of the change; its standard deviations are the repaired pair's.
     """
 
     pair: StereoPair
@@ -101,8 +102,8 @@ def repair_orientation(
     limits: RepairLimits | None = None,
     progress: Progress | None = None,
     cancel: CancelToken | None = None,
-) -> Repair:
-    """Estimate the orientation of camera 2 against camera 1 anew.
+) -> RepairedPair:
+    """Estimate the orientation of camera 2 relative to camera 1 again.
 
     Parameters
     ----------
@@ -113,11 +114,11 @@ def repair_orientation(
     grid
         Points in camera 1's images.
     options
-        As in :func:`core.measure.measure_shape`.
+        As in :func:`stereorig.core.measure.measure_shape`.
     limits
         Defaults to ``RepairLimits()``.
     progress, cancel
-        As in :func:`core.measure.measure_shape`.
+        As in :func:`stereorig.core.measure.measure_shape`.
 
     Raises
     ------
@@ -125,7 +126,7 @@ def repair_orientation(
         ``repair_no_match``, ``repair_too_few_points``, ``repair_too_large``, ``repair_structure`` or
         ``repair_uncertain``: the old calibration stays as it is, and the cameras have to be calibrated again.
     RegionError, ImageError, SeedError, Cancelled
-        As :func:`core.measure.measure_shape`.
+        As :func:`stereorig.core.measure.measure_shape`.
     """
     limits, report = limits or RepairLimits(), progress or no_progress
     taken = [
@@ -161,7 +162,7 @@ def repair_orientation(
 
 def _checked(
     old: StereoPair, new: StereoPair, estimate: OrientationEstimate, points: MatchedPoints, limits: RepairLimits
-) -> Repair:
+) -> RepairedPair:
     change = estimate.change
     _check_size(change, limits)
     before = structure_left_px(points, old.epipolar_residual_px(points.xy1_px, points.xy2_px), order=2)
@@ -184,7 +185,7 @@ def _checked(
             code="repair_structure",
             remedy="That is how a changed focus or lens shows: calibrate again.",
         )
-    # about the new pair: what is done with the estimate is done there
+    # about the new pair, at which the estimate is used
     estimate = estimate_change(new, points, bump_rad=estimate.bump_rad)
     consequence = consequence_of(new, points, change, estimate.covariance)
     shift, slopes = pinhole_shift(old, change)
@@ -196,15 +197,15 @@ def _checked(
         sigma_text = "unknown" if consequence is None else f"{consequence.strain_sigma_microstrain:.3g} microstrain"
         raise CalibrationError(
             f"The repaired orientation would leave shapes with an uncertainty of {sigma_text}, at most "
-            f"{limits.strain * 1e6:g} are allowed: too narrow a view to tell, or a pinhole shifted.",
+            f"{limits.strain * 1e6:g} are allowed: the view is too narrow to show it, or a pinhole shifted.",
             code="repair_uncertain",
             remedy="Give a larger region and steps at other depths and tilts, or calibrate again.",
         )
-    return Repair(new, change, estimate, points, before, after, structure, length_sigma, consequence)
+    return RepairedPair(new, change, estimate, points, before, after, structure, length_sigma, consequence)
 
 
 def _with_length(found: Consequence, pair: StereoPair, points: MatchedPoints, length_sigma: float) -> Consequence:
-    """Add the uncertainty of the common scale to that of the change."""
+    """Add the uncertainty of the common scale to the change's."""
     xyz = pair.triangulate(points.xy1_px, points.xy2_px).xyz_mm
     depth = pair.cam1.cam_from_sys.apply(xyz)[:, 2]
     size = float(np.sqrt(np.nanmean(((xyz - np.nanmean(xyz, axis=0)) ** 2).sum(axis=1))))

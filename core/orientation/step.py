@@ -11,16 +11,16 @@ import copy
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.stereo import StereoPair
-from core.field.points.images import MeasureImage
-from core.field.points.result import Field
-from core.field.settings import MeasureOptions
-from core.matching.fit import fit_shape
-from core.matching.slopes import SlopeFilter
-from core.orientation.matched import MatchedPoints, seen_by_camera2
-from core.robust import spread_indices
-from core.status import PointStatus
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.settings import MeasureOptions
+from stereorig.core.matching.fit import fit_shape
+from stereorig.core.matching.slopes import SlopeFilter
+from stereorig.core.orientation.matched import MatchedPoints, seen_by_camera2
+from stereorig.core.robust import spread_indices
+from stereorig.core.status import PointStatus
 
 SAMPLE = 1000
 _LARGE_PIXELS = 8_000_000  # from here on an image's gradients are made for this match alone: 12 bytes a pixel
@@ -45,10 +45,10 @@ def step_points(
     image1, image2
         Both cameras' images of the step.
     options
-        Of the measurement.
+        Options of the measurement.
     slopes
-        The reference's, which serve a step of the same camera as well as its own: they are the larger part of what an
-        image's gradients cost. Its own when left out.
+        The reference's filter, which suits a step of the same camera as well as its own: its computation is the larger
+        part of an image's gradients. Its own when left out.
 
     Returns
     -------
@@ -75,7 +75,7 @@ def step_points(
     if slopes is not None or images[0].raw.size > _LARGE_PIXELS:
         images[0] = copy.copy(images[0])
     if slopes is not None:
-        # whatever another match has made of this image meanwhile
+        # drop gradients that another match may have stored with this image
         vars(images[0]).pop("gradients", None)
         vars(images[0])["slopes"] = slopes
     fit = fit_shape(pair, images[0], images[1], xy, start, options.match_options())
@@ -90,14 +90,14 @@ def step_points(
 
 
 def current_plane(pair: StereoPair, w: Float, G: Float) -> tuple[Float, Float]:
-    """Return where camera 1 sees moved patches, (n, 2) px, and their inverse depths with slopes there, (n, 3).
+    """Return camera 1's images of moved patches, (n, 2) px, and their inverse depths with slopes there, (n, 3).
 
     Parameters
     ----------
     pair
         The calibrated cameras.
     w, G
-        (n, 3) and (n, 3, 3), see :class:`core.matching.fit.MotionFit`.
+        (n, 3) and (n, 3, 3), see :class:`stereorig.core.matching.fit.MotionFit`.
     """
     depth = G[:, 2, 0]
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.arrays import Float
-from core.field.region.trend import smooth_terms
-from core.orientation.matched import MatchedPoints
-from core.orientation.noise import SharedNoise, effective_variance, robust_weights
+from stereorig.core.arrays import Float
+from stereorig.core.field.region.trend import smooth_terms
+from stereorig.core.orientation.matched import MatchedPoints
+from stereorig.core.orientation.noise import SharedNoise, effective_variance, robust_weights
 
 
 def structure_left_px(points: MatchedPoints, offset_px: Float, *, order: int) -> float:
-    """Return the root mean square of the polynomial of some order in offsets (n,), less what noise makes of it.
+    """Return the root mean square of the polynomial of some order in offsets (n,), less the noise's part.
 
-    Each step has a polynomial of its own: a step's points lie elsewhere, at other depths.
+    Each step has a polynomial of its own: a step's points are at other places and depths.
     """
     square, count = 0.0, 0
     for step in np.unique(points.step):

@@ -1,1 +1,1 @@
-"""What a planned rig, calibration and measurement will leave uncertain, before anything is bought or moved."""
+"""Expected uncertainty of a planned rig, calibration and measurement, before anything is bought or moved."""

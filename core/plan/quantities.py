@@ -12,24 +12,24 @@ from typing import Literal
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.stereo import StereoPair
-from core.common.factor import ParameterCovariance
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels, roots_of
-from core.field.region.window import window_offsets
-from core.gauge.area import area_statistics
-from core.gauge.extensometer import extensometer
-from core.matching.geometry import tangent_frames
-from core.names import BUDGET, BudgetName
-from core.plan.settings import PlannedMeasurement
-from core.plan.synthetic import PlannedField, Sizes, laid_about, planned_field
-from core.strain.tensors import pulls_of, strain_of, strain_slopes
-from core.strain.window import plane_weights
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.common.factor import ParameterCovariance
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels, roots_of
+from stereorig.core.field.region.window import window_offsets
+from stereorig.core.gauge.area import area_statistics
+from stereorig.core.gauge.extensometer import extensometer
+from stereorig.core.matching.geometry import tangent_frames
+from stereorig.core.names import BUDGET, BudgetName
+from stereorig.core.plan.settings import PlannedMeasurement
+from stereorig.core.plan.synthetic import PlannedField, Sizes, laid_about, planned_field
+from stereorig.core.strain.tensors import pulls_of, strain_of, strain_slopes
+from stereorig.core.strain.window import plane_weights
 
 Of = Literal["point", "length", "mean", "strain"]
 _AXES = "XYZ"
-_MOST_ACROSS = 41  # points of an area's mean: more do not change what is common
+_MOST_ACROSS = 41  # points of an area's mean: more do not change the common part
 _SEEN = "a camera does not see all of it"
 
 
@@ -46,15 +46,15 @@ class PlannedQuantity:
     unit
         ``mm`` or ``1``.
     size_mm
-        Of the length, the area's side or the gauge; None for a point.
+        Length, side of the area or width of the gauge; None for a point.
     translation_mm
-        Of the body since the reference; None for a quantity of the reference's shape.
+        Translation of the body since the reference; None for a quantity of the reference's shape.
     sigma
-        Standard uncertainty (k = 1); None where it cannot be told.
+        Standard uncertainty (k = 1); None if it cannot be computed.
     budget
-        The same by cause; empty where it cannot be told.
+        The same by cause; empty if it cannot be computed.
     missing
-        Why it cannot be told; empty where it can.
+        Reason why it cannot be computed; empty if it can.
     """
 
     name: str
@@ -84,7 +84,7 @@ def planned_quantities(
     Raises
     ------
     FloatingPointError
-        Where the pixel beside the target's middle does not see its plane.
+        If the pixel next to the target's middle does not see its plane.
     """
     reader = _Reader(pair, sizes, source, plan)
     out = reader.of_shape()
@@ -126,7 +126,7 @@ class _Reader:
         names = ("u", "v", "w") if size_mm == 0.0 else ("uvw"[axis],)
         point = self._field(laid_about([self.middle_px], plan.spacing_px, 1), motion)
         out = [self._of_point(point, name, 3 + "uvw".index(name), motion) for name in names]
-        # enough points over the area, as near as they are planned or as 41 lie across it
+        # enough points over the area: with the planned spacing, or 41 across it
         across_px = plan.area_mm / self.mm_per_px
         step = max(plan.spacing_px, int(np.ceil(across_px / (_MOST_ACROSS - 1))))
         area = self._field(laid_about([self.middle_px], step, max(int(0.5 * across_px / step), 1)), motion)

@@ -1,4 +1,4 @@
-"""What is assumed of a measurement that is only planned, and how a rig that is not there yet departs from a rig file.
+"""Assumptions of a planned measurement, and differences of a planned rig from a rig file.
 
 Requests and the command line's options derive from these models.
 """
@@ -9,7 +9,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from core.settings import (
+from stereorig.core.settings import (
     ODD,
     SPACING_PX,
     STRAIN_WINDOW,
@@ -67,7 +67,7 @@ class PlannedMeasurement(Settings):
 
 
 class PlannedRig(Settings):
-    """What differs from the rig file's: lens, cameras, target, stage. What is left out is the file's."""
+    """Differences from the rig file: lens, cameras, target, stage. Values that are left out are the file's."""
 
     focal_mm: Positive | None = Field(None, description="Focal length of both lenses; needs pixel_um.")
     pixel_um: Annotated[Real, Field(ge=0.1, le=100.0)] | None = Field(None, description="Width of a sensor's pixel.")
@@ -105,7 +105,7 @@ class PlannedRig(Settings):
 
     @property
     def pinhole_px(self) -> float | None:
-        """The pinhole distance that these state; None where the file's holds."""
+        """The pinhole distance from these values; None if the file's is used."""
         if self.focal_mm is not None and self.pixel_um is not None:
             return 1e3 * self.focal_mm / self.pixel_um
         return self.phd_px

@@ -1,7 +1,7 @@
 """Fields of a planned measurement: points on the target's plane with the matching's expected noise.
 
 They are fields as a measurement returns them, so that its own functions read lengths, means and strain off them. The
-noise is kept apart by the pair of images that makes it.
+noise is stored separately for the pair of images that causes it.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from core.arrays import Bool, Float
-from core.cameras.stereo import StereoPair
-from core.common.factor import ParameterCovariance, factor_of
-from core.common.matches import match_gain, noise_covariances
-from core.field.points.result import Field
-from core.names import Cause
-from core.plan.settings import PlannedMeasurement
-from core.plan.texture import match_variance_px2
-from core.status import PointStatus
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.common.factor import ParameterCovariance, factor_of
+from stereorig.core.common.matches import match_gain, noise_covariances
+from stereorig.core.field.points.result import Field
+from stereorig.core.names import Cause
+from stereorig.core.plan.settings import PlannedMeasurement
+from stereorig.core.plan.texture import match_variance_px2
+from stereorig.core.status import PointStatus
 
 _NORMAL = np.array([0.0, 0.0, 1.0])
 Sizes = tuple[tuple[int, int], tuple[int, int]]
@@ -32,7 +32,7 @@ class PlannedField:
     Attributes
     ----------
     field
-        Its covariance is that of both parts; without a common factor.
+        Its covariance is the sum of both parts; without a common factor.
     reference, matching
         (r, c, n, n) covariance from the noise of the reference's pair of images and of the current one.
     points
@@ -56,7 +56,7 @@ class PlannedField:
         found = factor_of(source, self.points, self.displaced)
         covariance = np.where(self.field.valid[..., None, None], np.zeros_like(self.field.covariance), np.nan)
         out = {}
-        for cause in found.causes.told:
+        for cause in found.causes.separate:
             own = found.values[..., [name == cause for name in found.causes.columns]]
             if own.shape[-1] == 0:
                 continue
@@ -67,12 +67,12 @@ class PlannedField:
 
 
 def laid_about(positions_px: Sequence[Float], step_px: float, reach: int) -> tuple[Float, Float, Bool]:
-    """Return a grid of points x, y (r, c) of which those about some positions are wanted (r, c).
+    """Return a grid of points x, y (r, c), and (r, c) True for the points about some positions.
 
     Parameters
     ----------
     positions_px
-        (x, y) in camera 1's image; the first lies on a point.
+        (x, y) in camera 1's image; the first is on a point.
     step_px
         Distance of neighbouring points.
     reach
@@ -104,9 +104,9 @@ def planned_field(
     plan
         Subset, noise, pattern.
     grid
-        Of :func:`laid_about`.
+        Grid from :func:`laid_about`.
     translation_mm
-        Of the body; None for the shape. Points whose subsets leave an image have the status OUTSIDE_IMAGE.
+        Translation of the body; None for the shape. Points whose subsets leave an image have the status OUTSIDE_IMAGE.
     """
     x, y, wanted = grid
     xy = np.stack([x, y], axis=-1)

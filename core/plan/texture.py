@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.plan.settings import PlannedMeasurement
+from stereorig.core.plan.settings import PlannedMeasurement
 
 _FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 _STEPS = 2000
 
 
 def match_variance_px2(plan: PlannedMeasurement) -> float:
-    """Return the variance that one image's noise gives the shift of a subset, per direction, px^2.
+    """Return the variance of a subset's shift by one image's noise, per direction, px^2.
 
     A comparison of two images has twice it.
     """

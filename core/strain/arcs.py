@@ -11,11 +11,11 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from core.arrays import Bool, Float
-from core.field.region.window import fit_terms, window_offsets
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.field.region.window import fit_terms, window_offsets
 
 _FIRM = 1e-6
-_FACTORS = np.array([1.0 / 6.0, 0.5, 0.5, 1.0 / 6.0])  # of s^3, s^2 t, s t^2, t^3 in a Taylor series
+_FACTORS = np.array([1.0 / 6.0, 0.5, 0.5, 1.0 / 6.0])  # factors of s^3, s^2 t, s t^2, t^3 in a Taylor series
 
 
 def third_moments(weights: Float, half: int) -> Float:

@@ -1,15 +1,15 @@
-"""The common factor of a strain: that of the points through the weights of the windows, compiled."""
+"""The common factor of a strain: the points' factor through the weights of the windows, compiled."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float32, Floats
-from core.field.region.window import window_offsets
-from core.matching.kernels.naming import entry_with_arrays, inner
-from core.strain.result import StrainStatus
-from core.strain.window import Slopes
+from stereorig.core.arrays import Bool, Float32, Floats
+from stereorig.core.field.region.window import window_offsets
+from stereorig.core.matching.kernels.naming import entry_with_arrays, inner
+from stereorig.core.strain.result import StrainStatus
+from stereorig.core.strain.window import Slopes
 
 
 @inner
@@ -92,7 +92,7 @@ def common_part(factor: Floats, valid: Bool, slopes: Slopes, by_slope: Floats, h
     factor
         (r, c, 6, k) of the points.
     valid
-        (r, c) True where there are values.
+        (r, c) True at points that have values.
     slopes
         The windows' fits.
     by_slope

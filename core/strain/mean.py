@@ -11,33 +11,33 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Bool, Float
-from core.common.budget import Budget, budget_of
-from core.common.factor import Causes
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels, roots_of
-from core.field.region.window import window_offsets
-from core.strain.options import StrainOptions
-from core.strain.result import StrainStatus
-from core.strain.surface import surface_slopes
-from core.strain.tensors import strain_slopes
-from core.strain.window import Slopes, plane_weights
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.common.budget import Budget, budget_of
+from stereorig.core.common.factor import Causes
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels, roots_of
+from stereorig.core.field.region.window import window_offsets
+from stereorig.core.strain.options import StrainOptions
+from stereorig.core.strain.result import StrainStatus
+from stereorig.core.strain.surface import surface_slopes
+from stereorig.core.strain.tensors import strain_slopes
+from stereorig.core.strain.window import Slopes, plane_weights
 
 
 @dataclass(frozen=True)
 class MeanStrainVariance:
-    """Of the means of exx, eyy, exy over an area.
+    """Variances of the means of exx, eyy, exy over an area.
 
     Attributes
     ----------
     own
         (3,) variance from the points' own noise; NaN without strain.
     reference
-        (3,) the reference pair's part of it; None where it is not told apart.
+        (3,) the reference pair's part of it; None if it is not known separately.
     common
-        (3, k) common factor; None where it is not known.
+        (3, k) common factor; None if it is not known.
     causes
-        Of its columns.
+        Causes of the factor's columns.
     """
 
     own: Float
@@ -51,7 +51,7 @@ class MeanStrainVariance:
         return tuple(budget_of(*self.of(axis)) for axis in range(3))
 
     def of(self, axis: int) -> tuple[float, float | None, Float | None, Causes | None]:
-        """Of one mean: own variance, the reference pair's part of it, common factor (k,) and its causes."""
+        """Return one mean's own variance, the reference pair's part of it, the common factor (k,) and its causes."""
         return (
             float(self.own[axis]),
             None if self.reference is None else float(self.reference[axis]),
@@ -63,8 +63,8 @@ class MeanStrainVariance:
 def mean_strain_sigma(field: Field, options: StrainOptions, inside: Bool, *, subset_px: float) -> tuple[Float, Float]:
     """Return the standard uncertainties (3,) of the means of exx, eyy, exy over an area, and the calibration's part.
 
-    NaN without strain; the part alone where the field has no common factor. Takes what :func:`mean_strain_variance`
-    does.
+    NaN without strain; only the calibration's part is NaN if the field has no common factor. The parameters are those
+    in :func:`mean_strain_variance`.
     """
     found = mean_strain_variance(field, options, inside, subset_px=subset_px)
     if found.common is None:
@@ -81,7 +81,7 @@ def mean_strain_variance(field: Field, options: StrainOptions, inside: Bool, *, 
 def mean_strain_variances(
     field: Field, options: StrainOptions, areas: Sequence[Bool], *, subset_px: float
 ) -> list[MeanStrainVariance]:
-    """Return the uncertainty of the means of exx, eyy, exy over areas, by where it comes from.
+    """Return the uncertainty of the means of exx, eyy, exy over areas, by source.
 
     Parameters
     ----------
@@ -99,8 +99,8 @@ def mean_strain_variances(
     Errors dX_k, dU_k of the points change the slopes of a window by ``d_a = sum_k c_ak (dX, dU)_k``, and its strain by
     ``sum_a D_a . d_a``. The mean's error is ``sum_k v_k . (dX, dU)_k`` with v the sum of D over the windows that hold
     point k, times their weights c; its variance is ``sum_kl v_k S_k rho_kl S_l v_l``, S the roots of the points'
-    covariances. What planes leave out in one-sided windows (order ``auto``) may have one sign, and is added whole. The
-    common factor goes through the same weights: ``sum_k v_k . F_k``, squared.
+    covariances. The bias that planes leave in one-sided windows (order ``auto``) may have the same sign at all points
+    and is added in full. The common factor goes through the same weights: ``sum_k v_k . F_k``, squared.
     """
     shared = SharedPixels.of(field, subset_px)
     slopes, surface, left, _ = surface_slopes(field, options, shared)
@@ -137,7 +137,7 @@ def mean_strain_variances(
 
 
 def _through_windows(field: Field, options: StrainOptions, slopes: Slopes, used: Bool, by_slope: Float) -> Float:
-    """(r, c, 3, 6): each point's weight in the mean strain over the points ``used``, zero where it has none."""
+    """(r, c, 3, 6): each point's weight in the mean strain over the points ``used``, zero at points without weight."""
     from scipy.signal import oaconvolve  # slow to load, and not every start needs it
 
     D = np.zeros((*field.shape, 3, 2, 6))

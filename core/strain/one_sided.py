@@ -3,8 +3,8 @@
 There planes give the strain in the middle of the points left, off by its gradient times that middle's distance;
 quadratics give it at the point, with several times the noise. The gradient is known better than either strain: it is
 the derivative of the metric, from the second derivatives over the windows about the point, of which those farther from
-the edge are nearly free of noise. So the planes' error is estimated, and the smaller total error taken. Where planes
-stay, what they leave counts in the reported uncertainty.
+the edge are nearly free of noise. So the planes' error is estimated, and the smaller total error taken. If planes are
+kept, their remaining bias counts in the reported uncertainty.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from core.arrays import Bool, Float
-from core.field.region.window import distinct_windows
-from core.settings import StrainTensor
-from core.strain.reduced import window_sums
-from core.strain.result import StrainStatus
-from core.strain.tensors import as_tensor, strain_covariance
-from core.strain.window import Slopes
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.field.region.window import distinct_windows
+from stereorig.core.settings import StrainTensor
+from stereorig.core.strain.reduced import window_sums
+from stereorig.core.strain.result import StrainStatus
+from stereorig.core.strain.tensors import as_tensor, strain_covariance
+from stereorig.core.strain.window import Slopes
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class OnSurface:
     strain
         (n, 3) exx, eyy, exy.
     pulls
-        (n, 2, 6) of :func:`core.strain.tensors.pulls_of`.
+        (n, 2, 6) of :func:`stereorig.core.strain.tensors.pulls_of`.
     """
 
     frame: Float
@@ -62,7 +62,7 @@ def raise_order(slopes: Slopes, surface: OnSurface, tensor: StrainTensor) -> tup
     Parameters
     ----------
     slopes
-        Of planes (order ``auto``); quadratics' weights take the place of planes' in ``reduced``.
+        Slopes from planes (order ``auto``); quadratics' weights replace planes' in ``reduced``.
     surface
         The same on the surface.
     tensor
@@ -102,7 +102,7 @@ def raise_order(slopes: Slopes, surface: OnSurface, tensor: StrainTensor) -> tup
         r, c = r[better], c[better]
         raised[r, c] = True
         slope[r, c], spread[r, c], moments[r, c] = curved.slope[better], curved.spread[better], curved.moments[better]
-        weights[ok[better]] = curved.weights[better]  # where they are: a field's weights are its largest array
+        weights[ok[better]] = curved.weights[better]  # in place: a field's weights are its largest array
     return replace(slopes, slope=slope, spread=spread, moments=moments), left, raised
 
 
@@ -110,7 +110,7 @@ def _metric_gradients(slopes: Slopes, tensor: StrainTensor) -> Float:
     """(r, c, 2, 3) tangent a times second derivative k, of the deformed surface less the reference's; zero if unknown.
 
     Half the sum over a and b exchanged is the gradient of the Green-Lagrange strain in grid steps. A bend without
-    strain has none, since second derivatives then stand on the tangents.
+    strain gives zero, since second derivatives are then perpendicular to the tangents.
     """
     before, second = slopes.slope[..., :3, :], slopes.second[..., :3, :]
     now, second_now = before + slopes.slope[..., 3:, :], slopes.second[..., 3:, :]

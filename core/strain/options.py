@@ -6,8 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.errors import InputError
-from core.settings import STRAIN_ORDERS, STRAIN_TENSORS, STRAIN_WINDOW, StrainOrder, StrainSettings, StrainTensor
+from stereorig.core.errors import InputError
+from stereorig.core.settings import (
+    STRAIN_ORDERS,
+    STRAIN_TENSORS,
+    STRAIN_WINDOW,
+    StrainOrder,
+    StrainSettings,
+    StrainTensor,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,16 +28,16 @@ class StrainOptions:
     order
         1: the window's positions are fitted by planes; 2: by quadratics. In a whole window both give the same strain,
         since its quadratic terms have no effect on the slope in its middle. In a window cut by an edge, planes give the
-        strain in the middle of the points left, quadratics that at the point itself, with several times the noise.
-        ``auto``: point by point whichever has the smaller total error, see :mod:`core.strain.one_sided`.
+        strain in the middle of the points left, quadratics give it at the point itself, with several times the noise.
+        ``auto``: point by point the order with the smaller total error, see :mod:`stereorig.core.strain.one_sided`.
     tensor
         ``green_lagrange`` 1/2 (C - I), ``infinitesimal`` (the symmetric gradient; not free of rotation), or ``hencky``
         1/2 log C.
     min_share
-        Share of the window's points that must be left where edges, holes or cuts take some away. At a half, windows
-        on a straight edge are kept and those in a corner are not.
+        Share of the window's points that must be left if edges, holes or cuts take some away. At a half, windows on a
+        straight edge are kept and those in a corner are not.
     max_amplification
-        Largest ratio of the noise of a cut window's strain to a whole window's; beyond it its points lie too much on
+        Largest ratio of the noise of a cut window's strain to a whole window's; beyond it the points are too much on
         one side.
 
     Raises

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.field.region.window import window_offsets
-from core.matching.kernels.naming import entry
+from stereorig.core.arrays import Float
+from stereorig.core.field.region.window import window_offsets
+from stereorig.core.matching.kernels.naming import entry
 
 Index = NDArray[Any]
 
@@ -51,7 +51,7 @@ def window_sums(
         (m,) the windows' middles.
     which, weights
         (m,) number of each window's weights among (k, a, n) of the points of ``window_offsets``; zero where a window
-        has no point. What a weight of zero stands at is not looked at.
+        has no point. The grid's value at a weight of zero is not used.
     half
         Points to each side of a middle.
     from_centre

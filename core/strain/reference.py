@@ -1,15 +1,15 @@
-"""What of a strain's noise is the reference pair's: the same in all steps of a test."""
+"""The reference pair's share of a strain's noise: the same in all steps of a test."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Bool, Float
-from core.field.points.result import Field
-from core.matching.geometry import tangent_frames
-from core.strain.result import StrainField
-from core.strain.tensors import pulls_of, strain_covariance
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.field.points.result import Field
+from stereorig.core.matching.geometry import tangent_frames
+from stereorig.core.strain.result import StrainField
+from stereorig.core.strain.tensors import pulls_of, strain_covariance
 
 
 def reference_share(field: Field, strain: StrainField, points: Bool | None = None) -> Float | None:
@@ -18,21 +18,22 @@ def reference_share(field: Field, strain: StrainField, points: Bool | None = Non
     Parameters
     ----------
     field
-        What the strain was made of.
+        The displacement that the strain was computed from.
     strain
-        Of the same points.
+        Strain at the same points.
     points
         (r, c) True at the points that are asked for; all of them when left out.
 
     Returns
     -------
     Float
-        NaN where there is no strain, or it is not asked for; None where the reference's noise is not told apart.
+        NaN at points without strain and points that are not asked for; None if the reference's noise is not known
+        separately.
 
     Notes
     -----
-    A strain takes the points' noise along the tangents where they have gone, and what the motion makes of that of the
-    positions: both parts of the noise go the strain's own way, with the same weights of the window.
+    The strain contains the points' noise along the deformed tangents, and the positions' noise as the motion changes
+    it. Both parts are propagated as the strain is, with the same weights of the window.
     """
     if field.frozen is None or not field.has_motion:
         return None
@@ -43,7 +44,7 @@ def reference_share(field: Field, strain: StrainField, points: Bool | None = Non
     gradient = _moved(field, good, frame) - frame
     per_mm = np.linalg.inv(np.swapaxes(frame, -1, -2) @ _grid_tangents(field)[good])
     even = np.swapaxes(per_mm, -1, -2) @ per_mm  # a whole window's slopes are equally sure along columns and rows
-    both = np.stack([field.covariance[good]] * 2)  # of all noise, and of the reference's
+    both = np.stack([field.covariance[good]] * 2)  # covariance of all noise, and of the reference's
     both[1, :, 3:, 3:] = field.frozen[good]
     tensor = strain.options.tensor
     made = strain_covariance(pulls_of(frame, gradient, tensor), tensor, both, even, strain.strain[good])
@@ -72,7 +73,7 @@ def _steps(values: Float, axis: int) -> Float:
 
 
 def _moved(field: Field, good: Bool, frame: Float) -> Float:
-    """Tangents (n, 3, 2) where they have gone, as the patches know it."""
+    """Tangents (n, 3, 2) after the deformation that the patches measured."""
     moved = frame
     if field.stretch is not None:
         e = field.stretch[good]

@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float, Floats
-from core.strain.options import StrainOptions
+from stereorig.core.arrays import Bool, Float, Floats
+from stereorig.core.strain.options import StrainOptions
 
 
 class StrainStatus(IntEnum):
@@ -49,7 +49,7 @@ class StrainField:
         Width of the virtual gauge, (window - 1) step + subset; of displacements that were smoothed over a window of w
         points (w - 1) step more.
     gauge_mm
-        The same on the surface, median of the field; NaN where no strain was computed.
+        The same on the surface, median of the field; NaN if no strain was computed.
     status
         (r, c) int8, :class:`StrainStatus`.
     strain
@@ -57,13 +57,13 @@ class StrainField:
     covariance
         (r, c, 3, 3) of these, from the points' own covariances.
     common
-        (r, c, 3, k) common factor of these, from that of the points; None where it is not known.
+        (r, c, 3, k) common factor of these, from the points' factor; None if it is not known.
     patch
         (r, c, 3) exx, eyy, exy of each point's own stretch patch, the same tensor; NaN where the point is not valid,
         None for rigid patches.
     raised
-        (r, c) True where quadratics have replaced planes in a one-sided window; None where no such choice was made, or
-        it is not known.
+        (r, c) True at points whose one-sided window has quadratics in place of planes; None if no such choice was made
+        or it is not known.
     """
 
     options: StrainOptions
@@ -80,7 +80,7 @@ class StrainField:
 
     @property
     def valid(self) -> Bool:
-        """(r, c) True where there is a strain."""
+        """(r, c) True at points with a strain."""
         return np.asarray(self.status == StrainStatus.OK)
 
     @cached_property

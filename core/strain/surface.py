@@ -7,30 +7,30 @@ from dataclasses import fields, replace
 import numpy as np
 from scipy import ndimage
 
-from core.arrays import Bool, Float, Float32
-from core.common.factor import FINE, round_in_place, sample_of
-from core.errors import InputError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels
-from core.matching.geometry import tangent_frames
-from core.strain.arcs import missed_slope
-from core.strain.common_part import common_part
-from core.strain.one_sided import OnSurface, raise_order
-from core.strain.options import StrainOptions
-from core.strain.result import StrainField, StrainStatus
-from core.strain.tensors import pulls_of, strain_of, strain_of_stretch, strain_slopes
-from core.strain.window import Slopes, window_slopes
+from stereorig.core.arrays import Bool, Float, Float32
+from stereorig.core.common.factor import FINE, round_in_place, sample_of
+from stereorig.core.errors import InputError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.matching.geometry import tangent_frames
+from stereorig.core.strain.arcs import missed_slope
+from stereorig.core.strain.common_part import common_part
+from stereorig.core.strain.one_sided import OnSurface, raise_order
+from stereorig.core.strain.options import StrainOptions
+from stereorig.core.strain.result import StrainField, StrainStatus
+from stereorig.core.strain.tensors import pulls_of, strain_of, strain_of_stretch, strain_slopes
+from stereorig.core.strain.window import Slopes, window_slopes
 
-_POINTS_AT_ONCE = 4096  # what stays in the processor's cache
+_POINTS_AT_ONCE = 4096  # points whose arrays stay in the processor's cache
 
 
 def surface_strain(field: Field, options: StrainOptions | None = None, *, subset_px: int) -> StrainField:
     """Return the strain at each point, from a fit over the window about it.
 
     Reference and deformed positions of the window's points are fitted by the same polynomial in the grid's column and
-    row. The slopes of the first give the tangent plane, its frame and the tangents F0 in it; those of the second the
-    same tangents deformed, F1. With B = E^T F0 and E the frame, P = F1 B^-1 is the surface's deformation gradient and
-    C = P^T P, free of any rotation.
+    row. The slopes of the first give the tangent plane, its frame and the tangents F0 in it; the slopes of the second
+    give the same tangents deformed, F1. With B = E^T F0 and E the frame, P = F1 B^-1 is the surface's deformation
+    gradient and C = P^T P, free of any rotation.
 
     Parameters
     ----------
@@ -53,9 +53,9 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
 
     Notes
     -----
-    A fit over a window measures chords instead of arcs. Where the surface keeps its shape this cancels; where it bends
-    from flat to a radius R, planes over a window of half width h would have a bias of -h^2 / (10 R^2) (a quarter more
-    with 9 points in place of a continuum). It is computed from the windows' curvature and subtracted.
+    A fit over a window measures chords instead of arcs. If the surface keeps its shape this cancels; if it bends from
+    flat to a radius R, planes over a window of half width h would have a bias of -h^2 / (10 R^2) (a quarter more with 9
+    points in place of a continuum). It is computed from the windows' curvature and subtracted.
     """
     options = StrainOptions() if options is None else options
     if field.uvw_mm is None:
@@ -84,7 +84,7 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
         round_in_place(common, common.reshape(-1, *common.shape[2:])[some], typical, fine=2.0 * FINE)
         common[~good] = np.nan
     spacing_px = _step(field)
-    # of smoothed displacements it begins with the width of the smoothing
+    # with smoothed displacements the gauge begins with the width of the smoothing
     gauge_px = (options.window - 1) * spacing_px + shared.reach_px
     return StrainField(
         options=options,
@@ -102,7 +102,7 @@ def surface_strain(field: Field, options: StrainOptions | None = None, *, subset
 
 
 def _common_part(field: Field, slopes: Slopes, surface: OnSurface, options: StrainOptions) -> Float32:
-    """(r, c, 3, k) common factor of the strain: that of the points through the windows' weights."""
+    """(r, c, 3, k) common factor of the strain: the points' factor through the windows' weights."""
     assert field.common is not None
     good = slopes.status == StrainStatus.OK
     by_slope = np.zeros((*field.shape, 3, 12), np.float32)
@@ -131,9 +131,9 @@ def surface_slopes(
     Returns
     -------
     tuple
-        :class:`core.strain.window.Slopes`; :class:`core.strain.one_sided.OnSurface` of the n points that have a strain;
-        (r, c, 3) variance that the bias of one-sided planes adds; (r, c) True where quadratics replaced them, None
-        unless the order is ``auto``.
+        :class:`stereorig.core.strain.window.Slopes`; :class:`stereorig.core.strain.one_sided.OnSurface` of the n points
+        that have a strain; (r, c, 3) variance that the bias of one-sided planes adds; (r, c) True where quadratics
+        replaced them, None unless the order is ``auto``.
     """
     assert field.uvw_mm is not None
     values = np.concatenate([field.xyz_mm, field.uvw_mm], axis=-1)
@@ -153,7 +153,7 @@ def _on_surface(slopes: Slopes, field: Field, options: StrainOptions) -> OnSurfa
 
 
 def _replaced(surface: OnSurface, slopes: Slopes, field: Field, options: StrainOptions, raised: Bool) -> OnSurface:
-    """Return what holds at all points, made anew, in the same arrays, where quadratics took the place of planes."""
+    """Return the surface with the points recomputed, in the same arrays, that quadratics in place of planes changed."""
     good = slopes.status == StrainStatus.OK
     again = raised[good]
     if not again.any():

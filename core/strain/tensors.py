@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Float
-from core.matching.geometry import tangent_frames
-from core.settings import StrainTensor
-from core.strain.result import principal_of
+from stereorig.core.arrays import Float
+from stereorig.core.matching.geometry import tangent_frames
+from stereorig.core.settings import StrainTensor
+from stereorig.core.strain.result import principal_of
 
 
 def strain_of(frame: Float, gradient: Float, tensor: StrainTensor) -> Float:

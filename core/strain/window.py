@@ -1,8 +1,8 @@
 """Slopes of positions and displacements over square windows of points, and the propagation of noise into them.
 
-Parameters of the fits are the points' column and row in the grid. A fit is linear in the data, so that reference and
-deformed positions are fitted by the same weights: rigid motion and even stretch are reproduced exactly, for any shape
-of the surface.
+Parameters of the fits are the points' column and row in the grid. A fit is linear in the data: reference and deformed
+positions are fitted by the same weights, so that rigid motion and even stretch are reproduced exactly, for any shape of
+the surface.
 """
 
 from __future__ import annotations
@@ -12,32 +12,46 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import ndimage
 
-from core.arrays import Bool, Float
-from core.field.points.shared_pixels import SharedPixels
-from core.field.region.cuts import Cuts
-from core.field.region.window import connected_points, distinct_windows, fit_terms, steps_of, ways_cut, window_offsets
-from core.strain.arcs import reduced_moments, second_moments, second_weights, third_moments, whole_second_derivatives
-from core.strain.options import StrainOptions
-from core.strain.reduced import window_sums
-from core.strain.result import StrainStatus
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.core.field.region.window import (
+    connected_points,
+    distinct_windows,
+    fit_terms,
+    steps_of,
+    ways_cut,
+    window_offsets,
+)
+from stereorig.core.strain.arcs import (
+    reduced_moments,
+    second_moments,
+    second_weights,
+    third_moments,
+    whole_second_derivatives,
+)
+from stereorig.core.strain.options import StrainOptions
+from stereorig.core.strain.reduced import window_sums
+from stereorig.core.strain.result import StrainStatus
 
 _AT_ONCE = 1024
-_VALUES_AT_ONCE = 1_000_000  # of one quantity: large windows come in smaller batches
+_VALUES_AT_ONCE = 1_000_000  # values of one quantity: large windows come in smaller batches
 _RANK = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
 class Quadratics:
-    """Fits of quadratics over m windows that planes were fitted to, and what the planes leave out.
+    """Fits of quadratics over m windows that planes were fitted to, and the terms that the planes leave out.
 
     Attributes
     ----------
     status
         (m,) int8, :class:`StrainStatus`.
     slope, spread, moments, weights
-        As those of planes, in :class:`Slopes`.
+        The same as in :class:`Slopes`, from quadratics.
     bent
-        (m, 2, 3) the planes' weights' sums of s^2/2, s t, t^2/2 about the point: what second derivatives add to slopes.
+        (m, 2, 3) sums of s^2/2, s t, t^2/2 about the point with the planes' weights: the slopes' error by second
+        derivatives.
     """
 
     status: np.ndarray
@@ -49,7 +63,7 @@ class Quadratics:
 
 
 class Correlation:
-    """How the errors of a window's points correlate: by distance, so that windows are filtered along rows and columns.
+    """Correlation of the errors of a window's points, by distance, so that windows are filtered along rows and columns.
 
     Parameters
     ----------
@@ -84,16 +98,16 @@ class Correlation:
 
 @dataclass(frozen=True, eq=False)
 class ReducedWindows:
-    """What fits over windows need that edges, holes or cuts have reduced.
+    """Inputs for fits over windows that edges, holes or cuts have reduced.
 
     Attributes
     ----------
     values
         (r, c, 6) X Y Z U V W, mm.
     valid
-        (r, c) True where there are values.
+        (r, c) True at points that have values.
     correlation
-        Of the points of a window.
+        Correlation of the errors of a window's points.
     options
         Window, order, limits.
     """
@@ -104,7 +118,7 @@ class ReducedWindows:
     options: StrainOptions
 
     def sums(self, rows: np.ndarray, cols: np.ndarray, which: np.ndarray, weights: Float) -> Float:
-        """Weighted sums (m, a, 6) of the values about points (m,), see :func:`core.strain.reduced.window_sums`."""
+        """Weighted sums (m, a, 6) of the values about points (m,), see :func:`.strain.reduced.window_sums`."""
         return window_sums(self.values, rows, cols, which, weights, self.options.window // 2, from_centre=True)
 
     def fitted(
@@ -143,16 +157,16 @@ class Slopes:
     second
         (r, c, 6, 3) second derivatives of X Y Z and of X + U, Y + V, Z + W: over column twice, both, row twice.
     moments
-        (r, c, 2, 4) :func:`core.strain.arcs.third_moments` of the weights.
+        (r, c, 2, 4) :func:`stereorig.core.strain.arcs.third_moments` of the weights.
     reduced
-        Of windows that edges, holes or cuts have reduced, in batches: rows (m,), columns (m,), and weights (m, 2, n) of
+        Windows that edges, holes or cuts have reduced, in batches: rows (m,), columns (m,), and weights (m, 2, n) of
         the points of ``window_offsets`` in the slopes.
     seen
-        Of order ``auto``: the same batches' (m, n) True for the windows' connected points; else empty.
+        With order ``auto`` the same batches' (m, n) True at the windows' connected points; else empty.
     windows
-        What fits over reduced windows need.
+        Inputs for fits over reduced windows.
     second_spread
-        Of order ``auto``: (r, c, 3, 3) covariance of ``second`` in units of a point's, zero where undetermined.
+        With order ``auto`` (r, c, 3, 3) covariance of ``second`` in units of a point's, zero if undetermined.
     """
 
     status: np.ndarray
@@ -176,7 +190,7 @@ def window_slopes(
     values
         (r, c, 6) X Y Z U V W, mm.
     valid
-        (r, c) True where there are values.
+        (r, c) True at points that have values.
     xy_px
         (r, c, 2) the grid, px.
     cuts
@@ -221,7 +235,7 @@ def window_slopes(
         kinds, which = distinct_windows(seen)
         bending = second_weights(kinds, half)
         bent = np.swapaxes(windows.sums(r, k, which, bending), 1, 2)
-        bent[:, 3:] += bent[:, :3]  # of the displacement, then of the deformed position
+        bent[:, 3:] += bent[:, :3]  # sums of the displacement, then of the deformed position
         second[r, k] = bent
         status[r, k], slope[r, k], spread[r, k], moments[r, k], weights = windows.fitted(
             r, k, kinds, which, 2 if options.order == 2 else 1
@@ -251,7 +265,7 @@ def _whole_slopes(values: Float, half: int) -> Float:
 
 
 def _weights(seen: Bool, half: int, order: int, options: StrainOptions) -> tuple[np.ndarray, Float]:
-    """Status (m,) and weights (m, 2, n) of the points in the slopes; zero where there are none."""
+    """Status (m,) and weights (m, 2, n) of the points in the slopes; zero outside the window."""
     offsets, _ = window_offsets(half)
     A = fit_terms(offsets, half, order)
     n, terms = A.shape

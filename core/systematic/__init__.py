@@ -1,4 +1,5 @@
-"""Systematic terms that no standard uncertainty holds, estimated for each field from itself, to be stated beside it.
+"""Systematic errors that no standard uncertainty contains, estimated for each field from itself and stated separately.
 
-Interpolation of sharp texture, the order of patches on what bends, the width of the strain's window.
+They are: interpolation of sharp texture, the order of patches on bent surfaces and motions, the width of the strain's
+window.
 """

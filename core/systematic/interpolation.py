@@ -1,10 +1,9 @@
 """The bias that interpolation of sharp texture gives matches, seen in their own residuals.
 
 A spline through the pixels, and the pixels of a texture finer than they are, shift all matches alike by an amount that
-goes with the sine of the sub-pixel phase. What does it lies near the highest frequencies: a match of smoothed images is
-nearly free of it. At a sample of points the residuals say what such a match would change, and the part of that which
-goes with the phase's sine is the bias. Where the map from image to image runs through phases within a subset they
-cancel there.
+goes with the sine of the sub-pixel phase. The effect comes from the highest frequencies: a match of smoothed images is
+nearly free of it. At a sample of points the residuals show the change by such a match, and the part of it in proportion
+to the phase's sine is the bias. If the map from image to image runs through phases within a subset they cancel there.
 """
 
 from __future__ import annotations
@@ -16,27 +15,29 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Float, Float32
-from core.cameras.stereo import StereoPair
-from core.common.matches import Matches, match_gain
-from core.field.points.result import Field
-from core.matching.blur import Blur
-from core.matching.filters import correlate
-from core.matching.geometry import tangent_frames
-from core.matching.image import ImageData
-from core.robust import MAD_TO_SIGMA
-from core.status import PointStatus
-from core.systematic.sampled import residual_shifts
-from core.systematic.term import Figure, Term
+from stereorig.core.arrays import Float, Float32
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.common.matches import Matches, match_gain
+from stereorig.core.field.points.result import Field
+from stereorig.core.matching.blur import Blur
+from stereorig.core.matching.filters import correlate
+from stereorig.core.matching.geometry import tangent_frames
+from stereorig.core.matching.image import ImageData
+from stereorig.core.robust import MAD_TO_SIGMA
+from stereorig.core.status import PointStatus
+from stereorig.core.systematic.sampled import residual_shifts
+from stereorig.core.systematic.term import Figure, Term
 
 SMOOTH_PX = 1.5
-"""Of the smoother gradients: little of the bias is left in them. Wider ones see it less surely."""
-_LARGE_PIXELS = 8_000_000  # from here on only what is looked at is smoothed: 8 bytes a pixel
-_PROBED_PX = 21  # of a subset, its middle: a wider one costs more and tells little more
+"""Smoothing of the smoother gradients: little of the bias is left in them. With more smoothing the bias is less
+certain. Wider ones see it less surely.
+"""
+_LARGE_PIXELS = 8_000_000  # from here on only the examined parts are smoothed: 8 bytes a pixel
+_PROBED_PX = 21  # middle of a subset: a wider one costs more and adds little information
 _SAMPLE = 256
 _MIN_SAMPLE = 32
 _SURE = 2.0
-_MIN_SINE2 = 0.02  # mean square of the sines below which no phase tells
+_MIN_SINE2 = 0.02  # mean square of the sines below which the phase shows nothing
 _OUTLIER = 4.0
 _QUANTITIES = ("x_um", "y_um", "z_um", "u_um", "v_um", "w_um")
 
@@ -50,8 +51,8 @@ class SmoothSlopes:
     image
         As it was matched.
     whole
-        (rows, cols) its gradients along x and y after a Gaussian of :data:`SMOOTH_PX`; None of a large image: what is
-        looked at is smoothed anew each time.
+        (rows, cols) its gradients along x and y after a Gaussian of :data:`SMOOTH_PX`; None for a large image: the
+        examined parts are then smoothed each time.
     """
 
     image: ImageData
@@ -59,7 +60,7 @@ class SmoothSlopes:
 
     @staticmethod
     def of(image: ImageData) -> SmoothSlopes:
-        """Return those of a prepared image."""
+        """Return the smoothed gradients of a prepared image."""
         if image.raw.size > _LARGE_PIXELS:
             return SmoothSlopes(image, None)
         along_x, along_y = (np.empty(image.shape, np.float32) for _ in range(2))
@@ -113,10 +114,10 @@ def interpolation_term(
         ``match_px`` over points, comparisons and directions, and each coordinate in um.
     """
     if field.references is not None:
-        return Term("Not told: the step was matched against a later reference.")
+        return Term("Not known: the step was matched against a later reference.")
     index = np.flatnonzero((field.status == PointStatus.OK).ravel() & np.isfinite(field.normal_sys[..., 0].ravel()))
     if len(index) < _MIN_SAMPLE:
-        return Term(f"Not told: {len(index)} points are too few.")
+        return Term(f"Not known: {len(index)} points are too few.")
     index = index[np.linspace(0, len(index) - 1, min(_SAMPLE, len(index))).astype(np.int64)]
     centres = np.stack([field.x_px.ravel()[index], field.y_px.ravel()[index]], axis=-1)
     found = _matches(field, pair, index)
@@ -138,7 +139,7 @@ def interpolation_term(
             found.maps[:, k],
             probed_px,
         )
-        # in px of the other image, along whose rows and columns its pixels lie
+        # in px of the other image, along its rows and columns
         shifts.append((found.maps[:, k] @ (seen[:, :2] - seen[:, 2:])[..., None])[..., 0])
         sine = np.sin(2.0 * np.pi * images[:, k])
         sines.append(sine * _left_of_phase(found.maps[:, k], probed_px))
@@ -148,20 +149,20 @@ def interpolation_term(
 
 
 def _judged(shifts: Float, sines: Float, left: Float, found: Matches, moved: bool) -> Term:
-    """Term of shifts (n, comparisons, 2), of the sines in what was probed, and of those in the whole subsets."""
+    """Term from shifts (n, comparisons, 2), from the sines in the probed parts, and in the whole subsets."""
     amplitude, sd = np.full(2, np.nan), np.full(2, np.nan)
     for axis in range(2):
         found_here = _amplitude(sines[..., axis].ravel(), shifts[..., axis].ravel())
         if found_here is not None:
             amplitude[axis], sd[axis] = found_here
-    told = np.isfinite(amplitude)
-    if not told.any():
+    known = np.isfinite(amplitude)
+    if not known.any():
         return Term(
-            "Not told: within the subsets the phase runs through whole pixels, so that the bias cancels, or all points "
-            "lie at whole or half pixels, where there is none."
+            "Not known: within the subsets the phase runs through whole pixels, so that the bias cancels, or all "
+            "points are at whole or half pixels, without any bias."
         )
-    # where one direction does not tell, there is little of it: the texture is taken to be as sharp as along the other
-    amplitude, sd = (np.where(told, values, values[told].max()) for values in (amplitude, sd))
+    # a direction without information has little of it: the texture is assumed to be as sharp as along the other
+    amplitude, sd = (np.where(known, values, values[known].max()) for values in (amplitude, sd))
     shown = bool((np.abs(amplitude) > _SURE * sd).any())
     text = (
         f"From {len(shifts)} points' residuals: what a match through gradients smoothed by {SMOOTH_PX:g} px would "
@@ -179,7 +180,7 @@ def _judged(shifts: Float, sines: Float, left: Float, found: Matches, moved: boo
 
 
 def _amplitude(sines: Float, shifts: Float) -> tuple[float, float] | None:
-    """Amplitude of the shifts that go with the sines (n,), and its standard deviation; None where no phase tells."""
+    """Amplitude of the shifts in proportion to the sines (n,), and its standard deviation; None without information."""
     known = np.isfinite(sines) & np.isfinite(shifts)
     s, d = sines[known], shifts[known]
     if len(s) < _MIN_SAMPLE or not np.mean(s**2) > _MIN_SINE2:
@@ -206,7 +207,7 @@ def _to_mm(shifts_px: Float, found: Matches) -> Float:
 
 
 def _left_of_phase(maps: Float, subset_px: int) -> Float:
-    """(n, 2) what is left, after the mean over a subset, of a sine of the phase along the other image's axes."""
+    """(n, 2) mean over a subset of a sine of the phase along the other image's axes."""
     # whole pixels of the reference: a map's whole numbers change no phase
     off = np.pi * (maps - np.rint(maps))
     with np.errstate(invalid="ignore", divide="ignore"):

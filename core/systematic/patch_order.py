@@ -1,9 +1,9 @@
 """The bias of patches of limited order, estimated from the field that they measured.
 
 A plane patch averages the surface and the displacement below it: it is off by half the second derivative times the
-subset's second moment, (h^2 - 1) / 12 px^2 along either axis. A curved patch follows second derivatives and is off by
-what the fourth ones leave: 3 a^4 / 35 and a^4 / 9 of the Taylor terms x^4 and x^2 y^2, a half the subset. Inverse depth
-and the motion in its measure are linear in the image for planes that move; their differences over neighbours give the
+subset's second moment, (h^2 - 1) / 12 px^2 along either axis. A curved patch follows second derivatives and has the
+fourth ones' bias: 3 a^4 / 35 and a^4 / 9 of the Taylor terms x^4 and x^2 y^2, a half the subset. Inverse depth and the
+motion in its measure are linear in the image for planes that move; their differences over neighbours give the
 derivatives: a subset away, where the noise is their own, of quadratic patches half a subset.
 """
 
@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.stereo import StereoPair
-from core.field.points.result import Field
-from core.field.points.shared_pixels import steps_px
-from core.systematic.term import Term, figure_of
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.patch import format_length
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import steps_px
+from stereorig.core.systematic.term import Term, figure_of
 
 _NAMES = ("x_um", "y_um", "z_um"), ("u_um", "v_um", "w_um")
 _FAR_SUBSETS = 2.0  # neighbours further away say little about a subset
@@ -37,10 +38,12 @@ def patch_term(field: Field, pair: StereoPair, *, subset_px: int) -> Term:
     Returns
     -------
     Term
-        Of X, Y, Z for a shape, of U, V, W for a displacement, um.
+        Bias of X, Y, Z for a shape, of U, V, W for a displacement, um.
     """
     if field.patch is None:
-        return Term("Not told: the field has no record of its patches.")
+        return Term("Not known: the field has no record of its patches.")
+    if (off_mm := field.patch.taken_off_mm) is not None:
+        return Term(f"plane patches: {format_length(off_mm)} (rms) by the slopes about each point, taken off.")
     step = steps_px(field)
     curved = field.patch.patch == "quadratic"
     # fourth derivatives need neighbours twice as far, half a subset apart: their noise has little part in them
@@ -50,10 +53,12 @@ def patch_term(field: Field, pair: StereoPair, *, subset_px: int) -> Term:
     if any(lag * s > _FAR_SUBSETS * subset_px for lag, s in zip(lags, step, strict=True)) or (
         field.shape[0] < 2 * reach * lags[1] + 1 or field.shape[1] < 2 * reach * lags[0] + 1
     ):
-        return Term("Not told: too few points lie far enough apart.")
+        return Term("Not known: too few points are far enough apart.")
     off, noise = _fourth(field, pair, lags, step, subset_px) if curved else _second(field, pair, lags, step, subset_px)
+    if field.patch_degree is not None:  # quadratic patches among plane ones have no bias by second derivatives
+        off[field.patch_degree == 2] = np.nan
     names = _NAMES[1 if field.has_motion else 0]
-    # of neighbouring estimates those a subset apart are independent
+    # neighbouring estimates a subset apart are independent
     share = float(np.prod([min(s / subset_px, 1.0) for s in step]))
     figures = {}
     for k, name in enumerate(names):
@@ -61,7 +66,7 @@ def patch_term(field: Field, pair: StereoPair, *, subset_px: int) -> Term:
         if figure is not None:
             figures[name] = figure
     if not figures:
-        return Term("Not told: too few points have neighbours at that distance.")
+        return Term("Not known: too few points have neighbours at that distance.")
     what = "fourth" if curved else "second"
     kind = "quadratic" if curved else "plane"
     return Term(
@@ -72,7 +77,7 @@ def patch_term(field: Field, pair: StereoPair, *, subset_px: int) -> Term:
 
 
 def _measures(field: Field, pair: StereoPair) -> tuple[Float, Float]:
-    """(r, c, m) what planes make linear in the image, and (r, c, 3, m) mm of the system frame per unit of it."""
+    """(r, c, m) quantities that planes make linear in the image, and (r, c, 3, m) mm of the system frame per unit."""
     camera = pair.cam1.cam_from_sys
     at = camera.apply(field.xyz_mm)
     w = 1.0 / at[..., 2:]
@@ -123,13 +128,13 @@ def _fourth(
 
 
 def _own_variance(field: Field) -> Float:
-    """(r, c, 3) variance of what the bias is stated for, of the points' own noise."""
+    """(r, c, 3) variance of the quantities that the bias is stated for, from the points' own noise."""
     diagonal = np.diagonal(field.covariance, axis1=-2, axis2=-1)
     return np.asarray(diagonal[..., 3:] if field.has_motion else diagonal[..., :3])
 
 
 def _stencil(values: Float, weights: tuple[float, ...], axis: int, lag: int) -> Float:
-    """Weighted sum (r, c, m) over points ``lag`` apart along an axis; NaN where one is missing."""
+    """Weighted sum (r, c, m) over points ``lag`` apart along an axis; NaN if one is missing."""
     out = np.full(values.shape, np.nan)
     reach = (len(weights) // 2) * lag
     size = values.shape[axis]

@@ -1,17 +1,17 @@
 """Shifts that residuals of matched subsets show, seen through two filters of the reference's gradients.
 
-At a match the residuals stand on the gradients that made it. Through smoother gradients they show the shift that a
-match of smoother images would have added.
+At a match the residuals are orthogonal to the gradients that determined it. Through smoother gradients they show the
+shift that a match of smoother images would have added.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from core.arrays import Float, Float32
-from core.matching.image import PAD
-from core.matching.kernels.naming import entry_with_arrays, inner
-from core.threads import run_ranges
+from stereorig.core.arrays import Float, Float32
+from stereorig.core.matching.image import PAD
+from stereorig.core.matching.kernels.naming import entry_with_arrays, inner
+from stereorig.core.threads import run_ranges
 
 _SIXTH = 1.0 / 6.0
 _RANGE = 64  # points: one to three milliseconds
@@ -40,7 +40,7 @@ def _quintic(t):
 
 @inner
 def _cubic_value(c, width, x, y):
-    """Spline value at a place of a flat image of rows of ``width``; all its taps lie inside."""
+    """Spline value at a place of a flat image of rows of ``width``; all its taps are inside."""
     ix, iy = int(x), int(y)
     w0, w1, w2, w3 = _cubic(x - ix)
     v0, v1, v2, v3 = _cubic(y - iy)
@@ -78,7 +78,7 @@ def _quintic_value(c, width, x, y):
 
 @inner
 def _sample(flat, width, order, x, y, map_, half, current):
-    """Sample the other image over a subset about its place there; all taps lie inside."""
+    """Sample the other image over a subset about its place there; all taps are inside."""
     side = 2 * half + 1
     xx, xy, yx, yy = map_[0, 0], map_[0, 1], map_[1, 0], map_[1, 1]
     if order == 3:  # outside the loops: a choice of splines a pixel costs as much as a spline
@@ -95,7 +95,7 @@ def _sample(flat, width, order, x, y, map_, half, current):
 
 @inner
 def _inside(rows, cols, order, x, y, map_, half):
-    """True if all taps of a subset lie in the padded image; of an affine map its corners are the extremes."""
+    """True if all taps of a subset are inside the padded image; the corners are an affine map's extremes."""
     lead = order // 2
     wide = half * (abs(map_[0, 0]) + abs(map_[0, 1]))
     high = half * (abs(map_[1, 0]) + abs(map_[1, 1]))
@@ -184,13 +184,14 @@ def residual_shifts(
     pixels, slopes
         (rows, cols) of the reference: grey levels and the matcher's gradients.
     smooth
-        (n, subset_px, subset_px) smoother ones, of the subsets that lie in the image.
+        (n, subset_px, subset_px) smoother gradients of the subsets that are inside the image.
     coefficients, order
-        Spline of the other image, see :class:`core.matching.image.ImageData`.
+        Spline of the other image, see :class:`stereorig.core.matching.image.ImageData`.
     centres_px
         (n, 2) points of the reference.
     images_px, maps
-        (n, 2) their images in the other one, and (n, 2, 2) how a px of the reference lies there.
+        (n, 2) their images in the other one, and (n, 2, 2) derivative of the other image's position over the
+        reference's.
     subset_px
         Width of the subset.
     """

@@ -1,22 +1,22 @@
 """The bias of strain over a window, estimated from the strain itself.
 
 The slope of a plane over a window is the true slope averaged: along the slope by weights of second moment sum x^4 / (3
-sum x^2), across it evenly. Plane patches average besides. So strain is off by half its second derivatives times these
-moments: what the next order of the displacement over the window leaves. Bending without strain has none.
+sum x^2), across it evenly. Plane patches average in addition. So the bias of strain is half its second derivatives
+times these moments: the next order of the displacement over the window. Bending without strain has none.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from core.arrays import Float
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels, steps_px
-from core.field.region.window import window_offsets
-from core.matching.geometry import tangent_frames
-from core.strain.result import StrainField, StrainStatus
-from core.strain.window import plane_weights
-from core.systematic.term import Term, figure_of
+from stereorig.core.arrays import Float
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels, steps_px
+from stereorig.core.field.region.window import window_offsets
+from stereorig.core.matching.geometry import tangent_frames
+from stereorig.core.strain.result import StrainField, StrainStatus
+from stereorig.core.strain.window import plane_weights
+from stereorig.core.systematic.term import Term, figure_of
 
 _NAMES = ("exx_microstrain", "eyy_microstrain", "exy_microstrain")
 _MICRO = 1e6
@@ -37,13 +37,13 @@ def window_term(field: Field, strain: StrainField, *, subset_px: int) -> Term:
     Returns
     -------
     Term
-        Of exx, eyy, exy in microstrain.
+        Bias of exx, eyy, exy in microstrain.
     """
     half = strain.options.window // 2
     step = steps_px(field)
-    lag = (half + 1) // 2  # wider differences smooth more of what they are to show, narrower ones are noisier
+    lag = (half + 1) // 2  # wider differences smooth the derivative more, narrower ones are noisier
     if min(field.shape) < 2 * lag + 1:
-        return Term("Not told: the field is hardly wider than the window.")
+        return Term("Not known: the field is hardly wider than the window.")
     along, across = (3.0 * half**2 + 3.0 * half - 1.0) / 15.0, half * (half + 1) / 3.0
     plane = field.patch is not None and field.patch.patch != "quadratic"
     patch = tuple((subset_px**2 - 1) / 12.0 / s**2 if plane else 0.0 for s in step)
@@ -72,7 +72,7 @@ def window_term(field: Field, strain: StrainField, *, subset_px: int) -> Term:
         if figure is not None:
             figures[name] = figure
     if not figures:
-        return Term("Not told: too few points have strain on either side.")
+        return Term("Not known: too few points have strain on either side.")
     return Term(
         f"Second differences of the strain over {lag} points, times the second moments of the window's weights"
         f"{' and of the plane patches' if plane else ''}; noise of the strain taken off.",
@@ -113,7 +113,7 @@ def _second(values: Float, axis: int, lag: int) -> Float:
 
 
 def _noise_ratio(half: int, lag: int, moments: Float, shared: SharedPixels, step: tuple[float, float]) -> Float:
-    """(3,) variance of the estimate over that of the strain itself, in whole windows."""
+    """(3,) variance of the estimate over the variance of the strain itself, in whole windows."""
     offsets, _ = window_offsets(half)
     side = 2 * (half + lag) + 1
     at = np.arange(-side, side + 1)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from core.arrays import Float
+from stereorig.core.arrays import Float
 
 _TRIMMED = 0.02  # single wrong points, and steps at cracks and edges
 _MIN_POINTS = 16
@@ -22,10 +22,9 @@ class Figure:
     Attributes
     ----------
     rms, largest
-        Root mean square over the points, less the noise of the estimate, and the largest; None where the noise hides
-        it.
+        Root mean square over the points, less the noise of the estimate, and the largest; None if the noise hides it.
     below
-        What the root mean square is below, two standard deviations of the estimate above it.
+        Upper limit of the root mean square, two standard deviations of the estimate above it.
     """
 
     rms: float | None
@@ -40,9 +39,10 @@ class Term:
     Attributes
     ----------
     figures
-        By quantity with its unit (``match_px``, ``u_um``, ``exx_microstrain``); empty where it cannot be told.
+        Figures by quantity with its unit (``match_px``, ``u_um``, ``exx_microstrain``); empty if they cannot be
+        computed.
     text
-        How it was estimated, or why it cannot be told.
+        The method of the estimate, or the reason why it is missing.
     """
 
     text: str
@@ -68,7 +68,7 @@ def figure_of(values: Float, variances: Float, *, independent: float = 1.0) -> F
     Returns
     -------
     Figure or None
-        None where too few are left.
+        None if too few are left.
     """
     known = np.isfinite(values) & np.isfinite(variances)
     if known.sum() < _MIN_POINTS:
@@ -78,7 +78,7 @@ def figure_of(values: Float, variances: Float, *, independent: float = 1.0) -> F
     value, noise = value[order], noise[order]
     count = max(independent * len(value), 1.0)
     square = float(np.mean(value**2 - noise))
-    # of a mean of squares of noise; where the term itself is larger its own spread is no error
+    # standard deviation of a mean of squares of noise; if the term itself is larger, its own spread is no error
     spread = _SURE * float(np.sqrt(2.0 * np.mean(noise**2) + 4.0 * np.mean(noise) * max(square, 0.0))) / np.sqrt(count)
     below = float(np.sqrt(max(square, 0.0) + spread))
     if square <= spread:

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from core.cameras.stereo import StereoPair
-from core.field.points.result import Field
-from core.matching.image import ImageData
-from core.strain.result import StrainField
-from core.systematic.interpolation import SmoothSlopes, interpolation_term
-from core.systematic.patch_order import patch_term
-from core.systematic.strain_window import window_term
-from core.systematic.term import Term
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.result import Field
+from stereorig.core.matching.image import ImageData
+from stereorig.core.strain.result import StrainField
+from stereorig.core.systematic.interpolation import SmoothSlopes, interpolation_term
+from stereorig.core.systematic.patch_order import patch_term
+from stereorig.core.systematic.strain_window import window_term
+from stereorig.core.systematic.term import Term
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def terms_of(
 
 
 def with_strain(terms: Systematic, field: Field, strain: StrainField | None, *, subset_px: int) -> Systematic:
-    """Return the terms with that of the strain, computed from ``field``."""
+    """Return the terms with the strain's term, computed from ``field``."""
     if strain is None:
         return terms
     return replace(terms, strain_window=window_term(field, strain, subset_px=subset_px))

@@ -15,7 +15,7 @@ class Arrival(StrEnum):
 
 
 @dataclass(frozen=True)
-class Reading:
+class CounterReading:
     """Reading of one frame number.
 
     Attributes
@@ -52,25 +52,33 @@ class SequenceReader:
         self._size = last - first + 1
         self._newest: int | None = None
         self._recent: set[int] = set()
+        self._only: int | None = None  # the one number that all frames bore so far
+        #: True if the device's number stays as it is: frames are counted here, and lost ones leave no gap
+        self.counts = False
 
-    def read(self, raw: int) -> Reading:
-        """Read the next frame number as the device gave it."""
+    def read(self, raw: int, *, fresh: bool = False) -> CounterReading:
+        """Read the next frame number as the device gave it; ``fresh`` if its stamp shows that it is a new frame."""
         if not 0 <= raw - self._first < self._size:
             raise ValueError(f"frame number {raw} is outside the counter's range")
         if self._newest is None:
-            self._newest = raw
+            self._newest = self._only = raw
             self._recent = {raw}
-            return Reading(Arrival.NEXT, raw)
+            return CounterReading(Arrival.NEXT, raw)
+        self._only = raw if raw == self._only else None
+        self.counts = fresh and self._only is not None
+        if self.counts:
+            self._newest += 1
+            return CounterReading(Arrival.NEXT, self._newest)
         step = (raw - self._newest) % self._size
         if step >= self._size / 2:
             step -= self._size
         number = self._newest + step
         if number in self._recent:
-            return Reading(Arrival.DUPLICATE, number)
+            return CounterReading(Arrival.DUPLICATE, number)
         self._recent.add(number)
         if step < 0:
-            return Reading(Arrival.LATE, number)
+            return CounterReading(Arrival.LATE, number)
         self._newest = number
         # further back than this it cannot be distinguished from a late frame, which is refused too
         self._recent = {known for known in self._recent if known > number - 64}
-        return Reading(Arrival.NEXT, number, step - 1)
+        return CounterReading(Arrival.NEXT, number, step - 1)

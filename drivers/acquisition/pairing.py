@@ -16,9 +16,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from core.errors import CameraError
-from core.names import CAMERAS, CameraName
-from drivers.cameras.protocol import Frame, FrameStatus
+from stereorig.core.errors import CameraError
+from stereorig.core.names import CAMERAS, CameraName
+from stereorig.drivers.acquisition.simultaneity import Simultaneity, SkewSource, in_words, simultaneity
+from stereorig.drivers.cameras.protocol import Frame, FrameStatus
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,9 +33,11 @@ class Pair:
     number
         Trigger or frame number, counted from the first; in pairing by time, of the pair.
     skew_ms
-        Beginning of camera 2's exposure minus that of camera 1.
+        Beginning of camera 2's exposure minus the beginning of camera 1's.
     max_skew_ms
         Largest skew that the rig allows.
+    skew_uncertainty_ms, skew_source
+        Largest error of the skew, and its source (`stereorig.drivers.acquisition.simultaneity`).
     """
 
     cam1: Frame
@@ -42,25 +45,29 @@ class Pair:
     number: int
     skew_ms: float
     max_skew_ms: float
+    skew_uncertainty_ms: float = 0.0
+    skew_source: SkewSource = "clock"
 
     def __getitem__(self, cam: CameraName) -> Frame:
         return self.cam1 if cam == "cam1" else self.cam2
 
     @property
     def accepted(self) -> bool:
-        """True if its skew is within the limit."""
-        return abs(self.skew_ms) <= self.max_skew_ms
+        """True unless its skew is surely above the limit."""
+        return abs(self.skew_ms) - self.skew_uncertainty_ms <= self.max_skew_ms
 
     def require(self) -> Pair:
         """Return the pair itself; code ``skew_too_large`` when its skew is above the limit."""
         if not self.accepted:
             raise CameraError(
-                f"The exposures of pair {self.number} began {abs(self.skew_ms):.3f} ms apart, "
-                f"the rig allows {self.max_skew_ms:g} ms.",
+                f"The exposures of pair {self.number} began {abs(self.skew_ms):.3f} ms apart "
+                f"({in_words(self.skew_source, self.skew_uncertainty_ms)}), the rig allows {self.max_skew_ms:g} ms.",
                 code="skew_too_large",
                 remedy="Use a common hardware trigger, or raise max_skew_ms for a specimen at rest.",
                 skew_ms=self.skew_ms,
                 max_skew_ms=self.max_skew_ms,
+                skew_uncertainty_ms=self.skew_uncertainty_ms,
+                skew_source=self.skew_source,
             )
         return self
 
@@ -76,6 +83,9 @@ class PairingAccount:
     dropped: Annotated[int, Field(description="No frame came.")] = 0
     refused: Annotated[int, Field(description="Of the paired, those whose skew was too large.")] = 0
     late: Annotated[int, Field(description="Frames that came after their occasion was given up.")] = 0
+    slips: Annotated[
+        int, Field(description="Times that a camera missed a pulse and its numbers were aligned anew.")
+    ] = 0
 
     def as_dict(self) -> dict[str, int]:
         """Return names and numbers, for reports."""
@@ -96,11 +106,11 @@ class _Slot:
 class _Pairing:
     """Counts and skews, common to both ways of pairing."""
 
-    def __init__(self, *, max_skew_ms: float, common_clock: bool) -> None:
+    def __init__(self, *, max_skew_ms: float, common_clock: bool | Simultaneity) -> None:
         if not max_skew_ms >= 0:
             raise ValueError(f"max_skew_ms must not be negative, got {max_skew_ms}")
         self._max_skew_ms = max_skew_ms
-        self._common_clock = common_clock
+        self._times = simultaneity(common_clock)
         self._counts: dict[str, int] = {}
 
     @property
@@ -112,15 +122,9 @@ class _Pairing:
     def _count(self, name: str) -> None:
         self._counts[name] = self._counts.get(name, 0) + 1
 
-    def _time_ns(self, frame: Frame) -> int:
-        if self._common_clock:
-            return frame.device_ns
-        return frame.host_ns if frame.exposed_ns is None else frame.exposed_ns
-
     def _pair(self, frames: Mapping[CameraName, Frame], number: int) -> Pair:
-        one, two = frames["cam1"], frames["cam2"]
-        skew = (self._time_ns(two) - self._time_ns(one)) / 1e6
-        pair = Pair(one, two, number, skew, self._max_skew_ms)
+        skew_ms, uncertainty_ms, source = self._times.skew(frames)
+        pair = Pair(frames["cam1"], frames["cam2"], number, skew_ms, self._max_skew_ms, uncertainty_ms, source)
         self._count("paired")
         if not pair.accepted:
             self._count("refused")
@@ -128,10 +132,10 @@ class _Pairing:
 
 
 class NumberPairing(_Pairing):
-    """Pairs by a number that both cameras share: that of the trigger, or the frame number since both were armed.
+    """Pairs by a number that both cameras share: the trigger's number, or the frame number since both were armed.
 
-    Frame numbers must be unwrapped and start at ``origin`` in both cameras (the reader does the first). Numbers
-    of one camera may arrive late by ``depth``; then their trigger is closed.
+    Frame numbers must be unwrapped and start at ``origin`` in both cameras (the reader does the first). Numbers of one
+    camera may arrive late by ``depth``; then their trigger is closed.
 
     Parameters
     ----------
@@ -140,8 +144,8 @@ class NumberPairing(_Pairing):
     max_skew_ms
         Above it a pair is made and counted, but not accepted.
     common_clock
-        True if the device times of both cameras may be compared; else skew is that of the exposures converted to the
-        host's clock, or of the arrival at the host where that was not done.
+        Knowledge of both cameras' times. True if their device times may be compared; False if only the exposures' times
+        converted to the host's clock may be, or the arrivals at the host without a conversion.
     origin
         Frame number, in each camera, of the first trigger; its trigger number in pairing by trigger (cam1's counts).
     depth
@@ -153,7 +157,7 @@ class NumberPairing(_Pairing):
         *,
         by: Literal["trigger", "frame"],
         max_skew_ms: float,
-        common_clock: bool,
+        common_clock: bool | Simultaneity,
         origin: Mapping[CameraName, int] | None = None,
         depth: int = 8,
     ) -> None:
@@ -172,6 +176,7 @@ class NumberPairing(_Pairing):
 
     def feed(self, cam: CameraName, frame: Frame) -> Pair | None:
         """Take a frame, complete or not; returns a pair when it makes one."""
+        self._times.see(cam, frame)
         raw = frame.trigger if self._by == "trigger" else frame.sequence
         if raw is None:
             raise CameraError(
@@ -241,7 +246,9 @@ class TimePairing(_Pairing):
         Frames of one camera that wait for the other.
     """
 
-    def __init__(self, *, period_ms: float, max_skew_ms: float, common_clock: bool, depth: int = 8) -> None:
+    def __init__(
+        self, *, period_ms: float, max_skew_ms: float, common_clock: bool | Simultaneity, depth: int = 8
+    ) -> None:
         super().__init__(max_skew_ms=max_skew_ms, common_clock=common_clock)
         if not period_ms > 0:
             raise ValueError(f"period_ms must be positive, got {period_ms}")
@@ -252,12 +259,13 @@ class TimePairing(_Pairing):
 
     def feed(self, cam: CameraName, frame: Frame) -> Pair | None:
         """Take a frame, complete or not, in the order of its camera; returns a pair when it makes one."""
+        self._times.see(cam, frame)
         other: CameraName = "cam2" if cam == "cam1" else "cam1"
-        now = self._time_ns(frame)
-        # the other camera's frames are in order: what lies before this frame's window can find no partner any more
-        while self._waiting[other] and self._time_ns(self._waiting[other][0]) < now - self._window_ns:
+        now = self._times.time_ns(frame)
+        # the other camera's frames are in order: a frame before this frame's window can find no partner any more
+        while self._waiting[other] and self._times.time_ns(self._waiting[other][0]) < now - self._window_ns:
             self._close(other)
-        if self._waiting[other] and self._time_ns(self._waiting[other][0]) < now + self._window_ns:
+        if self._waiting[other] and self._times.time_ns(self._waiting[other][0]) < now + self._window_ns:
             partner = self._waiting[other].pop(0)
             slot = _Slot(self._number, {cam: frame, other: partner})
             self._number += 1

@@ -16,16 +16,28 @@ from dataclasses import replace
 
 import numpy as np
 
-from core.errors import CameraError
-from drivers.acquisition.clocks import DeviceClock
-from drivers.acquisition.frame_counter import Arrival, SequenceReader
-from drivers.cameras.protocol import Frame, FrameCounters, FrameGrabber, FrameStatus
+from stereorig.core.errors import CameraError
+from stereorig.drivers.acquisition.clocks import DeviceClock
+from stereorig.drivers.acquisition.frame_counter import Arrival, SequenceReader
+from stereorig.drivers.cameras.protocol import (
+    CameraDescription,
+    Frame,
+    FrameCounters,
+    FrameGrabber,
+    FrameStatus,
+    Latch,
+    LatchingGrabber,
+)
 
 # How long the thread waits in the grabber before it looks at the watchdog again
 _SLICE_S = 0.02
 _WATCHDOG_PERIODS = 3.0
 # A busy host stops for longer than three periods of a fast camera, which is no fault of the camera's
 _MIN_PATIENCE_S = 0.4
+# Latches of the camera's clock: so many at first, then the quickest of a few each second
+_FIRST_LATCHES, _LATCHES, _LATCH_PAUSE_S = 8, 3, 1.0
+# A reading that takes so long is the last for a while: twenty times as long as it took
+_LATE_LATCH_S, _LATCH_SHARE = 0.05, 20.0
 
 
 class CameraReader:
@@ -41,7 +53,7 @@ class CameraReader:
         Frame period in free run or under a hardware trigger; under software triggers, the longest time from a trigger
         to its frame.
     expects_frames
-        True where frames come by themselves. Under software triggers the watchdog runs only after `trigger`.
+        True if frames come by themselves. Under software triggers the watchdog runs only after `trigger`.
     buffer_frames
         Frames that may wait for the consumer; when it is too slow, the oldest is thrown away and counted.
     sequence
@@ -53,6 +65,8 @@ class CameraReader:
         Deliver incomplete frames too, with their status, so that pairing can count their triggers.
     on_fault
         Called once, from the reader's thread, when the camera is lost.
+    on_clock
+        Called with the camera's description when the clock was looked at again, from a thread of its own.
     """
 
     def __init__(
@@ -67,6 +81,7 @@ class CameraReader:
         compare_pixels: bool = False,
         pass_incomplete: bool = False,
         on_fault: Callable[[CameraError], None] | None = None,
+        on_clock: Callable[[CameraDescription], None] | None = None,
     ) -> None:
         self._grabber = grabber
         self._name = name
@@ -77,6 +92,8 @@ class CameraReader:
         self._compare_pixels = compare_pixels
         self._pass_incomplete = pass_incomplete
         self._on_fault = on_fault
+        self._on_clock = on_clock
+        self._stopped = threading.Event()
         self._clock = DeviceClock()
         self._buffer: deque[Frame] = deque()
         self._room = buffer_frames
@@ -95,6 +112,20 @@ class CameraReader:
         with self._changed:
             return self._counters
 
+    def device_ns(self, host_ns: int) -> int | None:
+        """Return the camera's time at a time of the host's monotonic clock; None if it cannot be asked for it."""
+        return self._clock.device_ns(host_ns)
+
+    @property
+    def notes(self) -> dict[str, str]:
+        """Return the device's duties that this reader takes over, by name."""
+        notes = {}
+        if self._sequence.counts:
+            notes["frame_counter"] = "counted here: the device's number stays the same, so lost frames leave no gap"
+        if self._last is not None and self._last.device_ns == self._last.host_ns:
+            notes["timestamp"] = "of the arrival: the device gives none"
+        return notes
+
     @property
     def fault(self) -> CameraError | None:
         """Error by which the camera was lost, or None."""
@@ -107,12 +138,33 @@ class CameraReader:
         self._last_sign_s = time.monotonic()
         self._thread = threading.Thread(target=self._run, name=f"reader {self._name}", daemon=True)
         self._thread.start()
+        if isinstance(self._grabber, LatchingGrabber):
+            # not waited for at the end: it may be asking a camera that is gone
+            watch = (self._grabber,)
+            threading.Thread(target=self._watch_clock, args=watch, name=f"clock {self._name}", daemon=True).start()
+
+    def _watch_clock(self, grabber: LatchingGrabber) -> None:
+        kept, asked, pause_s = _FIRST_LATCHES, _FIRST_LATCHES, 0.0
+        while not self._stopped.wait(pause_s):
+            try:
+                found, longest_s = _latches(grabber, asked)
+                description = grabber.renew_clock()
+            except CameraError:
+                return  # the reader raises the reason
+            for latch in sorted(sorted(found, key=lambda one: one.after_ns - one.before_ns)[:kept]):
+                self._clock.tie(latch)
+            if self._on_clock is not None and not self._stopped.is_set():
+                self._on_clock(description)
+            # one that has no latch is not asked for it again; one that answers late has other questions to answer too
+            kept, asked = 1, _LATCHES if found else 0
+            pause_s = max(_LATCH_PAUSE_S, _LATCH_SHARE * longest_s)
 
     def stop(self) -> None:
         """End the thread and disarm the grabber; frames that wait can still be taken."""
         with self._changed:
             self._ending = True
             self._changed.notify_all()
+        self._stopped.set()
         if self._thread is not None:
             self._thread.join()
             self._thread = None
@@ -152,11 +204,15 @@ class CameraReader:
     def _run(self) -> None:
         try:
             while not self._ending:
+                begun_s = time.monotonic()
                 frame = self._grabber.next_frame(_SLICE_S)
                 if frame is not None:
                     self._last_sign_s = time.monotonic()
                     self._sort(frame)
-                elif self._overdue():
+                    continue
+                # a busy host held this thread up, and perhaps the driver's threads too: no silence of the camera
+                self._last_sign_s += max(0.0, time.monotonic() - begun_s - 2.0 * _SLICE_S)
+                if self._overdue():
                     raise CameraError(
                         f"{self._name} has been silent for {self._patience_s:.2f} s: three frame periods, or 0.4 s.",
                         code="camera_lost",
@@ -176,6 +232,7 @@ class CameraReader:
             return expecting and time.monotonic() - self._last_sign_s > self._patience_s
 
     def _lose(self, error: CameraError) -> None:
+        self._stopped.set()
         with self._changed:
             self._fault = error
             self._changed.notify_all()
@@ -183,8 +240,10 @@ class CameraReader:
             self._on_fault(error)
 
     def _sort(self, frame: Frame) -> None:
-        reading = self._sequence.read(frame.sequence)
+        if frame.device_ns == 0:  # from a device that does not stamp
+            frame = replace(frame, device_ns=frame.host_ns)
         last, count = self._last, self._counters
+        reading = self._sequence.read(frame.sequence, fresh=last is not None and frame.device_ns != last.device_ns)
         delivered: Frame | None = None
         spoiled: Frame | None = None
         stale = last is not None and reading.arrival is Arrival.NEXT and self._is_stale(frame, last)
@@ -200,11 +259,10 @@ class CameraReader:
             elif frame.status is not FrameStatus.OK:
                 count = replace(count, incomplete=count.incomplete + 1)
                 if self._pass_incomplete:
-                    spoiled = replace(frame, sequence=reading.number)
+                    spoiled = self._timed(frame, reading.number)
             else:
                 count = replace(count, delivered=count.delivered + 1)
-                exposed_ns = self._clock.on_host(frame.device_ns, frame.host_ns)
-                delivered = replace(frame, sequence=reading.number, exposed_ns=exposed_ns)
+                delivered = self._timed(frame, reading.number)
                 self._last = frame
         with self._changed:
             if reading.arrival is Arrival.NEXT:
@@ -218,7 +276,37 @@ class CameraReader:
             self._counters = count
             self._changed.notify_all()
 
+    def _timed(self, frame: Frame, number: int) -> Frame:
+        """Return the frame with its number and the times that its clock gives; a damaged one may have a wrong stamp."""
+        stamped = frame.device_ns != frame.host_ns
+        latched = self._clock.latched(frame.device_ns, frame.host_ns) if stamped else None
+        begun_ns, error_ns = latched or (None, 0)
+        exposed_ns = None
+        if frame.status is FrameStatus.OK:
+            exposed_ns = self._clock.on_host(frame.device_ns, frame.host_ns)
+        return replace(
+            frame,
+            sequence=number,
+            exposed_ns=exposed_ns,
+            latched_ns=begun_ns,
+            latched_error_ns=error_ns,
+            stamped=stamped,
+        )
+
     def _is_stale(self, frame: Frame, last: Frame) -> bool:
         if frame.device_ns == last.device_ns:
             return True
         return self._compare_pixels and np.array_equal(frame.pixels, last.pixels)
+
+
+def _latches(grabber: LatchingGrabber, most: int) -> tuple[list[Latch], float]:
+    """Return some readings of a camera's clock, fewer of a camera that answers late, and the longest time of one."""
+    found: list[Latch] = []
+    longest_s = 0.0
+    while most > 0 and longest_s < _LATE_LATCH_S:
+        begun_s = time.monotonic()
+        latch = grabber.latch()
+        longest_s = max(longest_s, time.monotonic() - begun_s)
+        most = 0 if latch is None else most - 1
+        found += [] if latch is None else [latch]
+    return found, longest_s

@@ -2,21 +2,38 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
-from collections.abc import Callable
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from typing import Any
 
-from core.errors import CameraError
-from core.names import CameraName
-from drivers.acquisition.frame_counter import SequenceReader
-from drivers.acquisition.reader import CameraReader
-from drivers.cameras.protocol import CameraDescription, CameraSettings, Frame, FrameCounters, FrameGrabber, TriggerMode
+from stereorig.core.errors import CameraError
+from stereorig.core.names import CameraName
+from stereorig.drivers.acquisition.frame_counter import SequenceReader
+from stereorig.drivers.acquisition.reader import CameraReader
+from stereorig.drivers.cameras.genicam.describe import GIGE
+from stereorig.drivers.cameras.genicam.link import LOAD, SHARES, interface_of, speed_of
+from stereorig.drivers.cameras.genicam.synonyms import THROUGHPUT_MODE
+from stereorig.drivers.cameras.protocol import (
+    CameraDescription,
+    CameraSettings,
+    Frame,
+    FrameCounters,
+    FrameGrabber,
+    LatchingGrabber,
+    TriggerMode,
+)
 
 # From a trigger to its frame, beyond the exposure: a generous read-out, and the slowest usual line
 _READ_OUT_S = 0.2
 _BYTES_PER_S = 50e6
-# A device may round what it is given by its own steps
+# A busy host may not look at a fast camera's frames for so long
+_FAST_HZ = 100.0
+_BUFFER_S = 1.0
+# A device may round a value to its own steps
 _RELATIVE = 1e-3
 
 
@@ -66,7 +83,15 @@ class CameraUnit:
         self._fault: CameraError | None = None
         self._earlier = FrameCounters()
         self._guard = threading.Lock()
+        self._description: CameraDescription | None = None
+        self._settings: CameraSettings | None = None
+        self._found = False
+        self._share: tuple[float, float] | None = None
+        #: beginning of its connection, its loss or the search for it, seconds of Unix time
+        self.since_s = time.time()
         self.reconnections = 0
+        #: the camera's answers to commands of its own kind, for its statistics
+        self.commands: Counter[str] = Counter()
 
     def open(self, settings: CameraSettings) -> None:
         """Connect, check its identity, push settings, arm.
@@ -75,29 +100,39 @@ class CameraUnit:
         ------
         CameraError
             ``wrong_camera`` when another serial number answers, ``image_size_mismatch`` when its images have another
-            size than the rig file says, or an error of the device.
+            size than in the rig file, or an error of the device.
         """
-        wanted = replace(settings, trigger=self.trigger)
-        if self.trigger == "free" and self.rate_hz is not None:
-            wanted = replace(wanted, frame_rate_hz=self.rate_hz)
-        self._connect(wanted)
+        self.look_for(settings)
+        self._connect()
         self._start()
 
-    def _connect(self, wanted: CameraSettings) -> None:
+    def look_for(self, settings: CameraSettings) -> None:
+        """Take the settings with which `reconnect` opens it; until then it has a fault."""
+        self._wanted = replace(settings, trigger=self.trigger)
+        if self.trigger == "free" and self.rate_hz is not None:
+            self._wanted = replace(self._wanted, frame_rate_hz=self.rate_hz)
+        self._fault = CameraError(
+            f"{self.name} was not found yet: its driver is opening it.",
+            code="camera_lost",
+            remedy="Wait; check its cable and power if it does not come.",
+            camera=self.name,
+        )
+
+    def _connect(self) -> None:
         self.grabber: FrameGrabber = self._make()
         self.grabber.open()
-        self.description: CameraDescription = self.grabber.describe()
-        if self._serial is not None and self.description.serial != self._serial:
+        found = self._description = self.grabber.describe()
+        if self._serial is not None and found.serial != self._serial:
             raise CameraError(
-                f"{self.name} is the camera {self.description.serial}, the rig expects {self._serial}.",
+                f"{self.name} is the camera {found.serial}, the rig expects {self._serial}.",
                 code="wrong_camera",
                 remedy="Check the cables, or correct device and serial in the rig file.",
                 camera=self.name,
             )
-        self._serial = self.description.serial
-        self._wanted = wanted
-        self._take(wanted)
+        self._take(self._wanted)
+        self._take_share()
         self._check_size()
+        self._serial = found.serial
 
     def _check_size(self) -> None:
         region = self.settings.region_px
@@ -112,8 +147,61 @@ class CameraUnit:
             )
 
     def _take(self, settings: CameraSettings) -> None:
-        self.settings: CameraSettings = self.grabber.configure(settings)
-        self.description = self.grabber.describe()
+        self._settings = self.grabber.configure(settings)
+        self._description = self.grabber.describe()
+
+    def hold_back(self, bytes_per_s: float, link_bytes_per_s: float) -> None:
+        """Give a connected camera a share of its link, now and after each return; its error becomes its fault."""
+        if self._share == (bytes_per_s, link_bytes_per_s):
+            return
+        self._share = bytes_per_s, link_bytes_per_s
+        self._stop()
+        try:
+            self._take_share()
+            self._start()
+        except CameraError as error:
+            self.release()
+            self._fault = error
+
+    def _take_share(self) -> None:
+        given = self._wanted.features or {}
+        if (
+            self._share is None
+            or not isinstance(self.grabber, LatchingGrabber)
+            or {*SHARES, THROUGHPUT_MODE} & set(given)
+        ):
+            return
+        try:
+            self.grabber.hold_back(*self._share)
+        except CameraError as error:
+            # the description shows the share that it has
+            if error.code == "camera_lost":
+                raise
+        self._take(CameraSettings())  # its rate may be another now
+        rate_hz = self.settings.frame_rate_hz
+        if rate_hz is not None and rate_hz < (self._wanted.frame_rate_hz or 0.0):
+            self._wanted = replace(self._wanted, frame_rate_hz=rate_hz)  # it takes no more when it comes back
+
+    @property
+    def description(self) -> CameraDescription:
+        """Identity and abilities of the camera, with its reader's notes; raises the fault if it was not found."""
+        reader, known = self._reader, self._description
+        if known is None:
+            raise self._missing()
+        notes = {} if reader is None else reader.notes
+        return replace(known, extra={**known.extra, **notes}) if notes else known
+
+    @property
+    def settings(self) -> CameraSettings:
+        """Settings as read back; raises as `description`."""
+        if self._settings is None:
+            raise self._missing()
+        return self._settings
+
+    @property
+    def was_found(self) -> bool:
+        """True if it was connected at any time."""
+        return self._found
 
     def reconnect(self) -> None:
         """Connect a lost camera again and give it the settings it had; `resume` then puts it to work.
@@ -121,13 +209,14 @@ class CameraUnit:
         Raises
         ------
         CameraError
-            ``settings_not_restored`` when it does not take what it had before, or an error of the device.
+            ``settings_not_restored`` when it does not take its earlier settings, ``driver_failed`` with the error of a
+            driver that raises another one, or an error of the device.
         """
-        had = self.settings
-        self.release()
+        had, known = self._settings, self._description
         try:
-            self._connect(self._wanted)
-            lost = _differences(had, self.settings)
+            self.release()
+            self._connect()
+            lost = [] if had is None else _differences(had, self.settings)
             if lost:
                 raise CameraError(
                     f"{self.name} came back and did not take its settings again: {'; '.join(lost)}.",
@@ -135,21 +224,30 @@ class CameraUnit:
                     remedy="Check the camera, then PATCH its settings.",
                     camera=self.name,
                 )
-        except CameraError as error:
-            self.settings = had
-            self.release()
-            self._fault = error
-            raise
+        except Exception as error:  # noqa: BLE001 - a driver may bring up anything, which must be shown
+            self._settings, self._description = had, known
+            with contextlib.suppress(Exception):
+                self.release()
+            fault = self._fault = error if isinstance(error, CameraError) else self._failed(error)
+            raise fault from (None if fault is error else error)
+
+    def _failed(self, error: Exception) -> CameraError:
+        return CameraError(
+            f"The driver of {self.name} has failed: {type(error).__name__}: {error}",
+            code="driver_failed",
+            remedy="Install what the message names; report it with the message if the camera works elsewhere.",
+            camera=self.name,
+        )
 
     def resume(self) -> None:
         """Arm a camera that was connected again; only then its fault is over."""
-        self.reconnections += 1
+        self.reconnections += self._found
         self._start()
 
     @property
     def period_s(self) -> float:
         """Longest time from a trigger to its frame, or the frame period."""
-        if self.trigger != "software" and self.rate_hz is not None:
+        if self.trigger in ("free", "hardware") and self.rate_hz is not None:
             return 1.0 / self.rate_hz
         columns, rows = self.description.image_size_px
         return (self.settings.exposure_ms or 0.0) / 1000.0 + max(_READ_OUT_S, 2 * columns * rows / _BYTES_PER_S)
@@ -161,21 +259,36 @@ class CameraUnit:
 
     def _start(self) -> None:
         first, last = self.description.counter_range
+        rate_hz = self.rate_hz or 0.0
         reader = CameraReader(
             self.grabber,
             name=self.name,
             period_s=self.period_s,
             expects_frames=self.trigger == "free" or (self.trigger == "hardware" and self.rate_hz is not None),
+            buffer_frames=round(_BUFFER_S * rate_hz) if rate_hz > _FAST_HZ else 8,
             sequence=SequenceReader(first, last),
             pass_incomplete=True,
             on_fault=self._lose,
+            on_clock=self._describe_clock,
         )
-        self._fault = None
+        self._fault, self._found, self.since_s = None, True, time.time()
         self._reader = reader
         reader.start()
 
+    def _describe_clock(self, description: CameraDescription) -> None:
+        # only this: the rest may be older than settings made since then
+        known = self._description
+        if known is None:
+            return
+        self._description = replace(
+            known,
+            clock=description.clock,
+            clock_error_ms=description.clock_error_ms,
+            extra={**known.extra, **{k: v for k, v in description.extra.items() if k.startswith("ptp")}},
+        )
+
     def _lose(self, error: CameraError) -> None:
-        self._fault = error
+        self._fault, self.since_s = error, time.time()
         self.latest = None
         if self._on_lost is not None:
             self._on_lost(self.name, error)
@@ -190,17 +303,20 @@ class CameraUnit:
 
     @property
     def reader(self) -> CameraReader:
-        """Return the running reader; raise the reason where there is none."""
-        reader, fault = self._reader, self._fault
-        if reader is None or fault is not None:
-            cause = f"{self.name} is not armed." if fault is None else fault.cause
-            raise CameraError(
-                cause,
-                code="camera_lost" if fault is None else fault.code,
-                remedy="Check its cable and power; it is connected again by itself, or POST /rig/reconnect.",
-                camera=self.name,
-            )
+        """Return the running reader; raise the reason if there is none."""
+        reader = self._reader
+        if reader is None or self._fault is not None:
+            raise self._missing()
         return reader
+
+    def _missing(self) -> CameraError:
+        fault = self._fault
+        return CameraError(
+            f"{self.name} is not armed." if fault is None else fault.cause,
+            code="camera_lost" if fault is None else fault.code,
+            remedy="Check its cable and power; it is connected again by itself, or POST /rig:reconnect.",
+            camera=self.name,
+        )
 
     @property
     def wanted(self) -> CameraSettings:
@@ -237,7 +353,7 @@ class CameraUnit:
 
     def statistics(self) -> dict[str, int | float]:
         """The driver's own counts."""
-        return {} if self._reader is None else self.grabber.statistics()
+        return {} if self._reader is None else {**self.grabber.statistics(), **self.commands}
 
     def release(self) -> None:
         """End the reader, let the camera go; safe to call twice."""
@@ -247,6 +363,19 @@ class CameraUnit:
             grabber.close()
 
     close = release
+
+
+def share_links(units: Iterable[CameraUnit]) -> None:
+    """Share the speed of each interface evenly out over the connected GigE Vision cameras that send to it."""
+    on: dict[str | None, list[CameraUnit]] = {}
+    for unit in units:
+        if unit.fault is None and unit.was_found and unit.description.extra.get("protocol") == GIGE:
+            on.setdefault(interface_of(unit.description.extra["address"]), []).append(unit)
+    for name, sharing in on.items():
+        speed = None if name is None else speed_of(name)
+        if speed is not None and len(sharing) > 1:
+            for unit in sharing:
+                unit.hold_back(LOAD * speed / len(sharing), speed)
 
 
 def _differences(had: CameraSettings, has: CameraSettings) -> list[str]:

@@ -1,6 +1,6 @@
 """Gray values, right-aligned in uint8 or uint16, from the bytes that a GenICam camera sends.
 
-Names and codes are those of the Pixel Format Naming Convention (PFNC). Layouts, with ``P`` a pixel and the highest bit
+Names and codes follow the Pixel Format Naming Convention (PFNC). Layouts, with ``P`` a pixel and the highest bit
 written first:
 
 ========================  ==============================================================================================
@@ -15,8 +15,8 @@ written first:
 ========================  ==============================================================================================
 
 Packed pixels run on from the end of one line into the next, also within a byte, unless lines are padded: then each line
-begins at a byte of its own. It shows in the camera's line padding, or in as many bytes as whole lines need; where both
-ways come to the same number of bytes, they run on.
+begins at a byte of its own. It shows in the camera's line padding, or in as many bytes as whole lines need; if both
+ways give the same number of bytes, they run on.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import CameraError
-from drivers.cameras.protocol import Pixels
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.protocol import Pixels
 
 # Groups that are unpacked at a time: few enough to stay in the processor's cache, which makes it three times as fast
 _BLOCK = 2**16
@@ -62,6 +62,11 @@ class PixelFormat:
     def size_bytes(self, pixels: int) -> int:
         """Return the bytes that so many pixels in one run take."""
         return -(-pixels * self.bits // 8)
+
+    def blank(self, width: int, height: int) -> Pixels:
+        """Return an image without any light, for a frame that is not whole."""
+        size = height, width
+        return np.zeros(size, np.uint8) if self.bit_depth <= 8 else np.zeros(size, np.uint16)
 
 
 #: From plain to packed: where several carry as many bits, the first costs the least to read.

@@ -9,16 +9,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
-from typing import Annotated, Literal, Protocol, runtime_checkable
+from typing import Annotated, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from core.errors import CameraError
+from stereorig.core.errors import CameraError
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
-TriggerMode = Literal["free", "software", "hardware"]
+TriggerMode = Literal["free", "software", "hardware", "action"]
 FeatureValue = bool | int | float | str
 #: lowest and highest value, as the device reports them
 Range = tuple[float, float]
@@ -42,7 +42,7 @@ class Frame:
     bit_depth
         Significant bits per pixel, so that saturation is ``2**bit_depth - 1``.
     sequence
-        The device's own frame number; wraps where the device's counter does.
+        The device's own frame number; it wraps as the device's counter does.
     device_ns
         Start of the exposure by the device's clock, in ns; its zero is the device's own.
     host_ns
@@ -50,9 +50,15 @@ class Frame:
     status
         Anything but ``OK`` is counted and discarded by the reader.
     trigger
-        Number of the trigger that made this frame, where the device or driver knows it; pairs are made by it.
+        Number of the trigger that made this frame, if the device or driver knows it; pairs are made by it.
     exposed_ns
-        Start of the exposure converted to the host's monotonic clock (`drivers.acquisition.clocks`), set by the reader.
+        Start of the exposure converted to the host's monotonic clock by the frames' arrival, plus the camera's shortest
+        delay (`stereorig.drivers.acquisition.clocks`), set by the reader.
+    latched_ns, latched_error_ns
+        Start of the exposure on the host's monotonic clock by latches of the camera's clock, and the largest error of
+        that conversion; set by the reader if the camera has a latch.
+    stamped
+        False if the device gave no time, and ``device_ns`` is the arrival's; set by the reader.
     """
 
     pixels: Pixels
@@ -63,6 +69,15 @@ class Frame:
     status: FrameStatus = FrameStatus.OK
     trigger: int | None = None
     exposed_ns: int | None = None
+    latched_ns: int | None = None
+    latched_error_ns: int = 0
+    stamped: bool = True
+
+    @property
+    def begun_ns(self) -> int:
+        """Start of the exposure on the host's monotonic clock, as well as it is known."""
+        known = (self.latched_ns, self.exposed_ns, self.host_ns)
+        return next(at for at in known if at is not None)
 
     def __post_init__(self) -> None:
         if self.pixels.ndim != 2 or self.pixels.dtype not in (np.uint8, np.uint16):
@@ -84,9 +99,9 @@ class Frame:
 class CameraSettings:
     """Settings as requested; ``None`` leaves the device's own. `FrameGrabber.configure` returns them as read back.
 
-    Read back, they are the device's own, which may round them; ``None`` where it has no such setting. Of ``bit_depth``
-    the driver takes the plainest pixel format that carries it; ``pixel_format`` names one: ``Mono12Packed`` (GenICam),
-    ``Y12 `` (V4L2). ``features`` are GenICam features or V4L2 controls, set in this order.
+    Read back, they are the device's own, which may round them; ``None`` for a setting that it does not have. For
+    ``bit_depth`` the driver takes the plainest pixel format that carries it; ``pixel_format`` names one:
+    ``Mono12Packed`` (GenICam), ``Y12 `` (V4L2). ``features`` are GenICam features or V4L2 controls, set in this order.
     """
 
     exposure_ms: Annotated[float | None, Field(description="Exposure time.")] = None
@@ -118,9 +133,11 @@ class CameraOptions:
     packet_size_bytes
         GigE Vision packets; ``None`` asks the network for the largest that passes.
     ptp
-        Switch the camera's IEEE 1588 clock on; opening fails with ``ptp_unsupported`` where it has none.
+        Switch the camera's IEEE 1588 clock on; opening fails with ``ptp_unsupported`` if it has none.
     trigger_source, trigger_edge
         Line of the hardware trigger.
+    action_keys
+        Device key, group key and group mask of the action commands that trigger it (GigE Vision).
     trigger_features
         Trigger mode -> features that bring the device there, for devices that have no standard way (V4L2).
     """
@@ -131,6 +148,7 @@ class CameraOptions:
     ptp: bool = False
     trigger_source: str = "Line1"
     trigger_edge: Literal["rising", "falling"] = "rising"
+    action_keys: tuple[int, int, int] | None = None
     trigger_features: Mapping[TriggerMode, Mapping[str, FeatureValue]] = field(default_factory=dict)
 
 
@@ -167,11 +185,12 @@ class CameraIdentity:
 
 @dataclass(frozen=True)
 class CameraDescription(CameraIdentity):
-    """Identity and abilities of a camera; a range is ``None`` where the device has no such setting.
+    """Identity and abilities of a camera; a range is ``None`` if the device has no such setting.
 
     ``latency_s`` is for the watchdog: zero but for cameras that render. ``clock`` names the clock of
-    ``Frame.device_ns`` (``sim``, ``monotonic``, ``ptp:<grandmaster>``); empty for a clock of the camera's own.
-    ``counter_range`` is that of ``Frame.sequence``.
+    ``Frame.device_ns`` (``sim``, ``monotonic``, ``ptp:<grandmaster>``); empty for a clock of the camera's own;
+    ``clock_error_ms`` is the largest error of a time by a clock that has a name. ``counter_range`` is the range of
+    ``Frame.sequence``.
     """
 
     image_size_px: Annotated[tuple[int, int], Field(description="Width and height of its images.")]
@@ -186,6 +205,7 @@ class CameraDescription(CameraIdentity):
     clock: Annotated[
         str, Field(description="Clock of its times; two cameras' may be compared where both name the same one.")
     ] = ""
+    clock_error_ms: Annotated[float, Field(description="Largest error of a time by that clock.")] = 0.0
     counter_range: Annotated[
         tuple[int, int], Field(description="First and last frame number before it begins again.")
     ] = (0, 2**16 - 1)
@@ -194,6 +214,9 @@ class CameraDescription(CameraIdentity):
     extra: Annotated[Mapping[str, str], Field(description="What else the driver knows, as text.")] = field(
         default_factory=dict
     )
+    temperature_c: Annotated[
+        float | None, Field(description="Its temperature, degrees Celsius, at most seconds old; null if not known.")
+    ] = None
 
 
 @dataclass(frozen=True)
@@ -228,7 +251,7 @@ class FrameGrabber(Protocol):
         """Return the camera's identity and abilities; ranges may depend on its settings."""
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
-        """Set what is not ``None`` and return every setting as read back from the device.
+        """Set the values that are not ``None`` and return every setting as read back from the device.
 
         A value outside the device's range is refused with code ``out_of_range`` before anything is changed; a setting
         or feature that the device does not have with ``unknown_feature``; one that cannot be changed while armed with
@@ -242,7 +265,7 @@ class FrameGrabber(Protocol):
         """Stop delivering; a wait in `next_frame` ends with a timeout."""
 
     def trigger(self) -> int | None:
-        """Fire one software trigger; return its number where the driver counts them. Code ``wrong_trigger`` else."""
+        """Fire one software trigger; return its number if the driver counts them. Code ``wrong_trigger`` else."""
 
     def next_frame(self, timeout_s: float) -> Frame | None:
         """Wait for the next frame, complete or not; ``None`` when none came in time.
@@ -255,3 +278,25 @@ class FrameGrabber(Protocol):
 
     def close(self) -> None:
         """Release the device; safe to call twice."""
+
+
+class Latch(NamedTuple):
+    """A camera's time, and two times of the host's monotonic clock between which the camera latched it, in ns."""
+
+    before_ns: int
+    device_ns: int
+    after_ns: int
+
+
+@runtime_checkable
+class LatchingGrabber(Protocol):
+    """A `FrameGrabber` whose camera can be asked for its time, by any thread while it is armed, and be held back."""
+
+    def latch(self) -> Latch | None:
+        """Return the camera's time now; ``None`` if it has no latch. Raises `CameraError`."""
+
+    def renew_clock(self) -> CameraDescription:
+        """Look again at clock and temperature, and return the description. Raises `CameraError`."""
+
+    def hold_back(self, bytes_per_s: float, link_bytes_per_s: float) -> None:
+        """Let the camera, disarmed, send at most so much of its link's speed, if it can. Raises `CameraError`."""

@@ -1,7 +1,7 @@
-"""A channel read as lines of text, over TCP or from a serial port: a number in each line, stamped when it arrives.
+"""A channel read as lines of text from `stereorig.drivers.channels.ports`: a number in each line, stamped on arrival.
 
-A line that cannot be reached or that ended is opened again, again and again; a line that falls silent is said to be
-silent. Nothing is asked of the device unless a query is given.
+A line that cannot be reached or that ended is opened again and again; the state of a line without new values is
+``silent``. The device is only asked if a query is given.
 """
 
 from __future__ import annotations
@@ -10,81 +10,95 @@ import contextlib
 import logging
 import math
 import re
-import socket
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 from urllib.parse import urlsplit
 
-import serial
-
-from core.errors import InputError
+from stereorig.core.errors import InputError
+from stereorig.drivers.channels.numbers import Decimal, Notation
+from stereorig.drivers.channels.ports import OPEN_S, Analog, Port, Program, Serial, Socket
 
 _log = logging.getLogger("stereorig.channels")
 
 State = Literal["unreachable", "silent", "reading"]
 
-_WAIT_S = 0.1  # longest wait for bytes, so that an end is noticed
 _AGAIN_S = (0.2, 0.5, 1.0, 2.0)  # pauses before the line is opened again
-_OPEN_S = 3.0
-_CHUNK = 4096
 _LONGEST_LINE = 1024
-_APART = re.compile(r"[,;\s]+")
+_DELAYS = 0.1  # weight of a new delay in their mean
 
 
 @dataclass(frozen=True, kw_only=True)
 class LineSource:
-    """Where a channel is read, and what of a line is its value.
+    """Source of a channel, and the part of a line that is its value.
 
     Attributes
     ----------
     name
         The channel.
     url
-        ``tcp://host:port``, or a serial port as pyserial takes it.
+        ``tcp://host:port``, or a serial port as pyserial takes it; empty with ``exec`` or ``daq``.
+    exec
+        A program and its arguments, whose lines are read.
+    daq
+        An analog input of National Instruments, ``Dev1/ai0``; its lines are volts.
     baudrate
-        Of a serial port.
+        Rate of a serial port.
     pattern
         Regular expression whose first group is the number; None: ``column`` counts.
     column
-        Which part of the line, from 1; parts are set apart by commas, semicolons or blanks.
+        Number of the line's part that counts, from 1; commas, semicolons or blanks separate parts.
+    decimal, thousands
+        See `stereorig.drivers.channels.numbers.Notation`.
+    scale, offset
+        The value is the number times ``scale``, plus ``offset``.
+    frame
+        Bits, parity and stop bits of a serial port: ``8N1``, ``7E1``.
+    line_end
+        Characters other than CR and LF that end a line, as ``$`` or a prompt ``:``.
     query
-        Text that is sent, with a line's end, each time a value is wanted; None: the device sends by itself.
+        Text that is sent, with ``query_end``, each time a value is wanted; None: the device sends by itself.
     rate_hz
-        How often ``query`` is sent.
+        How often ``query`` is sent, or ``daq`` read.
     silence_s
         A line without a value for this long is silent.
     """
 
     name: str
-    url: str
+    url: str | None = None
+    exec: tuple[str, ...] | None = None
+    daq: str | None = None
     baudrate: int = 9600
     pattern: str | None = None
     column: int = 1
+    decimal: Decimal | None = None
+    thousands: Literal[",", ".", " ", "'"] | None = None
+    scale: float = 1.0
+    offset: float = 0.0
+    frame: str = "8N1"
+    line_end: str = ""
     query: str | None = None
+    query_end: str = "\n"
     rate_hz: float = 10.0
     silence_s: float = 1.0
 
-    def value_of(self, line: str) -> float | None:
-        """Return the number in a line; None where there is none."""
+    def value_of(self, line: str) -> float | str:
+        """Return the value in a line; the reason if there is none."""
+        if self.daq is not None:
+            return float(line) * self.scale + self.offset
+        notation = Notation(decimal=self.decimal, thousands=self.thousands)
         if self.pattern is None:
-            parts = _APART.split(line.strip())
-            text = parts[self.column - 1] if self.column <= len(parts) else ""
+            number = notation.column(line, self.column)
         else:
-            found = re.search(self.pattern, line)
-            text = "" if found is None else found.group(1) or ""
-        try:
-            value = float(text)
-        except ValueError:
-            return None
-        return value if math.isfinite(value) else None
+            number = notation.group(line, re.compile(self.pattern))
+        return number if isinstance(number, str) else number * self.scale + self.offset
 
 
 @dataclass(frozen=True)
 class LineState:
-    """How a line stands: its state, lines that had a value and lines that had none, times it was lost, and why."""
+    """State of a line: the state, lines with a value and lines without one, times it was lost, and the reason."""
 
     state: State
     values: int
@@ -93,63 +107,19 @@ class LineState:
     reason: str
 
 
-class _Port(Protocol):
-    """An open line."""
-
-    def read(self) -> bytes:
-        """Return what came; empty after a short wait."""
-
-    def write(self, data: bytes) -> None:
-        """Send."""
-
-    def close(self) -> None:
-        """Close it."""
-
-
-class _Socket:
-    def __init__(self, host: str, port: int) -> None:
-        self._link = socket.create_connection((host, port), timeout=_OPEN_S)
-        self._link.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        self._link.settimeout(_WAIT_S)
-
-    def read(self) -> bytes:
-        try:
-            data = self._link.recv(_CHUNK)
-        except TimeoutError:
-            return b""
-        if not data:
-            raise OSError("the other side closed the connection")
-        return data
-
-    def write(self, data: bytes) -> None:
-        self._link.sendall(data)
-
-    def close(self) -> None:
-        self._link.close()
-
-
-class _Serial:
-    def __init__(self, url: str, baudrate: int) -> None:
-        self._port = serial.serial_for_url(url, baudrate=baudrate, timeout=_WAIT_S, write_timeout=_OPEN_S)
-
-    def read(self) -> bytes:
-        first: bytes = self._port.read(1)
-        return first + self._port.read(min(self._port.in_waiting, _CHUNK)) if first else first
-
-    def write(self, data: bytes) -> None:
-        self._port.write(data)
-
-    def close(self) -> None:
-        self._port.close()
-
-
-def _open(source: LineSource) -> _Port:
+def _open(source: LineSource) -> Port:
+    if source.exec is not None:
+        return Program(source.exec)
+    if source.daq is not None:
+        return Analog(source.daq, source.rate_hz)
+    if source.url is None:
+        raise InputError(f"The channel {source.name} names nothing to read.", code="option_out_of_range")
     if not source.url.startswith("tcp://"):
-        return _Serial(source.url, source.baudrate)
+        return Serial(source.url, source.baudrate, source.frame)
     parts = urlsplit(source.url)
     if parts.hostname is None or parts.port is None:
         raise InputError(f"{source.url} names no host and port.", code="option_out_of_range")
-    return _Socket(parts.hostname, parts.port)
+    return Socket(parts.hostname, parts.port)
 
 
 class ChannelLine:
@@ -158,10 +128,10 @@ class ChannelLine:
     Parameters
     ----------
     source
-        Where, and what.
+        Source of the channel, and the part of a line that counts.
     put
-        Called with the monotonic time of arrival, s, and the value; from that thread. Of values that arrived together
-        the last one counts: when the others came is not known.
+        Called with the monotonic time of arrival, s, and the value; from that thread. If several values arrived
+        together, only the last one counts: the others' times are not known.
     """
 
     def __init__(self, source: LineSource, put: Callable[[float, float], None]) -> None:
@@ -171,27 +141,36 @@ class ChannelLine:
         self._lock = threading.Lock()
         self._open = False
         self._values, self._unreadable, self._losses, self._reason = 0, 0, 0, "not opened yet"
+        self._why_unreadable = ""
         self._last_s = -math.inf
+        #: time from the measurement to the arrival, s, as far as line and queries show it; it may err by as much
+        self.delay_s = 0.0
 
     def start(self) -> None:
         """Begin to read."""
         self._thread.start()
 
-    def stop(self) -> None:
-        """End; returns when the line is closed."""
+    def end(self) -> None:
+        """Let it end."""
         self._ending.set()
+
+    def stop(self) -> None:
+        """End it; returns when the line is closed."""
+        self.end()
         if self._thread.ident is not None:
-            self._thread.join(timeout=_OPEN_S + 1.0)
+            self._thread.join(timeout=OPEN_S + 1.0)
 
     @property
     def state(self) -> LineState:
-        """How it stands now."""
+        """State of the line now."""
         with self._lock:
             silent = time.monotonic() - self._last_s > self.source.silence_s
             state: State = "unreachable" if not self._open else ("silent" if silent else "reading")
             reason = self._reason
             if state == "silent":
                 reason = f"no value for {self.source.silence_s:g} s"
+                if self._why_unreadable:
+                    reason += f"; the last line that could not be read: {self._why_unreadable}"
             return LineState(state, self._values, self._unreadable, self._losses, "" if state == "reading" else reason)
 
     def _run(self) -> None:
@@ -204,9 +183,8 @@ class ChannelLine:
                 self._ending.wait(_AGAIN_S[min(failures, len(_AGAIN_S) - 1)])
                 failures += 1
                 continue
-            failures = 0
             with self._lock:
-                self._open = True
+                self._open, before = True, self._values
             try:
                 self._read(port)
             except Exception as error:  # noqa: BLE001 - as above
@@ -216,36 +194,45 @@ class ChannelLine:
             finally:
                 with contextlib.suppress(Exception):
                     port.close()
-            self._ending.wait(_AGAIN_S[0])
+            failures = 0 if self._values > before else failures + 1
+            self._ending.wait(_AGAIN_S[min(failures, len(_AGAIN_S) - 1)])
 
     def _lost(self, error: Exception, *, first: bool) -> None:
         with self._lock:
             self._open, self._reason = False, str(error) or type(error).__name__
         if first:
-            _log.warning("channel %s at %s: %s", self.source.name, self.source.url, error)
+            where = self.source.url or self.source.daq or "its program"
+            _log.warning("channel %s at %s: %s", self.source.name, where, error)
 
-    def _read(self, port: _Port) -> None:
+    def _read(self, port: Port) -> None:
         held, asked_s = b"", -math.inf
+        ends = bytes.maketrans(f"\r{self.source.line_end}".encode(), b"\n" * (1 + len(self.source.line_end)))
         while not self._ending.is_set():
             now = time.monotonic()
             if self.source.query is not None and now - asked_s >= 1.0 / self.source.rate_hz:
-                port.write(self.source.query.encode() + b"\n")
+                port.write((self.source.query + self.source.query_end).encode())
                 asked_s = now
             data = port.read()
             arrived_s = time.monotonic()
-            *lines, held = (held + data).replace(b"\r", b"\n").split(b"\n")
+            way_s = None if self.source.query is None else min(arrived_s - asked_s, 1.0)
+            *lines, held = (held + data).translate(ends).split(b"\n")
             if len(held) > _LONGEST_LINE:  # noise, or no lines at all
                 lines, held = [*lines, held[:_LONGEST_LINE]], b""
-            self._take(lines, arrived_s)
+            self._take(lines, arrived_s, way_s, port.byte_s)
 
-    def _take(self, lines: list[bytes], arrived_s: float) -> None:
+    def _take(self, lines: list[bytes], arrived_s: float, way_s: float | None, byte_s: float) -> None:
         texts = [line.decode("ascii", "replace") for line in lines if line.strip(b"\0 \t")]
         values = [self.source.value_of(text) for text in texts]
-        known = [value for value in values if value is not None]
+        known = [value for value in values if not isinstance(value, str)]
         with self._lock:
             self._unreadable += len(values) - len(known)
+            self._why_unreadable = next((value for value in values if isinstance(value, str)), self._why_unreadable)
             self._values += len(known)
             if known:
                 self._last_s = arrived_s
+                # it was measured before its first byte was sent, and after it was asked for
+                delay_s = byte_s * (1 + max(map(len, lines))) if way_s is None else way_s / 2.0
+                weight = _DELAYS if self._values > len(known) else 1.0
+                self.delay_s += weight * (delay_s - self.delay_s)
         if known:
             self._put(arrived_s, known[-1])

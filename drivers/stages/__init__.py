@@ -1,1 +1,1 @@
-"""Motion stages: the protocol, serial lines, and one driver a controller family."""
+"""Motion stages: the protocol, serial lines, and the common parts of all drivers."""

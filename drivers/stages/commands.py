@@ -3,15 +3,44 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Protocol
 
-from drivers.stages.protocol import AxisStatus, ControllerMessage, StageIdentity
+from stereorig.drivers.stages.protocol import AxisStatus, ControllerMessage, StageIdentity
+
+
+class ControllerLine(Protocol):
+    """Connection to a controller for `SerialStage`; `stereorig.drivers.stages.serial_line.SerialLine` is one."""
+
+    url: str
+
+    @property
+    def is_open(self) -> bool:
+        """True if it is open; independent of the device at the other end."""
+
+    def open(self) -> None:
+        """Connect."""
+
+    def renew(self) -> None:
+        """Connect again if it is closed, broken or a network's."""
+
+    def close(self) -> None:
+        """End the connection; safe to call twice."""
+
+    def urgent(self, text: str) -> None:
+        """Write a stop at once, around every lock that a waiting query holds."""
+
+    def last_words(self, text: str) -> list[tuple[int, bytes]]:
+        """Return copies of descriptors, to be closed, and the bytes by which another process stops this line.
+
+        Empty for a line without a descriptor.
+        """
 
 
 class ControllerCommands(ABC):
     """Commands and replies of one family of controllers."""
 
     def _check_unit(self, axis: int) -> None:  # noqa: B027 - few controllers need it
-        """Check that units are those at opening, where a controller can change them."""
+        """Check that units are still those at opening, for a controller that can change them."""
 
     def _check_settable(self, axis: int) -> None:  # noqa: B027
         """Raise an error for new velocities in a state in which the controller takes none."""
@@ -20,7 +49,7 @@ class ControllerCommands(ABC):
         """Mark an axis as not homed."""
 
     def _greatest(self, axis: int) -> tuple[float | None, float | None]:  # noqa: ARG002
-        """Return the greatest velocity and acceleration that the controller allows, where it reports them."""
+        """Return the greatest velocity and acceleration that the controller allows, if it reports them."""
         return None, None
 
     @abstractmethod
@@ -33,7 +62,7 @@ class ControllerCommands(ABC):
 
     @abstractmethod
     def _set_dynamics(self, axis: int) -> tuple[float, float]:
-        """Set velocity and acceleration where the options give them; return both as read back."""
+        """Set velocity and acceleration if the options give them; return both as read back."""
 
     @abstractmethod
     def _read_position_mm(self, axis: int) -> float:
@@ -63,13 +92,17 @@ class ControllerCommands(ABC):
     def _stop_text(self, axis: int | None) -> str:
         """Return the stop command for one axis or all."""
 
+    def _last_text(self) -> str:
+        """Return the stop of all axes for a process that outlives this one."""
+        return self._stop_text(None)
+
     @abstractmethod
     def _abort_text(self) -> str:
         """Return the command for an emergency stop of all axes."""
 
     @abstractmethod
     def _drain_errors(self, axis: int | None = None) -> list[ControllerMessage]:
-        """Read and clear the controller's errors (of one axis where it keeps them apart)."""
+        """Read and clear the controller's errors (of one axis if it keeps them separately)."""
 
     @abstractmethod
     def _code_of(self, message: ControllerMessage) -> str | None:

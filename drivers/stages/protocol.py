@@ -54,6 +54,10 @@ class AxisOptions:
     home_mode
         ESP301: mode of the home search (parameter of OR); ``None`` for the driver's usual one. The SMC100 family keeps
         its home search type (HT) in its configuration.
+    positioner
+        XPS: name of the axis, as ``Group1.Pos``; Zaber: device and axis, as ``1.1``.
+    mm_per_step
+        Standa: travel of a full motor step; Zaber: of a microstep; Kinesis: of a count.
     """
 
     soft_limits_mm: tuple[float, float] | None = None
@@ -65,6 +69,8 @@ class AxisOptions:
     tolerance_mm: float = 0.002
     assume_homed: bool = False
     home_mode: int | None = None
+    positioner: str | None = None
+    mm_per_step: float | None = None
 
 
 @dataclass(frozen=True)
@@ -115,7 +121,7 @@ class AxisDynamics:
 
 @dataclass(frozen=True)
 class AxisStatus:
-    """State of one axis, all read from the controller in one go except ``homed`` where it does not report it."""
+    """State of one axis, all read from the controller in one query except ``homed`` if it does not report it."""
 
     axis: Annotated[int, Field(description="Axis number.")]
     state: Annotated[AxisState, Field(description="What it is doing or lacks.", examples=["ready"])]
@@ -151,13 +157,13 @@ class MoveResult:
 class Stage(Protocol):
     """A stage with numbered axes. Every call may come from any thread; motion calls are serialised, `stop` never waits.
 
-    Errors are `core.errors.StageError` with one of these codes: ``out_of_limits`` (also NaN and infinite targets: no
-    byte went out), ``not_homed``, ``motor_off``, ``motion_fault`` (limit switch, stall, following error, position not
-    reached: the axis was stopped), ``stage_stopped`` (`stop` was called during or before the motion), ``stage_lost``
-    (silence or garbage: the position is unknown), ``stage_refused`` (the controller's own error), ``out_of_range`` (a
-    velocity or acceleration that the controller cannot do), ``configuration_state`` (an SMC100 that a program left in
-    its configuration state), ``unit_not_length``, ``units_changed`` (an ESP301's axis that counts in another unit than
-    when it was opened), ``invalid_axis``.
+    Errors are `stereorig.core.errors.StageError` with one of these codes: ``out_of_limits`` (also NaN and infinite
+    targets: no byte went out), ``not_homed``, ``motor_off``, ``motion_fault`` (limit switch, stall, following error,
+    position not reached: the axis was stopped), ``stage_stopped`` (`stop` was called during or before the motion),
+    ``stage_lost`` (silence or garbage: the position is unknown), ``stage_refused`` (the controller's own error),
+    ``out_of_range`` (a velocity or acceleration that the controller cannot do), ``configuration_state`` (an SMC100 that
+    a program left in its configuration state), ``unit_not_length``, ``units_changed`` (an ESP301's axis that counts in
+    another unit than when it was opened), ``invalid_axis``.
     """
 
     @property
@@ -182,8 +188,11 @@ class Stage(Protocol):
     def disable(self, axis: int) -> None:
         """Switch the motor off."""
 
-    def home(self, axis: int, *, timeout_s: float = 120.0) -> float:
-        """Search home, wait until it is found, and return the position read back in mm."""
+    def home(self, axis: int, *, timeout_s: float | None = None, since: int | None = None) -> float:
+        """Search home, wait until it is found, and return the position read back in mm; ``since`` as in `move_many`.
+
+        ``timeout_s`` is by default twice the time of the whole travel at the axis' velocity, and at least 120 s.
+        """
 
     def move_to(self, axis: int, position_mm: float) -> MoveResult:
         """Move, arrive from the configured side, settle, and return the position read back."""
@@ -191,13 +200,19 @@ class Stage(Protocol):
     def move_by(self, axis: int, distance_mm: float) -> MoveResult:
         """As `move_to`, from the position that is read back at the start."""
 
-    def move_many(self, targets_mm: Mapping[int, float]) -> dict[int, MoveResult]:
-        """Move several axes at the same time; all targets are checked before any axis starts."""
+    def move_many(self, targets_mm: Mapping[int, float], *, since: int | None = None) -> dict[int, MoveResult]:
+        """Move several axes at the same time; all targets are checked before any axis starts.
 
-    def stop(self, axis: int | None = None) -> None:
-        """Stop one axis or all, at once: never waits for a lock, never queued; motions waiting their turn are void."""
+        ``since`` is the number of the last stop that the caller knows of: after a later one nothing moves.
+        """
 
-    def abort(self) -> None:
+    def stop(self, axis: int | None = None) -> int:
+        """Stop one axis or all, at once, and return this stop's number, which grows from stop to stop.
+
+        It never waits for a lock and is never queued; motions that wait for their turn are void.
+        """
+
+    def abort(self) -> int:
         """Stop all axes as in an emergency and switch their motors off; the stop goes out at once, as with `stop`."""
 
     def dynamics(self, axis: int) -> AxisDynamics:
@@ -223,5 +238,5 @@ class Stage(Protocol):
     def errors(self, *, ask: bool = True) -> tuple[ControllerMessage, ...]:
         """Empty the controller's error queue and return it, with messages that earlier calls took from it unread.
 
-        With ``ask=False`` only the latter: nothing goes over the line.
+        With ``ask=False`` only the latter: nothing is sent over the line.
         """

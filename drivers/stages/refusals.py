@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from core.errors import StageError
-from drivers.stages.protocol import AxisLimits, AxisOptions
+from stereorig.core.errors import StageError
+from stereorig.drivers.stages.protocol import AxisLimits, AxisOptions
 
 
 def configuration_state(axis: int) -> StageError:
@@ -25,6 +25,23 @@ def not_in_configuration(axis: int) -> StageError:
         f"Axis {axis} is not in CONFIGURATION state.",
         code="not_in_configuration",
         remedy="There is nothing to leave; read the axis' state.",
+        axis=axis,
+    )
+
+
+def unit_not_length(axis: int, url: str, unit: str, remedy: str) -> StageError:
+    """Return the error of an axis that counts in a unit that is no length."""
+    return StageError(
+        f"Axis {axis} of {url} counts in {unit}, which is no length.", code="unit_not_length", remedy=remedy, axis=axis
+    )
+
+
+def no_travel(axis: int, url: str) -> StageError:
+    """Return the error of an axis whose travel neither its controller nor the rig file limits."""
+    return StageError(
+        f"Axis {axis} has no limits: neither the controller {url} nor the rig file gives any.",
+        code="out_of_limits",
+        remedy="Set soft_limits_mm in the rig file.",
         axis=axis,
     )
 

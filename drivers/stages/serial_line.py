@@ -7,6 +7,8 @@ was flushed; a command is written once and never again.
 
 from __future__ import annotations
 
+import contextlib
+import os
 import socket
 import threading
 import time
@@ -16,8 +18,8 @@ from typing import Literal, TypeVar
 
 import serial
 
-from core.errors import StageError
-from drivers.stages.transcript import Transcript
+from stereorig.core.errors import StageError
+from stereorig.drivers.stages.transcript import Transcript
 
 T = TypeVar("T")
 FlowControl = Literal["hardware", "software", "none"]
@@ -26,6 +28,9 @@ FlowControl = Literal["hardware", "software", "none"]
 _FLUSH_LIMIT_S = 1.0
 # A reply longer than this is noise: the longest true one is an error text below 100 characters
 _LONGEST_REPLY = 512
+# Errors that pyserial raises for a port that broke, or that another thread closed in between: a number or a socket that
+# is None
+_BROKEN = (serial.SerialException, OSError, TypeError, AttributeError)
 
 
 class SerialLine:
@@ -49,7 +54,7 @@ class SerialLine:
         For controllers whose replies do not name their question: a harmless query and a test for its reply. It is asked
         after a flush, and all that comes before its reply is a late answer to something older.
     record
-        File that gets a transcript of the wire, see `drivers.stages.transcript`.
+        File that gets a transcript of the wire, see `stereorig.drivers.stages.transcript`.
 
     Attributes
     ----------
@@ -80,6 +85,8 @@ class SerialLine:
         self._record: Transcript | None = None
         self._port: serial.Serial | None = None
         self._lock = threading.RLock()
+        self._ports = threading.Lock()  # while a port is closed or replaced
+        self._broken = False
         self._pending = bytearray()
         self._dirty = False
         self.losses = 0
@@ -94,91 +101,154 @@ class SerialLine:
         with self._lock:
             if self._port is not None:
                 return
-            try:
-                port = serial.serial_for_url(
-                    self.url,
-                    baudrate=self._baudrate,
-                    rtscts=self._flow_control == "hardware",
-                    xonxoff=self._flow_control == "software",
-                    timeout=self._quiet_s,
-                    # the one kind of URL whose port knows no such limit; its socket has one of five seconds
-                    write_timeout=None if self.url.lower().startswith("rfc2217:") else 1.0,
-                    exclusive=True,
-                )
-            except (serial.SerialException, OSError, ValueError, NotImplementedError) as error:
-                text = str(error)
-                if "exclusively lock" in text or "busy" in text.lower():
-                    raise StageError(
-                        f"The serial line {self.url} is held by another program ({text}).",
-                        code="device_busy",
-                        remedy="Close the other program, then reconnect.",
-                        url=self.url,
-                    ) from error
-                raise self._lost(f"The serial line {self.url} cannot be opened ({text}).") from error
-            # A stop must not wait for the acknowledgement of an earlier segment (Nagle, up to 40 ms)
-            connection = getattr(port, "_socket", None)
-            if isinstance(connection, socket.socket):
-                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            port = self._opened_port()
             if self._record_path is not None:
                 try:
                     self._record = Transcript(self._record_path, f"{self.url} at {self._baudrate} baud").open()
                 except StageError:
                     port.close()
                     raise
-            self._pending.clear()
-            self._dirty = True
-            self._port = port
+            self._take(port)
+
+    def renew(self) -> None:
+        """Open the line again if it is closed, broken or a network's; errors as `open`.
+
+        Silence of a network connection does not show if the other side is gone. The old connection is used until there
+        is a new one, so that a stop can be written at any time.
+        """
+        with self._lock:
+            if self._port is None or (self._broken and "://" not in self.url):
+                self.close()
+                self.open()
+            elif "://" in self.url:
+                try:
+                    port = self._opened_port()
+                except StageError:
+                    if self._broken:
+                        self.close()
+                        raise
+                    return  # some take one connection at a time
+                with self._ports:
+                    old = self._port
+                    self._take(port)
+                _close(old)
+
+    def _take(self, port: serial.Serial) -> None:
+        self._pending.clear()
+        self._dirty, self._broken = True, False
+        self._port = port
+
+    @property
+    def _write_timeout_s(self) -> float | None:
+        """Limit of a write; a busy host may hold a write to a socket for longer than a serial port's output waits."""
+        if "://" not in self.url:
+            return 1.0
+        # the one kind of URL whose port knows no such limit; its socket has the same
+        return None if self.url.lower().startswith("rfc2217:") else 5.0
+
+    def _opened_port(self) -> serial.Serial:
+        try:
+            port = serial.serial_for_url(
+                self.url,
+                baudrate=self._baudrate,
+                rtscts=self._flow_control == "hardware",
+                xonxoff=self._flow_control == "software",
+                timeout=self._quiet_s,
+                write_timeout=self._write_timeout_s,
+                exclusive=True,
+            )
+        except (serial.SerialException, OSError, ValueError, NotImplementedError) as error:
+            text = str(error)
+            if "exclusively lock" in text or "busy" in text.lower():
+                raise StageError(
+                    f"The serial line {self.url} is held by another program ({text}).",
+                    code="device_busy",
+                    remedy="Close the other program, then reconnect.",
+                    url=self.url,
+                ) from error
+            raise self._lost(f"The serial line {self.url} cannot be opened ({text}).") from error
+        # A stop must not wait for the acknowledgement of an earlier segment (Nagle, up to 40 ms)
+        connection = getattr(port, "_socket", None)
+        if isinstance(connection, socket.socket):
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return port
 
     def close(self) -> None:
         """Close the line; safe to call twice, and from any thread."""
-        port, self._port = self._port, None
-        if port is not None:
-            connection = getattr(port, "_socket", None)
-            port.close()
-            # pyserial shuts the connection down first, and leaves it open where the other side was quicker
-            if isinstance(connection, socket.socket):
-                connection.close()
+        with self._ports:
+            port, self._port = self._port, None
+            _close(port)
         record, self._record = self._record, None
         if record is not None:
             record.close()
+
+    def _bytes(self, text: str) -> bytes:
+        """Return a command as it is written."""
+        return text.encode("ascii") + self._terminator
 
     def command(self, text: str) -> None:
         """Write a command that has no reply; written once in any case."""
         with self._lock:
             if self._dirty:
                 self._flush()
-            self._write(text.encode("ascii") + self._terminator, ">")
+            self._write(self._bytes(text), ">")
 
     def urgent(self, text: str) -> None:
         """Write at once, around the lock that a waiting query holds.
 
-        It is written twice: should a broken byte or half a command stand in the controller's input, the first one ends
-        that, the second one is clean. Only for commands that may be repeated without harm, as stop.
+        It is written twice: if a broken byte or half a command is in the controller's input, the first one ends that,
+        the second one is clean. Only for commands that may be repeated without harm, as stop.
         """
-        self._write(2 * (text.encode("ascii") + self._terminator), "!")
+        port = self._port
+        try:
+            self._write(self.urgent_bytes(text), "!")
+        except StageError:
+            if self._port in (None, port):
+                raise
+            self._write(self.urgent_bytes(text), "!")  # to the connection that has just replaced the old one
 
-    def query(self, text: str, parse: Callable[[str], T], *, timeout_s: float | None = None) -> T:
+    def urgent_bytes(self, text: str) -> bytes:
+        """Return the bytes that `urgent` writes."""
+        return 2 * self._bytes(text)
+
+    def last_words(self, text: str) -> list[tuple[int, bytes]]:
+        """Return a copy of the open line's file descriptor, to be closed, and the bytes that `urgent` writes.
+
+        Empty if this kind of URL has no descriptor.
+        """
+        with self._ports:  # else another file may have got its number
+            port = self._open_port()
+            connection = getattr(port, "_socket", None)
+            try:
+                copy = os.dup((connection if isinstance(connection, socket.socket) else port).fileno())
+            except OSError:  # io.UnsupportedOperation is one
+                return []
+        return [(copy, self.urgent_bytes(text))]
+
+    def query(self, text: str, parse: Callable[[str], T], *, timeout_s: float | None = None, once: bool = False) -> T:
         """Ask and return ``parse(reply)``; ``parse`` raises ValueError for a text that is no answer to this question.
+
+        ``once`` is for a command whose reply is awaited: it is never written again.
 
         Raises
         ------
         StageError
-            ``stage_lost`` after the second silence or nonsense.
+            ``stage_lost`` after the second silence or nonsense, with ``once`` after the first.
         """
         timeout = self._timeout_s if timeout_s is None else timeout_s
         with self._lock:
             failures: list[str] = []
-            for _ in range(2):
+            for _ in range(1 if once else 2):
                 if self._dirty:
                     self._flush()
                 self._discard_waiting()
-                self._write(text.encode("ascii") + self._terminator, ">")
+                self._write(self._bytes(text), ">")
                 try:
                     return self._answer(parse, timeout)
                 except ValueError as error:
                     failures.append(str(error))
                     self._dirty = True
-            raise self._lost(f"{text!r} on {self.url} brought no answer, twice ({'; '.join(failures)}).", query=text)
+            raise self._lost(f"{text!r} on {self.url} brought no answer ({'; '.join(failures)}).", query=text)
 
     def _answer(self, parse: Callable[[str], T], timeout_s: float) -> T:
         deadline = time.monotonic() + timeout_s
@@ -216,7 +286,7 @@ class SerialLine:
         self._pending.clear()
         if self._resync is not None:
             text, is_reply = self._resync
-            self._write(text.encode("ascii") + self._terminator, ">")
+            self._write(self._bytes(text), ">")
             deadline = time.monotonic() + self._timeout_s
             while (line := self._read_line(deadline)) is not None:
                 if is_reply(line):
@@ -233,15 +303,15 @@ class SerialLine:
         try:
             while port.in_waiting and time.monotonic() < limit:
                 self._read()
-        except (serial.SerialException, OSError, TypeError) as error:
-            raise self._lost(f"The serial line {self.url} broke ({error}).") from error
+        except _BROKEN as error:
+            raise self._break(port, error) from error
 
     def _read(self) -> bytes:
         port = self._open_port()
         try:
             data = bytes(port.read(max(1, port.in_waiting)))
-        except (serial.SerialException, OSError, TypeError) as error:  # TypeError: closed by another thread meanwhile
-            raise self._lost(f"The serial line {self.url} broke ({error}).") from error
+        except _BROKEN as error:
+            raise self._break(port, error) from error
         if data:
             self._note("<", data)
         return data
@@ -250,13 +320,8 @@ class SerialLine:
         port = self._open_port()
         try:
             port.write(data)
-        except (
-            serial.SerialException,
-            OSError,
-            TypeError,
-            AssertionError,
-        ) as error:  # pyserial asserts on a full socket
-            raise self._lost(f"The serial line {self.url} broke ({error}).") from error
+        except (*_BROKEN, AssertionError) as error:  # pyserial asserts on a full socket
+            raise self._break(port, error) from error
         self._note(mark, data)
 
     def _open_port(self) -> serial.Serial:
@@ -270,6 +335,10 @@ class SerialLine:
         if record is not None:
             record.note(mark, data)
 
+    def _break(self, port: serial.Serial, error: Exception) -> StageError:
+        self._broken = self._broken or self._port is port
+        return self._lost(f"The serial line {self.url} broke ({error}).")
+
     def _lost(self, cause: str, **context: str) -> StageError:
         self._dirty = True
         self.losses += 1
@@ -282,3 +351,17 @@ class SerialLine:
             url=self.url,
             **context,
         )
+
+
+def _close(port: serial.Serial | None) -> None:
+    if port is None:
+        return
+    connection = getattr(port, "_socket", None)
+    if connection is None:
+        # the lock belongs to every copy of the descriptor, and another process may hold one
+        with contextlib.suppress(serial.SerialException, OSError, ValueError):
+            port.exclusive = False
+    port.close()
+    # pyserial shuts the connection down first, and leaves it open where the other side was quicker
+    if isinstance(connection, socket.socket):
+        connection.close()

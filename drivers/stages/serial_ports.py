@@ -17,38 +17,53 @@ from typing import Any
 
 from serial.tools import list_ports
 
-from core.errors import StageError
-from drivers.cameras.protocol import FoundDevice
+from stereorig.core.errors import StageError
+from stereorig.drivers.cameras.protocol import FoundDevice
 
-# USB ids of devices that are likely behind the port; Newport's are those of Linux' ftdi_sio driver
+# USB ids of devices that are likely behind the port; Newport's are from Linux' ftdi_sio driver
 _NEWPORT = 0x104D
 _HINTS: dict[tuple[int, int | None], str] = {
     (_NEWPORT, 0x3002): "Newport CONEX-CC: driver conex-cc",
     (_NEWPORT, 0x3000): "Newport Agilis controller: no driver here speaks its language",
     (_NEWPORT, 0x3006): "Newport CONEX-AGP: no driver here speaks its language",
     (_NEWPORT, None): "a Newport device",
+    (0x1A72, None): "PI controller: driver pi",
+    (0x2939, None): "Zaber device: driver zaber",
+    (0x0403, 0xFAF0): "Thorlabs Kinesis or APT controller: driver kinesis",
     (0x0403, None): "FTDI adapter, as many motion controllers and RS-232 cables have",
     (0x067B, None): "Prolific RS-232 adapter",
     (0x10C4, None): "Silicon Labs RS-232 adapter",
     (0x1A86, None): "WCH RS-232 adapter",
 }
 
+# USB devices that no driver of Linux turns into a port
+_WITHOUT_DRIVER = {
+    (_NEWPORT, 0x3001): (
+        "Newport ESP301",
+        "Linux has no driver for this USB port: use the controller's RS-232 port, at 19200 baud, with a USB adapter",
+    )
+}
+
 
 def discover_ports(
-    *, proc: Path = Path("/proc"), dev: Path = Path("/dev"), locks: Path = Path("/var/lock")
+    *,
+    proc: Path = Path("/proc"),
+    dev: Path = Path("/dev"),
+    locks: Path = Path("/var/lock"),
+    usb: Path = Path("/sys/bus/usb/devices"),
 ) -> list[FoundDevice]:
     """List serial ports with their problems.
 
     Parameters
     ----------
-    proc, dev, locks
+    proc, dev, locks, usb
         Paths of the system's tables.
 
     Returns
     -------
     list of FoundDevice
         ``extra`` may hold ``link`` (a name that stays the same when the port is plugged in elsewhere or later than
-        another), ``usb`` (vendor and product id) and ``hint`` (what the USB ids let expect).
+        another), ``usb`` (vendor and product id) and ``hint`` (the device that the USB ids suggest).
 
     Raises
     ------
@@ -64,7 +79,30 @@ def discover_ports(
             remedy="Name the port in the rig file all the same.",
         ) from error
     links = _links(dev / "serial" / "by-id") or _links(dev / "serial" / "by-path")
-    return [_describe(port, links, proc, locks) for port in ports]
+    return [*(_describe(port, links, proc, locks) for port in ports), *_without_port(usb)]
+
+
+def _without_port(usb: Path) -> list[FoundDevice]:
+    """Return the controllers on USB that have no serial port on Linux, each with the way that works."""
+    found = []
+    for folder in sorted(usb.glob("*")):
+        with contextlib.suppress(OSError, ValueError):
+            vendor, product = (int((folder / name).read_text(), 16) for name in ("idVendor", "idProduct"))
+            if (vendor, product) in _WITHOUT_DRIVER:
+                model, problem = _WITHOUT_DRIVER[vendor, product]
+                address = f"{vendor:04x}:{product:04x}"
+                found.append(
+                    FoundDevice(
+                        kind="serial",
+                        driver="",
+                        device=f"usb {folder.name}",
+                        model=model,
+                        address=address,
+                        problem=problem,
+                        extra={"usb": address},
+                    )
+                )
+    return found
 
 
 def port_problem(path: str, *, proc: Path = Path("/proc"), locks: Path = Path("/var/lock")) -> str | None:
@@ -155,7 +193,7 @@ def _holders(there: os.stat_result, path: str, proc: Path, locks: Path) -> list[
 def _openers(target: str, proc: Path) -> set[int]:
     found = set()
     for folder in proc.glob("[0-9]*/fd"):
-        with contextlib.suppress(OSError):  # another user's, or gone meanwhile
+        with contextlib.suppress(OSError):  # another user's, or gone in between
             if any(_link_target(link) == target for link in folder.iterdir()):
                 found.add(int(folder.parent.name))
     return found

@@ -1,10 +1,10 @@
 """Common parts of the serial stage drivers: checks before a byte is sent, one-sided arrival, waiting, stopping.
 
-A driver adds only its controller's commands, see `drivers.stages.commands`.
+A driver adds only its controller's commands, see `stereorig.drivers.stages.commands`.
 
 A stop takes no lock. It sets a number of its own on the axes it concerns, and then writes. A motion notes these numbers
-when it is asked for, and looks at them again after each command that starts movement: whichever of the two was first on
-the wire, the axis stands still afterwards, and a motion that was still waiting for its turn never starts.
+when it is asked for, and checks them again after each command that starts movement: in either order on the wire, the
+axis is at rest afterwards, and a motion that was still waiting for its turn never starts.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 
-from core.errors import StageError
-from drivers.stages.commands import ControllerCommands
-from drivers.stages.protocol import (
+from stereorig.core.errors import StageError
+from stereorig.drivers.stages.commands import ControllerCommands, ControllerLine
+from stereorig.drivers.stages.protocol import (
     AxisDynamics,
     AxisLimits,
     AxisOptions,
@@ -29,7 +29,7 @@ from drivers.stages.protocol import (
     MoveResult,
     StageIdentity,
 )
-from drivers.stages.refusals import (
+from stereorig.drivers.stages.refusals import (
     check_dynamic,
     check_number,
     check_target,
@@ -41,7 +41,6 @@ from drivers.stages.refusals import (
     not_in_configuration,
     tighten,
 )
-from drivers.stages.serial_line import SerialLine
 
 _POLL_S = 0.02
 # An axis that reports motion without moving for this long has jammed
@@ -50,22 +49,41 @@ _JAM_S = 1.0
 _MARGIN_S = 5.0
 # Messages kept for `errors`, which may never be called
 _MESSAGES = 100
+# Counter for all stages of a process, so that a stage that is opened again does not repeat its numbers
+_STOP_NUMBERS = itertools.count(1)
 # Longest time of an axis to come to rest after a stop
 _REST_S = 3.0
 
 
-class SerialStage(ControllerCommands):
-    """Base of the stage drivers; see `drivers.stages.protocol.Stage` for its interface."""
+# the longest search for home: so many times the whole travel, since the search is slower near its end
+_HOME_S, _HOME_MARGIN = 120.0, 2.0
 
-    def __init__(self, line: SerialLine, options: Mapping[int, AxisOptions]) -> None:
+
+def next_stop() -> int:
+    """Return the number of a new stop, higher than every earlier one in this process."""
+    return next(_STOP_NUMBERS)
+
+
+def longest_search_s(travel_mm: tuple[float, float], velocity_mm_s: float) -> float:
+    """Return how long a search for home may take over a travel (lowest, highest) at a velocity."""
+    return max(_HOME_S, _HOME_MARGIN * (travel_mm[1] - travel_mm[0]) / velocity_mm_s if velocity_mm_s > 0.0 else 0.0)
+
+
+class SerialStage(ControllerCommands):
+    """Base of the stage drivers; see `stereorig.drivers.stages.protocol.Stage` for its interface."""
+
+    def __init__(
+        self, line: ControllerLine, options: Mapping[int, AxisOptions], numbers: Mapping[int, int] | None = None
+    ) -> None:
         self._line = line
         self._options = dict(options)
+        self._own = {axis: axis if numbers is None else numbers[axis] for axis in self._options}
+        self._travel_mm: dict[int, tuple[float, float]] = {}
         self._limits: dict[int, AxisLimits] = {}
         self._velocity_mm_s: dict[int, float] = {}
         self._acceleration_mm_s2: dict[int, float] = {}
         self._messages: list[ControllerMessage] = []
         self._motion_lock = threading.RLock()
-        self._stop_numbers = itertools.count(1)
         self._stops = dict.fromkeys(self._options, 0)  # axis -> number of the last stop that concerned it
         self._moving: set[int] = set()
         self._identity: StageIdentity | None = None
@@ -80,14 +98,25 @@ class SerialStage(ControllerCommands):
         with self._motion_lock:
             self._line.open()
             try:
-                self._identity = self._connect()
-                for axis in self.axes:
-                    self._limits[axis] = tighten(axis, self._options[axis].soft_limits_mm, *self._read_travel_mm(axis))
-                    self._velocity_mm_s[axis], self._acceleration_mm_s2[axis] = self._set_dynamics(axis)
-                self._stop_left_over()
+                self._prepare()
             except BaseException:
                 self._line.close()
                 raise
+
+    def reconnect(self) -> None:
+        """Connect as `open` does; a line that is open and not broken stays open in any case."""
+        with self._motion_lock:
+            self._line.renew()
+            self._prepare()
+
+    def _prepare(self) -> None:
+        identity = self._connect()
+        for axis in self.axes:
+            self._travel_mm[axis] = self._read_travel_mm(axis)
+            self._limits[axis] = tighten(axis, self._options[axis].soft_limits_mm, *self._travel_mm[axis])
+            self._velocity_mm_s[axis], self._acceleration_mm_s2[axis] = self._set_dynamics(axis)
+        self._stop_left_over()
+        self._identity = identity
 
     def close(self) -> None:
         """Release the line; axes that this driver is moving are stopped first."""
@@ -130,16 +159,30 @@ class SerialStage(ControllerCommands):
         found, self._messages = self._messages, []
         return tuple(found)
 
-    def stop(self, axis: int | None = None) -> None:
-        """Stop one axis or all, at once; takes no lock."""
+    @property
+    def is_open(self) -> bool:
+        """True while its line is open, whether the controller answers or not."""
+        return self._line.is_open
+
+    @property
+    def is_moving(self) -> bool:
+        """True while a motion of this driver is under way."""
+        return bool(self._moving)
+
+    def stop(self, axis: int | None = None, *, number: int | None = None) -> int:
+        """Stop one axis or all, at once, and return the number of this stop; takes no lock.
+
+        ``number`` is a stop's that concerns other controllers too, of `next_stop`.
+        """
         if axis is not None:
             self._check_axis(axis)
-        self._mark_stopped(self.axes if axis is None else (axis,))
+        number = self._mark_stopped(self.axes if axis is None else (axis,), number)
         self._line.urgent(self._stop_text(axis))
+        return number
 
-    def abort(self) -> None:
-        """Stop all axes as in an emergency, then make sure that their motors are off."""
-        self._mark_stopped(self.axes)
+    def abort(self, *, number: int | None = None) -> int:
+        """Stop all axes as in an emergency, make sure that their motors are off, return the number of this stop."""
+        number = self._mark_stopped(self.axes, number)
         self._line.urgent(self._abort_text())
         rest = time.monotonic() + _REST_S
         for axis in self.axes:
@@ -147,11 +190,24 @@ class SerialStage(ControllerCommands):
                 time.sleep(_POLL_S)
             if status.motor_on:
                 self._switch_motor(axis, on=False)
+        return number
 
-    def _mark_stopped(self, axes: tuple[int, ...]) -> None:
-        number = next(self._stop_numbers)
+    def last_words(self) -> list[tuple[int, bytes]]:
+        """Return copies of the line's descriptors, to be closed, each with the bytes that stop axes.
+
+        They are for a process that outlives this one. None are returned if the line has no descriptor of its own.
+        """
+        return self._line.last_words(self._last_text())
+
+    def _axis_of(self, own: int) -> int:
+        """Return the axis that the controller counts as ``own``; its number for one that is not used here."""
+        return next((axis for axis, number in self._own.items() if number == own), own)
+
+    def _mark_stopped(self, axes: tuple[int, ...], number: int | None) -> int:
+        number = next_stop() if number is None else number
         for axis in axes:
             self._stops[axis] = number
+        return number
 
     def _stop_left_over(self) -> None:
         """Stop motions that an earlier program left when it died; no caller waits for them any more."""
@@ -214,10 +270,12 @@ class SerialStage(ControllerCommands):
         with self._motion_lock:
             self._switch_motor(axis, on=False)
 
-    def home(self, axis: int, *, timeout_s: float = 120.0) -> float:
+    def home(self, axis: int, *, timeout_s: float | None = None, since: int | None = None) -> float:
         """Search home and return the position read back in mm."""
         self._check_axis(axis)
-        noted = self._note_stops((axis,))
+        if timeout_s is None:
+            timeout_s = longest_search_s(self._travel_mm[axis], self._velocity_mm_s[axis])
+        noted = self._note_stops((axis,), since)
         with self._motion_lock:
             self._check_not_stopped(noted, write=False)
             with self._stopped_on_error((axis,)):
@@ -239,9 +297,9 @@ class SerialStage(ControllerCommands):
         with self._motion_lock:
             return self._move({axis: self._read_position_mm(axis) + distance_mm}, noted)[axis]
 
-    def move_many(self, targets_mm: Mapping[int, float]) -> dict[int, MoveResult]:
+    def move_many(self, targets_mm: Mapping[int, float], *, since: int | None = None) -> dict[int, MoveResult]:
         """Move several axes at the same time."""
-        noted = self._note_stops(tuple(targets_mm))
+        noted = self._note_stops(tuple(targets_mm), since)
         for axis, target in targets_mm.items():
             self._check_axis(axis)
             self._check_target(axis, target)
@@ -347,12 +405,13 @@ class SerialStage(ControllerCommands):
         self._check_unit(axis)
         return status
 
-    def _note_stops(self, axes: tuple[int, ...]) -> dict[int, int]:
-        return {axis: self._stops.get(axis, 0) for axis in axes}
+    def _note_stops(self, axes: tuple[int, ...], since: int | None = None) -> dict[int, int]:
+        """Return the last stop of each axis; of those that the caller knows of, ``since`` is the last one."""
+        return {axis: self._stops.get(axis, 0) if since is None else since for axis in axes}
 
     def _check_not_stopped(self, noted: Mapping[int, int], *, write: bool = True) -> None:
         axes = tuple(noted)
-        if self._note_stops(axes) == noted:
+        if all(self._stops.get(axis, 0) <= noted[axis] for axis in axes):
             return
         if write:
             # The stop may have been on the wire before the command that started this motion
@@ -403,6 +462,6 @@ class SerialStage(ControllerCommands):
         return StageError(
             f"The controller refused for axis {axis} the {request}: {text}.",
             code=next((code for message in messages if (code := self._code_of(message)) is not None), "stage_refused"),
-            remedy="Correct what the controller names, then try again.",
+            remedy="Correct the cause that the controller names, then try again.",
             axis=axis,
         )

@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Self
 
-from core.errors import StageError
+from stereorig.core.errors import StageError
 
 #: bytes after which a new file is begun: about a day of polling at rest
 LIMIT_BYTES = 20 << 20
@@ -98,7 +98,7 @@ class Transcript:
         line = self._line(text)
         try:
             os.write(fd, line)
-        except OSError:  # a full or broken disk: the motion goes on
+        except OSError:  # a full or broken disk: the motion continues
             self._broken = True
             return
         self._size += len(line)

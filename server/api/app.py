@@ -11,17 +11,18 @@ from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
 from starlette.types import Lifespan
 
-from server.api.docs import front, openapi, problem_pages
-from server.api.docs import pages as doc_pages
-from server.api.protocol import problems
-from server.api.protocol.audit import AuditLog, Recorder
-from server.api.protocol.auth import AccessRules, Door, Sessions
-from server.api.protocol.delivery import Delivery
-from server.api.protocol.guard import LOOPBACK_NAMES, Guard
-from server.api.protocol.old_addresses import OldAddresses
-from server.api.routes.analyses import (
+from stereorig.server.api.docs import front, openapi, problem_pages
+from stereorig.server.api.docs import pages as doc_pages
+from stereorig.server.api.protocol import problems
+from stereorig.server.api.protocol.audit import Recorder
+from stereorig.server.api.protocol.auth import AccessRules, Door
+from stereorig.server.api.protocol.bodies import Bodies
+from stereorig.server.api.protocol.delivery import Delivery
+from stereorig.server.api.protocol.guard import Guard
+from stereorig.server.api.routes.analyses import (
     analyses,
     comparison,
+    evaluations,
     exports,
     gauges,
     history,
@@ -32,21 +33,24 @@ from server.api.routes.analyses import (
     report,
     results,
 )
-from server.api.routes.calibrations import calibrations, guide, noise, repair, review
-from server.api.routes.calibrations import checks as calibration_checks
-from server.api.routes.calibrations import exports as calibration_exports
-from server.api.routes.certificates import certificates, procedure
-from server.api.routes.rig import cameras, devices, live_check, stage
-from server.api.routes.service import jobs, session, system
-from server.api.routes.tests import channels, frame, live, metadata, models, recipes, tests, watch, workspace
-from server.api.routes.tests.trash import router as trash_router
-from server.http.access import KeyFile
-from server.http.line_protocol import LineServer
-from server.workflows.calibration.guided import Guides
-from server.workflows.live.runs import LiveRuns
-from server.workflows.live_check import LiveChecks
-from server.workflows.service import Service
-from server.workflows.watch import Watches
+from stereorig.server.api.routes.calibrations import calibrations, guide, noise, repair, review
+from stereorig.server.api.routes.calibrations import checks as calibration_checks
+from stereorig.server.api.routes.calibrations import exports as calibration_exports
+from stereorig.server.api.routes.certificates import certificates, procedure
+from stereorig.server.api.routes.rig import cameras, devices, live_check, stage
+from stereorig.server.api.routes.service import jobs, session, system
+from stereorig.server.api.routes.tests import channels, frame, live, metadata, models, recipes, tests, watch, workspace
+from stereorig.server.api.routes.tests.trash import router as trash_router
+from stereorig.server.http.line_protocol import LineServer
+from stereorig.server.http.rights import LOOPBACK_NAMES, Callers
+from stereorig.server.http.shutout import ShutOut
+from stereorig.server.store.audit_log import AuditLog
+from stereorig.server.workflows.calibration.guided import Guides
+from stereorig.server.workflows.live.runs import LiveRuns
+from stereorig.server.workflows.live_check import LiveChecks
+from stereorig.server.workflows.recording import Recordings
+from stereorig.server.workflows.service import Service
+from stereorig.server.workflows.watch import Watches
 
 PREFIX = "/api/v1"
 _DESCRIPTION = """Stereo measurement of shape and 3-D displacement.
@@ -54,11 +58,11 @@ _DESCRIPTION = """Stereo measurement of shape and 3-D displacement.
 Anything that takes long answers 202 with a job; with `?wait=30` once the job has ended, or after so many seconds; so
 does `GET /jobs/{id}?wait=30`, and `/jobs/{id}/events` follows it. Errors are problem+json (RFC 9457) with a stable
 `code`, the cause in `detail` and a `remedy`; so is the `problem` of a job. What is no plain reading or changing of a
-thing is `thing:verb`; addresses of earlier versions still answer, with a `Deprecation` header. POSTs that make
-something take an `Idempotency-Key`. What GET answers, HEAD does without a body. Answers have an ETag; asked with it in
-`If-None-Match`, they come as 304 while nothing has changed, and changes with `If-Match` are refused where something
-has. Lists come in pages: `next_cursor` leads to the next one. Answers are compressed for those who accept gzip.
-Lengths are in millimetres in the calibration target's frame unless a name states another one."""
+thing is `thing:verb`. POSTs that make something take an `Idempotency-Key`. What GET answers, HEAD does without a body.
+Answers have an ETag; asked with it in `If-None-Match`, they come as 304 while nothing has changed, and changes with
+`If-Match` are refused where something has. Lists come in pages: `next_cursor` leads to the next one. Answers are
+compressed for those who accept gzip. Lengths are in millimetres in the calibration target's frame unless a name states
+another one."""
 
 
 def create_app(
@@ -83,6 +87,7 @@ def create_app(
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         await lines.start()
+        audit.open()
         yield
         await lines.close()
         await run_in_threadpool(live_runs.close)
@@ -92,21 +97,23 @@ def create_app(
 
     section = service.config.service
     audit = AuditLog(service.folder.root)
-    sessions = Sessions()
+    shut_out = ShutOut(audit.write)
     rules = AccessRules(
-        KeyFile(service.folder.root),
+        Callers(service.folder.root),
         required=section.require_key if keys_required is None else keys_required,
         requests_per_s=section.requests_per_s,
+        shut_out=shut_out,
     )
 
     live_runs = LiveRuns(service)
-    lines = LineServer(section=service.config.live, runs=live_runs)
+    lines = LineServer(service.config.live, live_runs, shut_out)
     app = bare_app(lifespan)
     app.state.live_runs = live_runs
     app.state.lines = lines
     app.state.service = service
-    app.state.sessions = sessions
+    app.state.callers = rules.callers
     app.state.watches = Watches(service)
+    app.state.recordings = Recordings(service)
     app.state.guides = Guides(service)
     app.state.live_checks = LiveChecks(service)
     app.state.view_limiter = CapacityLimiter(4)
@@ -118,10 +125,10 @@ def create_app(
     front.install(app)
     # the last that is added is the first that a request meets
     app.add_middleware(Delivery)
-    app.add_middleware(Door, rules=rules, sessions=sessions)
+    app.add_middleware(Bodies, service=service)
+    app.add_middleware(Door, rules=rules)
     app.add_middleware(Guard, allowed=hosts | frozenset(section.allowed_hosts))
     app.add_middleware(Recorder, log=audit, metrics=service.metrics)
-    app.add_middleware(OldAddresses, prefix=PREFIX)
     return app
 
 
@@ -169,6 +176,7 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         history,
         gauges,
         comparison,
+        evaluations,
         exports,
         report,
         certificates,

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from core.errors import InputError, StateError
+from stereorig.core.errors import InputError, StateError
 
 
 class NotFoundError(InputError):
     """No such calibration, test, step, analysis, job or camera."""
 
     code = "not_found"
-    remedy = "List what there is, and use one of those ids."
+    remedy = "List the entries, and use one of their ids."
 
 
 class BusyError(StateError):

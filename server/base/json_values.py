@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from pydantic import TypeAdapter, ValidationError
 from typing_extensions import TypeAliasType
 
-from core.errors import InputError
+from stereorig.core.errors import InputError
 
 Asked = TypeVar("Asked")
 
@@ -28,16 +28,16 @@ def without_nan(value: Any) -> Any:
 
 
 def asked_in(text: str, kind: TypeAdapter[Asked], *, named: str, code: str, remedy: str) -> Asked:
-    """Return what a JSON text asks for.
+    """Return the request in a JSON text.
 
     Parameters
     ----------
     text, kind
-        The text, and what it must hold.
+        The text, and the type of its value.
     named
-        What it is to name, in the error: ``frame``.
+        Name of the value in the error: ``frame``.
     code, remedy
-        Of the error.
+        Code and remedy of the error.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""Where compiled kernels are kept: beside their sources, in the user's cache, or where ``NUMBA_CACHE_DIR`` says.
+"""Folder of compiled kernels: next to their sources, in the user's cache, or the one in ``NUMBA_CACHE_DIR``.
 
-numba refuses to load a kernel that it may keep where none of these can be written, as under a user without a home on
-an installation that is another's. The command line then keeps them for as long as it runs.
+numba refuses to load a kernel that it may keep if none of these can be written, as under a user without a home on
+an installation that another user owns. The command line then keeps them for as long as it runs.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import shutil
 import tempfile
 from pathlib import Path
 
-import core
+from stereorig import core
 
 # the package itself takes seconds to load
 _KERNELS = Path(core.__file__).parent / "matching" / "kernels"
@@ -33,14 +33,14 @@ def named_folder() -> Path | None:
 
 
 def can_write(folder: Path) -> bool:
-    """Whether a file could be made in a folder that is there, or that would have to be made."""
+    """Return True if a file could be made in a folder that exists, or that would have to be made."""
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     return folder.is_dir() and os.access(folder, os.W_OK)
 
 
 def ensure_kernel_folder() -> None:
-    """Have kernels kept in a folder of this process, taken away at its end, where they can be kept nowhere else."""
+    """Keep kernels in a folder of this process, removed at its end, if they can be kept nowhere else."""
     global _temporary
     if _temporary is None and not any(map(can_write, kernel_folders())):
         _temporary = Path(tempfile.mkdtemp(prefix="stereorig-kernels-"))

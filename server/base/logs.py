@@ -2,27 +2,35 @@
 
 from __future__ import annotations
 
+import contextlib
 import contextvars
 import json
 import logging
 import re
+import threading
+import time
+from collections import deque
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from datetime import UTC, datetime
-from typing import Any, Literal
+from typing import Any, Literal, TextIO
 
 LogFormat = Literal["text", "json"]
 FORMATS: tuple[LogFormat, ...] = ("text", "json")
 
 _about: contextvars.ContextVar[dict[str, str] | None] = contextvars.ContextVar("stereorig_log_about", default=None)
 _jobs = logging.getLogger("stereorig.jobs")
+_threads = logging.getLogger("stereorig.threads")
+#: lines that a process writes in any second at most
+LINES_PER_S = 100
+#: fewer are no use of a traceback
+_CUT_LINES = 6
 # attributes that a logger's caller gave as `extra`, not those that every record has
 _USUAL = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "color_message", "about", "taskName"}
 # a client's text must not begin a line of its own, nor talk to a terminal
 _CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f-\x9f\u2028\u2029]")
 
 
-@contextmanager
+@contextlib.contextmanager
 def about(**ids: str) -> Iterator[None]:
     """Add these ids to every log line of the block, in this thread or task and those it starts."""
     token = _about.set({**(_about.get() or {}), **ids})
@@ -79,7 +87,78 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(line, ensure_ascii=False, default=str)
 
 
-def configure(level: str, form: LogFormat) -> None:
+class LimitedHandler(logging.StreamHandler[TextIO]):
+    """Writes to standard error, at most so many lines in any second, and then states how many messages it left out.
+
+    A fault that repeats, as a listener without descriptors does, must not fill the disk of the log.
+    """
+
+    def __init__(self, lines_per_s: int = LINES_PER_S) -> None:
+        super().__init__()
+        self._most = lines_per_s - 1  # the last one is for the count
+        self._written: deque[float] = deque()
+        self._left_out = 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record, or count it where the last second has no room for it."""
+        kept = 0 if record.levelno >= logging.WARNING else self._most // 5  # requests must not crowd out errors
+        while self._written and self._written[0] <= time.monotonic() - 1.0:
+            self._written.popleft()
+        room = self._most - kept - len(self._written)
+        lines = self._lines_of(record, room) if room > 0 else []
+        if 0 < len(lines) <= room and self._write(lines):
+            self._written.extend([time.monotonic()] * len(lines))
+            return
+        self._left_out += 1
+        if self._left_out == 1:
+            with contextlib.suppress(RuntimeError):  # no thread starts in a process that ends: `close` reports
+                timer = threading.Timer(1.0, self.report)
+                timer.daemon = True
+                timer.start()
+
+    def report(self) -> None:
+        """Write how many messages were left out."""
+        self.acquire()
+        try:
+            count, self._left_out = self._left_out, 0
+            if count:
+                text = f"{count} messages were left out: at most {self._most + 1} lines a second are written."
+                self._write(self._lines_of(logging.makeLogRecord(_record_of(text)), 1))
+                self._written.append(time.monotonic())
+        finally:
+            self.release()
+
+    def close(self) -> None:
+        """Report the count of messages left out so far."""
+        self.report()
+        super().close()
+
+    def _lines_of(self, record: logging.LogRecord, room: int) -> list[str]:
+        """Return a record's lines; of one that has more than there is room for the first and the last."""
+        try:
+            lines = self.format(record).split("\n")
+        except Exception as error:  # noqa: BLE001 - a wrong call of the logger, which must not print a traceback itself
+            lines = [self.format(logging.makeLogRecord(_record_of(f"{record.name} cannot be formatted: {error!r}")))]
+        if len(lines) <= room or room < _CUT_LINES:
+            return lines
+        return [*lines[: room // 3], "  ...", *lines[1 + room // 3 - room :]]
+
+    def _write(self, lines: list[str]) -> bool:
+        """Write lines; return False where standard error takes none."""
+        try:
+            self.stream.write("\n".join(lines) + "\n")
+            self.flush()
+        except (OSError, ValueError):  # full, or closed at the other end
+            return False
+        return True
+
+
+def _record_of(text: str) -> dict[str, object]:
+    """Return the entries of a warning about the log itself."""
+    return {"name": "stereorig.log", "levelno": logging.WARNING, "levelname": "WARNING", "msg": text}
+
+
+def configure(level: str, form: LogFormat, *, lines_per_s: int = LINES_PER_S) -> None:
     """Send every log line of this process to standard error.
 
     Parameters
@@ -88,13 +167,23 @@ def configure(level: str, form: LogFormat) -> None:
         Name of the minimum level that is shown.
     form
         ``text`` or ``json``.
+    lines_per_s
+        Lines in any second at most; further messages are counted.
     """
-    handler = logging.StreamHandler()
+    handler = LimitedHandler(lines_per_s)
     handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
     handler.addFilter(AboutFilter())
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(level.upper())
+    threading.excepthook = _log_end_of_thread
+
+
+def _log_end_of_thread(args: threading.ExceptHookArgs) -> None:
+    """Log the error that ended a thread, so that it counts as all lines do."""
+    if args.exc_value is not None and args.exc_type is not SystemExit:
+        name = None if args.thread is None else args.thread.name
+        _threads.error("thread %s ended", name, exc_info=args.exc_value)
 
 
 def log_job_event(name: str, data: Mapping[str, Any]) -> None:

@@ -1,6 +1,6 @@
 """Rounds of the garbage collector that leave out lasting objects: no long pauses.
 
-That memory stays what it is over days is the allocator's part: MALLOC_ARENA_MAX in the systemd unit.
+That memory does not grow over days depends on the allocator: MALLOC_ARENA_MAX in the systemd unit.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ def hurry() -> None:
 
 
 def go_on() -> None:
-    """End the pause; what was loaded in it is left out of the rounds, and so is its little garbage."""
+    """End the pause; the objects loaded in it are left out of the rounds, and so is their little garbage."""
     gc.freeze()
     gc.enable()
 

@@ -12,7 +12,7 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessColl
 from prometheus_client.core import CollectorRegistry as Registry
 from prometheus_client.exposition import generate_latest
 
-from core.errors import StereorigError
+from stereorig.core.errors import StereorigError
 
 T = TypeVar("T")
 P = ParamSpec("P")
@@ -100,7 +100,7 @@ class Metrics:
         return generate_latest(self.registry)
 
     def on_event(self, name: str, data: Mapping[str, Any]) -> None:
-        """Count the events of the hub; by the monotonic clock, since the other one may be set."""
+        """Count the events of the hub; by the monotonic clock, since the wall clock may be set."""
         if name == "result":
             self.results.inc()
         elif name == "job":

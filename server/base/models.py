@@ -25,7 +25,7 @@ from pydantic.config import JsonDict
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import core_schema
 
-from core.settings import Real, Whole
+from stereorig.core.settings import Real, Whole
 
 
 def _not_a_truth_value(value: Any) -> Any:
@@ -59,8 +59,8 @@ def _in_utc(value: datetime) -> datetime:
         raise ValueError("is outside the calendar in UTC") from error
 
 
-#: what a line of text may hold, as browsers and schemas read it: no control character, no break of a line, nothing that
-#: turns the direction of what follows (which shows one name as another)
+#: characters of a line of text, as browsers and schemas read it: no control character, no break of a line, none that
+#: turns the direction of later ones (which shows one name as another)
 ONE_LINE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]*$"
 SOME_LINES = r"^[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]*$"
 # halves of a character too, which no file and no answer could hold
@@ -78,18 +78,18 @@ def _without(forbidden: re.Pattern[str], value: str) -> str:
 
 
 def one_line(value: str) -> str:
-    """Return a name or label as it is; raise ValueError where it holds a control character."""
+    """Return a name or label as it is; raise ValueError if it holds a control character."""
     return _without(_NO_LINE, value)
 
 
 def plain_text(value: str) -> str:
-    """Return text of several lines as it is; raise ValueError where it holds another control character."""
+    """Return text of several lines as it is; raise ValueError if it holds another control character."""
     return _without(_NO_TEXT, value)
 
 
 @dataclass(frozen=True)
 class _WithoutControl:
-    """Mark of a text, after its length: no control characters, which the schema says too."""
+    """Mark of a text, after its length: no control characters, which the schema states too."""
 
     check: Callable[[str], str]
     pattern: str

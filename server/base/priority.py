@@ -17,9 +17,10 @@ from pathlib import Path
 _SERVICE_NICE = -10
 _WORKER_NICE = 5
 BELOW_WORKER, LAST = 12, 19
-"""For what the worker need not wait for yet, and for what it needs after that."""
+"""Niceness of work that the worker does not need yet, and of work that it needs later still."""
 _SWITCH_S = 0.001
 _PR_SET_PDEATHSIG = 1
+_OOM_SCORE = "300"
 _AUTOGROUP = Path("/proc/self/autogroup")
 
 
@@ -55,14 +56,23 @@ def raise_file_limit() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
-def end_with_parent() -> None:
+def die_first() -> None:
+    """Let the kernel choose this process and its children when memory is out, not those that stop the stage."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE, encoding="ascii")
+
+
+def end_with_parent(parent_pid: int | None = None) -> None:
     """End this process at once when the one that started it is gone, killed or not.
 
-    A worker whose service was killed must not write where the next one's does. A thread that watches a pipe of the
-    parent's would be plainer, and late: it waits for the interpreter, and a result is written meanwhile.
+    ``parent_pid`` is needed if the parent did not use multiprocessing. A worker whose service was killed must not
+    write into the files of the next service's worker. A thread that watches a pipe of the parent would be plainer, but
+    late: it waits for the interpreter, and a result may be written before it runs.
     """
     parent = multiprocessing.parent_process()
     with contextlib.suppress(OSError, AttributeError):  # not on every system; elsewhere it ends with its task
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if parent is not None and os.getppid() != parent.pid:
+    if parent_pid is None and parent is not None:
+        parent_pid = parent.pid
+    if parent_pid is not None and os.getppid() != parent_pid:
         os._exit(1)  # gone already

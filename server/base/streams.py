@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Literal
 
-from server.base.errors import QueueFullError
+from stereorig.server.base.errors import QueueFullError
 
 StreamKind = Literal["live_view", "events"]
 _WORDS: dict[StreamKind, str] = {"live_view": "live views", "events": "event streams"}

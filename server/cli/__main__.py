@@ -1,8 +1,8 @@
-"""``python -m server.cli``: the command, where it is not installed."""
+"""``python -m stereorig.server.cli``: the command, if it is not installed."""
 
 import sys
 
-from server.cli.main import main
+from stereorig.server.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -3,56 +3,75 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import re
 import sys
 from collections.abc import Sequence
 from types import ModuleType
 from typing import NoReturn
 
-from core.errors import Cancelled, StereorigError
-from server.base.library_threads import one_library_thread
-from server.base.memory import go_on, hurry
-from server.formats.version import software_version
-from server.worker.kernel_compiler import compiled_aside
+from stereorig.core.errors import Cancelled, StereorigError
+from stereorig.core.lazy import load_module
+from stereorig.server.base.library_threads import one_library_thread
+from stereorig.server.base.memory import go_on, hurry
+from stereorig.server.formats.version import software_version
+from stereorig.server.worker.kernel_compiler import compiled_aside
 
 # name -> (module, one-line help); each module has add_arguments(parser) and run(args) -> int,
 # and is imported only when it is asked for, so that `--help` and errors in one do not wait for the others
 COMMANDS: dict[str, tuple[str, str]] = {
-    "serve": ("server.cli.operation.serve", "start the service"),
-    "keys": ("server.cli.operation.keys", "make, list and remove keys for the service"),
-    "demo": ("server.cli.operation.demo", "run one of the paper's experiments on the simulated rig, over HTTP"),
-    "devices": ("server.cli.operation.devices", "list cameras and serial ports, and what is wrong with them"),
-    "doctor": ("server.cli.operation.doctor", "check the whole bench: cameras, stage, disk, machine"),
-    "rigfile": ("server.cli.operation.rigfile", "check rig files; print every key with its meaning"),
-    "simstage": ("server.cli.operation.simstage", "run a simulated motion controller on a socket or pty"),
-    "simframe": ("server.cli.operation.simframe", "run a simulated load frame that pulls the strip of a simulated rig"),
-    "live": ("server.cli.operation.live", "measure a test while it runs: begin, show, stop"),
-    "calibrate": ("server.cli.measurement.calibrate", "calibrate a pair of cameras from grid images"),
-    "expect": ("server.cli.operation.expect", "predict what a planned measurement will leave uncertain"),
-    "channels": ("server.cli.operation.channels", "a load frame's record, aligned with the steps of a test by time"),
-    "guide": ("server.cli.operation.guide", "calibrate on a running service from a target held by hand"),
-    "noise": ("server.cli.measurement.noise", "measure the cameras' noise from repeated frames"),
-    "measure": ("server.cli.measurement.measure", "measure shape and displacement from image files"),
-    "report": ("server.cli.measurement.report", "write a report of results: one HTML file that a lab can file"),
-    "verify": ("server.cli.operation.verify", "check a data folder: damage, leftovers, checksums"),
-    "reproduce": ("server.cli.evidence.reproduce", "measure a stored analysis again and compare"),
-    "certify": ("server.cli.evidence.certify", "judge the measuring system by known motions and lengths"),
-    "compare-model": ("server.cli.evidence.compare_model", "compare a measured step with a finite element result"),
-    "bundle": ("server.cli.evidence.bundle", "pack a test into one file, or open such a file"),
-    "repair": ("server.cli.operation.repair", "put a data folder in order after a crash"),
-    "trash": ("server.cli.operation.trash", "what was deleted: list, restore, remove for good"),
-    "gauge": ("server.cli.measurement.gauge", "read extensometers, lines and areas off measured results"),
+    "serve": ("stereorig.server.cli.operation.serve", "start the service"),
+    "keys": ("stereorig.server.cli.operation.keys", "make, list and remove keys for the service"),
+    "demo": (
+        "stereorig.server.cli.operation.demo",
+        "run one of the paper's experiments on the simulated rig, over HTTP",
+    ),
+    "devices": ("stereorig.server.cli.operation.devices", "list cameras and serial ports, with their faults"),
+    "doctor": ("stereorig.server.cli.operation.doctor", "check the whole bench: cameras, stage, disk, machine"),
+    "rigfile": ("stereorig.server.cli.operation.rigfile", "check rig files; print every key with its meaning"),
+    "simstage": ("stereorig.server.cli.operation.simstage", "run a simulated motion controller on a socket or pty"),
+    "simframe": (
+        "stereorig.server.cli.operation.simframe",
+        "run a simulated load frame that pulls the strip of a simulated rig",
+    ),
+    "live": ("stereorig.server.cli.operation.live", "measure a test while it runs: begin, show, stop"),
+    "calibrate": ("stereorig.server.cli.measurement.calibrate", "calibrate a pair of cameras from grid images"),
+    "expect": ("stereorig.server.cli.operation.expect", "predict the uncertainties of a planned measurement"),
+    "channels": (
+        "stereorig.server.cli.operation.channels",
+        "a load frame's record, aligned with the steps of a test by time",
+    ),
+    "guide": ("stereorig.server.cli.operation.guide", "calibrate on a running service from a target held by hand"),
+    "noise": ("stereorig.server.cli.measurement.noise", "measure the cameras' noise from repeated frames"),
+    "measure": ("stereorig.server.cli.measurement.measure", "measure shape and displacement from image files"),
+    "report": (
+        "stereorig.server.cli.measurement.report",
+        "write a report of results: one HTML file that a lab can file",
+    ),
+    "verify": ("stereorig.server.cli.operation.verify", "check a data folder: damage, leftovers, checksums"),
+    "reproduce": ("stereorig.server.cli.evidence.reproduce", "measure a stored analysis again and compare"),
+    "certify": ("stereorig.server.cli.evidence.certify", "judge the measuring system by known motions and lengths"),
+    "compare-model": (
+        "stereorig.server.cli.evidence.compare_model",
+        "compare a measured step with a finite element result",
+    ),
+    "evaluate": ("stereorig.server.cli.evidence.evaluate", "run an installed evaluation over measured results"),
+    "bundle": ("stereorig.server.cli.evidence.bundle", "pack a test into one file, or open such a file"),
+    "repair": ("stereorig.server.cli.operation.repair", "put a data folder in order after a crash"),
+    "trash": ("stereorig.server.cli.operation.trash", "deleted data: list, restore, remove for good"),
+    "gauge": ("stereorig.server.cli.measurement.gauge", "read extensometers, lines and areas off measured results"),
     "calibration": (
-        "server.cli.measurement.calibration_files",
+        "stereorig.server.cli.measurement.calibration_files",
         "calibration files to and from other programs; epipolar checks",
     ),
-    "export": ("server.cli.measurement.export", "results as NetCDF, CSV, VTU, MATLAB, HDF5, figures and films"),
+    "export": (
+        "stereorig.server.cli.measurement.export",
+        "results as NetCDF, CSV, VTU, MATLAB, HDF5, figures and films",
+    ),
 }
 
 #: commands that load the kernels
 _MEASURING = ("measure", "reproduce")
-_NEGATIVE_LIST = re.compile(r"-[\d.]+(e[-+]?\d+)?,")
+_NEGATIVE_LIST = re.compile(r"-[0-9.]+(e[-+]?[0-9]+)?,")
 
 
 def _measuring(module: str) -> ModuleType:
@@ -60,7 +79,7 @@ def _measuring(module: str) -> ModuleType:
     one_library_thread()
     hurry()
     try:
-        return importlib.import_module(module)
+        return load_module(module)
     finally:
         go_on()
 
@@ -92,7 +111,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, (module, text) in COMMANDS.items():
         sub = subparsers.add_parser(name, help=text, description=text)
         if arguments and arguments[0] == name:
-            command = _measuring(module) if name in _MEASURING else importlib.import_module(module)
+            command = _measuring(module) if name in _MEASURING else load_module(module)
             command.add_arguments(sub)
             sub.set_defaults(run=command.run)
     args = parser.parse_args(arguments)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from core.errors import InputError
+from stereorig.core.errors import InputError
 
 
 def check_port(args: argparse.Namespace) -> None:
@@ -14,7 +14,7 @@ def check_port(args: argparse.Namespace) -> None:
 
 
 def port_unusable(port: str, error: Exception) -> InputError:
-    """Return the error for a port that the machine does not give; ``port`` as it is told."""
+    """Return the error for a port that the machine does not give; ``port`` as the user gave it."""
     return InputError(
         f"Port {port} cannot be used: {error}.", code="port_unusable", remedy="Give another --port; 0 takes any."
     )

@@ -9,13 +9,13 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from core.errors import InputError
-from core.field.region.outlines import outlines_of
-from core.settings import Outline
-from server.formats.files import make_folder, write_bytes
+from stereorig.core.errors import InputError
+from stereorig.core.field.region.outlines import outlines_of
+from stereorig.core.settings import Outline
+from stereorig.server.formats.files import make_folder, write_bytes
 
 if TYPE_CHECKING:
-    from server.api.models.recipes import Recipe
+    from stereorig.server.api.models.recipes import Recipe
 
 #: options whose value is text or a number, by the setting's name
 _PLAIN = {
@@ -26,7 +26,6 @@ _PLAIN = {
     "prefilter": "prefilter_px",
     "max_sigma": "max_sigma_px",
     "reference_update": "reference_update",
-    "split_step": "split_step",
     "smooth": "smoothing_window",
     "dense": "dense_step_px",
 }
@@ -42,7 +41,9 @@ def load_recipe(path: Path) -> Recipe:
     InputError
         ``recipe_invalid``; ``file_missing`` if there is none.
     """
-    from server.api.models.recipes import recipe_in  # with all that travels: a third of a start, and seldom needed
+    from stereorig.server.api.models.recipes import (
+        recipe_in,  # with all that travels: a third of a start, and seldom needed
+    )
 
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
@@ -102,10 +103,10 @@ def mask_of(recipe: Recipe | None, args: argparse.Namespace, out: Path) -> Path 
 
 
 def notes_on(recipe: Recipe | None) -> Sequence[str]:
-    """Return what a recipe asks for that the command line does not have."""
+    """Return notes on a recipe's requests that the command line does not have."""
     notes = []
     if recipe is not None and recipe.settings.kind == "profile" and recipe.settings.pattern == "surface":
-        notes.append("the recipe asks for shapes alone; displacement is measured beside them")
+        notes.append("the recipe asks for shapes alone; displacement is measured too")
     if recipe is not None and recipe.settings.noise_id is not None:
         notes.append(f"the recipe's noise measurement {recipe.settings.noise_id} is a service's; give --noise FILE")
     return notes

@@ -1,9 +1,9 @@
-"""Compile kernels in processes of their own, beside the work that does not need them yet.
+"""Compile kernels in processes of their own, while other work does not need them yet.
 
 numba compiles one kernel at a time in a process, and keeps it on disk for every other. A displacement's kernels are
-compiled while another process compiles those of a shape, which a measurement needs first. A service has all compiled
-aside when it starts, those that find a line grid before a shape's, a shape's before a displacement's: its worker
-calibrates meanwhile, and waits only for those that a task needs.
+compiled while another process compiles a shape's, which a measurement needs first. When a service starts, it has all
+kernels compiled in such processes, in the order line grid, shape, displacement: its worker can calibrate before all
+are done, and waits only for the kernels that a task needs.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from core.compiling import COMPILING, NotCompiledError, no_collection, refuse_compiling
-from server.base.priority import BELOW_WORKER, LAST, end_with_parent, lower_worker
-from server.worker.kernel_compiler import start_module
+from stereorig.core.compiling import COMPILING, NotCompiledError, no_collection, refuse_compiling
+from stereorig.server.base.priority import BELOW_WORKER, LAST, end_with_parent, lower_worker
+from stereorig.server.worker.kernel_compiler import start_module
 
 _MAX_WAIT_S = 300.0
 _POLL_S = 0.05
@@ -37,7 +37,7 @@ class BackgroundCompilation:
     def __init__(self, patch: str) -> None:
         self._degree = "quadratic" if patch == "quadratic" else "plane"
         self._process: subprocess.Popen[bytes] | None = None
-        from core.threads import available_threads  # loads numba
+        from stereorig.core.threads import available_threads  # loads numba
 
         self._wanted = available_threads() > 1  # a single processor has no time to spare
 
@@ -67,10 +67,10 @@ class BackgroundCompilation:
 
 
 class Task(Protocol):
-    """What waits: a task of the worker, told of its progress and asked whether to go on."""
+    """The waiting task of the worker: it gets progress, and can be stopped."""
 
     def check(self) -> None:
-        """Raise where it is to stop."""
+        """Raise an error if the task is to stop."""
 
     def progress(self, phase: str, done: int, total: int) -> None:
         """Report progress."""
@@ -82,7 +82,7 @@ class KernelsAside:
     Parameters
     ----------
     what
-        ``grid``: those that find a line grid. ``shape``, ``motion``: those of a first shape and displacement.
+        Kernels to compile: ``grid``, of finding a line grid; ``shape``, ``motion``, of a first shape and displacement.
     """
 
     def __init__(self, what: str) -> None:
@@ -95,7 +95,7 @@ class KernelsAside:
 
     @property
     def ended(self) -> bool:
-        """True once nobody would have to wait."""
+        """True once a wait would return at once."""
         return self._process is None or self._process.poll() is not None
 
     def wait(self, task: Task) -> None:
@@ -127,18 +127,18 @@ def _start(what: str) -> subprocess.Popen[bytes]:
 
 def _compile_shape() -> None:
     lower_worker(BELOW_WORKER)
-    from core.threads import set_threads
-    from server.compute.measurement import measure_small_steps
+    from stereorig.core.threads import set_threads
+    from stereorig.server.compute.measurement import measure_small_steps
 
     set_threads(1)
     measure_small_steps(motion=False)
 
 
 def _compile_after_shape() -> None:
-    """Compile a displacement's fit beside a shape's kernels, and what both are needed for once those are on disk."""
+    """Compile a displacement's fit while a shape's kernels are compiled; then the other kernels of a displacement."""
     lower_worker(LAST)
-    from core.threads import set_threads
-    from server.compute.measurement import measure_small_steps
+    from stereorig.core.threads import set_threads
+    from stereorig.server.compute.measurement import measure_small_steps
 
     set_threads(1)
     _compile_motion("affine")
@@ -155,18 +155,18 @@ def _compile_after_shape() -> None:
 
 def _compile_grid() -> None:
     lower_worker()
-    from server.compute.grid_kernels import find_drawn_grid
+    from stereorig.server.compute.grid_kernels import find_drawn_grid
 
     find_drawn_grid()
 
 
 def _compile_motion(patch: Any) -> None:
     """Fit one point that has no start, and compute its covariance: this compiles all kernels of a displacement."""
-    from core.cameras.camera import Camera
-    from core.cameras.stereo import StereoPair
-    from core.matching.cluster_robust import cluster_robust_covariance
-    from core.matching.fit import fit_motion
-    from core.matching.options import MatchOptions
+    from stereorig.core.cameras.camera import Camera
+    from stereorig.core.cameras.stereo import StereoPair
+    from stereorig.core.matching.cluster_robust import cluster_robust_covariance
+    from stereorig.core.matching.fit import fit_motion
+    from stereorig.core.matching.options import MatchOptions
 
     camera = Camera.from_paper(
         phd_px=1000.0,
@@ -191,7 +191,7 @@ def _compile_motion(patch: Any) -> None:
 
 
 def main() -> int:
-    """Compile a displacement's kernels for plane or quadratic patches, or those of a grid, a first shape or motion."""
+    """Compile a displacement's kernels for plane or quadratic patches, or a grid's, a first shape's or motion's."""
     end_with_parent()
     what = sys.argv[1]
     with no_collection():

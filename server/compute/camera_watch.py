@@ -1,4 +1,4 @@
-"""Whether a camera moved, step by step: since the calibration, since the reference, since the step before."""
+"""Watch for a moved camera, step by step: since the calibration, since the reference, since the step before."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration import COVARIANCE_NAMES
-from core.cameras.stereo import StereoPair
-from core.errors import SeedError
-from core.field.points.images import MeasureImage
-from core.field.points.result import Field
-from core.field.settings import MeasureOptions
-from core.matching.slopes import SlopeFilter
-from core.orientation import judge_offsets
-from core.orientation.change import Ends, ends_of
-from core.orientation.coarse import features_off_px
-from core.orientation.finding import Against
-from core.orientation.matched import matched_points
-from core.orientation.offsets import StepOffsets
-from core.orientation.step import SAMPLE, step_points
-from server.formats.results.camera_motion import MOVED_REMEDY, CameraMotion
+from stereorig.core.calibration import COVARIANCE_NAMES
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import SeedError
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.settings import MeasureOptions
+from stereorig.core.matching.slopes import SlopeFilter
+from stereorig.core.orientation import judge_offsets
+from stereorig.core.orientation.change import Ends, ends_of
+from stereorig.core.orientation.coarse import features_off_px
+from stereorig.core.orientation.finding import Against
+from stereorig.core.orientation.matched import matched_points
+from stereorig.core.orientation.offsets import StepOffsets
+from stereorig.core.orientation.step import SAMPLE, step_points
+from stereorig.server.formats.results.camera_motion import MOVED_REMEDY, MotionCheck
 
 _KEPT = 3
 _FAR_PX = 1.0  # starts are looked for within 1.5 px of the epipolar line, features found to 0.7 px
@@ -32,7 +32,7 @@ Images = tuple[MeasureImage, MeasureImage]
 
 @dataclass(eq=False)
 class CameraWatch:
-    """The epipolar offsets of a sequence's steps, held against one another.
+    """Comparison of the epipolar offsets of a sequence's steps.
 
     Parameters
     ----------
@@ -41,9 +41,9 @@ class CameraWatch:
     reference
         Number of the reference step.
     covariance
-        Names and covariance (n, n) of the cameras' parameters, where it is known.
+        Names and covariance (n, n) of the cameras' parameters, if it is known.
     own_px
-        The calibration's own offset at most, where it is known.
+        The calibration's own offset at most, if it is known.
     imported
         True for another program's calibration.
     slopes
@@ -77,7 +77,7 @@ class CameraWatch:
         off_px = None if self.imported else features_off_px(self.pair, *images)
         if off_px is not None and off_px > _FAR_PX:
             raise SeedError(
-                f"Step {n}: most feature matches between both cameras lie about {off_px:.1f} px off their epipolar "
+                f"Step {n}: most feature matches between both cameras are about {off_px:.1f} px off their epipolar "
                 "lines: a camera moved, or the calibration belongs to another set-up.",
                 code="camera_moved",
                 remedy=MOVED_REMEDY,
@@ -93,7 +93,7 @@ class CameraWatch:
         shape: Field,
         previous: int | None,
         before: tuple[Field, Images] | None,
-    ) -> CameraMotion | None:
+    ) -> MotionCheck | None:
         """Judge a step that was measured; it may have been measured and judged before.
 
         Parameters
@@ -122,7 +122,7 @@ class CameraWatch:
             self.pair, step, covariance=covariance, names=names, own_px=self.own_px, imported=self.imported
         )
         if n == self.reference:
-            return CameraMotion.of(against_calibration, None, None)
+            return MotionCheck.of(against_calibration, None, None)
         reference = self._of(self.reference, shape, images)
         earlier = None
         if previous is not None and previous != self.reference:
@@ -134,7 +134,7 @@ class CameraWatch:
             else judge_offsets(self.pair, step, before=other, against=name, covariance=covariance, names=names)
             for other, name in compared
         )
-        return CameraMotion.of(against_calibration, against_reference, against_last)
+        return MotionCheck.of(against_calibration, against_reference, against_last)
 
     def _of(self, n: int, result: Field, images: Images) -> StepOffsets | None:
         """Offsets of a step: those known of it, or else of this field and these images, kept from now on."""

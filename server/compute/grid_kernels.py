@@ -1,25 +1,25 @@
 """The kernels that find a line grid, run once on a grid drawn here: this loads or compiles them.
 
-They are a calibration's first work, and so compiled first, beside those of a measurement.
+They are a calibration's first work, and so compiled first, at the same time as a measurement's.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from core.grid import detect_grid
-from core.target import GridTarget
-from server.compute.background_compilation import KernelsAside
-from server.worker.process import current_task
+from stereorig.core.grid import detect_grid
+from stereorig.core.target import GridTarget
+from stereorig.server.compute.background_compilation import KernelsAside
+from stereorig.server.worker.process import current_task
 
 _LINES, _PITCH_PX, _SIGMA_PX, _ANGLE_RAD = 11, 28.0, 0.8, 0.6
 
 grid_aside = KernelsAside("grid")
-"""Started by the worker's warm-up where they are not on disk."""
+"""Started by the worker's warm-up if the kernels are not on disk."""
 
 
 def await_grid_kernels(target: object) -> None:
-    """Return once the kernels that find this target are there; a board's are compiled where they are needed.
+    """Return once the kernels that find this target are compiled; a board's are compiled at their first use.
 
     Raises
     ------

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.errors import ImageError, MeasurementError, RegionError
-from core.field.checks.epipolar_offset import FAILED_PX, check_epipolar
-from core.field.points.images import MeasureImage
-from core.field.region.region import PointGrid
-from core.field.settings import MeasureOptions
-from core.measure import measure_shape
-from core.orientation.coarse import features_off_px
-from server.formats.calibrations.recognise import load_calibration
-from server.formats.calibrations.volume import own_px_of, rbe_of
-from server.worker.tasks import LiveCheckTask, LiveFinding
+from stereorig.core.errors import ImageError, MeasurementError, RegionError
+from stereorig.core.field.checks.epipolar_offset import FAILED_PX, check_epipolar
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.field.settings import MeasureOptions
+from stereorig.core.measure import measure_shape
+from stereorig.core.orientation.coarse import features_off_px
+from stereorig.server.compute.tasks import LiveCheckTask, LiveFinding
+from stereorig.server.formats.calibrations.recognise import load_calibration
+from stereorig.server.formats.calibrations.volume import own_px_of, rbe_of
 
 _POINTS = 300  # over the whole image: a smooth offset needs no more
 _MIN_VALID = 20
@@ -24,8 +24,8 @@ _COARSE_PX = 1.0  # features are found to 0.7 px: above it they say more than su
 def check_live(task: LiveCheckTask) -> LiveFinding:
     """Return the offset from the epipolar lines.
 
-    A surface is measured as a test's reference would be, on a coarse grid over the whole image. Where the cameras
-    turned so far that nothing matches, the offset is that of features, to some tenths of a pixel.
+    A surface is measured as a test's reference would be, on a coarse grid over the whole image. If the cameras turned
+    so far that nothing matches, the offset is measured by features, to some tenths of a pixel.
     """
     loaded = load_calibration(task.calibration)
     images = [MeasureImage(task.pixels[k], f"camera {k + 1}'s live image") for k in range(2)]
@@ -48,7 +48,7 @@ def check_live(task: LiveCheckTask) -> LiveFinding:
     off_px = features_off_px(loaded.pair, *images)
     if off_px is None or off_px < max(_COARSE_PX, FAILED_PX + (own or 0.0)):
         return _no_texture(own)
-    text = f"features lie about {off_px:.1f} px off their epipolar lines"
+    text = f"features are about {off_px:.1f} px off their epipolar lines"
     if loaded.imported:
         level, text = "warning", text + "; the imported calibration's own error is not known"
     else:

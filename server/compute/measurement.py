@@ -2,8 +2,8 @@
 
 The parts that the steps of one analysis share (cameras, reference images and their spline coefficients, the grid of
 points, the last fields) are kept between tasks, the next step's images are read while a step is fitted, and that step
-is fitted while this one's file is written; a fresh worker makes them again from the files, so a step measured anywhere
-gives the same result to the last bit.
+is fitted while this one's file is written; a fresh worker makes them again from the files, so that a step gives the
+same result in every worker, to the last bit.
 """
 
 from __future__ import annotations
@@ -17,33 +17,32 @@ from typing import Any
 import cv2
 import numpy as np
 
-from core.cameras.camera import Camera
-from core.cameras.stereo import StereoPair
-from core.compiling import NotCompiledError, refuse_compiling, report_compiling
-from core.field.points.result import Field
-from core.field.region.region import PointGrid
-from core.field.seeding.seeds import Seed
-from core.measure import MeasureOptions, ReferencePair
-from core.progress import CancelToken, Progress
-from core.systematic.interpolation import SmoothSlopes, interpolation_term
-from core.threads import available_threads, set_threads
-from server.compute.background_compilation import BackgroundCompilation, KernelsAside
-from server.compute.grid_kernels import find_drawn_grid, grid_aside
-from server.compute.overlap import Asked, Measure, MeasureAhead, timed
-from server.compute.sequence import Pair, SequenceMeasurement
-from server.compute.tiles.folder_crew import FolderCrew
-from server.formats.calibrations.recognise import load_calibration
-from server.formats.images import read_mask
-from server.formats.noise_json import load_noise
-from server.formats.results.starts import starts_file
-from server.worker.process import current_task
-from server.worker.tasks import StepImages, StepTask
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.compiling import NotCompiledError, refuse_compiling, report_compiling
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.field.seeding.seeds import Seed
+from stereorig.core.measure import MeasureOptions, ReferencePair
+from stereorig.core.progress import CancelToken, Progress
+from stereorig.core.systematic.interpolation import SmoothSlopes, interpolation_term
+from stereorig.core.threads import available_threads, set_threads
+from stereorig.server.compute.background_compilation import BackgroundCompilation, KernelsAside
+from stereorig.server.compute.grid_kernels import find_drawn_grid, grid_aside
+from stereorig.server.compute.overlap import Measure, MeasureAhead, RequestedStep, timed
+from stereorig.server.compute.sequence import Pair, SequenceMeasurement
+from stereorig.server.compute.tasks import StepImages, StepTask
+from stereorig.server.formats.calibrations.recognise import load_calibration
+from stereorig.server.formats.images import read_mask
+from stereorig.server.formats.noise_json import load_noise
+from stereorig.server.formats.results.starts import starts_file
+from stereorig.server.worker.process import current_task
 
 _KEPT = 2
 
 
 @dataclass(eq=False)
-class _Kept:
+class _Analysis:
     """A measurement between its tasks."""
 
     sequence: SequenceMeasurement
@@ -55,7 +54,7 @@ class _Kept:
         return ahead[1].result() if ahead is not None and ahead[0] == step else None
 
 
-_kept: OrderedDict[str, _Kept] = OrderedDict()
+_kept: OrderedDict[str, _Analysis] = OrderedDict()
 _shape_aside, _motion_aside = KernelsAside("shape"), KernelsAside("motion")
 _reader = ThreadPoolExecutor(1, thread_name_prefix="stereorig-read")
 _ahead = MeasureAhead()
@@ -74,10 +73,12 @@ def measure_step(task: StepTask) -> dict[str, object]:
         The service asked for it.
     """
     channel = current_task()
-    measured = _ahead.take(Asked(_key_of(task), task.step, task.previous, task.from_head, task.against), channel)
-    kept = _kept_of(task)
+    measured = _ahead.take(
+        RequestedStep(_key_of(task), task.step, task.previous, task.from_head, task.against), channel
+    )
+    kept = _analysis_of(task)
     sequence = kept.sequence
-    sequence.go_on(task.generation)
+    sequence.forget_replaced(task.generation)
     sequence.steps |= task.earlier
     if measured is None:
         measured = timed(_measuring(kept, task, task.step, task.previous), channel.progress, channel)
@@ -87,7 +88,7 @@ def measure_step(task: StepTask) -> dict[str, object]:
     elif task.following is not None:
         kept.ahead = task.following, _reader.submit(sequence.read, task.following)
     if task.following is not None and channel.keeps_going and _motion_aside.ended:
-        after = Asked(_key_of(task), task.following, task.step.n)
+        after = RequestedStep(_key_of(task), task.following, task.step.n)
         _ahead.begin(after, _measuring(kept, task, task.following, task.step.n))
     agrees = {}
     if task.compared is not None:
@@ -105,8 +106,8 @@ def measure_step(task: StepTask) -> dict[str, object]:
     return {**finished.summary, **agrees, "compute_s": measured.seconds}
 
 
-def _measuring(kept: _Kept, task: StepTask, step: StepImages, previous: int | None) -> Measure:
-    """Return the measurement of a step; images of the one that follows the task's are read meanwhile."""
+def _measuring(kept: _Analysis, task: StepTask, step: StepImages, previous: int | None) -> Measure:
+    """Return the function that measures a step; the following step's images are read at the same time."""
 
     def measure(progress: Progress, cancel: CancelToken) -> Field:
         sequence = kept.sequence
@@ -114,9 +115,7 @@ def _measuring(kept: _Kept, task: StepTask, step: StepImages, previous: int | No
         if task.following is not None and step != task.following:
             kept.ahead = task.following, _reader.submit(sequence.read, task.following)
         alone: dict[str, Any] = {} if step != task.step else {"from_head": task.from_head, "against": task.against}
-        return sequence.measure(
-            step, images, previous=previous, shares=task.shares, progress=progress, cancel=cancel, **alone
-        )
+        return sequence.measure(step, images, previous=previous, progress=progress, cancel=cancel, **alone)
 
     return measure
 
@@ -125,10 +124,10 @@ def _key_of(task: StepTask) -> str:
     return repr((task.folder, task.calibration, task.reference, task.settings))
 
 
-def _kept_of(task: StepTask) -> _Kept:
+def _analysis_of(task: StepTask) -> _Analysis:
     key = _key_of(task)
     if key not in _kept:
-        _kept[key] = _Kept(_begin(task))
+        _kept[key] = _Analysis(_begin(task))
         while len(_kept) > _KEPT:
             _kept.popitem(last=False)
     _kept.move_to_end(key)
@@ -145,12 +144,11 @@ def _begin(task: StepTask) -> SequenceMeasurement:
         reference=task.reference,
         folder=task.folder,
         noise=None if task.noise is None else load_noise(task.noise),
-        crew=FolderCrew(task.folder, task.calibration, lambda tiles: current_task().call(tiles)),
     )
 
 
 def warm_up(threads: int) -> None:
-    """Load the kernels of the default settings; what is not on disk is compiled aside, see :func:`await_kernels`."""
+    """Load the default settings' kernels; missing ones are compiled in other processes, see :func:`await_kernels`."""
     set_threads(threads)
     if available_threads() < 2:  # a single processor has no time to spare
         compile_here(threads)
@@ -165,7 +163,7 @@ def warm_up(threads: int) -> None:
 
 
 def await_kernels(*, motion: bool = True) -> None:
-    """Return once the kernels are there that :func:`warm_up` has compiled aside; ``motion``: a displacement's too.
+    """Return once :func:`warm_up` has a shape's kernels compiled; with ``motion`` also a displacement's.
 
     Raises
     ------
@@ -178,14 +176,14 @@ def await_kernels(*, motion: bool = True) -> None:
 
 
 def compile_here(threads: int) -> None:
-    """Load the kernels of the default settings, or compile them: a displacement's in a process beside this one."""
+    """Load the kernels of the default settings, or compile them: a displacement's in another process."""
     set_threads(threads)
     with BackgroundCompilation("affine") as compilation, report_compiling(compilation.start):
         measure_small_steps(compilation.wait)
 
 
 def measure_small_steps(before_motion: Callable[[], None] = lambda: None, *, motion: bool = True) -> None:
-    """Measure the shape in a small pair of images, and a displacement of nothing where ``motion`` says so."""
+    """Measure the shape in a small pair of images, and with ``motion`` a displacement of zero."""
     # a plane imaged by two cameras side by side: camera 2's image is camera 1's, shifted by 6 px
     rng = np.random.default_rng(1)
     noise = cv2.GaussianBlur(rng.normal(size=(128, 150)), (0, 0), 1.3)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
-from core.errors import ImageError, InputError
-from core.names import CAMERAS
-from core.noise import NoiseModel, measure_noise
-from server.formats.noise_frames import read_frames
-from server.formats.noise_json import noise_content, write_noise
-from server.worker.tasks import NoiseTask
+from stereorig.core.errors import ImageError, InputError
+from stereorig.core.names import CAMERAS
+from stereorig.core.noise import NoiseModel, measure_noise, measure_pattern
+from stereorig.server.compute.tasks import NoiseTask
+from stereorig.server.formats.noise_json import noise_content, read_frames, write_noise
 
 
 def fit_noise(task: NoiseTask) -> dict[str, object]:
@@ -19,7 +19,7 @@ def fit_noise(task: NoiseTask) -> dict[str, object]:
     Raises
     ------
     InputError, ImageError
-        As :func:`core.noise.measure_noise`, with ``camera``.
+        As :func:`stereorig.core.noise.measure_noise` and :func:`stereorig.core.noise.measure_pattern`, with ``camera``.
     """
     folder = Path(task.folder)
     document = json.loads((folder / "frames.json").read_text())
@@ -32,6 +32,9 @@ def fit_noise(task: NoiseTask) -> dict[str, object]:
                 read_frames([folder / entry["file"] for entry in files]),
                 full_scale=float((1 << document["bit_depth"][cam]) - 1),
             )
+            if document.get("even"):
+                whole = read_frames([folder / entry["file"] for entry in files], whole=True)
+                models[cam] = replace(models[cam], sensor=measure_pattern(whole))
         except (ImageError, InputError) as error:
             raise type(error)(f"{cam}: {error.cause}", code=error.code, remedy=error.remedy, camera=cam) from error
         sources[cam] = [{"file": entry["file"], "sha256": entry["sha256"]} for entry in files]

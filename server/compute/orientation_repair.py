@@ -10,32 +10,32 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.field.points.images import MeasureImage, check_calibrated_size
-from core.field.region.lay_points import lay_points
-from core.field.region.region import PointGrid, check_region
-from core.field.settings import MeasureOptions
-from core.names import CAMERAS
-from core.orientation import Repair, RepairLimits, repair_orientation
-from core.progress import CancelToken, Progress
-from core.settings import SPACING_PX, Region
-from server.formats.calibrations.recognise import load_calibration, parse_calibration
-from server.formats.calibrations.repaired import native_content, repaired_content
-from server.formats.files import mismatch, sha256_of
-from server.formats.images import read_file, read_image, read_mask
-from server.formats.results.summary import to_json
-from server.store.durable import write_json
-from server.worker.process import current_task
-from server.worker.tasks import RepairTask, StepImages
+from stereorig.core.field.points.images import MeasureImage, check_calibrated_size
+from stereorig.core.field.region.lay_points import lay_points
+from stereorig.core.field.region.region import PointGrid, check_region
+from stereorig.core.field.settings import MeasureOptions
+from stereorig.core.names import CAMERAS
+from stereorig.core.orientation import RepairedPair, RepairLimits, repair_orientation
+from stereorig.core.progress import CancelToken, Progress
+from stereorig.core.settings import SPACING_PX, Region
+from stereorig.server.compute.tasks import RepairTask, StepImages
+from stereorig.server.formats.calibrations.recognise import load_calibration, parse_calibration
+from stereorig.server.formats.calibrations.repaired import native_content, repaired_content
+from stereorig.server.formats.files import mismatch, sha256_of
+from stereorig.server.formats.images import read_file, read_image, read_mask
+from stereorig.server.formats.results.summary import to_json
+from stereorig.server.store.durable import write_json
+from stereorig.server.worker.process import current_task
 
 _ENOUGH_POINTS = 10_000
 
 
 @dataclass(frozen=True, eq=False)
 class RepairedCalibration:
-    """The content of the new calibration.json, and what was found."""
+    """The content of the new calibration.json, and the repair that it comes from."""
 
     content: dict[str, Any]
-    repair: Repair
+    repair: RepairedPair
 
 
 def repair_from_files(
@@ -50,7 +50,7 @@ def repair_from_files(
     progress: Progress | None = None,
     cancel: CancelToken | None = None,
 ) -> RepairedCalibration:
-    """Estimate the cameras' relative orientation anew from the images of some steps.
+    """Estimate the cameras' relative orientation again from the images of some steps.
 
     Parameters
     ----------
@@ -59,18 +59,18 @@ def repair_from_files(
     steps
         Images, all taken after the bump.
     region
-        Where points lie in camera 1's images; None: all of them.
+        Region of the points in camera 1's images; None: all of them.
     mask
-        (rows, cols) True where points may lie, or None.
+        (rows, cols) True where points are allowed, or None.
     subset_px, spacing_px
-        As for a measurement; no spacing: so many points that further ones would tell nothing new.
+        As for a measurement; no spacing: as many points as add information.
     limits, progress, cancel
-        As for :func:`core.orientation.repair_orientation`.
+        As for :func:`stereorig.core.orientation.repair_orientation`.
 
     Raises
     ------
     CalibrationError
-        Where it does not hold, see :func:`core.orientation.repair_orientation`.
+        If the repair is refused, see :func:`stereorig.core.orientation.repair_orientation`.
     FileFormatError
         Calibration or images cannot be read.
     RegionError, ImageError, SeedError, Cancelled

@@ -1,7 +1,7 @@
 """Reading ahead, writing behind and measuring ahead: disk, decoder and fits at work together, one item each way.
 
-All keep the order of the items, hold one item at most besides the one in work, and hand errors over where a plain loop
-would have met them.
+All keep the order of the items, hold one item at most in addition to the one in work, and raise errors at the place
+where a plain loop would have met them.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Generic, TypeVar
 
-from core.field.points.result import Field
-from core.progress import CancelToken, Progress
-from server.worker.process import TaskChannel
-from server.worker.tasks import StepImages
+from stereorig.core.field.points.result import Field
+from stereorig.core.progress import CancelToken, Progress
+from stereorig.server.compute.tasks import StepImages
+from stereorig.server.worker.process import TaskChannel
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -49,7 +49,7 @@ class ReadAhead(Generic[Item, Result]):
         return self
 
     def __next__(self) -> Result:
-        """Return the next result, or raise what reading it raised; reading the one after it begins."""
+        """Return the next result, or raise the error of reading it; begin to read the one after it."""
         if self._next is None:
             raise StopIteration
         try:
@@ -109,7 +109,7 @@ class WriteBehind(Generic[Result]):
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredStep:
     """A measured step and the time that it took, s."""
 
     field: Field
@@ -120,8 +120,8 @@ Measure = Callable[[Progress, CancelToken], Field]
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What a task asks for: a step of a measurement, and the step that it starts from, or its head; or a head."""
+class RequestedStep:
+    """A task's request: a step of a measurement, and the step that it starts from, or its head; or a head."""
 
     measurement: str
     step: StepImages
@@ -130,11 +130,11 @@ class Asked:
     against: int | None = None
 
 
-def timed(measure: Measure, progress: Progress, cancel: CancelToken) -> Measured:
+def timed(measure: Measure, progress: Progress, cancel: CancelToken) -> MeasuredStep:
     """Measure a step now."""
     began = time.perf_counter()
     field = measure(progress, cancel)
-    return Measured(field, round(time.perf_counter() - began, 3))
+    return MeasuredStep(field, round(time.perf_counter() - began, 3))
 
 
 class _Channel:
@@ -156,26 +156,26 @@ class _Channel:
 class MeasureAhead:
     """The next step of a sequence, measured while the last one's file is written.
 
-    A step depends on the one before, not on its file. One step at most is begun before it is asked for; what it ends
-    with, an error too, goes to the task that asks for just this step, and is dropped where another one comes.
+    A step depends on the one before, not on its file. One step at most is begun before it is asked for; its result or
+    error goes to the task that asks for just this step, and is dropped if another step is asked for.
     """
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="stereorig-ahead")
-        self._begun: tuple[Asked, _Channel, Future[Measured]] | None = None
+        self._begun: tuple[RequestedStep, _Channel, Future[MeasuredStep]] | None = None
 
-    def begin(self, asked: Asked, measure: Measure) -> None:
+    def begin(self, asked: RequestedStep, measure: Measure) -> None:
         """Begin a step; the one before was taken or dropped."""
         channel = _Channel()
         self._begun = asked, channel, self._pool.submit(timed, measure, channel.progress, channel)
 
-    def take(self, asked: Asked, task: TaskChannel) -> Measured | None:
+    def take(self, asked: RequestedStep, task: TaskChannel) -> MeasuredStep | None:
         """Return the step if it was begun, once it is measured; else None, and nothing else is under way.
 
         Raises
         ------
         Exception
-            What its measurement ended with.
+            The error of its measurement.
         """
         if self._begun is None or self._begun[0] != asked:
             self.drop()
@@ -185,11 +185,11 @@ class MeasureAhead:
         return future.result()
 
     def drop(self) -> None:
-        """Stop what was begun, and wait until it has."""
+        """Stop the step that was begun, and wait until it has ended."""
         if self._begun is None:
             return
         _, channel, future = self._begun
         self._begun = None
         channel.dropped.set()
-        with contextlib.suppress(Exception):  # nobody asked for it
+        with contextlib.suppress(Exception):  # the step is not wanted any more
             future.result()

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from core.cameras.stereo import StereoPair
-from core.errors import RegionError
-from core.field.seeding.epipolar_search import visible_depths
-from core.field.seeding.seeds import Seed, seeds_of
-from core.settings import AnalysisSettings
-from server.formats.calibrations.recognise import load_calibration
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import RegionError
+from stereorig.core.field.seeding.epipolar_search import visible_depths
+from stereorig.core.field.seeding.seeds import Seed, seeds_of
+from stereorig.core.settings import AnalysisSettings
+from stereorig.server.formats.calibrations.recognise import load_calibration
 
 #: a click is good to some pixels; further from the epipolar line it is another point
 MAX_EPIPOLAR_PX = 8.0
@@ -57,7 +57,7 @@ def check_positions(pair: StereoPair, seeds: Sequence[Seed], size2_px: tuple[int
         assert seed.xy2_px is not None
         if not (0.0 <= seed.xy2_px[0] <= size2_px[0] - 1 and 0.0 <= seed.xy2_px[1] <= size2_px[1] - 1):
             raise RegionError(
-                f"The seed's position ({seed.xy2_px[0]:g}, {seed.xy2_px[1]:g}) lies outside camera 2's image of "
+                f"The seed's position ({seed.xy2_px[0]:g}, {seed.xy2_px[1]:g}) is outside camera 2's image of "
                 f"{size2_px[0]} x {size2_px[1]} px.",
                 code="seed_outside",
                 remedy="Give positions inside camera 2's reference image.",
@@ -68,7 +68,7 @@ def check_positions(pair: StereoPair, seeds: Sequence[Seed], size2_px: tuple[int
         one, two = seeds[worst].xy_px, seeds[worst].xy2_px
         assert two is not None
         raise RegionError(
-            f"The seed ({one[0]:g}, {one[1]:g}) cannot be at ({two[0]:g}, {two[1]:g}) in camera 2: that lies "
+            f"The seed ({one[0]:g}, {one[1]:g}) cannot be at ({two[0]:g}, {two[1]:g}) in camera 2: that is "
             f"{off[worst]:.1f} px from its epipolar line; {MAX_EPIPOLAR_PX:g} px are allowed.",
             code="seed_off_epipolar",
             remedy="Click the same point in both views, or leave camera 2's position out.",
@@ -76,7 +76,7 @@ def check_positions(pair: StereoPair, seeds: Sequence[Seed], size2_px: tuple[int
 
 
 def distances_px(pair: StereoPair, seeds: Sequence[Seed]) -> np.ndarray:
-    """Return the distance (n,) of each seed's position in camera 2 from its epipolar line; NaN where there is none."""
+    """Return the distance (n,) of each seed's position in camera 2 from its epipolar line; NaN without one."""
     out = np.full(len(seeds), np.nan)
     for k, seed in enumerate(seeds):
         if seed.xy2_px is not None:

@@ -17,35 +17,36 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import FileFormatError, MeasurementError, SeedError
-from core.field.points.images import MeasureImage, check_calibrated_size
-from core.field.points.result import Field
-from core.field.region.lay_points import make_grid
-from core.field.seeding.seeds import seeds_of
-from core.field.sequence.joint import agree
-from core.field.settings import MeasureOptions
-from core.measure import PreviousStep, ReferencePair, Updating
-from core.names import CAMERAS
-from core.progress import CancelToken, Progress
-from core.settings import StoredSettings
-from core.strain import StrainOptions
-from core.systematic.terms import with_strain
-from server.compute.beside import StepsBeside
-from server.compute.dense.steps import DenseStep, DenseSteps
-from server.compute.strain import strain_of_step, summarise_strain
-from server.compute.tiles.folder_crew import FolderCrew
-from server.formats.calibrations.recognise import LoadedCalibration
-from server.formats.calibrations.volume import rbe_of
-from server.formats.files import make_folder, sha256_of, write_bytes
-from server.formats.images import read_image
-from server.formats.noise_json import LoadedNoise
-from server.formats.results.folder import dense_result
-from server.formats.results.reading import read_measured
-from server.formats.results.starts import starts_file, with_starts, write_starts
-from server.formats.results.summary import summarise, to_json
-from server.formats.results.writing import Provenance, write_field
-from server.formats.version import software_version
-from server.worker.tasks import Earlier, StepImages, files_of
+from stereorig.core.errors import FileFormatError, MeasurementError, SeedError
+from stereorig.core.field.checks.epipolar_offset import rows_not_together
+from stereorig.core.field.points.images import MeasureImage, check_calibrated_size
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.lay_points import make_grid
+from stereorig.core.field.seeding.image_faults import INTERLACED_PX, field_shift_px, unsure_error
+from stereorig.core.field.seeding.seeds import seeds_of
+from stereorig.core.field.sequence.joint import agree
+from stereorig.core.field.settings import MeasureOptions
+from stereorig.core.measure import PreviousStep, ReferencePair, Updating
+from stereorig.core.names import CAMERAS
+from stereorig.core.progress import CancelToken, Progress
+from stereorig.core.settings import StoredSettings
+from stereorig.core.strain import StrainOptions
+from stereorig.core.systematic.terms import with_strain
+from stereorig.server.compute.beside import StepsBeside
+from stereorig.server.compute.dense.steps import DenseStep, DenseSteps
+from stereorig.server.compute.strain import strain_of_step, summarise_strain
+from stereorig.server.compute.tasks import Earlier, StepImages, files_of
+from stereorig.server.formats.calibrations.recognise import LoadedCalibration
+from stereorig.server.formats.calibrations.volume import rbe_of
+from stereorig.server.formats.files import make_folder, sha256_of, write_bytes
+from stereorig.server.formats.images import read_image
+from stereorig.server.formats.noise_json import LoadedNoise
+from stereorig.server.formats.results.folder import dense_result
+from stereorig.server.formats.results.reading import read_measured
+from stereorig.server.formats.results.starts import starts_file, with_starts, write_starts
+from stereorig.server.formats.results.summary import ROWS_APART, summarise, to_json
+from stereorig.server.formats.results.writing import Provenance, write_field
+from stereorig.server.formats.version import software_version
 
 Pair = tuple[MeasureImage, MeasureImage]
 
@@ -57,7 +58,7 @@ class FinishedStep:
     Attributes
     ----------
     field
-        As the file has it: smoothed where that was asked for, points outside the calibrated volume marked.
+        As the file has it: smoothed if asked for, points outside the calibrated volume marked.
     summary
         The step's entry of ``summary.json``, without the time that its measurement took.
     """
@@ -76,7 +77,7 @@ class SequenceMeasurement:
     calibration, settings
         The calibration, and the settings of the measurement.
     mask
-        (rows, cols) True where points may lie, or None.
+        (rows, cols) True where points are allowed, or None.
     reference
         Step that the first comparison is made with.
     folder
@@ -85,8 +86,6 @@ class SequenceMeasurement:
         Models of both cameras.
     inputs
         Name and SHA-256 of further files that the result depends on.
-    crew
-        Those who may fit parts of a step; None: nobody.
 
     Raises
     ------
@@ -103,7 +102,6 @@ class SequenceMeasurement:
     folder: Path
     noise: LoadedNoise | None = None
     inputs: Mapping[str, str] = field(default_factory=dict)
-    crew: FolderCrew | None = None
 
     def __post_init__(self) -> None:
         self.options = MeasureOptions.of(self.settings)
@@ -115,6 +113,7 @@ class SequenceMeasurement:
         self._from_head = False
         self._generation = 0
         self._last_images: tuple[int, Pair] | None = None
+        self._interlaced: dict[int, str] = {}
         self._sequence: Updating | None = None
         self._watched: int | None = None  # the last step that the cameras' watch was given
         self._dense = DenseSteps(self.calibration.pair, self.options, self.settings.dense_step_px)
@@ -127,8 +126,8 @@ class SequenceMeasurement:
         own = self.pair.image1, self.pair.image2
         self._beside = StepsBeside(self.calibration, self.settings, self.options, self.reference.n, own)
 
-    def go_on(self, generation: int) -> None:
-        """Forget fields of steps, and what was begun at them, if their results have been replaced since."""
+    def forget_replaced(self, generation: int) -> None:
+        """Forget fields of steps, and work begun on them, if their results have been replaced since."""
         if generation != self._generation:
             own = self.file_of(self.reference.n)
             self._fields = {path: f for path, f in self._fields.items() if path == own}
@@ -140,10 +139,8 @@ class SequenceMeasurement:
             MeasureImage(read_image(path), str(path), noise=None if model is None else model.averaged(*step.averages))
             for path, model in zip(step.files, self._models, strict=True)
         )
-        for image, path in zip((one, two), step.files, strict=True):
-            prepared = image.prepared(self.options.interpolation, None, self.options.blur)
-            if self.crew is not None:
-                self.crew.know(prepared, path)
+        for image in (one, two):
+            image.prepared(self.options.interpolation, None, self.options.blur)
             image.contrast()
         return one, two
 
@@ -155,7 +152,6 @@ class SequenceMeasurement:
         previous: int | None = None,
         from_head: bool = False,
         against: int | None = None,
-        shares: bool = False,
         progress: Progress | None = None,
         cancel: CancelToken | None = None,
     ) -> Field:
@@ -171,8 +167,6 @@ class SequenceMeasurement:
             Take the previous step's field from its head, see :meth:`keep_head`.
         against
             Reference to match the step against from seeds, without a previous step.
-        shares
-            Let the crew take parts of it.
 
         Raises
         ------
@@ -185,7 +179,7 @@ class SequenceMeasurement:
         Cancelled
             If the token was set.
         """
-        more: dict[str, Any] = {"progress": progress, "cancel": cancel, "crew": self.crew if shares else None}
+        more: dict[str, Any] = {"progress": progress, "cancel": cancel}
         seeds = seeds_of(self.settings)
         if seeds is not None:
             more["seeds"] = seeds
@@ -224,7 +218,7 @@ class SequenceMeasurement:
         return result
 
     def _keep(self, file: Path, field: Field) -> None:
-        """Keep a field beside the reference's, for the step after it."""
+        """Keep a field, and the reference's, for the next step."""
         own = self.file_of(self.reference.n)
         self._fields = {path: f for path, f in self._fields.items() if path == own} | {file: field}
 
@@ -243,7 +237,7 @@ class SequenceMeasurement:
         self._keep(path, result)
 
     def agrees(self, step: StepImages, result: Field, earlier: Earlier) -> bool:
-        """Return True if steps that were measured from what is there of a step stand, see :func:`agree`."""
+        """Return True if steps measured from the earlier result of a step remain valid, see :func:`agree`."""
         path = self.file_of(step.n, earlier)
         return path.exists() and agree(result, read_measured(path))
 
@@ -254,7 +248,7 @@ class SequenceMeasurement:
         return self._field(previous), self._previous_images(previous)
 
     def _matched(self, n: int, images: Pair, measure: Callable[[], Field]) -> Field:
-        """Return what is measured; where nothing matches, say so if a camera turned too far."""
+        """Return the measured field; if nothing matches, raise an error that names a camera that turned too far."""
         try:
             result = measure()
         except SeedError as error:
@@ -263,17 +257,45 @@ class SequenceMeasurement:
         if not result.valid.any():
             self._beside.watch.refuse_moved(n, images)
             one, two = self.steps[n].files
+            if result.unsure is not None:
+                raise unsure_error(
+                    f"step {n} ({one.name}, {two.name})",
+                    self.pair.pair,
+                    (self.pair.image1, self.pair.image2),
+                    images if result.has_motion else (),
+                    result.unsure,
+                    subset_px=self.settings.subset_px,
+                    region_px=self.grid.extent_px,
+                )
             raise MeasurementError(
                 f"No point of step {n} ({one.name}, {two.name}) could be measured.",
                 code="nothing_measured",
                 remedy="Check that both cameras see the same textured surface, in this order, and the region.",
             )
+        rows = rows_not_together(result, self._rbe_px)
+        if rows is not None:
+            raise MeasurementError(
+                f"Step {n} is not measured: {rows}.",
+                code="rows_not_together",
+                remedy="Take the images with a global shutter, with a flash, or of a specimen at rest.",
+            )
+        self._fields_of_rows(n, images)
         return result
+
+    def _fields_of_rows(self, n: int, images: Pair) -> None:
+        """Note where an image consists of two fields, whose rows alternate."""
+        off = {k: abs(field_shift_px(image.pixels)) for k, image in enumerate(images, 1)}
+        named = [f"of camera {k} are {px:.1f} px apart" for k, px in off.items() if px > INTERLACED_PX]
+        if named:
+            self._interlaced[n] = (
+                f"every second row is of another moment, the rows {' and those '.join(named)}: interlaced images, "
+                "whose measured values are between both moments; take whole frames"
+            )
 
     def finish(
         self, step: StepImages, result: Field, *, about: Mapping[str, str], in_service: bool, keep_starts: bool = False
     ) -> FinishedStep:
-        """Strain a measured step, smoothed and marked meanwhile, write its file, and summarise it.
+        """Compute the strain of a measured step, after its smoothing and marking; write its file, and summarise it.
 
         Parameters
         ----------
@@ -282,9 +304,9 @@ class SequenceMeasurement:
         about
             Further text attributes of the file.
         in_service
-            Put the file's SHA-256 and its summary beside it: after a kill, a step is complete or not there.
+            Write the file's SHA-256 and its summary too: after a kill, a step is complete or not there.
         keep_starts
-            Keep the matcher's own unknowns beside the file, for a process that goes on from there.
+            Write the matcher's own unknowns into a file next to it, for a process that continues from there.
 
         Raises
         ------
@@ -294,12 +316,15 @@ class SequenceMeasurement:
         began = time.perf_counter()
         subset_px = self.settings.subset_px
         begun = self._beside.take(step.n)
-        shown = begun.shown.result()
+        shown, lines = begun.shown.result()
         strain = strain_of_step(shown, StrainOptions.of(self.settings.strain), subset_px=subset_px)
         path = self.file_of(step.n)
         judged = begun.judged.result()
         systematic = with_strain(judged.terms, shown, strain, subset_px=subset_px).document()
         about = {**about, "systematic": json.dumps(systematic, sort_keys=True)}
+        rows_apart = self._interlaced.pop(step.n, "")
+        if rows_apart:
+            about[ROWS_APART] = rows_apart
         summary = {
             "n": step.n,
             "step": step.n,
@@ -311,12 +336,16 @@ class SequenceMeasurement:
                 imported=self.calibration.imported,
                 camera_motion=judged.motion,
                 systematic=systematic,
+                rows_apart=rows_apart,
             ).document(),
             "strain": None if strain is None else summarise_strain(strain, shown).document(),
         }
         dense = self._dense.take(step.n)
         if dense is not None:
             summary["dense"] = self._finish_dense(step, dense, about, systematic, in_service=in_service)
+        if lines is not None:
+            summary["sensor_pattern"] = lines.document()
+            about = {**about, "sensor_pattern": json.dumps(summary["sensor_pattern"], sort_keys=True)}
         greys = {cam: made for cam, made in zip(CAMERAS, step.grey_from, strict=True) if made is not None}
         if greys:
             summary["grey_from"] = greys
@@ -346,7 +375,7 @@ class SequenceMeasurement:
         shown = self._beside.show_dense(dense.field)
         path = dense_result(self.file_of(step.n))
         make_folder(path.parent)
-        # what sharp texture does to a match is the same; the ordinary patches' own terms are not a dense field's
+        # interpolation acts the same on both; the ordinary patches' own terms are not a dense field's
         terms = {"interpolation": systematic["interpolation"], "patch_order": None, "strain_window": None}
         more = {**about, "systematic": json.dumps(terms)}
         provenance = self._provenance(step, dense.field, more)
@@ -373,7 +402,7 @@ class SequenceMeasurement:
         return self._sequence
 
     def _previous_images(self, n: int) -> Pair:
-        """Images of an earlier step: those of the last one are still here, others are read and checked again."""
+        """Images of an earlier step: the last step's are still here, others are read and checked again."""
         if self._last_images is not None and self._last_images[0] == n:
             return self._last_images[1]
         step = self.steps[n]

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.field.points.result import Field
-from core.field.points.smoothing_record import Smoothing
-from core.field.smoothed import smoothed_displacement
-from core.robust import median
-from core.settings import StrainOrder
-from core.strain import StrainField, StrainOptions, StrainStatus, surface_strain
-from server.formats.results.budgets import spread_points, strain_budgets
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.smoothing_record import Smoothing
+from stereorig.core.field.smoothed import smoothed_displacement
+from stereorig.core.robust import median
+from stereorig.core.settings import StrainOrder
+from stereorig.core.strain import StrainField, StrainOptions, StrainStatus, surface_strain
+from stereorig.server.formats.results.budgets import spread_points, strain_budgets
 
 _NAMES = ("exx", "eyy", "exy")
 
@@ -33,7 +33,7 @@ def strain_options(settings: Mapping[str, Any] | None) -> StrainOptions | None:
 
 
 def smoothed_step(field: Field, window: int | None, *, subset_px: float) -> Field:
-    """Return a step's field with its displacement smoothed; as it is where that was not asked for, or of a shape."""
+    """Return a step's field with its displacement smoothed; unchanged without a window, or for a shape."""
     if not window or not field.has_motion:
         return field
     return smoothed_displacement(field, window, subset_px=subset_px)
@@ -53,7 +53,7 @@ def smoothing_note(smoothing: Smoothing, gauge_px: float | None, *, strain_windo
 
 
 def strain_of_step(field: Field, options: StrainOptions | None, *, subset_px: int) -> StrainField | None:
-    """Strain of a step; None where it was not asked for, or the step is the reference."""
+    """Strain of a step; None without options, or for the reference."""
     if options is None or not field.has_motion:
         return None
     return surface_strain(field, options, subset_px=subset_px)

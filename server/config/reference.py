@@ -6,7 +6,7 @@ import json
 
 from pydantic.json_schema import JsonSchemaValue
 
-from server.config.rig_file import RigConfig
+from stereorig.server.config.rig_file import RigConfig
 
 #: schemas of the models, by name
 Definitions = dict[str, JsonSchemaValue]
@@ -19,8 +19,7 @@ here is an error, and so is a value outside its range; the message names the key
 without opening any device, and `stereorig rigfile --schema` prints a JSON schema, with which editors complete and check
 keys while you write.
 
-This page is made from the model that reads the file (`make reference`). Complete
-examples with comments are in `config/`.
+Complete examples with comments are in `config/`.
 """
 
 
@@ -40,10 +39,11 @@ def markdown() -> str:
     # cam1 and cam2 are alike: one table for both
     sections: dict[str, list[str]] = {}
     for name, field in schema["properties"].items():
-        target = _target(field)
+        target = _table(field)
         sections.setdefault(target or name, []).append(name)
     for target, names in sections.items():
-        title = ", ".join(f"`[{name}]`" for name in names)
+        listed = "items" in _core(schema["properties"][names[0]])
+        title = ", ".join(f"`[[{name}]]`" if listed else f"`[{name}]`" for name in names)
         if target not in known:
             lines += [f"## {title}", "", schema["properties"][names[0]].get("description", ""), ""]
             continue

@@ -7,15 +7,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from server.demo.client import Calibrated
-from server.demo.session import Check, Session, table
-from server.formats.calibrations.record import ChecksRecord
+from stereorig.server.demo.client import Calibrated
+from stereorig.server.demo.session import DemoCheck, DemoRun, table
+from stereorig.server.formats.calibrations.record import ChecksRecord
 
 HELD_OUT_LIMIT_PX = 0.1  # the band of a good calibration
 
 
 @dataclass(frozen=True, eq=False)
-class ViewResiduals:
+class ViewIntersections:
     """One view's intersections (n, 2), and measured minus projected (n, 2)."""
 
     title: str
@@ -34,12 +34,12 @@ class CalibrationReport:
     """Lines to print, figures with limits, and the views' residuals for the picture."""
 
     lines: list[str] = field(default_factory=list)
-    checks: list[Check] = field(default_factory=list)
-    views: list[ViewResiduals] = field(default_factory=list)
+    checks: list[DemoCheck] = field(default_factory=list)
+    views: list[ViewIntersections] = field(default_factory=list)
 
 
-def describe(session: Session, made: Calibrated) -> CalibrationReport:
-    """Tell a calibration's checks and verdict, and fetch its residuals for the picture."""
+def describe(session: DemoRun, made: Calibrated) -> CalibrationReport:
+    """Return a calibration's checks and verdict as text, and its residuals for the picture."""
     report = CalibrationReport()
     checks, verdict = made.record.checks or ChecksRecord(), made.record.verdict
     rows = []
@@ -55,11 +55,11 @@ def describe(session: Session, made: Calibrated) -> CalibrationReport:
     ]
     if checks.held_out is not None and checks.held_out.rbe_px is not None:
         rbe = checks.held_out.rbe_px
-        report.checks = [Check("held-out RBE of the calibration", "px", rbe, None, rbe, HELD_OUT_LIMIT_PX)]
+        report.checks = [DemoCheck("held-out RBE of the calibration", "px", rbe, None, rbe, HELD_OUT_LIMIT_PX)]
     for view in session.client.get(f"/calibrations/{made.id}/residuals")["views"]:
         xy = np.asarray(view["found_px"], dtype=np.float64).reshape(-1, 2)
         residual = np.asarray(view["residual_px"], dtype=np.float64).reshape(-1, 2)
         use = np.isfinite(xy).all(axis=1) & np.isfinite(residual).all(axis=1)
         title = f"{view['camera']}, dZ {float(view['dz_mm']):+.3f} mm"
-        report.views.append(ViewResiduals(title, bool(view["held_out"]), xy[use], residual[use]))
+        report.views.append(ViewIntersections(title, bool(view["held_out"]), xy[use], residual[use]))
     return report

@@ -12,11 +12,11 @@ import httpx
 import numpy as np
 from pydantic import TypeAdapter
 
-from core.arrays import Float
-from core.errors import MeasurementError, StateError, StorageError
-from server.formats.calibrations.record import CalibrationRecord
-from server.formats.gauges.readings import StepReadings
-from server.formats.records import Record
+from stereorig.core.arrays import Float
+from stereorig.core.errors import MeasurementError, StateError, StorageError
+from stereorig.server.formats.calibrations.record import CalibrationRecord
+from stereorig.server.formats.gauges.readings import StepReadings
+from stereorig.server.formats.records import Record
 
 OnProgress = Callable[[str, int, int, float | None], None]
 
@@ -53,12 +53,11 @@ class _Progress(Record):
 
 class _Problem(Record):
     code: str = "job_failed"
-    cause: str | None = None
     detail: str = "no reason given"
     remedy: str = "Look at the service's log."
 
 
-class Job(Record):
+class DemoJob(Record):
     """A job of the service."""
 
     kind: str
@@ -206,7 +205,7 @@ class ServiceClient:
             With the job's problem, if it did not succeed.
         """
         while True:
-            job = Job.model_validate(self.get(f"/jobs/{job_id}"))
+            job = DemoJob.model_validate(self.get(f"/jobs/{job_id}"))
             at = job.progress
             if self._on_progress is not None:
                 self._on_progress(at.phase or job.state, at.done, at.total, at.eta_s)
@@ -216,7 +215,7 @@ class ServiceClient:
         if job.state != "succeeded":
             problem = job.problem
             raise MeasurementError(
-                f"The {job.kind} job {job_id} ended as {job.state}: {problem.cause or problem.detail}",
+                f"The {job.kind} job {job_id} ended as {job.state}: {problem.detail}",
                 code=problem.code,
                 remedy=problem.remedy,
             )

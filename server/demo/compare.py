@@ -1,7 +1,7 @@
-"""Measured against true, point by point.
+"""Comparison of measured and true values, point by point.
 
 The measured system frame is the one that the grid defined; it differs from the simulation's own by the calibration's
-error (micrometres). Displacements are compared as they are, shapes after taking out each one's best plane.
+error (micrometres). Displacements are compared as they are, shapes after subtracting each one's best plane.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.cameras.stereo import StereoPair
-from core.field.points.result import Field
-from server.demo.session import pixels_of
-from sim.catalog import make_scene
-from sim.rig import SimRig
-from sim.truth import Truth, truth_at
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.result import Field
+from stereorig.server.demo.session import pixels_of
+from stereorig.sim.catalog import make_scene
+from stereorig.sim.rig import SimRig
+from stereorig.sim.truth import Truth, truth_at
 
 WRONG_PX = 0.1  # a matched point is off by hundredths of a pixel; a mismatch by tenths and more
 WRONG_SIGMA = 5.0
@@ -32,7 +32,7 @@ class MotionComparison:
     truth
         At the points' pixels.
     error_mm
-        (r, c, 3) measured minus true, NaN where nothing was measured.
+        (r, c, 3) measured minus true, NaN at points that were not measured.
     wrong
         (r, c) valid, but further off than ``WRONG_PX`` on the target and ``WRONG_SIGMA`` standard deviations together.
     """

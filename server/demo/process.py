@@ -14,7 +14,7 @@ from pathlib import Path
 
 import httpx
 
-from core.errors import StateError
+from stereorig.core.errors import StateError
 
 _START_S = 120.0  # the first start compiles
 _STOP_S = 15.0
@@ -29,7 +29,7 @@ def free_port() -> int:
 
 @contextlib.contextmanager
 def running_service(config: Path, data: Path, log: Path) -> Iterator[str]:
-    """Run ``stereorig serve`` until the block ends, whatever ends it; yields its base URL.
+    """Run ``stereorig serve`` until the block ends, also by an error; yields its base URL.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def running_service(config: Path, data: Path, log: Path) -> Iterator[str]:
     command = [
         sys.executable,
         "-m",
-        "server.cli",
+        "stereorig.server.cli",
         "serve",
         "--config",
         str(config),

@@ -1,4 +1,4 @@
-"""Common parts of the three experiments: the running service, the rig's truth, the folder for what they find."""
+"""Common parts of the three experiments: the running service, the rig's truth, the folder for the results."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.field.points.result import Field
-from server.demo.client import AnalysisHandle, Calibrated, ServiceClient
-from server.formats.files import make_folder, write_bytes
-from server.formats.results.reading import read_field
-from sim.rig import SimRig
+from stereorig.core.field.points.result import Field
+from stereorig.server.demo.client import AnalysisHandle, Calibrated, ServiceClient
+from stereorig.server.formats.files import make_folder, write_bytes
+from stereorig.server.formats.results.reading import read_field
+from stereorig.sim.rig import SimRig
 
 
 @dataclass(frozen=True)
-class Check:
+class DemoCheck:
     """One figure with its truth and its limit.
 
     Attributes
     ----------
     name, unit
-        What it is, and the unit of ``found`` and ``true``.
+        Name of the figure, and the unit of ``found`` and ``true``.
     found, true
-        The figure and the truth; ``true`` is None where the figure is itself an error or a count.
+        The figure and the truth; ``true`` is None if the figure is itself an error or a count.
     error, limit
-        What must not exceed what.
+        The error, and its largest allowed value.
     error_unit
-        Unit of these two, where it is not ``unit``.
+        Unit of these two, if it is not ``unit``.
     """
 
     name: str
@@ -58,19 +58,19 @@ class Outcome:
     lines
         Text of the table, ready to print.
     pictures
-        Files with what each shows.
+        Files and their captions.
     data
         Further figures for ``report.json``.
     """
 
-    checks: list[Check] = field(default_factory=list)
+    checks: list[DemoCheck] = field(default_factory=list)
     lines: list[str] = field(default_factory=list)
     pictures: dict[str, str] = field(default_factory=dict)
     data: dict[str, object] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
-class Session:
+class DemoRun:
     """One demo run.
 
     Parameters
@@ -112,7 +112,7 @@ class Session:
 
     def reference_image(self, test_id: str, step: int = 0) -> NDArray[Any]:
         """Fetch camera 1's image of a step."""
-        from server.formats.images import decode_image
+        from stereorig.server.formats.images import decode_image
 
         data = self.client.call("GET", f"/tests/{test_id}/steps/{step}/cam1", params={"format": "tiff"}).content
         return decode_image(data, name=f"step {step} of {test_id}")
@@ -124,7 +124,7 @@ def pixels_of(result: Field) -> NDArray[np.float64]:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lay out columns, numbers to the right."""
+    """Format columns as lines of text, numbers to the right."""
     widths = [max(len(str(row[k])) for row in [head, *rows]) for k in range(len(head))]
     lines = ["  ".join(str(cell).rjust(w) for cell, w in zip(row, widths, strict=True)) for row in [head, *rows]]
     return [lines[0], "-" * len(lines[0]), *lines[1:]]

@@ -1,4 +1,4 @@
-"""Strain of the demo's fields: along directions, beside what the gauge would read on the true surface."""
+"""Strain of the demo's fields along directions, measured and as the gauge would read it on the true surface."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Bool, Float
-from core.errors import FileFormatError
-from core.field.points.result import Field
-from core.strain import StrainField, surface_strain
-from server.demo.session import Session
-from server.formats.results.strain import read_strain
-from sim.truth import Truth
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.errors import FileFormatError
+from stereorig.core.field.points.result import Field
+from stereorig.core.strain import StrainField, surface_strain
+from stereorig.server.demo.session import DemoRun
+from stereorig.server.formats.results.strain import read_strain
+from stereorig.sim.truth import Truth
 
 MICRO = 1e6
 SAFE = 3.0  # standard deviations that chance is given
 
 
 @dataclass(frozen=True)
-class Difference:
+class StrainDifference:
     """Measured strain against another, over some points; microstrain.
 
     Attributes
@@ -40,7 +40,7 @@ class Difference:
     chi: float
 
 
-def fetched_strain(session: Session, steps: Sequence[int], folder: str = "results") -> list[StrainField]:
+def fetched_strain(session: DemoRun, steps: Sequence[int], folder: str = "results") -> list[StrainField]:
     """Read the strain of result files that ``session.fetch`` has kept.
 
     Raises
@@ -66,7 +66,7 @@ def along(strain: StrainField, direction: ArrayLike) -> tuple[Float, Float]:
         (r, c) points.
     direction
         (..., 2) over the strain's axes 1 and 2, which are X_sys and Y_sys on a surface that faces the cameras; any
-        length, axis 1 where it has none.
+        length, axis 1 for a length of zero.
     """
     n = np.asarray(direction, dtype=np.float64)
     length = np.linalg.norm(n, axis=-1, keepdims=True)
@@ -77,17 +77,17 @@ def along(strain: StrainField, direction: ArrayLike) -> tuple[Float, Float]:
 
 
 def as_read(result: Field, truth: Truth, strain: StrainField) -> StrainField:
-    """Return what the same gauge reads on the true surface, at the same points and without noise."""
+    """Return the same gauge's reading on the true surface, at the same points and without noise."""
     true = replace(result, xyz_mm=truth.xyz_mm, uvw_mm=truth.uvw_mm)
     return surface_strain(true, strain.options, subset_px=strain.subset_px)
 
 
-def difference(found: Float, other: Float, sigma: Float, use: Bool) -> Difference:
+def difference(found: Float, other: Float, sigma: Float, use: Bool) -> StrainDifference:
     """Compare strain (r, c) with other values over the points ``use``."""
     off, sd = (found - other)[use], sigma[use]
     if not off.size:
-        return Difference(*[float("nan")] * 4)
-    return Difference(
+        return StrainDifference(*[float("nan")] * 4)
+    return StrainDifference(
         mean=MICRO * float(off.mean()),
         rms=MICRO * float(np.sqrt(np.mean(off**2))),
         reported=MICRO * float(np.sqrt(np.mean(sd**2))),
@@ -104,7 +104,7 @@ def whole_gauges(strain: StrainField) -> Bool:
 
 
 def chi_limit(strain: StrainField) -> float:
-    """Return how far above 1 chance may bring chi: as many independent readings as gauges lie side by side."""
+    """Return the largest chi that chance explains: as many independent readings as gauges fit into the field."""
     rows, cols = strain.status.shape
     gauges = rows * cols * (strain.spacing_px / strain.gauge_px) ** 2
     return 1.0 + SAFE / float(np.sqrt(2.0 * max(gauges, 1.0)))

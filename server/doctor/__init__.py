@@ -1,6 +1,6 @@
-"""Checks of a whole bench: machine, disk, cameras, stage, each with the measured value, its limit and what to do."""
+"""Checks of a whole bench: machine, disk, cameras, stage, each with the measured value, its limit and a remedy."""
 
-from server.doctor.report import Check, Report
-from server.doctor.run import examine
+from stereorig.server.doctor.report import AllChecks, Check
+from stereorig.server.doctor.run import examine
 
-__all__ = ["Check", "Report", "examine"]
+__all__ = ["AllChecks", "Check", "examine"]

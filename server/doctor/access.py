@@ -1,13 +1,16 @@
-"""What this user may not reach, or somebody else has: the service's port, USB cameras."""
+"""Devices and ports that this user may not open, or another program holds: the service's port, USB cameras."""
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import socket
 from pathlib import Path
 
-from server.doctor.report import Notebook
+from stereorig.server.cell.cell import Cell
+from stereorig.server.cell.sandbox import ALL_WALLS, walls
+from stereorig.server.doctor.report import Notebook
 
 # interface class, subclass of USB3 Vision
 _USB3_VISION = ("ef", "05")
@@ -36,10 +39,24 @@ def check_service_port(book: Notebook, host: str, port: int) -> None:
     book.note("service", "port", "ok", f"port {port} of {host} is free")
 
 
+def check_cell(book: Notebook) -> None:
+    """See which walls there are around the reading of a file that a client sends."""
+    with book.guard("service", "foreign files"), contextlib.closing(Cell()) as cell:
+        held = cell.read(walls, [])
+        lacking = [name for name in ALL_WALLS if name not in held]
+        book.note(
+            "service",
+            "foreign files",
+            "warning" if lacking else "ok",
+            f"read behind {', '.join(held)}" + (f"; this system has no {' and no '.join(lacking)}" if lacking else ""),
+            remedy="Use Linux 5.13 or newer, and a container that allows Landlock and seccomp.",
+        )
+
+
 def check_usb_cameras(
     book: Notebook, *, devices: Path = Path("/sys/bus/usb/devices"), dev: Path = Path("/dev")
 ) -> None:
-    """See whether this user may open the USB3 Vision cameras that are plugged in; note nothing where none is."""
+    """Note for each USB3 Vision camera that is plugged in if this user may open it."""
     cameras = {path.name.split(":")[0] for path in devices.glob("*:*") if _class_of(path) == _USB3_VISION}
     for name in sorted(cameras):
         node = _node_of(devices / name, dev)
@@ -63,7 +80,7 @@ def _class_of(interface: Path) -> tuple[str, str]:
 
 def _node_of(device: Path, dev: Path) -> Path | None:
     bus, number = _text(device / "busnum"), _text(device / "devnum")
-    if not (bus.isdecimal() and number.isdecimal()):
+    if not (bus.isascii() and bus.isdecimal() and number.isascii() and number.isdecimal()):
         return None
     node = dev / "bus" / "usb" / f"{int(bus):03d}" / f"{int(number):03d}"
     return node if node.exists() else None
@@ -72,5 +89,5 @@ def _node_of(device: Path, dev: Path) -> Path | None:
 def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="ascii", errors="replace").strip()
-    except OSError:  # unplugged meanwhile
+    except OSError:  # unplugged just now
         return ""

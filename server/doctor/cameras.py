@@ -1,4 +1,4 @@
-"""The cameras: who they are, what they took of their settings, and how their frames come."""
+"""The cameras: their identity, their settings as taken, and the course of their frames."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from core.errors import CameraError
-from core.names import CAMERAS, CameraName
-from drivers.acquisition.sources import common_clock
-from drivers.acquisition.unit import CameraUnit
-from server.config.rig_file import RigConfig
-from server.doctor.report import Notebook, State, percentile
-from server.results.images.quality import image_quality
-from server.rig.cameras import CameraPair, CapturedPair
+from stereorig.core.errors import CameraError
+from stereorig.core.names import CAMERAS, CameraName
+from stereorig.drivers.acquisition.simultaneity import in_words, no_common_ptp
+from stereorig.drivers.acquisition.unit import CameraUnit
+from stereorig.server.config.rig_file import RigConfig
+from stereorig.server.doctor.report import Notebook, State, percentile
+from stereorig.server.results.images.quality import image_quality
+from stereorig.server.rig.cameras import CameraPair, CapturedPair
 
 #: relative difference of a setting that is the device's rounding; beyond it the device has another value
 _ROUNDING = 0.01
@@ -29,7 +29,7 @@ _PASSING = {"skew_too_large", "frame_incomplete", "pair_incomplete", "no_frames"
 _QUALITY = {
     "dark": "The image is black: open the shutter, switch the lamp on, or expose longer.",
     "saturated": "Expose less, or lower the gain.",
-    "blank": "The image shows nothing: check lens cap, focus and what stands before the camera.",
+    "blank": "The image shows nothing: check lens cap, focus and the scene before the camera.",
     "low_texture": "Nothing here could be matched: put a speckled specimen (or the grid) before the camera, and focus.",
     "blurred": "Focus the lens, or expose for a shorter time if something moves.",
 }
@@ -39,17 +39,29 @@ _Count = TypeVar("_Count", int, float)
 
 
 @dataclass
-class Watch:
+class PairLog:
     """Measurements while pairs were captured one after the other."""
 
     seconds: float = 0.0
     durations_ms: list[float] = field(default_factory=list)
     skews_ms: list[float] = field(default_factory=list)
+    #: uncertainty and source of the largest of them
+    skew_by: str = ""
+    #: of them, those surely above the limit
+    skews_refused: int = 0
     passing: dict[str, int] = field(default_factory=dict)
     last: CapturedPair | None = None
     frames: dict[CameraName, dict[str, int]] = field(default_factory=dict)
     account: dict[str, int] = field(default_factory=dict)
     link: dict[CameraName, dict[str, float]] = field(default_factory=dict)
+
+    def skew(self, known: Mapping[str, Any]) -> None:
+        """Take a pair's skew, with its uncertainty and source."""
+        skew_ms = abs(known["skew_ms"])
+        if skew_ms >= max(self.skews_ms, default=0.0):
+            source, uncertainty_ms = known.get("skew_source", "clock"), known.get("skew_uncertainty_ms", 0.0)
+            self.skew_by = in_words(source, uncertainty_ms)
+        self.skews_ms.append(skew_ms)
 
     @property
     def pairs_per_s(self) -> float | None:
@@ -93,7 +105,7 @@ def check_identity(book: Notebook, pair: CameraPair) -> None:
 
 
 def check_settings(book: Notebook, unit: CameraUnit) -> None:
-    """Compare what the rig file asks for with what was read back."""
+    """Compare the rig file's settings with the settings read back."""
     wanted = unit.wanted
     asked = {name: value for name, value in vars(wanted).items() if value is not None and name != "features"}
     asked |= {f"feature {name}": value for name, value in (wanted.features or {}).items()}
@@ -122,15 +134,15 @@ def _agrees(asked: Any, got: Any) -> bool:
     return isinstance(got, int | float) and abs(got - asked) <= _ROUNDING * abs(asked)
 
 
-def watch(pair: CameraPair, seconds: float) -> Watch:
-    """Capture pairs for so long, at least one; what can go wrong with a single pair is counted.
+def watch(pair: CameraPair, seconds: float) -> PairLog:
+    """Capture pairs for so long, at least one; count the errors that concern a single pair.
 
     Raises
     ------
     CameraError
         When a camera is lost.
     """
-    seen = Watch()
+    seen = PairLog()
     _warm_up(pair)
     before = {cam: pair.units[cam].counters() for cam in CAMERAS}
     account = pair.account()
@@ -145,10 +157,11 @@ def watch(pair: CameraPair, seconds: float) -> Watch:
                 raise
             seen.passing[error.code] = seen.passing.get(error.code, 0) + 1
             if "skew_ms" in error.context:
-                seen.skews_ms.append(abs(error.context["skew_ms"]))
+                seen.skew(error.context)
+                seen.skews_refused += 1
             continue
         seen.durations_ms.append(1e3 * (time.monotonic() - start))
-        seen.skews_ms.append(abs(seen.last.skew_ms))
+        seen.skew(seen.last.skew)
     seen.seconds = time.monotonic() - begin
     seen.frames = {cam: _grown(pair.units[cam].counters(), before[cam]) for cam in CAMERAS}
     seen.account = _grown(pair.account(), account)
@@ -173,7 +186,7 @@ def _grown(now: Mapping[str, _Count], before: Mapping[str, _Count]) -> dict[str,
     return {name: value - before.get(name, 0) for name, value in now.items()}
 
 
-def check_frames(book: Notebook, unit: CameraUnit, seen: Watch) -> None:
+def check_frames(book: Notebook, unit: CameraUnit, seen: PairLog) -> None:
     """Rates, losses and image of one camera."""
     cam = unit.name
     counts, announced = seen.frames[cam], seen.announced(cam)
@@ -231,19 +244,31 @@ def _check_rate(book: Notebook, unit: CameraUnit, announced: int, seconds: float
     )
 
 
-def check_pairs(book: Notebook, pair: CameraPair, seen: Watch, config: RigConfig) -> None:
+def check_ptp(book: Notebook, pair: CameraPair) -> None:
+    """Note if both cameras follow one PTP master."""
+    why = no_common_ptp({cam: pair.units[cam].description for cam in CAMERAS})
+    book.note(
+        "pairs",
+        "ptp",
+        "warning" if why else "ok",
+        why or f"both follow {pair.units['cam1'].description.clock}",
+        remedy="Connect both by a switch that passes PTP, and wait until they have settled.",
+    )
+
+
+def check_pairs(book: Notebook, seen: PairLog, config: RigConfig) -> None:
     """Skew, account and latency of the pairs."""
     limit = config.rig.skew_bound_ms
     if seen.skews_ms:
         worst = max(seen.skews_ms)
         # pairs between the captures are refused too, where frames come by themselves
-        refused = max(sum(skew > limit for skew in seen.skews_ms), seen.account["refused"])
+        refused = max(seen.skews_refused, seen.account["refused"])
         book.note(
             "pairs",
             "skew",
             _state_of_share(refused, max(len(seen.skews_ms), seen.account["paired"])),
             f"median {statistics.median(seen.skews_ms):.3f} ms, worst {worst:.3f} ms over {len(seen.skews_ms)} pairs, "
-            + ("by the cameras' common clock" if common_clock(pair.units) else "by this machine's clock")
+            + seen.skew_by
             + (f"; {refused} refused" if refused else ""),
             limit=f"{limit:g} ms but for 1 or {100 * _LOSS_SHARE:g} %",
             remedy="Use a common hardware trigger (docs/how_to/triggers.md), or raise max_skew_ms "
@@ -292,7 +317,7 @@ def _state_of_share(bad: int, of: int) -> State:
     return "ok" if bad == 0 else "warning" if bad <= max(1.0, _LOSS_SHARE * of) else "failed"
 
 
-def _mib_per_s(seen: Watch) -> float:
+def _mib_per_s(seen: PairLog) -> float:
     if seen.last is None or seen.pairs_per_s is None:
         return 0.0
     return sum(pixels.nbytes for pixels in seen.last.pixels.values()) * seen.pairs_per_s / 2**20

@@ -9,9 +9,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from core.errors import StorageError
-from server.doctor.report import Notebook, percentile
-from server.formats.files import storage_error, write_bytes
+from stereorig.core.errors import StorageError
+from stereorig.server.doctor.report import Notebook, percentile
+from stereorig.server.formats.files import storage_error, write_bytes
 
 _SECONDS = 1.5
 _MAX_FILES = 64

@@ -13,14 +13,20 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from server.base.kernel_folder import can_write, kernel_folders, named_folder
-from server.doctor.report import Notebook
-from server.formats.version import software_version
+from stereorig.server.base.kernel_folder import can_write, kernel_folders, named_folder
+from stereorig.server.doctor.report import Notebook
+from stereorig.server.formats.version import software_version
 
 #: whose versions matter in a report of trouble
 _PACKAGES = ("numpy", "scipy", "opencv-python-headless", "numba", "pyserial", "fastapi", "netCDF4", "tifffile")
-#: what more can be done with packages that need not be there
-_EXTRAS = {"xarray": ("xarray", "data sets"), "progress": ("rich", "progress bars"), "aravis": ("PyGObject", "GenICam")}
+#: features of packages that need not be there
+_EXTRAS = {
+    "xarray": ("xarray", "data sets"),
+    "progress": ("rich", "progress bars"),
+    "aravis": ("PyGObject", "GenICam"),
+    "pylon": ("pypylon", "Basler"),
+    "standa": ("libximc", "Standa"),
+}
 _NAME = re.compile(r"^[A-Za-z0-9._-]+")
 _MEMORY_GIB = 1.0
 # of the wall clock against the monotonic one while the doctor runs; slewing by NTP stays below 0.5 ms a second
@@ -63,7 +69,7 @@ def check_software(book: Notebook) -> None:
 
 
 def check_kernels(book: Notebook, folders: list[Path] | None = None) -> None:
-    """Note where compiled kernels are kept; where nothing can be kept, every start compiles them anew."""
+    """Note the folder of compiled kernels; if none can be written, every start compiles them again."""
     named = named_folder()
     folders = folders or ([named] if named else kernel_folders())
     place = next((p for p in folders if can_write(p)), None)
@@ -193,7 +199,7 @@ def _clock_synchronised() -> bool | None:
 
 
 class ClockWatch:
-    """Tells whether the wall clock was set while it ran."""
+    """Measures by how much the wall clock was set while it ran."""
 
     def __init__(self) -> None:
         self._before = time.time() - time.monotonic()
@@ -207,6 +213,6 @@ class ClockWatch:
             "ok" if abs(step) <= _STEP_S else "warning",
             f"wall clock moved by {1e3 * step:+.1f} ms against the monotonic one",
             limit=f"{1e3 * _STEP_S:g} ms",
-            remedy="Somebody sets the clock: let one program do it, by slewing.",
+            remedy="A program sets the clock: let one program do it, by slewing.",
             step_ms=1e3 * step,
         )

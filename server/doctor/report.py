@@ -9,7 +9,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from core.errors import StereorigError
+from stereorig.core.errors import StereorigError
 
 State = Literal["ok", "warning", "failed", "not checked"]
 
@@ -23,14 +23,14 @@ class Check(BaseModel):
     name: str = Field(description="Name of the check.")
     state: State = Field(description="`failed` makes the verdict bad; `warning` and `not checked` do not.")
     found: str = Field(description="The measured value, or the cause, in words.")
-    limit: str | None = Field(None, description="Limit of the value; null where there is none.")
+    limit: str | None = Field(None, description="Limit of the value; null if there is none.")
     remedy: str | None = Field(None, description="Remedy, when it is not ok.")
     figures: dict[str, float | None] = Field(
         default_factory=dict, description="The measured values; units are in the names, null is unknown."
     )
 
 
-class Report(BaseModel):
+class AllChecks(BaseModel):
     """All checks."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -109,7 +109,7 @@ class Notebook:
 
 
 def line_of(check: Check) -> str:
-    """Return a check as text: one line, and one with the remedy where there is something to do."""
+    """Return a check as text: one line, and a second one with the remedy if it has one."""
     limit = f"   [limit: {check.limit}]" if check.limit else ""
     text = f"{check.state:<12}{check.part + ' ' + check.name:<28}{check.found}{limit}"
     return text if check.remedy is None else f"{text}\n{'':<12}-> {check.remedy}"

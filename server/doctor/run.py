@@ -6,20 +6,27 @@ import contextlib
 from collections.abc import Callable
 from pathlib import Path
 
-from core.errors import StereorigError
-from core.names import CAMERAS
-from drivers.stages.serial_ports import port_problem
-from server.config.rig_file import RigConfig, load_config
-from server.doctor.access import check_service_port, check_usb_cameras
-from server.doctor.cameras import check_frames, check_identity, check_pairs, check_settings, watch
-from server.doctor.disk import check_disk
-from server.doctor.link import check_link, check_network
-from server.doctor.machine import ClockWatch, check_kernels, check_machine, check_software
-from server.doctor.report import Check, Notebook, Report
-from server.doctor.stage import check_stage
-from server.formats.version import software_version
-from server.rig.build import Devices, check_config, first_settings, make_unit, open_configured_stage, open_devices
-from server.rig.devices import DeviceFinder, DeviceListing, is_called
+from stereorig.core.errors import StereorigError
+from stereorig.core.names import CAMERAS
+from stereorig.drivers.stages.serial_ports import port_problem
+from stereorig.server.config.rig_file import RigConfig, load_config
+from stereorig.server.doctor.access import check_cell, check_service_port, check_usb_cameras
+from stereorig.server.doctor.cameras import check_frames, check_identity, check_pairs, check_ptp, check_settings, watch
+from stereorig.server.doctor.disk import check_disk
+from stereorig.server.doctor.link import check_link, check_network
+from stereorig.server.doctor.machine import ClockWatch, check_kernels, check_machine, check_software
+from stereorig.server.doctor.report import AllChecks, Check, Notebook
+from stereorig.server.doctor.stage import check_stage
+from stereorig.server.formats.version import software_version
+from stereorig.server.rig.build import (
+    Devices,
+    check_config,
+    first_settings,
+    make_unit,
+    open_configured_stage,
+    open_devices,
+)
+from stereorig.server.rig.devices import DeviceFinder, DeviceListing, is_called
 
 
 def examine(
@@ -33,7 +40,7 @@ def examine(
     home: bool = False,
     record: Path | None = None,
     on_check: Callable[[Check], None] | None = None,
-) -> Report:
+) -> AllChecks:
     """Examine the bench that a rig file names.
 
     Parameters
@@ -59,10 +66,12 @@ def examine(
     check_kernels(book)
     check_machine(book)
     check_service_port(book, host, port)
+    check_cell(book)
     config = _read(book, path)
     if config is not None:
         _check_drivers(book, config)
-        _check_port(book, config.stage.url)
+        for line in [] if config.stage is None else config.stage.lines(config.axes):
+            _check_port(book, line.url)
         _check_devices(book, config, seconds, move=move, home=home, record=record)
     # under software triggers pairs come as they are asked for: there is no rate to keep up with
     rate = None if config is None else config.rig.frame_rate_hz
@@ -71,7 +80,7 @@ def examine(
     check_disk(book, data, image_bytes=columns * rows * wide, pairs_per_s=rate)
     clock.check(book)
     good, verdict = book.verdict()
-    return Report(
+    return AllChecks(
         version=software_version(),
         rig=None if config is None else config.rig.name,
         config=str(path),
@@ -118,7 +127,7 @@ def _check_drivers(book: Notebook, config: RigConfig) -> None:
 
 
 def _check_port(book: Notebook, url: str) -> None:
-    """See what keeps a serial port of this machine from being used."""
+    """Note the reasons for which a serial port of this machine cannot be used."""
     if url.startswith("/"):
         problem = port_problem(url)
         book.note(
@@ -160,7 +169,8 @@ def _check_devices(
         _check_cameras(book, devices, config, seconds)
         # a rig with simulated cameras may still have a real stage
         simulated = devices.controller is not None
-        check_stage(book, devices.stage, config, move=move or simulated, home=home or simulated)
+        if config.stage is not None:
+            check_stage(book, devices.stage, config, move=move or simulated, home=home or simulated)
 
 
 def _check_each(
@@ -178,7 +188,7 @@ def _check_each(
             check_settings(book, unit)
     bad = [check for check in book.checks if check.state == "failed" and check.name == "opening"]
     if any("camera_busy" in check.found for check in bad):
-        # over a network a controller takes several programs at once, and the other one may be about to move it
+        # over a network a controller takes several programs at once, and the other program may be about to move it
         book.note(
             "stage",
             "opening",
@@ -186,11 +196,11 @@ def _check_each(
             "another program uses the cameras, and perhaps the stage",
             remedy="End that program, then run the doctor again.",
         )
-    elif config.stage.url == "sim":
+    elif config.stage_is_simulated:
         book.note("stage", "opening", "not checked", "a simulated stage runs with the whole rig only")
-    else:
+    elif config.stage is not None:
         with book.guard("stage", "opening"):
-            stage = open_configured_stage(config, config.stage.url, record=record)
+            stage = open_configured_stage(config, record=record)
             with contextlib.closing(stage):
                 check_stage(book, stage, config, move=move, home=home)
     if not any(check.state == "failed" and check.name == "opening" for check in book.checks):
@@ -200,7 +210,7 @@ def _check_each(
         "frames",
         "not checked",
         "not all devices could be opened",
-        remedy="Put right what failed, then run the doctor again.",
+        remedy="Put the failed parts right, then run the doctor again.",
     )
 
 
@@ -218,4 +228,6 @@ def _check_cameras(book: Notebook, devices: Devices, config: RigConfig, seconds:
         check_frames(book, pair.units[cam], seen)
         check_link(book, pair.units[cam], seen)
     check_network(book, pair.units, seen)
-    check_pairs(book, pair, seen, config)
+    if config.cam1.ptp and config.cam2.ptp:
+        check_ptp(book, pair)
+    check_pairs(book, seen, config)

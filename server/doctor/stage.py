@@ -1,13 +1,13 @@
-"""The stage: who it is, what state it is in, how fast it answers and stops; motion only where it is allowed."""
+"""The stage: its identity and state, the times of its answers and of its stop; motion only if it is allowed."""
 
 from __future__ import annotations
 
 import time
 
-from core.names import CAMERAS
-from drivers.stages.protocol import AxisState, Stage
-from server.config.rig_file import RigConfig
-from server.doctor.report import Notebook, State, percentile
+from stereorig.core.names import CAMERAS
+from stereorig.drivers.stages.protocol import AxisState, Stage
+from stereorig.server.config.rig_file import RigConfig
+from stereorig.server.doctor.report import Notebook, State, percentile
 
 _QUERIES = 50
 _STOPS = 20
@@ -15,7 +15,7 @@ _STOPS = 20
 _MAX_WAIT_S = 2.0
 #: an answer later than this and the end of a motion is noticed late; stops share the line with it
 _SLOW_ANSWER_MS = 100.0
-#: what the service promises, from the request to the wire
+#: the service's promise, from the request to the wire
 _STOP_MS = 50.0
 _STEP_MM = 0.1
 
@@ -27,7 +27,7 @@ def check_stage(book: Notebook, stage: Stage, config: RigConfig, *, move: bool, 
         axes = ", ".join(f"axis {a.axis} {a.model} {a.serial}".rstrip() for a in who.axes)
         book.note("stage", "identity", "ok", f"{who.model} {who.firmware} on {who.url}: {axes}")
     with book.guard("stage", "errors"):
-        # read before anything is asked of it: what stands there is older than this run
+        # read before any other question: these messages are older than this run
         messages = stage.errors()
         book.note(
             "stage",
@@ -93,7 +93,9 @@ def _check_axis(book: Notebook, stage: Stage, config: RigConfig, axis: int) -> N
             state,
             f"{status.state.value}, at {status.position_mm:.4f} mm {status.detail}".rstrip(),
             limit="ready",
-            remedy=remedies.get(status.state, "Put right what the controller names, then run the doctor again."),
+            remedy=remedies.get(
+                status.state, "Put right the faults that the controller names, then run the doctor again."
+            ),
             position_mm=status.position_mm,
         )
         outside = _outside(config, axis, limits.low_mm, limits.high_mm)
@@ -112,7 +114,7 @@ def _check_axis(book: Notebook, stage: Stage, config: RigConfig, axis: int) -> N
 
 def _outside(config: RigConfig, axis: int, low_mm: float, high_mm: float) -> str:
     """Say which positions of the calibration plan this axis cannot reach from the side that it has to."""
-    section, plan = config.stage.of_axis(axis), config.calibration
+    section, plan = config.axis(axis), config.calibration
     turn = section.backlash_mm * (-1.0 if section.approach_from == "below" else 1.0)
     bad = []
     for cam in CAMERAS:
@@ -141,7 +143,7 @@ def _check_answers(book: Notebook, stage: Stage) -> None:
             "ok" if p99 <= _SLOW_ANSWER_MS else "warning",
             f"median {percentile(times, 0.5):.2f} ms, p99 {p99:.2f} ms ({len(times)} positions read)",
             limit=f"p99 {_SLOW_ANSWER_MS:g} ms",
-            remedy="Check baud rate and adapter (an FTDI's latency_timer set to 1 ms), and what lies between.",
+            remedy="Check baud rate and adapter (an FTDI's latency_timer set to 1 ms), and the devices between.",
             median_ms=percentile(times, 0.5),
             p99_ms=p99,
         )
@@ -211,7 +213,7 @@ def _move(book: Notebook, stage: Stage, config: RigConfig, axis: int) -> None:
     back = stage.move_to(axis, here)
     worst = max(abs(there.position_mm - there.target_mm), abs(back.position_mm - back.target_mm))
     seconds = time.monotonic() - start
-    tolerance = config.stage.of_axis(axis).tolerance_mm
+    tolerance = config.axis(axis).tolerance_mm
     book.note(
         "stage",
         name,

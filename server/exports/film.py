@@ -13,35 +13,35 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from core.errors import InputError, StorageError
-from server.exports.pictures import picture_of
-from server.formats.figures.axes import COLOURS
-from server.formats.figures.colours import colour_map
-from server.formats.figures.figure import Frames, Picture, Scale, scale_of
-from server.formats.figures.options import FigureStyle
-from server.formats.files import written_temporary
-from server.results.steps import Source, columns_of, each
-from server.worker.process import current_task
+from stereorig.core.errors import InputError, StorageError
+from stereorig.server.exports.pictures import picture_of
+from stereorig.server.formats.figures.axes import COLOURS
+from stereorig.server.formats.figures.colours import colour_map
+from stereorig.server.formats.figures.figure import FigureData, Frames, Scale, scale_of
+from stereorig.server.formats.figures.options import FigureStyle
+from stereorig.server.formats.files import written_temporary
+from stereorig.server.results.steps import ExportSource, columns_of, each
+from stereorig.server.worker.process import current_task
 
 FPS_RANGE = (0.1, 60.0)
 # VP9, which browsers play; MPEG-4 part 2, which they do not, only where OpenCV was built without libvpx
 CODECS = ("vp09", "mp4v")
 _MAX_SAMPLES = 20_000  # of a step, for the percentiles of a film
-_COLOURS = 255  # of a GIF, besides the one that is transparent
+_COLOURS = 255  # of a GIF; the 256th is transparent
 _OF_THE_BAR = 96
 
 
 @dataclass(frozen=True)
 class _Survey:
-    """What the frames of a film have in common."""
+    """Common data of the frames of a film."""
 
     numbers: list[int]  # of the steps that have the variable
     scale: Scale | None
-    first: Picture  # with the longest title and notes
+    first: FigureData  # with the longest title and notes
 
 
 def frames(
-    source: Source, steps: Sequence[int] | None, name: str, style: FigureStyle, image: NDArray[np.generic] | None
+    source: ExportSource, steps: Sequence[int] | None, name: str, style: FigureStyle, image: NDArray[np.generic] | None
 ) -> Iterator[NDArray[np.uint8]]:
     """Draw the steps that have the variable, one after the other, on one colour scale.
 
@@ -65,7 +65,7 @@ def frames(
 
 
 def _survey(
-    source: Source, steps: Sequence[int] | None, name: str, style: FigureStyle, image: NDArray[np.generic] | None
+    source: ExportSource, steps: Sequence[int] | None, name: str, style: FigureStyle, image: NDArray[np.generic] | None
 ) -> _Survey:
     task = current_task()
     samples, ends, numbers = [], [], []
@@ -96,7 +96,7 @@ def _survey(
     return _Survey(numbers, scale, replace(first, title=title, notes=notes))
 
 
-def _check_same_points(first: Picture, picture: Picture) -> None:
+def _check_same_points(first: FigureData, picture: FigureData) -> None:
     if first.values.shape != picture.values.shape or not (
         np.array_equal(first.x_px, picture.x_px) and np.array_equal(first.y_px, picture.y_px)
     ):
@@ -132,7 +132,7 @@ def write_gif(
 
 
 def _palette(pixels: NDArray[np.uint8], style: FigureStyle, opacity: float) -> NDArray[np.uint8]:
-    """Return (n, 3) a palette for all frames: what has few pixels, bar and axes, and the picture's own colours."""
+    """Return (n, 3) a palette for all frames: the colours of bar and axes, which few pixels have, and the picture's."""
     levels = np.linspace(0.0, 1.0, _OF_THE_BAR)
     map_ = colour_map(style.colours, style.levels, reverse=style.reverse)(levels)[:, :3]
     rare = np.concatenate([opacity * map_ + 1.0 - opacity, [to_rgb(one) for one in COLOURS.values()]])
@@ -158,7 +158,7 @@ def write_mp4(path: Path, drawn: Iterator[NDArray[np.uint8]], fps: float) -> Non
     Raises
     ------
     StorageError
-        ``storage_failed`` if the film cannot be opened for writing or nothing came of it.
+        ``storage_failed`` if the film cannot be opened for writing or has no content.
     """
     check_fps(fps)
     first = next(drawn)

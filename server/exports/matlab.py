@@ -10,23 +10,24 @@ from typing import Any
 import numpy as np
 import scipy.io
 
-from core.errors import InputError
-from server.formats.channel_units import plain_names
-from server.formats.files import written_temporary
-from server.formats.matlab_names import matlab_name
-from server.results.provenance import provenance
-from server.results.steps import Source, StepResult
+from stereorig.core.errors import InputError
+from stereorig.server.formats.channel_units import plain_names
+from stereorig.server.formats.files import written_temporary
+from stereorig.server.formats.gauges.matlab import matlab_name
+from stereorig.server.results.provenance import provenance
+from stereorig.server.results.steps import ExportSource, StepResult
 
 _MAX_BYTES = (1 << 31) - (1 << 20)  # of one variable in this version of the format
 
 
-def write_mat(path: Path, steps: Iterable[StepResult], source: Source) -> None:
+def write_mat(path: Path, steps: Iterable[StepResult], source: ExportSource) -> None:
     """Write ``step_<nnnn>``, a struct for each step, and one ``about_<nnnn>`` that describes it.
 
     A step's struct has ``n``, ``load_n``, ``time_s`` (since the reference; NaN where not known), ``label``, the struct
-    ``channels`` if any were recorded, and each variable as a double array: rows and columns of the grid, NaN where a
-    point has no number. ``about_<nnnn>`` has ``units`` and ``meaning`` by
-    variable, and the provenance; settings are JSON text, for ``jsondecode``. Steps are written one after the other.
+    ``channels`` if any were recorded (``channel_u``: standard uncertainties of those that the rig file names), and each
+    variable as a double array: rows and columns of the grid, NaN where a point has no number. ``about_<nnnn>`` has
+    ``units`` and ``meaning`` by variable, and the provenance; settings are JSON text, for ``jsondecode``. Steps are
+    written one after the other.
 
     Raises
     ------
@@ -52,6 +53,8 @@ def write_mat(path: Path, steps: Iterable[StepResult], source: Source) -> None:
             if step.recorded.channels:
                 plain = plain_names(step.recorded.channels, matlab_name)
                 held["channels"] = {plain[name]: value for name, value in step.recorded.channels.items()}
+                if step.recorded.u:
+                    held["channel_u"] = {plain[name]: u for name, u in step.recorded.u.items()}
             held |= {names[name]: v.values.astype(np.float64) for name, v in step.variables.items()}
             about = {matlab_name(k): _plain(v) for k, v in provenance(step, source).items()}
             about["units"] = {names[name]: v.units for name, v in step.variables.items()}
@@ -63,7 +66,7 @@ def write_mat(path: Path, steps: Iterable[StepResult], source: Source) -> None:
             }
             about["parts"] = {names[name]: " ".join(v.parts) for name, v in step.variables.items() if v.parts}
             content = {f"step_{step.n:04d}": held, f"about_{step.n:04d}": about}
-            # on an open file, each call adds to what is there
+            # on an open file, each call appends
             save: Any = scipy.io.savemat  # its stubs have names of files alone
             save(out, content, long_field_names=True, do_compression=True)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.field.region.cuts import Cuts, crosses
+from stereorig.core.arrays import Float
+from stereorig.core.field.region.cuts import Cuts, crosses
 
 Indices = NDArray[np.intp]
 
@@ -19,22 +19,22 @@ def triangles_of(
     Parameters
     ----------
     x_px, y_px, valid
-        (r, c) positions in camera 1's reference image, and True where they are points.
+        (r, c) positions in camera 1's reference image, and True at measured points.
     cuts
         Lines over which no triangle reaches.
     mask
-        Camera 1's image, False where no side of a triangle may pass.
+        Camera 1's image, False at pixels that no side of a triangle may pass.
 
     Notes
     -----
     Each quadrilateral of four neighbours gives two; with one corner failed, the triangle of the other three. No side
-    meets a cut, and no cut lies inside one. They turn as x to the right and y down does: clockwise in the image.
+    meets a cut, and no cut is inside one. They turn as x to the right and y down does: clockwise in the image.
     """
     rows, cols = valid.shape
     index = np.arange(rows * cols).reshape(rows, cols)
     a, b, c, d = (index[i : rows - 1 + i, j : cols - 1 + j].ravel() for i in (0, 1) for j in (0, 1))
     ok = valid.ravel()
-    # the other diagonal where one end of the usual one failed
+    # the other diagonal if one end of the usual one failed
     other = (~ok[b] | ~ok[c]) & ok[a] & ok[d]
     first = np.where(other[:, None], np.stack([a, b, d], 1), np.stack([a, b, c], 1))
     second = np.where(other[:, None], np.stack([a, d, c], 1), np.stack([b, d, c], 1))
@@ -66,7 +66,7 @@ def _over_black(corners: Float, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _holds_a_cut(corners: Float, cuts: Cuts) -> NDArray[np.bool_]:
-    """Return True if a whole cut lies inside a triangle (m, 3, 2): its first point does, and it meets no side."""
+    """Return True if a whole cut is inside a triangle (m, 3, 2): its first point is, and it meets no side."""
     held = np.zeros(len(corners), dtype=bool)
     low, high = corners.min(axis=1), corners.max(axis=1)
     for line in cuts.lines_px:

@@ -3,32 +3,32 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.field.region.cuts import Cuts
-from server.base.errors import NotFoundError
-from server.formats.figures.axes import directions_of, scale_of_image
-from server.formats.figures.figure import Picture, PictureForm, draw
-from server.formats.figures.options import FigureStyle
-from server.formats.files import write_bytes
-from server.formats.images import read_image
-from server.results.provenance import notes_of, provenance
-from server.results.steps import Source, StepResult, columns_of
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.formats.figures.axes import directions_of, scale_of_image
+from stereorig.server.formats.figures.figure import FigureData, PictureForm, draw
+from stereorig.server.formats.figures.options import FigureStyle
+from stereorig.server.formats.files import write_bytes
+from stereorig.server.formats.images import read_image
+from stereorig.server.formats.results.variables import described
+from stereorig.server.results.provenance import notes_of, provenance
+from stereorig.server.results.steps import ExportSource, StepResult, columns_of
 
-_STRAIN = re.compile(r"(sigma_|expanded_)?(exx|eyy|exy|e1|e2|max_shear|von_mises)(_patch)?")
 
-
-def picture_of(step: StepResult, name: str, source: Source, image: NDArray[np.generic] | None = None) -> Picture:
+def picture_of(
+    step: StepResult, name: str, source: ExportSource, image: NDArray[np.generic] | None = None
+) -> FigureData:
     """Return a variable of a step as a picture.
 
     Parameters
     ----------
     name
-        Of a variable with one number a point; ``zncc_<comparison>`` is one.
+        Name of a variable with one number a point, such as ``zncc_<comparison>``.
     image
         Camera 1's reference image to draw over.
 
@@ -50,10 +50,10 @@ def picture_of(step: StepResult, name: str, source: Source, image: NDArray[np.ge
     label = f" ({step.label})" if step.label else ""
     cuts: Cuts | None = step.cuts
     places = [columns[at].values for at in ("x_px", "y_px", "x_mm", "y_mm")]
-    return Picture(
+    return FigureData(
         axes=directions_of(*places),
         px_per_mm=scale_of_image(*places),
-        strain=_STRAIN.fullmatch(name) is not None,
+        strain=described(name).kind == "strain",
         values=variable.values,
         x_px=columns["x_px"].values,
         y_px=columns["y_px"].values,
@@ -73,7 +73,7 @@ def picture_of(step: StepResult, name: str, source: Source, image: NDArray[np.ge
     )
 
 
-def image_of(source: Source, over_image: bool) -> NDArray[np.generic] | None:
+def image_of(source: ExportSource, over_image: bool) -> NDArray[np.generic] | None:
     """Return camera 1's reference image if it is to be drawn over.
 
     Raises
@@ -93,6 +93,6 @@ def image_of(source: Source, over_image: bool) -> NDArray[np.generic] | None:
     return read_image(source.image)
 
 
-def write_figure(path: Path, picture: Picture, style: FigureStyle, form: PictureForm) -> None:
+def write_figure(path: Path, picture: FigureData, style: FigureStyle, form: PictureForm) -> None:
     """Write one figure."""
     write_bytes(path, draw(picture, style, form))

@@ -13,10 +13,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from server.base.errors import QueueFullError
-from server.exports.request import ExportRequest
-from server.worker.executor import TaskFuture
-from server.worker.resting import RestingWorker
+from stereorig.server.base.errors import QueueFullError
+from stereorig.server.exports.request import ExportRequest
+from stereorig.server.worker.executor import TaskFuture
+from stereorig.server.worker.resting import RestingWorker
 
 FOLDER = ".exports"
 _MAX_WAITING = 4
@@ -26,8 +26,8 @@ _KEPT_FILES = 8  # of exports that were jobs
 def export_task(folder: str, files: list[str], request: ExportRequest, out: str) -> str:
     """Export an analysis' result files as one file; return its path. Runs in the export process."""
     # matplotlib and SciPy are loaded here alone
-    from server.exports.run import export_packed
-    from server.exports.source import source_of
+    from stereorig.server.exports.run import export_packed
+    from stereorig.server.exports.source import source_of
 
     made = export_packed(source_of(Path(folder), [Path(f) for f in files]), request, Path(out))
     return str(made)
@@ -58,7 +58,7 @@ class ExportProcess:
         return Path(tempfile.mkdtemp(dir=self._folder))
 
     def keep(self, job_id: str, file: Path) -> Path:
-        """Keep a job's file until eight later ones are kept, or the service ends; return where it lies then."""
+        """Keep a job's file until eight later ones are kept, or the service ends; return its new path."""
         home = self._folder / "kept" / job_id
         home.mkdir(parents=True, exist_ok=True)
         kept = file.rename(home / file.name)

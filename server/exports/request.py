@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
 
-from core.errors import InputError
-from core.settings import Coverage, CoverageFields
-from server.formats.figures.options import FigureStyle
+from stereorig.core.errors import InputError
+from stereorig.core.settings import Coverage, CoverageFields
+from stereorig.server.formats.figures.options import FigureStyle
 
 ExportFormat = Literal["nc", "csv", "vtu", "mat", "h5", "png", "svg", "gif", "mp4"]
 FORMATS: tuple[ExportFormat, ...] = get_args(ExportFormat)
@@ -54,7 +54,7 @@ class ExportRequest:
     fps
         Steps a second in a film.
     coverage
-        Of the expanded uncertainties beside the standard ones; one standard uncertainty: none.
+        Coverage of expanded uncertainties in addition to the standard ones; one standard uncertainty: none.
     """
 
     format: ExportFormat
@@ -67,7 +67,7 @@ class ExportRequest:
 
     @property
     def drawn_variables(self) -> Sequence[str] | None:
-        """Variables that are read; None: all. One picture shows ``w_mm`` or ``z_mm`` where none are named."""
+        """Variables that are read; None: all. Without a name a picture shows ``w_mm`` or ``z_mm``."""
         if self.variables is None and self.format in ("png", "svg", "gif", "mp4"):
             return ("w_mm",)
         return self.variables

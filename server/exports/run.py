@@ -4,35 +4,44 @@ from __future__ import annotations
 
 import itertools
 import json
-import shutil
 import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from core.errors import InputError
-from server.exports.film import check_fps, frames, write_gif, write_mp4
-from server.exports.matlab import write_mat
-from server.exports.pictures import image_of, picture_of, write_figure
-from server.exports.request import ExportRequest
-from server.exports.stacked import scalars_of, write_stacked
-from server.exports.table import write_table
-from server.exports.vtu import NEEDS, write_pvd, write_vtu
-from server.formats.files import written_temporary
-from server.formats.images import read_mask
-from server.formats.results.folder import home_of, number_of
-from server.formats.results.netcdf import add_scalars
-from server.results.channels import has_more, rising
-from server.results.provenance import provenance
-from server.results.steps import Source, chosen, columns_of, each, read_step, require_known, variables_of, with_coverage
-from server.results.uncertainty import in_file
-from server.worker.process import current_task
+from stereorig.core.errors import InputError
+from stereorig.server.exports.film import check_fps, frames, write_gif, write_mp4
+from stereorig.server.exports.matlab import write_mat
+from stereorig.server.exports.pictures import image_of, picture_of, write_figure
+from stereorig.server.exports.request import ExportRequest
+from stereorig.server.exports.stacked import scalars_of, write_stacked
+from stereorig.server.exports.table import write_table
+from stereorig.server.exports.vtu import NEEDS, write_pvd, write_vtu
+from stereorig.server.formats.files import written_temporary
+from stereorig.server.formats.images import read_mask
+from stereorig.server.formats.manifest import checked_bytes
+from stereorig.server.formats.results.folder import home_of, number_of
+from stereorig.server.formats.results.netcdf import add_scalars
+from stereorig.server.results.channels import has_more, rising
+from stereorig.server.results.provenance import provenance
+from stereorig.server.results.steps import (
+    ExportSource,
+    chosen,
+    columns_of,
+    each,
+    read_step,
+    require_known,
+    variables_of,
+    with_coverage,
+)
+from stereorig.server.results.uncertainty import in_file
+from stereorig.server.worker.process import current_task
 
 _PACKED = (".nc", ".png", ".gif", ".mp4", ".mat", ".h5")
 
 
-def export(source: Source, request: ExportRequest, out: Path) -> Iterator[Path]:
+def export(source: ExportSource, request: ExportRequest, out: Path) -> Iterator[Path]:
     """Write an export's files into a folder, one after the other; yields each as it is finished.
 
     Raises
@@ -71,7 +80,7 @@ def export(source: Source, request: ExportRequest, out: Path) -> Iterator[Path]:
         yield from _drawn(source, files, request, out)
 
 
-def export_packed(source: Source, request: ExportRequest, folder: Path) -> Path:
+def export_packed(source: ExportSource, request: ExportRequest, folder: Path) -> Path:
     """Write an export into a folder as one file: its only one, or a ZIP of several; return its path."""
     made = _watched(export(source, request, folder), source, request)
     first = next(made)
@@ -87,7 +96,7 @@ def export_packed(source: Source, request: ExportRequest, folder: Path) -> Path:
     return packed
 
 
-def _watched(made: Iterator[Path], source: Source, request: ExportRequest) -> Iterator[Path]:
+def _watched(made: Iterator[Path], source: ExportSource, request: ExportRequest) -> Iterator[Path]:
     """Report each file of an export to the task that makes it, and end with it; a film reports its frames itself."""
     task, film = current_task(), request.format in ("gif", "mp4")
     expected = len(chosen(source, request.steps)) * (
@@ -100,11 +109,11 @@ def _watched(made: Iterator[Path], source: Source, request: ExportRequest) -> It
         yield path
 
 
-def _path(out: Path, source: Source, n: int, suffix: str) -> Path:
+def _path(out: Path, source: ExportSource, n: int, suffix: str) -> Path:
     return out / f"{source.name}_step_{n:04d}.{suffix}"
 
 
-def _as_stored(source: Source, files: Sequence[Path], request: ExportRequest, out: Path) -> Iterator[Path]:
+def _as_stored(source: ExportSource, files: Sequence[Path], request: ExportRequest, out: Path) -> Iterator[Path]:
     if request.variables is not None:
         raise InputError(
             "NetCDF files are given as they are stored, with all variables.",
@@ -120,13 +129,13 @@ def _as_stored(source: Source, files: Sequence[Path], request: ExportRequest, ou
     for path in files:
         copy = _path(out, source, number_of(path), "nc")
         with written_temporary(copy) as temporary:
-            shutil.copyfile(path, temporary)
+            temporary.write_bytes(checked_bytes(path))
             if has_more(path, source.home or home_of(path)):
                 add_scalars(temporary, scalars_of(read_step(path, [], home=source.home).recorded))
         yield copy
 
 
-def _as_vtu(source: Source, files: Sequence[Path], request: ExportRequest, out: Path) -> Iterator[Path]:
+def _as_vtu(source: ExportSource, files: Sequence[Path], request: ExportRequest, out: Path) -> Iterator[Path]:
     mask = None if source.mask is None else read_mask(source.mask)
     there = {path: variables_of(path, derived=True) for path in source.files}
     moves = any("u_mm" in names for names in there.values())
@@ -149,7 +158,7 @@ def _as_vtu(source: Source, files: Sequence[Path], request: ExportRequest, out: 
     yield series
 
 
-def _drawn(source: Source, files: Sequence[Path], request: ExportRequest, out: Path) -> Iterator[Path]:
+def _drawn(source: ExportSource, files: Sequence[Path], request: ExportRequest, out: Path) -> Iterator[Path]:
     image = image_of(source, request.over_image)
     names = request.variables
     if names is None:

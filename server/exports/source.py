@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from core.errors import InputError
-from server.formats.calibrations.in_test import calibration_id_in
-from server.formats.results.folder import first_results, home_of, results_in
-from server.formats.results.reading import read_head
-from server.results.staleness import stale_results
-from server.results.steps import Source, failed_steps
-from server.store.durable import known_json
+from stereorig.core.errors import InputError
+from stereorig.server.formats.calibrations.in_test import calibration_id_in
+from stereorig.server.formats.results.folder import first_results, home_of, results_in
+from stereorig.server.formats.results.reading import read_head
+from stereorig.server.results.staleness import stale_results
+from stereorig.server.results.steps import ExportSource, failed_steps
+from stereorig.server.store.durable import known_json
 
 
-def find_source(folder: Path, analysis: str | None = None) -> Source:
-    """Return the results of a folder, with the records beside them.
+def find_source(folder: Path, analysis: str | None = None) -> ExportSource:
+    """Return the results of a folder, with their records.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ def find_source(folder: Path, analysis: str | None = None) -> Source:
     Raises
     ------
     InputError
-        ``results_missing``; ``analysis_ambiguous`` where a test has several and none is named.
+        ``results_missing``; ``analysis_ambiguous`` if a test has several and none is named.
     """
     if (folder / "analyses").is_dir() or (folder / "steps").is_dir():
         folder = _of_test(folder, analysis)
@@ -39,10 +39,10 @@ def find_source(folder: Path, analysis: str | None = None) -> Source:
     return source_of(folder.absolute(), first_results(folder, [folder]))
 
 
-def source_of(folder: Path, files: list[Path]) -> Source:
+def source_of(folder: Path, files: list[Path]) -> ExportSource:
     """Return the source of an analysis' folder, or of a folder of ``stereorig measure``; or of its dense fields."""
     heads = [read_head(path) for path in files]
-    # dense fields lie in a folder of their own, and their copies in another frame elsewhere
+    # dense fields are in a folder of their own, and their copies in another frame elsewhere
     dense = "_dense" if "dense" in heads[0].attributes else ""
     folder = home_of(folder / files[0].name)
     stale, mask = stale_results(files, heads, folder), _mask(folder, heads[0].settings)
@@ -65,12 +65,12 @@ def source_of(folder: Path, files: list[Path]) -> Source:
         if folder.parent.name == "analyses":
             about["analysis_id"] = folder.name
             name = f"{test.name}_{folder.name}"
-        return Source(files, name + dense, title, image, about, mask, stale, home=folder)
+        return ExportSource(files, name + dense, title, image, about, mask, stale, home=folder)
     image_file = heads[0].image_file("cam1")
     calibration = known_json(folder / "summary.json").get("calibration")
     if isinstance(calibration, dict) and calibration.get("file"):
         about["calibration_file"] = str(calibration["file"])
-    return Source(
+    return ExportSource(
         files,
         (folder.name or "results") + dense,
         folder.name,
@@ -83,7 +83,7 @@ def source_of(folder: Path, files: list[Path]) -> Source:
 
 
 def _mask(folder: Path, settings: object) -> Path | None:
-    """Return the mask of the points, where it is still there: an analysis keeps its own copy."""
+    """Return the mask of the points, if it still exists: an analysis keeps its own copy."""
     region = settings.get("region") if isinstance(settings, dict) else None
     named = region.get("mask") if isinstance(region, dict) else None
     for path in (folder / "mask.png", *([Path(named)] if isinstance(named, str) else [])):

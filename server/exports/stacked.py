@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from core.common.factor import Causes, joined
-from server.formats.channel_units import plain_names, unit_of
-from server.formats.results.netcdf import opened, written_dataset
-from server.results.channels import Recorded
-from server.results.provenance import provenance
-from server.results.steps import Source, StepResult, causes_in, chosen, each, require_same_grid
-from server.results.uncertainty import COMMON_FACTOR
+from stereorig.core.common.factor import Causes, joined
+from stereorig.server.formats.channel_units import plain_names
+from stereorig.server.formats.results.netcdf import opened, written_dataset
+from stereorig.server.results.channels import Recorded
+from stereorig.server.results.provenance import provenance
+from stereorig.server.results.steps import ExportSource, StepResult, causes_in, chosen, each, require_same_grid
+from stereorig.server.results.uncertainty import COMMON_FACTOR
 
 LOAD_MEANS = "load, where it is known"
 _NO_STATE = -1  # of an integer variable in a step that does not have it
@@ -25,7 +25,7 @@ _COMMON = ("x_px", "y_px")
 _OF_A_STEP = ("step", "label", "load_n", "kind", "time_s", "channels")
 
 
-def write_stacked(path: Path, source: Source, steps: Sequence[int] | None, names: Sequence[str] | None) -> None:
+def write_stacked(path: Path, source: ExportSource, steps: Sequence[int] | None, names: Sequence[str] | None) -> None:
     """Write one file of all steps, one step in memory at a time.
 
     Datasets have the axes step, row, col (MATLAB, which counts from the other end, has col, row, step); ``x_px`` and
@@ -37,7 +37,7 @@ def write_stacked(path: Path, source: Source, steps: Sequence[int] | None, names
     Raises
     ------
     InputError
-        ``steps_mixed`` if the steps lie on different points.
+        ``steps_mixed`` if the steps have different points.
     """
     files = chosen(source, steps)
     count, causes = len(files), _all_causes(files)
@@ -79,14 +79,17 @@ def _aligned(step: StepResult, causes: Causes | None) -> StepResult:
 
 
 def scalars_of(recorded: Recorded) -> Iterator[tuple[str, float, str, str]]:
-    """Yield what was recorded with a step as name, value, unit and meaning; what is not known is left out."""
+    """Yield the scalars recorded with a step as name, value, unit and meaning; unknown ones are left out."""
     if recorded.load_n is not None:
         yield "load_n", recorded.load_n, "N", LOAD_MEANS
     if recorded.time_s is not None:
         yield "time_s", recorded.time_s, "s", "time since the reference"
     plain = plain_names(recorded.channels)
     for name, value in recorded.channels.items():
-        yield f"channel_{plain[name]}", value, unit_of(name), f"channel {name}, as recorded with the step"
+        yield f"channel_{plain[name]}", value, recorded.units[name], f"channel {name}, as recorded with the step"
+        if name in recorded.u:
+            means = f"standard uncertainty of the channel {name} at the exposure"
+            yield f"channel_{plain[name]}_u", recorded.u[name], recorded.units[name], means
 
 
 def _begin(data: Any, step: StepResult, count: int) -> None:
@@ -102,7 +105,7 @@ def _begin(data: Any, step: StepResult, count: int) -> None:
         _describe(data.createVariable(name, str, ("step",)), "1", meaning)
 
 
-def _put(data: Any, k: int, step: StepResult, source: Source) -> None:
+def _put(data: Any, k: int, step: StepResult, source: ExportSource) -> None:
     document = provenance(step, source)
     if k == 0:
         of_all = {n: v for n, v in document.items() if n not in _OF_A_STEP}

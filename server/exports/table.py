@@ -10,22 +10,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from server.formats.files import written_temporary
-from server.results.provenance import provenance
-from server.results.steps import Source, StepResult, columns_of
+from stereorig.server.formats import csv_cells
+from stereorig.server.formats.files import written_temporary
+from stereorig.server.results.provenance import provenance
+from stereorig.server.results.steps import ExportSource, StepResult, columns_of
 
 _LINES_AT_ONCE = 2000
 
 
-def write_table(path: Path, step: StepResult, source: Source, *, matrices: bool = False) -> None:
+def write_table(path: Path, step: StepResult, source: ExportSource, *, matrices: bool = False) -> None:
     """Write one step as CSV.
 
     Parameters
     ----------
     path
-        Of the file.
+        The file.
     step, source
-        Its numbers, and where they come from.
+        Its numbers, and their provenance.
     matrices
         Write covariances (upper triangle) and common factors among its variables too, an entry a column.
 
@@ -38,15 +39,15 @@ def write_table(path: Path, step: StepResult, source: Source, *, matrices: bool 
     columns = columns_of(step, matrices=matrices)
     with written_temporary(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as out:
         for name, value in provenance(step, source).items():
-            out.write(f"# {name}: {_one_line(value)}\n")
+            out.write(csv_cells.comment(f"{name}: {_text(value)}"))
         out.write("# column row, unit 1: row of the grid of points\n# column col, unit 1: column of the grid\n")
         header = ["row", "col"]
         for name, variable in columns.items():
-            out.write(f"# column {name}, unit {variable.units}: {_one_line(variable.long_name)}\n")
+            out.write(csv_cells.comment(f"column {name}, unit {variable.units}: {variable.long_name}"))
             header.append(name)
             if variable.flags is not None:
                 header.append(f"{name}_name")
-        out.write(",".join(header) + "\n")
+        out.write(csv_cells.row(header))
         rows, cols = step.shape
         texts: list[tuple[Callable[[Any], str], NDArray[Any]]] = [
             (str, np.repeat(np.arange(rows), cols)),
@@ -71,9 +72,9 @@ def _text_of(values: NDArray[Any]) -> Callable[[Any], str]:
 
 
 def _name_of(flags: dict[int, str]) -> Callable[[Any], str]:
-    return lambda v: flags.get(v, "")
+    names = {state: csv_cells.row([name]).rstrip("\n") for state, name in flags.items()}
+    return lambda v: names.get(v, "")
 
 
-def _one_line(value: Any) -> str:
-    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, sort_keys=True)
-    return " ".join(text.split())
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, sort_keys=True)

@@ -12,13 +12,12 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from server.exports.mesh import triangles_of, turned_as
-from server.formats.channel_units import unit_of
-from server.formats.files import write_bytes, written_temporary
-from server.results.provenance import provenance
-from server.results.reader import Variable
-from server.results.steps import Source, StepResult, columns_of, statement_of
-from server.results.uncertainty import matrix_columns
+from stereorig.server.exports.mesh import triangles_of, turned_as
+from stereorig.server.formats.files import write_bytes, written_temporary
+from stereorig.server.results.provenance import provenance
+from stereorig.server.results.reader import FileVariable
+from stereorig.server.results.steps import ExportSource, StepResult, columns_of, statement_of
+from stereorig.server.results.uncertainty import matrix_columns
 
 NEEDS = ("x_px", "y_px", "x_mm", "y_mm", "z_mm", "status", "u_mm", "v_mm", "w_mm", "normal_x", "normal_y", "normal_z")
 _VECTORS = {"displacement": ("u_mm", "v_mm", "w_mm"), "normal": ("normal_x", "normal_y", "normal_z")}
@@ -30,7 +29,7 @@ _TYPES = {"f8": "Float64", "f4": "Float32", "i8": "Int64", "i4": "Int32", "i2": 
 def write_vtu(
     path: Path,
     step: StepResult,
-    source: Source,
+    source: ExportSource,
     *,
     mask: NDArray[np.bool_] | None = None,
     at_rest: bool = False,
@@ -41,15 +40,15 @@ def write_vtu(
     Parameters
     ----------
     path
-        Of the file.
+        The file.
     step
         With the variables of :data:`NEEDS` that it has.
     source
         Its provenance.
     mask
-        Camera 1's image, False where no triangle may lie.
+        Camera 1's image, False at pixels that no triangle may cover.
     time
-        Of the step in the time series; its number if left out.
+        Time of the step in the time series; None: its number.
     at_rest
         Displacements are relative to this step: its own is zero, which a time series needs to warp all its steps.
 
@@ -58,7 +57,7 @@ def write_vtu(
     Points that failed are not in the file. ``displacement`` and ``normal`` are vectors; warping by ``displacement``
     gives the surface as it is at the step. A point of no triangle is written as a vertex. Triangles turn so that their
     normals point as ``normal`` does. Units, frame and settings are JSON in a comment at the top, and in the field data
-    (``provenance_json_utf8``, its bytes), what the uncertainties include in ``uncertainty_utf8``; arrays carry VTK's
+    (``provenance_json_utf8``, its bytes), the included uncertainties in ``uncertainty_utf8``; arrays carry VTK's
     UNITS_LABEL. ``covariance`` has the entries of its upper triangle as components, ``common_factor`` its own.
     """
     columns = columns_of(step)
@@ -121,16 +120,18 @@ def write_pvd(path: Path, files: Iterable[tuple[float, str]]) -> None:
     write_bytes(path, "\n".join(text).encode())
 
 
-def _vector(columns: dict[str, Variable], parts: tuple[str, ...]) -> NDArray[np.float64] | None:
+def _vector(columns: dict[str, FileVariable], parts: tuple[str, ...]) -> NDArray[np.float64] | None:
     if not all(name in columns for name in parts):
         return None
     return np.stack([columns[name].values.ravel().astype(np.float64) for name in parts], axis=1)
 
 
-def _field_data(out: TextIO, step: StepResult, source: Source, about: str, time: float) -> None:
+def _field_data(out: TextIO, step: StepResult, source: ExportSource, about: str, time: float) -> None:
     _array(out, "TimeValue", np.array([time]), tuples=1)
     for name, value in step.recorded.channels.items():
-        _array(out, name, np.array([value]), tuples=1, units=unit_of(name))
+        _array(out, name, np.array([value]), tuples=1, units=step.recorded.units[name])
+    for name, u in step.recorded.u.items():
+        _array(out, f"{name}_u", np.array([u]), tuples=1, units=step.recorded.units[name])
     if step.load_n is not None:
         _array(out, "load_n", np.array([step.load_n]), tuples=1)
     # as bytes: readers other than VTK's own do not take its arrays of text
@@ -140,7 +141,7 @@ def _field_data(out: TextIO, step: StepResult, source: Source, about: str, time:
     _array(out, "uncertainty_utf8", said, tuples=said.size)
 
 
-def _about(step: StepResult, source: Source, columns: dict[str, Variable]) -> str:
+def _about(step: StepResult, source: ExportSource, columns: dict[str, FileVariable]) -> str:
     units = {name: v.units for name, v in columns.items()} | {"displacement": "mm", "normal": "1", "Points": "mm"}
     states = {name: {str(k): t for k, t in v.flags.items()} for name, v in columns.items() if v.flags is not None}
     document = {**provenance(step, source), "units": units, "states": states}

@@ -1,1 +1,1 @@
-"""Files in and out: images, calibrations, results. Stands on `core` alone."""
+"""Files in and out: images, calibrations, results. Imports `core` alone."""

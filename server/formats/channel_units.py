@@ -1,4 +1,4 @@
-"""Units of channels: a channel's name ends in its unit (``force_kn``), so that it travels with every number."""
+"""Units of channels: as a record states them, else as a channel's name ends in one (``force_kn``)."""
 
 from __future__ import annotations
 
@@ -6,52 +6,72 @@ import re
 import unicodedata
 from collections.abc import Callable, Iterable
 
-#: what ends a name, and the unit as it is written
-_UNITS = {
-    "n": "N",
-    "kn": "kN",
-    "nm": "N m",
-    "pa": "Pa",
-    "kpa": "kPa",
-    "mpa": "MPa",
-    "gpa": "GPa",
-    "bar": "bar",
-    "um": "um",
-    "mm": "mm",
-    "cm": "cm",
-    "m": "m",
-    "mm_s": "mm/s",
-    "mm_min": "mm/min",
-    "um_m": "um/m",
-    "s": "s",
-    "ms": "ms",
-    "min": "min",
-    "hz": "Hz",
-    "c": "degC",
-    "k": "K",
-    "v": "V",
-    "mv": "mV",
-    "ma": "mA",
-    "deg": "deg",
-    "rad": "rad",
-    "percent": "%",
+#: ends of a channel's name that state its unit. ``nm`` is N m here: a record's own unit is kept with its channel
+_UNITS = {"nm": "N m", "c": "degC", "k": "K", "v": "V", "mv": "mV", "ma": "mA", "percent": "%", "hz": "Hz"}
+_FORCES = "N kN cN daN lbf klbf kip kgf"
+_UNITS |= {one.lower(): one for one in f"{_FORCES} Pa kPa MPa GPa bar psi ksi".split()}
+_LENGTHS = "um mm cm m"
+_UNITS |= {one.replace("/", "_"): one for one in f"{_LENGTHS} mm/s mm/min um/m s ms min deg rad".split()}
+#: newtons (CODATA and NIST SP 811: the pound and the standard gravity are exact)
+FORCE_N = {
+    **{"N": 1.0, "kN": 1e3, "MN": 1e6, "GN": 1e9, "mN": 1e-3, "uN": 1e-6, "cN": 1e-2, "daN": 10.0, "dyn": 1e-5},
+    **{"lbf": 4.4482216152605, "lb": 4.4482216152605, "ozf": 0.2780138509537812},
+    **{"kip": 4448.2216152605, "klbf": 4448.2216152605, "kgf": 9.80665, "gf": 9.80665e-3, "tf": 9806.65},
 }
-_WRITTEN = {unit.lower().replace(" ", ""): ending for ending, unit in _UNITS.items()}
-_WRITTEN |= {
-    "°c": "c",
-    "c": "c",
-    "µm": "um",
-    "μm": "um",
-    "µm/m": "um_m",
-    "n/mm²": "mpa",
-    "n/mm2": "mpa",
-    "n/mm^2": "mpa",
+TIME_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0, "h": 3600.0, "d": 86400.0}
+#: other spellings of a unit, without blanks and signs of a product
+_SPELLINGS = {
+    "s": "sec secs second seconds sek sekunden seconde secondes segundos secondi seg 秒 с сек",
+    "ms": "msec millisecond milliseconds",
+    "min": "mins minute minutes minuten minutos 分",
+    "h": "hr hrs hour hours std stunden heures horas",
+    "d": "days",
+    "lb": "lbs",
+    "kip": "kips",
+    "kgf": "kp",
+    "tf": "tonf",
+    "in": 'inch inches "',
+    "mil": "mils thou",
+    "degC": "C ℃",
+    "degF": "℉",
+    "MPa": "N/mm2",
+    "um": "micron microns",
+    "um/m": "ue uε microstrain ustrain",
+    "N m": "Nm",
+    "N mm": "Nmm",
+    "kN m": "kNm",
+    "lbf in": "lbfin inlbf inlb lbin",
+    "lbf ft": "lbfft ftlbf ftlb lbft",
 }
-_WRITTEN |= {"sec": "s", "seconds": "s", "n*m": "nm", "n·m": "nm", "µε": "um_m", "microstrain": "um_m", "°": "deg"}
+_PLAIN = """uA mA A uV mV V mV/V Hz kHz deg rad K kg g % mm/mm m/m in/in mm/m nm um mm cm m in mil ft Pa hPa kPa MPa GPa
+bar mbar psi ksi Msi kgf/mm2 kgf/cm2 mm/s mm/min um/s m/s in/s in/min %/s %/min 1/s N/s kN/s kN/min MPa/s N/mm kN/mm"""
+_WRITTEN = {one: one for one in (*FORCE_N, *TIME_S, *_PLAIN.split(), *_SPELLINGS)}
+_WRITTEN |= {one: unit for unit, others in _SPELLINGS.items() for one in others.split()}
+_SIGNS = str.maketrans(
+    {**dict.fromkeys(" .·⋅∙*×^-_\u00a0"), "µ": "u", "μ": "u", "²": "2", "³": "3", "°": "deg", "º": "deg"}
+)
+#: in any letter case, if that leaves one unit only: MN is not mN, and nm not N m
+_ANY_CASE: dict[str, set[str]] = {}
+for _one, _unit in _WRITTEN.items():
+    _ANY_CASE.setdefault(_one.lower(), set()).add(_unit)
+_LONGEST_UNIT = 40
+
+
+def known_unit(written: str) -> str | None:
+    """Return a unit in the program's spelling; None if it is not known, or is one of two as ``NM``."""
+    plain = written.strip().translate(_SIGNS)
+    found = _ANY_CASE.get(plain.lower(), set())
+    return _WRITTEN.get(plain) or (next(iter(found)) if len(found) == 1 else None)
+
+
+def stated_unit(written: str) -> str:
+    """Return a unit in the program's spelling, as written if it is not known; empty for none."""
+    plain = "".join(c if c.isprintable() else " " for c in written).strip()
+    return known_unit(plain) or ("" if plain in ("-", "1") else plain[:_LONGEST_UNIT])
 
 
 def unit_of(name: str) -> str:
-    """Return the unit that a channel's name ends in, as NetCDF writes it; ``1`` where it ends in none."""
+    """Return the unit that a channel's name ends in, as NetCDF writes it; ``1`` if it ends in none."""
     parts = name.lower().split("_")
     for count in (2, 1):
         ending = "_".join(parts[-count:])
@@ -63,8 +83,45 @@ def unit_of(name: str) -> str:
 def channel_name(title: str, unit: str = "") -> str:
     """Return a channel's name for a column's title and unit: ``Force`` and ``kN`` make ``force_kn``."""
     name = _word(title) or "channel"
-    ending = _WRITTEN.get(unit.strip().lower().replace(" ", ""), _word(unit))
+    known = known_unit(unit) or unit
+    ending = {"degC": "c", "degF": "f", "N m": "nm"}.get(known) or _word(known)
     return (name if not ending or name.endswith(f"_{ending}") else f"{name}_{ending}")[:100]
+
+
+def titled_unit(title: str) -> tuple[str, str]:
+    """Return a title without the unit that it states, and that unit as written: ``Force [kN]``, ``Force in kN``.
+
+    A title such as ``Force_MN`` keeps its ending, which is its unit in the letters of the file.
+    """
+    parted = title_and_unit(title, "[(/")
+    if parted is not None and (title[len(parted[0]) :].lstrip()[:1] != "/" or known_unit(parted[1])):
+        return parted
+    for mark in (" in ", ", ", ","):
+        name, found, unit = title.rpartition(mark)
+        if found and known_unit(unit):
+            return name.strip(), unit
+    ending = title.replace("_", " ").rpartition(" ")[2]
+    mixed = ending.translate(_SIGNS) in _WRITTEN and (len(ending) > 1 or "_" in title) and not title.islower()
+    mixed = mixed and ending.lower() != "min"  # of a peak and its valley
+    return title, ending if mixed else ""
+
+
+#: longest title of a column, and longest line of a table
+MAX_TITLE, MAX_LINE = 200, 1 << 16
+
+
+def title_and_unit(title: str, openings: str) -> tuple[str, str] | None:
+    """Return a title's name and the unit after it, as in ``Force [kN]``, without the marks; None if it has no unit.
+
+    Parameters
+    ----------
+    openings
+        The characters that a unit may begin with.
+    """
+    end = len(title) - title.endswith((")", "]"))
+    inner = max(title.rfind(")", 0, end), title.rfind("]", 0, end))
+    begin = min((k for k in (title.find(mark, inner + 1, end) for mark in openings) if k >= 0), default=-1)
+    return None if begin < 0 else (title[:begin].rstrip(), title[begin + 1 : end].strip())
 
 
 def plain_names(names: Iterable[str], plain: Callable[[str], str] | None = None) -> dict[str, str]:
@@ -84,6 +141,12 @@ def plain_names(names: Iterable[str], plain: Callable[[str], str] | None = None)
     return found
 
 
+def folded(text: str) -> str:
+    """Return a text in small letters without accents."""
+    return unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().lower()
+
+
 def _word(text: str) -> str:
-    plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().lower()
-    return re.sub(r"[^a-z0-9]+", "_", plain.replace("%", " percent ")).strip("_")
+    plain = re.sub(r"[^a-z0-9]+", "_", folded(text).replace("%", " percent ")).strip("_")
+    # a title in another script keeps its letters
+    return plain or re.sub(r"\W+", "_", unicodedata.normalize("NFKC", text).lower()).strip("_")

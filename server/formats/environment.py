@@ -1,6 +1,6 @@
-"""What a result was computed by: program, libraries and processor, all that its last bits may depend on.
+"""Environment that computed a result: program, libraries and processor, all that its last bits may depend on.
 
-Kept with every result, so that a repetition elsewhere can name what is different there.
+Stored with every result, so that a repetition on another machine can name the differences.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from pathlib import Path
 
-from server.formats.version import software_version
+from stereorig.server.formats.version import software_version
 
 #: packages whose arithmetic reaches the numbers of a result
 _LIBRARIES = ("numpy", "scipy", "numba", "llvmlite", "opencv-python-headless", "netCDF4")
-#: packages whose code computes; a hash of it tells versions of a checkout apart that bear the same number
+#: packages whose code computes; a hash of it distinguishes versions of a checkout that have the same number
 _CODE = ("core", "server/compute", "server/formats")
 
 
@@ -29,13 +29,13 @@ class Environment:
     Attributes
     ----------
     software_version, code_sha256
-        Of this program; the second is of the modules that compute.
+        Version of this program; SHA-256 of its modules that compute.
     python, libraries
         Versions.
     processor
         Name of the model.
     processor_kind
-        What kernels are compiled for: architecture and features, as LLVM names them. Two models of one kind execute
+        Architecture and features that kernels are compiled for, as LLVM names them. Two models of one kind execute
         the same instructions.
     system
         Operating system and C library.
@@ -55,7 +55,7 @@ class Environment:
 
     @staticmethod
     def of(text: str) -> Environment | None:
-        """Read what :meth:`text` wrote; None where that is missing or something else."""
+        """Read the JSON that :meth:`text` wrote; None if it is empty or something else."""
         try:
             found = json.loads(text)
         except ValueError:
@@ -72,14 +72,14 @@ class Environment:
 
 @dataclass(frozen=True)
 class Change:
-    """One thing that is not as it was.
+    """One difference between two environments.
 
     Parameters
     ----------
     what
         ``version``, ``code``, ``python``, ``processor``, ``processor_kind``, ``system`` or a library's name.
     before, now
-        None where it is not known, or not there.
+        Value in each; None if it is not known, or not installed.
     """
 
     what: str
@@ -93,7 +93,7 @@ class Change:
 
 @functools.cache
 def current_environment() -> Environment:
-    """Return that of this process."""
+    """Return the environment of this process."""
     return Environment(
         software_version=software_version(),
         code_sha256=_code_sha256(),
@@ -106,7 +106,7 @@ def current_environment() -> Environment:
 
 
 def changes_between(before: Environment | None, now: Environment) -> list[Change]:
-    """Return what is different; a record from before environments were kept is one change, ``environment``."""
+    """Return the differences; a result without a stored environment gives one change, ``environment``."""
     if before is None:
         return [Change("environment", None, f"stereorig {now.software_version} on {now.processor}")]
     names = {"software_version": "version", "code_sha256": "code", "python": "python", "system": "system"}

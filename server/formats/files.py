@@ -1,6 +1,6 @@
 """Files on disk: written under a temporary name, synced, renamed; and their checksums.
 
-A file written here is either the whole new one or the old one, whatever happens in between.
+A file written here is either the whole new one or the old one, even if the program or the machine stops in between.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ import errno
 import hashlib
 import os
 import secrets
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from core.errors import FileFormatError, InputError, StorageError
-from server.formats import disk as _disk
+from stereorig.core.errors import FileFormatError, InputError, StorageError
+from stereorig.server.formats import disk as _disk
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _CHUNK_BYTES = 1 << 20
@@ -44,24 +44,8 @@ def fsync_path(path: Path) -> None:
 
 
 def mark_of(found: os.stat_result) -> tuple[int, int, int]:
-    """Return what differs once a file was touched: the time of its inode's change, which no program can set."""
+    """Return (inode, change time in ns, size in bytes); any write changes the time, which no program can set back."""
     return found.st_ino, found.st_ctime_ns, found.st_size
-
-
-#: checksums by what names a file as it was: of each some 250 bytes are held, a quarter of what path and time would take
-_hashes: dict[bytes, bytes] = {}
-_MAX_HASHES = 50_000
-
-
-def known_sha256(path: Path) -> str:
-    """As `sha256_of`, but a file that was not touched since is not read again."""
-    key = hashlib.blake2b(repr((str(path), mark_of(path.stat()))).encode(), digest_size=16).digest()
-    known = _hashes.get(key)
-    if known is None:
-        if len(_hashes) >= _MAX_HASHES:
-            _hashes.clear()
-        _hashes[key] = known = bytes.fromhex(sha256_of(path))
-    return known.hex()
 
 
 def checksum_file(path: Path) -> Path:
@@ -70,7 +54,7 @@ def checksum_file(path: Path) -> Path:
 
 
 def recorded_sha256(path: Path) -> str | None:
-    """Return the checksum kept beside a file; None where there is none."""
+    """Return the checksum in the file's ``.sha256`` file; None if that does not exist or cannot be read."""
     try:
         text = checksum_file(path).read_text(encoding="ascii").split()
     except (OSError, UnicodeDecodeError):
@@ -83,30 +67,20 @@ def mismatch(name: str, of: str, folder: str) -> FileFormatError:
     return FileFormatError(
         f"{name} of {of} does not match its checksum.",
         code="checksum_mismatch",
-        remedy="Restore the file from a backup, or make it anew; nothing else is touched.",
+        remedy="Restore the file from a backup, or make it again; nothing else is touched.",
         file=f"{folder}/{name}",
     )
 
 
-def require_recorded(path: Path, of: str, folder: str) -> None:
-    """Raise an error if a file does not match the checksum beside it, where there is one.
-
-    Raises
-    ------
-    FileFormatError
-        ``checksum_mismatch``, naming the file.
-    """
-    recorded = recorded_sha256(path)
-    if recorded is not None and known_sha256(path) != recorded:
-        raise mismatch(path.name, of, folder)
-
-
 @contextlib.contextmanager
-def written_temporary(path: Path, *, checksum: bool = False) -> Iterator[Path]:
+def written_temporary(
+    path: Path, *, checksum: bool = False, before: Callable[[], None] | None = None
+) -> Iterator[Path]:
     """Yield a temporary path in the same folder; on leaving, sync it, rename it to ``path``, sync the folder.
 
-    With ``checksum``, its SHA-256 is put beside it first, so that a file under its real name never lacks it. If the
-    body raises, the temporary file is removed and ``path`` is left as it was.
+    With ``checksum``, its SHA-256 file is written first, so that a file under its real name never lacks it.
+    ``before`` is called when the temporary file is durable, and before it is renamed. If the body or ``before`` raises,
+    the temporary file is removed and ``path`` is left as it was.
 
     Raises
     ------
@@ -119,6 +93,8 @@ def written_temporary(path: Path, *, checksum: bool = False) -> Iterator[Path]:
         fsync_path(temporary)
         if checksum:
             write_bytes(checksum_file(path), f"{sha256_of(temporary)}  {path.name}\n".encode())
+        if before is not None:
+            before()
         _disk.disk.replace(temporary, path)
         fsync_path(path.parent)
     except OSError as error:

@@ -1,39 +1,35 @@
 """Image files: gray or colour, 8 or 16 bit, in and out; every number of a gray image as the camera gave it.
 
 Read: TIFF, PNG, BMP, JPEG. A colour file whose channels are equal everywhere is a gray image saved as colour and keeps
-its numbers; of true colour the luminance is taken, and said so, since the conversion is part of the measurement. Size
-and type are checked in the header, before anything is decoded.
+its numbers; a true colour image is reduced to its luminance, and the result states so, since the conversion is part
+of the measurement. Size and type are checked in the header, before anything is decoded.
 """
 
 from __future__ import annotations
 
 import io
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
-from core.errors import ImageError
-from server.formats.files import write_bytes
+from stereorig.core.errors import ImageError
+from stereorig.server.formats.codecs.flat import PNG_HEAD, decode_bmp, decode_png
+from stereorig.server.formats.codecs.jpeg import decode_jpeg
+from stereorig.server.formats.codecs.refusals import too_large, unreadable, unsupported
+from stereorig.server.formats.codecs.tiff import MAGIC, decode_tiff
+from stereorig.server.formats.files import write_bytes
+from stereorig.server.formats.manifest import checked_bytes
 
 GrayImage = NDArray[np.uint8] | NDArray[np.uint16]
 
-MAX_PIXELS = 160_000_000  # the largest area sensors have 151 million
-MAX_SIDE_PX = 32_767
 MAX_FILE_BYTES = 2 << 30
-_TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_PIL_FORMATS = ("PNG", "BMP", "JPEG")
-_REDUCED_PAGE = 1  # NewSubfileType bit: a thumbnail of another page
-_MIN_IS_WHITE = 0
-_TIFF_RGB = 2  # PhotometricInterpretation
 LUMINANCE = (0.299, 0.587, 0.114)
-"""Weights of red, green and blue in a grey level: those of ITU-R BT.601, as OpenCV and most cameras take them."""
+"""Weights of red, green and blue in a grey level: ITU-R BT.601, as OpenCV and most cameras use them."""
 LUMINANCE_TEXT = "luminance, {} R + {} G + {} B".format(*LUMINANCE)
 _ROWS_AT_ONCE = 256
 
@@ -47,56 +43,30 @@ class Decoded:
     pixels
         (rows, cols) uint8 or uint16.
     grey_from
-        What its grey levels were made from, if they are not the file's own: ``LUMINANCE_TEXT`` of a colour image.
+        Origin of the grey levels if they are not the file's own: ``LUMINANCE_TEXT`` of a colour image.
+    bit_depth
+        Significant bits of a pixel, as the file states them: 8, 12 (packed) or 16.
     """
 
     pixels: GrayImage
-    grey_from: str | None = None
+    grey_from: str | None
+    bit_depth: int
 
 
-def _unreadable(name: str, why: str) -> ImageError:
-    return ImageError(
-        f"{name} cannot be read as an image: {why}.",
-        code="image_unreadable",
-        remedy="Copy or save the file again; TIFF, PNG, BMP and JPEG are read.",
-    )
-
-
-def _unsupported(name: str, why: str) -> ImageError:
-    return ImageError(
-        f"{name} is not a gray or RGB image of 8 or 16 bit: {why}.",
-        code="image_unsupported",
-        remedy="Save both cameras' images as one-channel 8 or 16 bit TIFF or PNG, or as RGB.",
-    )
-
-
-def _too_large(cause: str) -> ImageError:
-    return ImageError(cause, code="image_too_large", remedy="Give the camera's own image, or a part of it.")
-
-
-def _check_size(name: str, width: int, height: int) -> None:
-    if width < 1 or height < 1:
-        raise _unreadable(name, f"its header gives a size of {width} x {height} px")
-    if width * height > MAX_PIXELS or max(width, height) > MAX_SIDE_PX:
-        raise _too_large(
-            f"{name} is {width} x {height} px; at most {MAX_PIXELS} px and {MAX_SIDE_PX} px a side are read."
-        )
-
-
-def _one_channel(name: str, pixels: NDArray[Any], *, space: str = "RGB") -> Decoded:
+def _one_channel(name: str, pixels: NDArray[Any], bits: int, *, space: str = "RGB") -> Decoded:
     """Reduce (rows, cols[, channels]) of one image to grey levels (rows, cols), or raise an error."""
     if pixels.dtype not in (np.uint8, np.uint16):
-        raise _unsupported(name, f"its pixels are {pixels.dtype}")
+        raise unsupported(name, f"its pixels are {pixels.dtype}")
     if pixels.ndim == 3:
         colour = pixels[..., :3] if pixels.shape[2] >= 3 else pixels[..., :1]
         if pixels.shape[2] in (2, 4) and (pixels[..., -1] != np.iinfo(pixels.dtype).max).any():
-            raise _unsupported(name, "it has transparent pixels")
+            raise unsupported(name, "it has transparent pixels")
         if (colour != colour[..., :1]).any():
             if space != "RGB":
-                raise _unsupported(name, f"its colours are {space}, not RGB")
-            return Decoded(luminance(colour), LUMINANCE_TEXT)
+                raise unsupported(name, f"its colours are {space}, not RGB")
+            return Decoded(luminance(colour), LUMINANCE_TEXT, bits)
         pixels = colour[..., 0]
-    return Decoded(np.ascontiguousarray(pixels))
+    return Decoded(np.ascontiguousarray(pixels), None, bits)
 
 
 def luminance(rgb: NDArray[Any]) -> GrayImage:
@@ -106,84 +76,6 @@ def luminance(rgb: NDArray[Any]) -> GrayImage:
     for top in range(0, len(out), _ROWS_AT_ONCE):  # in bands: as float64 a large image would take gigabytes
         out[top : top + _ROWS_AT_ONCE] = np.rint(rgb[top : top + _ROWS_AT_ONCE] @ weights)
     return out
-
-
-def _decode_tiff(name: str, data: bytes) -> Decoded:
-    try:
-        with tifffile.TiffFile(io.BytesIO(data)) as tif:
-            pages = [p for p in tif.pages[:4] if not p.aspage().subfiletype & _REDUCED_PAGE]
-            if not pages:
-                raise _unreadable(name, "it holds no image")
-            if len(pages) > 1:
-                raise _unsupported(name, "it holds more than one image")
-            page = pages[0].aspage()
-            _check_size(name, int(page.imagewidth), int(page.imagelength))
-            if page.dtype not in (np.uint8, np.uint16) or page.imagedepth != 1:
-                raise _unsupported(name, f"its pixels are {page.dtype or 'of an unknown type'}")
-            if page.samplesperpixel > 4:
-                raise _unsupported(name, f"it has {page.samplesperpixel} channels")
-            # tifffile fills missing data with zeros; a measurement must not
-            ends = [o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=False)]
-            if not ends or min(page.databytecounts) == 0 or max(ends) > len(data):
-                raise _unreadable(name, f"it is truncated ({len(data)} bytes, {max(ends, default=0)} expected)")
-            try:
-                pixels = page.asarray()
-            except ValueError as error:
-                if "imagecodecs" not in str(error):
-                    raise
-                pixels = _decode_pil(name, data, ("TIFF",))  # LZW and the like: libtiff's work
-                inverted, space = False, "RGB"  # what libtiff makes of any
-            else:
-                inverted = int(page.photometric) == _MIN_IS_WHITE
-                is_rgb = int(page.photometric) == _TIFF_RGB
-                space = "RGB" if is_rgb else getattr(page.photometric, "name", str(page.photometric))
-            if page.samplesperpixel > 1 and int(page.planarconfig) == 2 and pixels.ndim == 3:
-                pixels = np.moveaxis(pixels, 0, -1)
-    except ImageError:
-        raise
-    except Exception as error:  # a damaged file can fail anywhere inside the reader
-        raise _unreadable(name, f"{type(error).__name__}, {error}") from error
-    gray = _one_channel(name, pixels, space=space)
-    return Decoded(np.iinfo(gray.pixels.dtype).max - gray.pixels) if inverted else gray
-
-
-def _decode_pil(name: str, data: bytes, formats: tuple[str, ...]) -> NDArray[Any]:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own limit is below
-            with Image.open(io.BytesIO(data), formats=formats) as image:
-                _check_size(name, *image.size)
-                if image.mode == "P":
-                    image.load()
-                    return np.asarray(image.convert("RGBA" if "transparency" in image.info else "RGB"))
-                # Pillow would cut 16 bit colour to 8 bit without a word
-                if image.mode in ("RGB", "RGBA", "LA") and any("16" in _raw_mode(tile[3]) for tile in image.tile):
-                    return _decode_deep_colour(name, data)
-                if image.mode not in ("L", "LA", "I;16", "I;16B", "I;16L", "I;16N", "RGB", "RGBA"):
-                    raise _unsupported(name, f"its pixel type is {image.mode!r}")
-                image.load()
-                pixels = np.asarray(image)
-                return pixels.astype(np.uint16) if image.mode.startswith("I;16") else pixels
-    except ImageError:
-        raise
-    except Image.DecompressionBombError as error:  # raised while opening, far above our own limit
-        raise _too_large(f"{name} is too large: {error}") from error
-    except Exception as error:  # a damaged file can fail anywhere inside the reader
-        raise _unreadable(name, f"{type(error).__name__}, {error}") from error
-
-
-def _raw_mode(arguments: object) -> str:
-    """Return the pixel form, as RGB;16B, of a Pillow decoder's arguments: the others may be offsets with any digits."""
-    return str(arguments[0] if isinstance(arguments, tuple) and arguments else arguments)
-
-
-def _decode_deep_colour(name: str, data: bytes) -> NDArray[Any]:
-    """Return (rows, cols, 3 or 4) red, green, blue of a colour image of 16 bit; its size was checked before."""
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
-        raise _unsupported(name, "it is a colour image of 16 bit that cannot be read")
-    order = [2, 1, 0] if pixels.shape[2] == 3 else [2, 1, 0, 3]
-    return np.asarray(pixels[..., order])
 
 
 def decode_image(data: bytes, *, name: str = "the image") -> GrayImage:
@@ -204,19 +96,36 @@ def decode(data: bytes, *, name: str = "the image") -> Decoded:
     Returns
     -------
     Decoded
-        (rows, cols) uint8 or uint16, C-contiguous, and what they were made from.
+        (rows, cols) uint8 or uint16, C-contiguous, and the origin of its grey levels.
 
     Raises
     ------
     ImageError
-        ``image_unreadable`` (damaged, truncated, no image), ``image_unsupported`` (colours that are not RGB,
-        transparent or other pixels, several images), ``image_too_large`` (checked in the header).
+        ``image_unreadable`` (damaged, no image, or any strip, row or segment that is missing), ``image_unsupported``
+        (colours that are not RGB, transparent or other pixels, several images), ``image_too_large`` (by the header).
     """
-    if data[:4] in _TIFF_MAGIC:
-        return _decode_tiff(name, data)
-    if data[:8] == b"\x89PNG\r\n\x1a\n" or data[:2] in (b"BM", b"\xff\xd8"):
-        return _one_channel(name, _decode_pil(name, data, _PIL_FORMATS))
-    raise _unreadable(name, "it is none of TIFF, PNG, BMP, JPEG" if data else "it is empty")
+    pixels, space, bits = _samples(data, name)
+    if bits == 1:
+        raise unsupported(name, "its pixels are of one bit")
+    return _one_channel(name, pixels, bits, space=space)
+
+
+def _samples(data: bytes, name: str) -> tuple[NDArray[Any], str, int]:
+    """Return (rows, cols[, channels]), the name of their colours, and the bits a channel."""
+    try:
+        if data[:4] in MAGIC:
+            return decode_tiff(data, name)
+        if data[:8] == PNG_HEAD:
+            pixels = decode_png(data, name)
+        elif data[:2] == b"BM":
+            pixels = decode_bmp(data, name)
+        elif data[:2] == b"\xff\xd8":
+            pixels = decode_jpeg(data, name)
+        else:
+            raise unreadable(name, "it is none of TIFF, PNG, BMP, JPEG" if data else "it is empty")
+    except OSError as error:  # of Pillow
+        raise unreadable(name, str(error)) from error
+    return pixels, "RGB", 1 if pixels.dtype == np.bool_ else 8 * pixels.itemsize
 
 
 def read_file(path: Path, *, kind: str = "image") -> bytes:
@@ -230,12 +139,12 @@ def read_file(path: Path, *, kind: str = "image") -> bytes:
     try:
         size = path.stat().st_size
         if size > MAX_FILE_BYTES:
-            raise _too_large(f"The {kind} {path} has {size} bytes; at most {MAX_FILE_BYTES} are read.")
-        return path.read_bytes()
+            raise too_large(f"The {kind} {path} has {size} bytes; at most {MAX_FILE_BYTES} are read.")
+        return checked_bytes(path)
     except FileNotFoundError as error:
         raise ImageError(f"The {kind} {path} does not exist.", code="file_missing", remedy="Check the path.") from error
     except OSError as error:
-        raise _unreadable(str(path), error.strerror or str(error)) from error
+        raise unreadable(str(path), error.strerror or str(error)) from error
 
 
 def read_image(path: str | Path) -> GrayImage:
@@ -255,7 +164,7 @@ def read_image(path: str | Path) -> GrayImage:
 
 
 def read_mask(path: str | Path) -> NDArray[np.bool_]:
-    """Read a mask image: True (points may lie) where it is brighter than half of full scale.
+    """Read a mask image: True (points allowed) at pixels brighter than half of full scale.
 
     Raises
     ------
@@ -268,23 +177,15 @@ def read_mask(path: str | Path) -> NDArray[np.bool_]:
 
 def decode_mask(data: bytes, *, name: str = "the mask") -> NDArray[np.bool_]:
     """Decode a mask image's bytes, see :func:`read_mask`."""
-    try:
-        gray = decode_image(data, name=name)
-    except ImageError as error:
-        if error.code != "image_unsupported":
-            raise
-        try:  # one bit a pixel is a proper mask, though no measurement image; its size was checked above
-            with Image.open(io.BytesIO(data), formats=("PNG", "BMP", "TIFF")) as image:
-                if image.mode != "1":
-                    raise error
-                return np.asarray(image).astype(np.bool_)
-        except OSError as damaged:
-            raise _unreadable(name, str(damaged)) from damaged
-    return np.asarray(gray > np.iinfo(gray.dtype).max // 2)
+    pixels, space, bits = _samples(data, name)
+    if bits == 1:  # a proper mask, though no measurement image
+        return pixels
+    gray = _one_channel(name, pixels, bits, space=space).pixels
+    return np.asarray(gray > ((1 << bits) - 1) // 2)
 
 
 def encode_png(mask: NDArray[np.bool_]) -> bytes:
-    """Encode a mask (rows, cols) as a PNG, white where it is True."""
+    """Encode a mask (rows, cols) as a PNG, white at True."""
     buffer = io.BytesIO()
     Image.fromarray(mask.astype(np.uint8) * np.uint8(255)).save(buffer, "PNG")
     return buffer.getvalue()

@@ -1,7 +1,7 @@
 """Images in object storage: copied to the disk before they are measured, by fsspec and the user's own credentials.
 
-Addresses are those of fsspec, ``s3://bucket/key``, patterns included. Endpoint and credentials come from where the
-storage's own tools take them (for S3: ``AWS_*`` variables, ``~/.aws``, a machine's role), never from an address.
+Addresses are fsspec's, ``s3://bucket/key``, patterns included. Endpoint and credentials are found like by the
+storage's own tools (for S3: ``AWS_*`` variables, ``~/.aws``, a machine's role), never taken from an address.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from core.errors import ImageError, InputError
-from server.formats.files import make_folder, written_temporary
+from stereorig.core.errors import ImageError, InputError
+from stereorig.server.formats.files import make_folder, written_temporary
 
 _ADDRESS = re.compile(r"([a-z][a-z0-9+.-]+)://(.*)", re.DOTALL)
 _PACKAGES = {"s3": "'stereorig[s3]'", "s3a": "'stereorig[s3]'"}
@@ -25,7 +25,7 @@ def is_address(text: str) -> bool:
 
 
 def copied(option: str, items: Sequence[str], folder: Path) -> list[str]:
-    """Copy what lies in object storage into a folder; return all as paths and patterns of this machine.
+    """Copy objects from object storage into a folder; return all items as paths and patterns of this machine.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def copied(option: str, items: Sequence[str], folder: Path) -> list[str]:
     items
         Paths, patterns and addresses; addresses may have patterns.
     folder
-        Copies go there under their own names; it is made where there are any.
+        Copies go there under their own names; it is made if there are any.
 
     Raises
     ------
@@ -131,7 +131,7 @@ def _missing(option: str, key: str) -> ImageError:
 
 
 def _problem(option: str, key: str, error: Exception) -> ImageError:
-    """Return the error for what a storage's package has raised."""
+    """Return the error for an exception of a storage's package."""
     if isinstance(error, FileNotFoundError):
         return _missing(option, key)
     if isinstance(error, PermissionError) or "Credentials" in type(error).__name__:

@@ -9,11 +9,11 @@ from pathlib import Path
 
 @functools.cache
 def software_version() -> str:
-    """Return the installed distribution's version, or that of the source tree it runs from."""
+    """Return the installed distribution's version; if it is not installed, the source tree's."""
     try:
         return metadata.version("stereorig")
     except metadata.PackageNotFoundError:
-        import tomllib  # loaded where it is used
+        import tomllib  # imported late: only a source tree needs it
 
         project = Path(__file__).resolve().parents[2] / "pyproject.toml"
         return str(tomllib.loads(project.read_text())["project"]["version"])

@@ -21,7 +21,7 @@ class Notifier:
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
         found = os.environ if environment is None else environment
         path = found.get("NOTIFY_SOCKET", "")
-        # a name that begins with @ is abstract: it lies in no folder
+        # a name that begins with @ is abstract: it is in no folder
         self._address = f"\0{path[1:]}" if path.startswith("@") else path
         self._every_s = _watchdog_s(found) / 2.0
         self._due = time.monotonic()
@@ -55,7 +55,7 @@ class Notifier:
 
 
 def _watchdog_s(environment: Mapping[str, str]) -> float:
-    """Return the watchdog's period; 0 where there is none, or it is another process'."""
+    """Return the watchdog's period, s; 0 if there is none, or it is another process'."""
     if environment.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
         return 0.0
     try:

@@ -1,7 +1,7 @@
 """Events of the service, as a numbered stream that readers can resume.
 
-Events live in a bounded ring. A slow reader loses the oldest ones and gets an event ``gap``; it never holds up
-a writer. Numbers grow over restarts too, so that a reader which comes back after one learns what it missed.
+Events are kept in a bounded ring. A slow reader loses the oldest ones and gets an event ``gap``; it never holds up
+a writer. Numbers grow over restarts too, so that a reader that returns after one learns which events it missed.
 """
 
 from __future__ import annotations
@@ -80,9 +80,9 @@ class EventHub:
             return [self._ring[index] for index in range(first, last)]
 
     def gap(self, number: int) -> Event | None:
-        """Return the event ``gap`` for a reader that had ``number`` last and lost some since; None where none are lost.
+        """Return the event ``gap`` for a reader that had ``number`` last and lost some since; None if none are lost.
 
-        Its own number is the one from which the reader can go on.
+        Its own number is the one from which the reader can continue.
         """
         with self._lock:
             known = self._number - len(self._ring)

@@ -16,9 +16,9 @@ from typing import TypeVar
 
 from pydantic import Field
 
-from core.errors import StateError
-from server.base.errors import BusyError
-from server.base.models import Document
+from stereorig.core.errors import StateError
+from stereorig.server.base.errors import BusyError
+from stereorig.server.base.models import Document
 
 T = TypeVar("T")
 
@@ -44,7 +44,7 @@ class HardwareHold:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._acting = threading.RLock()  # what is done to a holder from outside comes before the next one's hold
+        self._acting = threading.RLock()  # an action on a holder from outside ends before the next hold begins
         self._hold: _Hold | None = None
         self._shut = False
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="hardware")
@@ -110,5 +110,5 @@ class HardwareHold:
         return self._thread.submit(contextvars.copy_context().run, function).result()
 
     def close(self) -> None:
-        """Let the owner thread end after what it is doing."""
+        """Let the owner thread finish its present call, and end it."""
         self._thread.shutdown(wait=True, cancel_futures=True)

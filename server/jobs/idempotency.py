@@ -1,6 +1,6 @@
-"""Requests that have one effect however often they come: the Idempotency-Key and what it identifies.
+"""Requests that have one effect however often they come: the Idempotency-Key and the result that it identifies.
 
-What a key made is remembered in the catalogue, and in the document of what was made: a catalogue that is lost learns
+The ids that a request with a key made are kept in the catalogue, and in the made document: a lost catalogue learns
 it again from the folders.
 """
 
@@ -12,25 +12,25 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from core.errors import StateError, StorageError
-from server.base.models import Ids
-from server.store.catalog import Catalog
+from stereorig.core.errors import StateError, StorageError
+from stereorig.server.base.models import Ids
+from stereorig.server.store.catalog import Catalog
 
 _log = logging.getLogger("stereorig.service")
 
 
 @dataclass(frozen=True)
 class RequestMark:
-    """An Idempotency-Key with what it identifies; kept with whatever the request made.
+    """An Idempotency-Key with its request; stored with the entry that the request made.
 
     Parameters
     ----------
     scope
-        What is made: the same key means something else elsewhere.
+        Kind of entry to make: the same key means something else elsewhere.
     key
         As the client sent it; None without one.
     body_sha256
-        Of everything that the client asked for.
+        Hash of the request's content.
     """
 
     scope: str
@@ -38,13 +38,13 @@ class RequestMark:
     body_sha256: str
 
     def document(self) -> dict[str, object]:
-        """Return what goes into the document of the thing that is made; nothing without a key."""
+        """Return the part for the document of the new entry; empty without a key."""
         if self.key is None:
             return {}
         return {"request": {"scope": self.scope, "key": self.key, "body_sha256": self.body_sha256}}
 
     def made(self, ids: Ids) -> tuple[str, str, str, Ids] | None:
-        """Return the row of the catalogue that names what it made."""
+        """Return the row of the catalogue with the ids that the request made; None without a key."""
         return None if self.key is None else (self.scope, self.key, self.body_sha256, ids)
 
 
@@ -64,9 +64,9 @@ class OneEffect:
         return not self._unwritten
 
     def once(self, mark: RequestMark, make: Callable[[], Ids]) -> tuple[Ids, bool]:
-        """Run ``make`` once per key; return what it made and whether it was made before.
+        """Run ``make`` once per key; return the made ids and True if they were made before.
 
-        ``make`` returns the ids of what it made, from which the answer is built again.
+        ``make`` returns the ids of the new entry, from which the answer is built again.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""One job: its states, its phases, its progress, and what the API shows of it."""
+"""One job: its states, its phases, its progress, and its document for the API."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
-from core.errors import Cancelled
-from server.base.models import Ids, JobState
-from server.base.problem import JobProblem
-from server.store.documents import JobRecord, Progress
-from server.store.folder import now_utc
+from stereorig.core.errors import Cancelled
+from stereorig.server.base.models import Ids, JobState
+from stereorig.server.base.problem import JobProblem
+from stereorig.server.documents.jobs import JobRecord, Progress
+from stereorig.server.store.folder import now_utc
 
 State = JobState
 FINAL: tuple[State, ...] = ("succeeded", "failed", "cancelled", "interrupted")
@@ -22,9 +22,9 @@ ACTIVE: tuple[State, ...] = ("queued", "running", "cancelling")
 
 @dataclass(frozen=True)
 class Phase:
-    """One phase of a job: its lane and its function; what ``run`` returns is merged into the job's result.
+    """One phase of a job: its lane and its function; the result of ``run`` is merged into the job's result.
 
-    What runs ``beside`` the lanes waits for neither: its work is done in another process.
+    A phase ``beside`` the lanes waits for neither: its work is done in another process.
     """
 
     lane: Literal["hardware", "compute", "beside"]
@@ -44,7 +44,7 @@ class Work:
     on_end
         Called with the final state before that state is shown (writes summaries).
     on_cancel
-        Called at once when the job is cancelled, from whatever thread asks (stops the stage).
+        Called at once when the job is cancelled, from the cancelling thread (stops the stage).
     follows
         The test whose new steps wake it.
     """
@@ -89,7 +89,7 @@ class _Pace:
         self._last_shown = 0.0
 
     def to(self, phase: str, done: int, total: int) -> bool:
-        """Take what a phase reports; return whether readers should see it: they need it ten times a second."""
+        """Take a phase's report; return True if readers should see it: they need it ten times a second."""
         now = time.monotonic()
         changed = phase != self._phase
         if total != self._total or done < self._done or self._from is None:
@@ -107,7 +107,7 @@ class _Pace:
 
     def _eta_s(self) -> float | None:
         """Seconds left in these units, from their own pace; None while there is nothing to go by."""
-        begun = self._from  # the phases' thread may set it anew meanwhile
+        begun = self._from  # the phases' thread may replace it at any moment
         if begun is None or self._total <= 0:
             return None
         since, first = begun
@@ -118,18 +118,18 @@ class _Pace:
 
 
 class Job:
-    """A job at work: its record, and what its phases and its manager do with it.
+    """A job at work: its record, and the methods that its phases and its manager call.
 
     Doubles as progress callback and cancel token of its phases.
 
     Parameters
     ----------
     record
-        As it begins; progress is added where it is shown.
+        As it begins; progress is added when it is shown.
     work
-        What it does.
+        Its phases and callbacks.
     publish
-        Called with what has changed.
+        Called with the job and the kind of change.
     """
 
     def __init__(self, record: JobRecord, work: Work, publish: Callable[[Job, str], None]) -> None:
@@ -140,7 +140,7 @@ class Job:
         self.woken = threading.Event()
         #: gives the hardware back, if the job has it; before its end is shown
         self.let_go: Callable[[], None] | None = None
-        #: one document after the other, and none after that of its end
+        #: held while a document is written: one after the other, and none after the final one
         self.saving = threading.Lock()
         self.ended = False
         self._publish = publish
@@ -156,25 +156,30 @@ class Job:
 
     @property
     def subject(self) -> dict[str, object]:
-        """Ids of what it works on."""
+        """Ids of the test, analysis or calibration that it works on."""
         return self.record.subject
 
     # for its phases --------------------------------------------------------------------------------------------
 
     @property
     def cancelled(self) -> bool:
-        """Return True if the job should stop (:class:`core.progress.CancelToken`)."""
+        """Return True if the job should stop (:class:`stereorig.core.progress.CancelToken`)."""
         return self._cancel.is_set()
 
     def check(self) -> None:
-        """Raise :class:`core.errors.Cancelled` if the job should stop."""
+        """Raise :class:`stereorig.core.errors.Cancelled` if the job should stop."""
         if self.cancelled:
             raise Cancelled(f"The {self.record.kind} was cancelled.")
 
     def progress(self, phase: str, done: int, total: int) -> None:
-        """Report progress (:class:`core.progress.Progress`)."""
+        """Report progress (:class:`stereorig.core.progress.Progress`)."""
         if self._pace.to(phase, done, total):
             self._publish(self, "progress")
+
+    def await_part(self, part: str) -> None:
+        """Report that it waits for something outside; the progress so far stays."""
+        now = self._pace.progress(active=False)
+        self.progress(part, now.done, now.total)
 
     @property
     def result(self) -> dict[str, object] | None:
@@ -197,7 +202,7 @@ class Job:
     # for its manager -------------------------------------------------------------------------------------------
 
     def made(self, ids: Ids) -> None:
-        """Add what was made for it to what it works on."""
+        """Add the ids of entries made for it to its subject."""
         self._change(subject={**self.record.subject, **ids})
 
     def await_lane(self) -> None:
@@ -221,7 +226,7 @@ class Job:
             self._change(state="cancelling")
 
     def interrupt(self) -> None:
-        """Stop what it waits for, if it waits."""
+        """Stop its waiting, if it waits."""
         stop = self._stop_waiting
         if stop is not None:
             stop()

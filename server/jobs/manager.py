@@ -1,8 +1,8 @@
 """Jobs: anything that takes longer than a request.
 
 A job goes through phases, each on a lane: ``hardware`` (exclusive, never queued) or ``compute`` (queued, bounded, one
-at a time); or it has one phase ``beside`` both. Its states are ``queued running cancelling succeeded failed cancelled
-interrupted``. A job is in the catalogue before it is acknowledged; what was not finished when the service ended reads
+time); or it has one phase ``beside`` both. Its states are ``queued running cancelling succeeded failed cancelled
+interrupted``. A job is in the catalogue before it is acknowledged; a job that was unfinished when the service ended is
 ``interrupted`` after the next start.
 """
 
@@ -13,19 +13,19 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 
-from core.errors import Cancelled, StateError, StereorigError, StorageError
-from server.base.errors import NotFoundError, QueueFullError
-from server.base.json_values import without_nan
-from server.base.logs import about
-from server.base.models import Ids
-from server.base.problem import RESTART, problem_of
-from server.jobs.events import EventHub
-from server.jobs.hardware import HardwareHold
-from server.jobs.idempotency import RequestMark
-from server.jobs.job import ACTIVE, Job, Phase, State, Waiting, Work, new_record
-from server.store.catalog import Catalog
-from server.store.documents import JobRecord
-from server.store.folder import IdMaker, is_id, now_utc
+from stereorig.core.errors import Cancelled, StateError, StereorigError, StorageError
+from stereorig.server.base.errors import NotFoundError, QueueFullError
+from stereorig.server.base.json_values import without_nan
+from stereorig.server.base.logs import about
+from stereorig.server.base.models import Ids
+from stereorig.server.base.problem import RESTART, problem_of
+from stereorig.server.documents.jobs import JobRecord
+from stereorig.server.jobs.events import EventHub
+from stereorig.server.jobs.hardware import HardwareHold
+from stereorig.server.jobs.idempotency import RequestMark
+from stereorig.server.jobs.job import ACTIVE, Job, Phase, State, Waiting, Work, new_record
+from stereorig.server.store.catalog import Catalog
+from stereorig.server.store.folder import IdMaker, is_id, now_utc
 
 _log = logging.getLogger("stereorig.jobs")
 
@@ -62,7 +62,7 @@ class JobManager:
         self._thread = threading.Thread(target=self._run_compute, name="compute-jobs", daemon=True)
 
     def start(self) -> None:
-        """Say of what the last service left running that it was interrupted, and begin to work."""
+        """Mark the jobs that the last service left running as interrupted, and begin to work."""
         self._interrupt_left_overs()
         self._thread.start()
 
@@ -87,6 +87,7 @@ class JobManager:
         on_end: Callable[[Job, State], None] | None = None,
         on_cancel: Callable[[Job], None] | None = None,
         follows: str | None = None,
+        without_disk: bool = False,
     ) -> Job:
         """Acknowledge a job and start it.
 
@@ -95,12 +96,15 @@ class JobManager:
         purpose
             The holder's name as a busy caller will read it.
         prepare
-            Runs once it is certain that the job is accepted, before it starts; what it returns, ids of what it
-            made, joins the subject.
+            Runs once it is certain that the job is accepted, before it starts; the ids that it returns are added
+            to the subject.
         request
-            What asked for the job: written with it, so that a crash leaves both or none.
+            Mark of the request for the job: written with it, so that a crash leaves both or none.
         follows
             Id of a test whose new steps wake the job when it waits.
+        without_disk
+            Start it though the disk does not take its record, which is then written as soon as there is room; never
+            for a request that must have one effect only.
 
         Raises
         ------
@@ -120,7 +124,12 @@ class JobManager:
             made = prepare(job) if prepare is not None else {}
             job.made(made)
             row = None if request is None else request.made({**made, "job_id": job.id})
-            self._catalog.put_job(job.document(), row)
+            try:
+                self._catalog.put_job(job.document(), row)
+            except StorageError:
+                if row is not None or not without_disk:
+                    raise
+                _log.warning("the record of job %s (%s) is kept in memory: the disk does not take it", job.id, kind)
         except BaseException:
             if token is not None:
                 self._hardware.release(token)
@@ -182,7 +191,7 @@ class JobManager:
             return len(self._active)
 
     def is_idle(self) -> bool:
-        """Return True if no job goes on, and the state of each is on disk."""
+        """Return True if no job is running, and the state of each is on disk."""
         with self._lock:
             return not self._active and not self._unsaved
 
@@ -237,7 +246,7 @@ class JobManager:
             self._rouse(job)
 
     def finish(self, job_id: str) -> JobRecord:
-        """Let a job that follows a test end once it has done what there is.
+        """Let a job that follows a test end once it has measured all present steps.
 
         Raises
         ------
@@ -266,7 +275,7 @@ class JobManager:
                 self._wake.notify()
 
     def _park(self, job: Job) -> bool:
-        """Suspend a job until it is woken; False where it was woken or is to end, and should go on."""
+        """Suspend a job until it is woken; False if it was woken already or is to end, and should continue."""
         with self._wake:
             if job.woken.is_set() or job.cancelled or self._closing:
                 return False
@@ -411,7 +420,7 @@ class JobManager:
         self._hub.publish("job", document)
 
     def begin_close(self) -> None:
-        """Accept nothing more; what ends from now on without its result was interrupted."""
+        """Accept nothing more; a job that ends from now on without its result counts as interrupted."""
         with self._wake:
             self._closing = True
             self._wake.notify_all()

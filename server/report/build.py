@@ -9,26 +9,26 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from core.field.points.result import Field
-from core.field.region.outlines import corners_px
-from core.names import BUDGET, CAMERAS
-from core.settings import CoverageFields, Outline
-from server.formats.results.camera_motion import MOVED_REMEDY
-from server.formats.results.uncertainty import NOT_INCLUDED, Statement
-from server.formats.version import software_version
-from server.report import pictures
-from server.report.calibration import CalibrationPart, calibration_gaps
-from server.report.evidence.models import compared_models
-from server.report.floor import STRAINS, UM
-from server.report.geometry import geometry
-from server.report.hardware import hardware, image_sizes
-from server.report.histories import courses, gauges
-from server.report.items import Item, Missing, Value, plain
-from server.report.page import PNG, Picture, render
-from server.report.settings import analysis
-from server.report.source import Source
-from server.report.steps import Measured, Shown, read_steps
-from server.report.uncertainty import field_budgets, sentence
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.outlines import corners_px
+from stereorig.core.names import ALL_PARTS, BUDGET, CAMERAS
+from stereorig.core.settings import CoverageFields, Outline
+from stereorig.server.formats.results.camera_motion import MOVED_REMEDY
+from stereorig.server.formats.results.uncertainty import NOT_INCLUDED, Statement
+from stereorig.server.formats.version import software_version
+from stereorig.server.report import pictures
+from stereorig.server.report.calibration import CalibrationPart, calibration_gaps
+from stereorig.server.report.evidence.models import compared_models
+from stereorig.server.report.floor import STRAINS, UM
+from stereorig.server.report.geometry import geometry
+from stereorig.server.report.hardware import hardware, image_sizes
+from stereorig.server.report.histories import courses, gauges
+from stereorig.server.report.items import Item, Missing, Value, plain
+from stereorig.server.report.page import PNG, PagePicture, render
+from stereorig.server.report.settings import analysis
+from stereorig.server.report.source import Source
+from stereorig.server.report.steps import DrawnStep, MeasuredSteps, read_steps
+from stereorig.server.report.uncertainty import field_budgets, sentence
 
 _COMPONENTS = (("U", 0), ("V", 1), ("W", 2))
 _LEVELS = {"ok": "good", "good": "good", "warning": "warning", "failed": "failed"}
@@ -78,9 +78,9 @@ def make_report(source: Source, coverage: CoverageFields | None = None) -> Repor
     Parameters
     ----------
     source
-        What it is made from.
+        Result files, records, calibration and metadata.
     coverage
-        Of the uncertainties that it states; left out: that of the metadata's gauges, or one standard uncertainty.
+        Coverage of the stated uncertainties; None: the metadata's gauges', or one standard uncertainty.
 
     Raises
     ------
@@ -106,6 +106,7 @@ def make_report(source: Source, coverage: CoverageFields | None = None) -> Repor
             "draw extensometers, points, areas or lines on the Results screen, or name them in `gauges` of the metadata"
         )
         missing.append(Missing("Gauges", remedy))
+    budget = field_budgets(measured)
     made = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
     page, policy = render(
         f"{source.title}  \u00b7  stereorig {software_version()}  \u00b7  {made}",
@@ -127,15 +128,15 @@ def make_report(source: Source, coverage: CoverageFields | None = None) -> Repor
         gauges=gauges(source, measured),
         models=compared_models(source),
         uncertainty=sentence(measured),
-        budget=field_budgets(measured),
-        budget_names=list(BUDGET),
+        budget=budget,
+        budget_names=list(BUDGET if all(row.parts[-1] is None for row in budget[1]) else ALL_PARTS),
         missing=missing,
         origin=_origin(source),
     )
     return Report(page, policy, missing)
 
 
-def _under(source: Source, measured: Measured, made_utc: str) -> list[str]:
+def _under(source: Source, measured: MeasuredSteps, made_utc: str) -> list[str]:
     """Return the lines under the title."""
     kind = "displacement" if any(s.max_displacement_mm is not None for s in measured.steps) else "shape"
     under = [f"Report of a {kind} measurement with two cameras", f"{len(measured.steps)} steps"]
@@ -145,7 +146,7 @@ def _under(source: Source, measured: Measured, made_utc: str) -> list[str]:
     return [*under, f"made {made_utc} by stereorig {software_version()}"]
 
 
-def _boxes(source: Source, measured: Measured) -> list[Box]:
+def _boxes(source: Source, measured: MeasuredSteps) -> list[Box]:
     verdict, held = None, None
     if source.calibration is not None:
         record = source.calibration.record
@@ -178,7 +179,7 @@ def _boxes(source: Source, measured: Measured) -> list[Box]:
     ]
 
 
-def the_test(source: Source, measured: Measured) -> list[Item]:
+def the_test(source: Source, measured: MeasuredSteps) -> list[Item]:
     """Return the items of the test."""
     metadata = source.metadata
     times = [s.captured_utc for s in measured.steps if s.captured_utc]
@@ -209,7 +210,7 @@ def the_test(source: Source, measured: Measured) -> list[Item]:
     ]
 
 
-def _floor_gaps(source: Source, measured: Measured) -> list[Missing]:
+def _floor_gaps(source: Source, measured: MeasuredSteps) -> list[Missing]:
     if not measured.static:
         remedy = (
             "take steps before anything is loaded and name them in static_steps, or begin their labels with `static`"
@@ -226,7 +227,7 @@ def _floor_gaps(source: Source, measured: Measured) -> list[Missing]:
     return gaps
 
 
-def _reference(source: Source, measured: Measured) -> tuple[list[Picture], list[Missing]]:
+def _reference(source: Source, measured: MeasuredSteps) -> tuple[list[PagePicture], list[Missing]]:
     """Both cameras' reference images with the measured points, and those that are not there."""
     field = measured.reference_sys
     drawn, missing = [], []
@@ -235,7 +236,7 @@ def _reference(source: Source, measured: Measured) -> tuple[list[Picture], list[
         image = source.reference_image(cam)
         name = cam.replace("cam", "camera ")
         if image is None:
-            remedy = "the file must lie where it was measured from, with the same checksum"
+            remedy = "the file must be at its path of the measurement, with the same checksum"
             missing.append(Missing(f"Reference image of {name}", remedy))
             continue
         if cam == "cam1":
@@ -251,7 +252,7 @@ def _reference(source: Source, measured: Measured) -> tuple[list[Picture], list[
         caption = f"{name.capitalize()}, reference: green where a point was measured, red where not"
         caption += ", yellow the region that was asked for" if outlines else ""
         text = f"reference image of {name} with the measured points"
-        drawn.append(Picture(data, PNG, text, caption, half=False))
+        drawn.append(PagePicture(data, PNG, text, caption, half=False))
     return drawn, missing
 
 
@@ -262,11 +263,11 @@ def _outlines(source: Source) -> list[NDArray[np.float64]]:
     return [corners_px(outline) for outline in given if outline.rectangle or outline.polygon or outline.circle]
 
 
-def _fields(measured: Measured) -> list[tuple[str, list[Picture]]]:
+def _fields(measured: MeasuredSteps) -> list[tuple[str, list[PagePicture]]]:
     """Maps of the reference's shape, of the steps that are drawn, and of the states; each set with its title."""
     reference = measured.reference
     height = pictures.field_map(reference, reference.xyz_mm[..., 2], "Z of the reference", "Shape, Z")
-    drawn = [Picture(height, PNG, "map of the reference's Z", "Shape of the reference: Z")]
+    drawn = [PagePicture(height, PNG, "map of the reference's Z", "Shape of the reference: Z")]
     if not measured.shown:
         drawn.append(_status(reference, "the reference"))
     return [
@@ -275,12 +276,12 @@ def _fields(measured: Measured) -> list[tuple[str, list[Picture]]]:
     ]
 
 
-def _status(field: Field, subject: str) -> Picture:
+def _status(field: Field, subject: str) -> PagePicture:
     data = pictures.status_map(field, f"States of the points, {subject}")
-    return Picture(data, PNG, f"map of the points' states, {subject}", f"States of the points, {subject}")
+    return PagePicture(data, PNG, f"map of the points' states, {subject}", f"States of the points, {subject}")
 
 
-def _maps(shown: Shown, statement: Statement) -> list[Picture]:
+def _maps(shown: DrawnStep, statement: Statement) -> list[PagePicture]:
     field, drawn = shown.field, []
     layers: list[tuple[str, NDArray[np.float64], bool]] = []
     if field.uvw_mm is not None:
@@ -292,12 +293,12 @@ def _maps(shown: Shown, statement: Statement) -> list[Picture]:
     for name, values, strain in layers:
         title = f"{name}, step {shown.n}"
         data = pictures.field_map(field, values, name, title, strain=strain)
-        drawn.append(Picture(data, PNG, f"map of {name} in step {shown.n}", title))
+        drawn.append(PagePicture(data, PNG, f"map of {name} in step {shown.n}", title))
     interval, name = statement.k * field.sigma_mm[..., -1], "W" if field.has_motion else "Z"
     label = "expanded uncertainty" if statement.expanded else "standard uncertainty"
     data = pictures.field_map(field, interval, label, f"{statement.symbol} of {name}, step {shown.n}")
     text = f"map of the predicted uncertainty in step {shown.n}"
-    drawn.append(Picture(data, PNG, text, f"Predicted {label} of {name}; {statement.text}"))
+    drawn.append(PagePicture(data, PNG, text, f"Predicted {label} of {name}; {statement.text}"))
     drawn.append(_status(field, f"step {shown.n}"))
     return drawn
 

@@ -6,13 +6,13 @@ from dataclasses import dataclass, fields, is_dataclass
 
 import numpy as np
 
-from core.cameras.camera import ELEVEN_PARAMETER_NAMES
-from core.names import CAMERAS
-from server.formats.calibrations.recognise import LoadedCalibration
-from server.formats.calibrations.record import CalibrationRecord, Measures
-from server.report.items import Missing, Value
-from server.report.source import Source
-from server.report.steps import Measured
+from stereorig.core.cameras.camera import ELEVEN_PARAMETER_NAMES
+from stereorig.core.names import CAMERAS
+from stereorig.server.formats.calibrations.recognise import LoadedCalibration
+from stereorig.server.formats.calibrations.record import CalibrationRecord, RecordedMeasures
+from stereorig.server.report.items import Missing, Value
+from stereorig.server.report.source import Source
+from stereorig.server.report.steps import MeasuredSteps
 
 _CHECKS = (
     ("rbe_px", "RBE (mean distance of found and projected intersections)", "px"),
@@ -31,7 +31,7 @@ _KINDS = {
 
 
 @dataclass(frozen=True)
-class Check:
+class CheckRow:
     """One measure over some positions: of both cameras, of camera 1, of camera 2."""
 
     key: str
@@ -58,7 +58,7 @@ class CalibrationPart:
         self.kind = _KINDS.get(loaded.source, loaded.source)
 
     @property
-    def checks(self) -> list[Check]:
+    def checks(self) -> list[CheckRow]:
         """The measures at fitted and at held-out positions."""
         rows = []
         for name, label, unit in _CHECKS:
@@ -66,8 +66,8 @@ class CalibrationPart:
                 found = getattr(self._record.checks, which)
                 each = {} if found is None else found.per_camera
                 measures = (found, *(each.get(cam) for cam in CAMERAS))
-                values = tuple(getattr(m, name) if isinstance(m, Measures) else None for m in measures)
-                rows.append(Check(f"calibration.{which}.{name}", f"{label}, {positions}", unit, values))
+                values = tuple(getattr(m, name) if isinstance(m, RecordedMeasures) else None for m in measures)
+                rows.append(CheckRow(f"calibration.{which}.{name}", f"{label}, {positions}", unit, values))
         return rows
 
     @property
@@ -152,7 +152,7 @@ def _with_sd(value: float, sd: float | None) -> str:
     return f"{value:.{digits}f} \u00b1 {sd:.{digits}f}"
 
 
-def calibration_gaps(source: Source, measured: Measured) -> list[Missing]:
+def calibration_gaps(source: Source, measured: MeasuredSteps) -> list[Missing]:
     """Return the entries that the calibration's record and the analysis' check of it lack."""
     record = CalibrationRecord() if source.calibration is None else source.calibration.record
     gaps = []

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.field.points.result import Field
-from core.strain import StrainField
+from stereorig.core.arrays import Float
+from stereorig.core.field.points.result import Field
+from stereorig.core.strain import StrainField
 
 UM = "\u00b5m"
 LENGTHS = ("U", "V", "W", "X", "Y", "Z")

@@ -1,4 +1,4 @@
-"""Geometry of the rig from the calibration and the measured surface: stereo angle, stand-off, scale, field of view.
+"""Geometry of the rig from the calibration and the measured surface: stereo angle, distance, scale, field of view.
 
 All of it holds at the middle of the measured points, on the plane that fits the surface best.
 """
@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.camera import Camera
-from core.cameras.stereo import StereoPair
-from core.field.points.result import Field
-from core.names import CAMERAS
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.result import Field
+from stereorig.core.names import CAMERAS
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The hardware parameters: those of the reporting tables of the iDICs Good Practices Guide (2018), and some more."""
+"""The hardware parameters: the reporting tables of the iDICs Good Practices Guide (2018), and some more."""
 
 from __future__ import annotations
 
@@ -7,16 +7,27 @@ from typing import Literal
 
 import numpy as np
 
-from core.calibration.checks.measures import focal_lengths_px
-from core.names import CAMERAS, CameraName
-from core.pattern import PatternSize, pattern_size
-from server.config.camera_metadata import CameraMetadata, LensMetadata, merged
-from server.formats.calibrations.record import CameraIdentity
-from server.report.geometry import Geometry, View
-from server.report.items import CALIBRATION, MEASURED, RECORD, STATED, Item, Value, each, of_number, of_text, one
-from server.report.records import CameraRecord
-from server.report.source import Source
-from server.report.steps import Measured
+from stereorig.core.calibration.checks.measures import focal_lengths_px
+from stereorig.core.names import CAMERAS, CameraName
+from stereorig.core.pattern import PatternSize, pattern_size
+from stereorig.server.config.camera_metadata import CameraMetadata, LensMetadata, merged
+from stereorig.server.documents.steps import CameraRecord
+from stereorig.server.formats.calibrations.record import RecordedCamera
+from stereorig.server.report.geometry import Geometry, View
+from stereorig.server.report.items import (
+    CALIBRATION,
+    MEASURED,
+    RECORD,
+    STATED,
+    Item,
+    Value,
+    each,
+    of_number,
+    of_text,
+    one,
+)
+from stereorig.server.report.source import Source
+from stereorig.server.report.steps import MeasuredSteps
 
 _METADATA_SOURCE = "the form Metadata of the test's screen (PUT /tests/{id}/metadata, or metadata.toml)"
 _RIG_FILE = f"the rig file or {_METADATA_SOURCE}"
@@ -25,12 +36,12 @@ _BY_SERVICE = "is recorded when the service captures"
 _NEEDS_CALIBRATION = "needs the calibration that the results were measured with (--calibration)"
 
 
-def hardware(source: Source, measured: Measured, found: Geometry | None) -> list[Item]:
+def hardware(source: Source, measured: MeasuredSteps, found: Geometry | None) -> list[Item]:
     """Return the hardware parameters."""
     cameras = {}
     for cam in CAMERAS:
         recorded = source.rig.cameras.get(cam, CameraRecord())
-        cameras[cam] = merged(source.metadata.camera(cam), recorded.model_dump(exclude_none=True))
+        cameras[cam] = merged(source.metadata.camera(cam), recorded.plain())
     return [
         *_camera_items(source, cameras),
         *_lens_items(source, cameras),
@@ -49,12 +60,12 @@ def hardware(source: Source, measured: Measured, found: Geometry | None) -> list
 
 def _camera_items(source: Source, cameras: dict[CameraName, CameraMetadata]) -> list[Item]:
     step, sizes = source.reference_step, _sizes(source)
-    identity = step.cameras
+    identity = step.cameras or {}
     if not identity and source.calibration is not None:
         identity = source.calibration.record.provenance.cameras
 
     def device(cam: CameraName, name: Literal["model", "serial"]) -> Value | None:
-        return of_text(getattr(identity.get(cam, CameraIdentity()), name), "from the camera itself")
+        return of_text(getattr(identity.get(cam, RecordedCamera()), name), "from the camera itself")
 
     def recorded_text(name: Literal["maker", "model", "sensor"], cam: CameraName) -> Value | None:
         return of_text(getattr(cameras[cam], name), _IN_FILE)
@@ -76,7 +87,7 @@ def _camera_items(source: Source, cameras: dict[CameraName, CameraMetadata]) -> 
         each(
             "camera.depth",
             "Significant bits",
-            lambda cam: of_number(step.bit_depth.get(cam), "d", "bit", RECORD),
+            lambda cam: of_number((step.bit_depth or {}).get(cam), "d", "bit", RECORD),
             f"{_BY_SERVICE} or imports",
         ),
         each("camera.sensor", "Sensor", lambda cam: recorded_text("sensor", cam), f"camN.sensor of {_RIG_FILE}"),
@@ -178,7 +189,7 @@ def _geometry_items(source: Source, found: Geometry | None) -> list[Item]:
     return [*items, one("baseline", "Distance of the pinholes", baseline, _NEEDS_CALIBRATION)]
 
 
-def _recording_items(source: Source, measured: Measured) -> list[Item]:
+def _recording_items(source: Source, measured: MeasuredSteps) -> list[Item]:
     metadata, rig, read_back = source.metadata, source.rig, "read back from the camera"
     set_to = {cam: rig.cameras.get(cam, CameraRecord()) for cam in CAMERAS}
     lighting = of_text(metadata.lighting, STATED) or of_text(rig.lighting, "as stated (rig file)")
@@ -212,7 +223,7 @@ def _recording_items(source: Source, measured: Measured) -> list[Item]:
 
 
 def _sizes(source: Source) -> dict[str, tuple[tuple[int, int], str] | None]:
-    """Width and height of each camera's images, and where they are from."""
+    """Width and height of each camera's images, and the source that states them."""
     recorded = source.reference_step.image_size_px
     calibration = source.calibration
     calibrated = (None, None) if calibration is None else (calibration.image_size1_px, calibration.image_size2_px)
@@ -231,12 +242,12 @@ def _sizes(source: Source) -> dict[str, tuple[tuple[int, int], str] | None]:
 
 
 def image_sizes(source: Source) -> tuple[tuple[int, int] | None, tuple[int, int] | None]:
-    """Width and height of both cameras' images, None where they are not known."""
+    """Width and height of both cameras' images, None if they are not known."""
     one, two = (_sizes(source)[cam] for cam in CAMERAS)
     return None if one is None else one[0], None if two is None else two[0]
 
 
-def _rate(source: Source, measured: Measured) -> Value | None:
+def _rate(source: Source, measured: MeasuredSteps) -> Value | None:
     if source.metadata.frame_rate_hz is not None:
         return of_number(source.metadata.frame_rate_hz, "g", "Hz", STATED)
     rate, trigger = source.rig.frame_rate_hz, source.rig.trigger
@@ -251,17 +262,19 @@ def _rate(source: Source, measured: Measured) -> Value | None:
     return Value(text, 1.0 / usual if usual > 0.0 else None, RECORD)
 
 
-def _synchronisation(source: Source, measured: Measured) -> Value | None:
-    skews = [abs(step.skew_ms) for step in measured.steps if step.skew_ms is not None]
-    if not skews:
+def _synchronisation(source: Source, measured: MeasuredSteps) -> Value | None:
+    known = [(abs(step.skew_ms), step.skew_by) for step in measured.steps if step.skew_ms is not None]
+    if not known:
         return None
+    skew, by = max(known, key=lambda one: one[0])
+    shown = f" ({by})" if by else ""
     rig = source.rig
     trigger = f"{rig.trigger} trigger; " if rig.trigger else ""
     limit = "" if rig.max_skew_ms is None else f", at most {rig.max_skew_ms:g} ms is allowed"
-    return Value(f"{trigger}maximum skew of a pair {max(skews):.3g} ms{limit}", max(skews), RECORD)
+    return Value(f"{trigger}maximum skew of a pair {skew:.3g} ms{shown}{limit}", skew, RECORD)
 
 
-def _pattern(source: Source, measured: Measured, found: Geometry | None) -> list[Item]:
+def _pattern(source: Source, measured: MeasuredSteps, found: Geometry | None) -> list[Item]:
     size, metadata = _pattern_size(source, measured), source.metadata
     feature, contrast, needs = None, None, "needs the reference image of camera 1"
     remark = (
@@ -282,7 +295,7 @@ def _pattern(source: Source, measured: Measured, found: Geometry | None) -> list
     return [*items, one("pattern.contrast", "Pattern contrast", contrast, needs, of)]
 
 
-def _pattern_size(source: Source, measured: Measured) -> PatternSize | None:
+def _pattern_size(source: Source, measured: MeasuredSteps) -> PatternSize | None:
     image = source.reference_image("cam1")
     if image is None:
         return None
@@ -294,8 +307,8 @@ def _pattern_size(source: Source, measured: Measured) -> PatternSize | None:
     return pattern_size(image, inside)
 
 
-def _noise(source: Source, measured: Measured) -> tuple[Value | None, ...]:
-    depth = source.reference_step.bit_depth
+def _noise(source: Source, measured: MeasuredSteps) -> tuple[Value | None, ...]:
+    depth = source.reference_step.bit_depth or {}
     residual = measured.noise_grey
     values: list[Value | None] = []
     for cam in CAMERAS:

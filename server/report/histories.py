@@ -7,23 +7,24 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from core.errors import StereorigError
-from server.formats.channel_units import unit_of
-from server.formats.gauges.readings import LineReading, Number, StepReadings
-from server.formats.results.uncertainty import Statement
-from server.report.floor import STRAINS, UM
-from server.report.items import Value
-from server.report.page import SVG, Picture
-from server.report.pictures import Lines, course
-from server.report.source import Source
-from server.report.steps import Measured, StepFigures
-from server.report.uncertainty import Budget, gauge_budgets
-from server.results.gauges.readings import read_gauges
+from stereorig.core.errors import StereorigError
+from stereorig.core.names import CAMERAS
+from stereorig.server.formats.channel_units import unit_of
+from stereorig.server.formats.gauges.readings import LineReading, Number, StepReadings
+from stereorig.server.formats.results.uncertainty import Statement
+from stereorig.server.report.floor import STRAINS, UM
+from stereorig.server.report.items import Value
+from stereorig.server.report.page import SVG, PagePicture
+from stereorig.server.report.pictures import Lines, course
+from stereorig.server.report.source import Source
+from stereorig.server.report.steps import MeasuredSteps, StepRow
+from stereorig.server.report.uncertainty import BudgetRow, gauge_budgets
+from stereorig.server.results.gauges.readings import read_gauges
 
 #: a gauge's values in every step, or the reason why there are none
 _Readings = Sequence[tuple[Mapping[str, Number], str]]
 _EXTENSOMETER = ("elongation_mm", "strain")
-_FOLLOWS = 0.9  # correlation of the mean motion with what drives it
+_FOLLOWS = 0.9  # correlation of the mean motion with the load or channel that drives it
 
 
 @dataclass(frozen=True)
@@ -38,36 +39,36 @@ class GaugeTable:
 
 @dataclass(frozen=True)
 class Gauges:
-    """All gauges; the curves are None where they could not be read at all.
+    """All gauges; the curves are None if they could not be read at all.
 
     Attributes
     ----------
     budgets, budget_step
-        Of their uncertainties in one step, and its number.
+        Budgets of the gauges' uncertainties in one step, and the step's number.
     """
 
-    curves: list[Picture] | None
+    curves: list[PagePicture] | None
     problems: list[str]
     tables: list[GaugeTable]
-    budgets: list[Budget] = field(default_factory=list)
+    budgets: list[BudgetRow] = field(default_factory=list)
     budget_step: int | None = None
 
 
 @dataclass(frozen=True)
 class _Axis:
-    """Abscissa of the curves: what drives the test, else time since the reference, else the step's number."""
+    """Abscissa of the curves: the load or channel that drives the test, else the time, else the step."""
 
     positions: list[float]
     label: str
-    name: str = ""  # of what drives the test
+    name: str = ""  # of the load or channel that drives the test
     as_given: bool = False
 
     @staticmethod
-    def of(steps: Sequence[StepFigures]) -> _Axis:
+    def of(steps: Sequence[StepRow]) -> _Axis:
         return _driving(steps) or _Axis.in_time(steps)
 
     @staticmethod
-    def in_time(steps: Sequence[StepFigures]) -> _Axis:
+    def in_time(steps: Sequence[StepRow]) -> _Axis:
         """Return the time since the reference, or the steps' numbers."""
         times = [s.seconds for s in steps]
         known = [t for t in times if t is not None]
@@ -75,19 +76,19 @@ class _Axis:
             return _Axis(known, "time since the reference, s")
         return _Axis([float(s.n) for s in steps], "step")
 
-    def only(self, chosen: Sequence[StepFigures], of: Sequence[StepFigures]) -> _Axis:
+    def only(self, chosen: Sequence[StepRow], of: Sequence[StepRow]) -> _Axis:
         """Return the same abscissa of some of the steps."""
         numbers = {s.n for s in chosen}
         return replace(self, positions=[x for x, s in zip(self.positions, of, strict=True) if s.n in numbers])
 
-    def draw(self, lines: Lines, y_label: str, title: str, *, text: str, caption: str) -> Picture:
+    def draw(self, lines: Lines, y_label: str, title: str, *, text: str, caption: str) -> PagePicture:
         against = f" against {self.name}" if self.name else ""
         data = course(self.positions, lines, x_label=self.label, y_label=y_label, title=title, as_given=self.as_given)
-        return Picture(data, SVG, f"{text} over the steps", f"{caption}{against}")
+        return PagePicture(data, SVG, f"{text} over the steps", f"{caption}{against}")
 
 
-def _driving(steps: Sequence[StepFigures]) -> _Axis | None:
-    """Return the load or the channel that the motion follows; None where nothing recorded in every step does."""
+def _driving(steps: Sequence[StepRow]) -> _Axis | None:
+    """Return the load or the channel that the motion follows; None if none of those recorded in every step does."""
     spans = [[span.mean for span in (s.summary.displacement_mm or {}).values() if span] for s in steps]
     moved = np.array([float(np.linalg.norm(means)) if means else 0.0 for means in spans])
     if len(steps) < 3 or not np.ptp(moved):
@@ -99,15 +100,15 @@ def _driving(steps: Sequence[StepFigures]) -> _Axis | None:
         known = np.array([np.nan if v is None else v for v in values])
         if np.isfinite(known).all() and np.ptp(known):
             found.append((abs(float(np.corrcoef(np.abs(known - known[0]), moved)[0, 1])), name, known))
-    # a load that is recorded says more than a temperature that happens to rise with it
+    # the load comes first: a temperature may happen to rise with it
     name, positions = next(((name, known) for follows, name, known in found if follows >= _FOLLOWS), ("", None))
     if positions is None:
         return None
-    label = "load, N" if name == "load" else _with_unit(name)
+    label = "load, N" if name == "load" else _with_unit(name, steps)
     return _Axis(positions.tolist(), label, name, as_given=True)
 
 
-def courses(measured: Measured) -> list[Picture] | None:
+def courses(measured: MeasuredSteps) -> list[PagePicture] | None:
     """Draw loads, channels, and the means of displacement and strain; None with fewer than two steps."""
     steps = measured.steps
     if len(steps) < 2:
@@ -119,10 +120,10 @@ def courses(measured: Measured) -> list[Picture] | None:
         drawn.append(time.draw(lines, "load, N", "Load", text="load", caption="Load as recorded with the steps"))
     for name in measured.channels:
         lines = {name: ([s.channels.get(name) for s in steps], None)}
-        label = _with_unit(name)
+        label = _with_unit(name, steps)
         drawn.append(time.draw(lines, label, name, text=name, caption=f"{name} as recorded with the steps"))
 
-    # displacement and strain are relative to the reference, where they are zero
+    # displacement and strain are relative to the reference, and zero there
     moving = [s for s in steps if s.summary.displacement_mm or s.n == measured.reference_step]
     if measured.moved:
         lines = {}
@@ -145,11 +146,26 @@ def courses(measured: Measured) -> list[Picture] | None:
         drawn.append(
             axis.only(chosen, steps).draw(lines, "mean strain, microstrain", title, text="mean strain", caption=caption)
         )
+    return drawn + _against_temperature(steps)
+
+
+def _against_temperature(steps: Sequence[StepRow]) -> list[PagePicture]:
+    """Draw the mean epipolar offset against each camera's temperature: a rig that warms up drifts with it."""
+    drawn = []
+    for cam in CAMERAS:
+        known = [s for s in steps if s.temperature_c(cam) is not None]
+        axis = _Axis([float(s.temperature_c(cam) or 0.0) for s in known], f"temperature of {cam}, °C", as_given=True)
+        if len(set(axis.positions)) < 2:
+            continue
+        lines: Lines = {"offset": ([s.summary.epipolar_offset_mean_px for s in known], None)}
+        title, caption = f"Epipolar offset and temperature of {cam}", "Mean of the offset across the epipolar line"
+        picture = axis.draw(lines, "mean epipolar offset, px", title, text="epipolar offset", caption=caption)
+        drawn.append(replace(picture, caption=f"{caption} against the temperature that {cam} reported"))
     return drawn
 
 
-def gauges(source: Source, measured: Measured) -> Gauges | None:
-    """Read the gauges of the metadata in every step, and draw their courses; None where none were asked for."""
+def gauges(source: Source, measured: MeasuredSteps) -> Gauges | None:
+    """Read the gauges of the metadata in every step, and draw their courses; None if none were asked for."""
     if source.metadata.gauges is None:
         return None
     try:
@@ -157,7 +173,7 @@ def gauges(source: Source, measured: Measured) -> Gauges | None:
         readings = read_gauges(list(source.files.values()), asked)
     except StereorigError as error:
         return Gauges(None, [f"The gauges could not be read: {error.cause}"], [])
-    problems = [f"Step {s.n}: {s.problem.cause}" for s in readings.steps if s.problem is not None]
+    problems = [f"Step {s.n}: {s.problem.detail}" for s in readings.steps if s.problem is not None]
     steps = readings.read
     if not steps:
         return Gauges([], problems, [])
@@ -165,7 +181,7 @@ def gauges(source: Source, measured: Measured) -> Gauges | None:
     read_ = [figures[s.n] for s in steps]
     axis = _Axis.of(measured.steps).only(read_, measured.steps)
     at_rest = [s.n == measured.reference_step for s in read_]
-    curves: list[Picture] = []
+    curves: list[PagePicture] = []
     tables = []
     for k, extensometer in enumerate(steps[0].extensometers):
         read: _Readings = [(s.extensometers[k].values, s.extensometers[k].missing) for s in steps]
@@ -191,23 +207,25 @@ def gauges(source: Source, measured: Measured) -> Gauges | None:
     return Gauges(curves, problems, tables, gauge_budgets(steps[-1], measured.statement), steps[-1].n)
 
 
-def _with_unit(channel: str) -> str:
-    return channel if unit_of(channel) == "1" else f"{channel}, {unit_of(channel)}"
+def _with_unit(channel: str, steps: Sequence[StepRow]) -> str:
+    stated = [getattr(s, "units", {}).get(channel) for s in steps]
+    unit = next((unit for unit in stated if unit), unit_of(channel))
+    return channel if unit == "1" else f"{channel}, {unit}"
 
 
 def _against_loads(
-    title: str, steps: Sequence[StepFigures], read: Sequence[Mapping[str, Number]], statement: Statement
-) -> list[Picture]:
-    """Draw the strain of an extensometer against the load and each channel; what a step lacks is left out."""
+    title: str, steps: Sequence[StepRow], read: Sequence[Mapping[str, Number]], statement: Statement
+) -> list[PagePicture]:
+    """Draw the strain of an extensometer against the load and each channel; steps without a value are left out."""
     names = sorted({name for s in steps for name in s.channels})[:4]
-    loads = {_with_unit(name): [s.channels.get(name) for s in steps] for name in names}
+    loads = {_with_unit(name, steps): [s.channels.get(name) for s in steps] for name in names}
     loads = {"load, N": [s.load_n for s in steps], **loads}
     drawn = []
     for label, values in loads.items():
         points = [
             (x, 0.0 if v is None or v.value is None else 1e6 * v.value, None if v is None else v.sigma)
             for s, x, v in zip(steps, values, (numbers.get("strain") for numbers in read), strict=True)
-            # strain is relative to the reference, where it is zero
+            # strain is relative to the reference, and zero there
             if x is not None and ((v is not None and v.value is not None) or not s.summary.displacement_mm)
         ]
         if len({x for x, _, _ in points}) < 2:
@@ -224,7 +242,7 @@ def _against_loads(
             as_given=True,
         )
         caption = f"{title} against {name}; bars are \u00b1 {statement.text}"
-        drawn.append(Picture(data, SVG, f"{title} against {name}", caption))
+        drawn.append(PagePicture(data, SVG, f"{title} against {name}", caption))
     return drawn
 
 
@@ -256,7 +274,7 @@ def _curves(
     axis: _Axis,
     at_rest: Sequence[bool],
     statement: Statement,
-) -> list[Picture]:
+) -> list[PagePicture]:
     if not wanted:
         return []
     factor, unit = (1e3, UM) if wanted[0].endswith("_mm") else (1e6, "microstrain")
@@ -273,7 +291,7 @@ def _curves(
     return [axis.draw(lines, unit, title, text=title, caption=caption)]
 
 
-def _line(line: LineReading, n: int) -> list[Picture]:
+def _line(line: LineReading, n: int) -> list[PagePicture]:
     drawn = []
     for name, read in list(line.values.items())[:6]:
         data = course(
@@ -283,5 +301,5 @@ def _line(line: LineReading, n: int) -> list[Picture]:
             y_label=f"{name}, {read.units}",
             title=f"Line {line.name}, step {n}",
         )
-        drawn.append(Picture(data, SVG, f"{name} along line {line.name}", f"Line {line.name}: {name} in step {n}"))
+        drawn.append(PagePicture(data, SVG, f"{name} along line {line.name}", f"Line {line.name}: {name} in step {n}"))
     return drawn

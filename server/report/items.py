@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.names import CAMERAS, CameraName
+from stereorig.core.names import CAMERAS, CameraName
 
 CALIBRATION, MEASURED, STATED, RECORD, SETTINGS = (
     "from the calibration",
@@ -46,7 +46,7 @@ class Item:
     label
         Its name.
     values
-        One for the rig, or one for each camera; None where it is not stated.
+        One for the rig, or one for each camera; None if it is not stated.
     remedy
         Instruction how to state it.
     comment
@@ -95,7 +95,7 @@ def of_number(value: float | None, form: str, unit: str, origin: str) -> Value |
 
 
 def plain(value: float, digits: int = 4) -> str:
-    """A number with so many digits, without an exponent where that reads better."""
+    """Return a number with so many digits, without an exponent down to 1e-6."""
     if value == 0.0 or not np.isfinite(value):
         return "0" if value == 0.0 else "-"
     decimals = int(max(0, digits - 1 - np.floor(np.log10(abs(value)))))

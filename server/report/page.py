@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import jinja2
 from markupsafe import Markup
 
-from server.report.items import plain
+from stereorig.server.report.items import plain
 
 PNG, SVG = "image/png", "image/svg+xml"
 
 
 @dataclass(frozen=True)
-class Picture:
+class PagePicture:
     """A picture that becomes part of the page.
 
     Attributes
@@ -79,7 +79,7 @@ def render(head: str, *, template: str = "report.html.j2", **content: object) ->
         The page, and the Content-Security-Policy that it needs: its own style, pictures that it holds, nothing else.
     """
     templates = jinja2.Environment(
-        loader=jinja2.PackageLoader("server.report"),
+        loader=jinja2.PackageLoader("stereorig.server.report"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         finalize=_printable,

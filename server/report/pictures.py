@@ -13,14 +13,14 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image, ImageChops
 
-from core.arrays import Float
-from core.field.points.result import Field
-from core.field.region.cuts import Cuts
-from core.status import PointStatus
-from core.strain import StrainField
-from server.formats.figures.axes import directions_of, scale_of_image
-from server.formats.figures.figure import Picture, draw
-from server.formats.figures.options import FigureStyle
+from stereorig.core.arrays import Float
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.core.status import PointStatus
+from stereorig.core.strain import StrainField
+from stereorig.server.formats.figures.axes import directions_of, scale_of_image
+from stereorig.server.formats.figures.figure import FigureData, draw
+from stereorig.server.formats.figures.options import FigureStyle
 
 #: by name, values and their standard deviations
 Lines = dict[str, tuple[Sequence[float | None], Sequence[float | None] | None]]
@@ -62,19 +62,19 @@ def field_map(
     places = (field.x_px, field.y_px, field.xyz_mm[..., 0], field.xyz_mm[..., 1])
     scale = scale_of_image(*places)
     axes = directions_of(*places)
-    picture = Picture(shown, field.x_px, field.y_px, name, units, title, cuts=field.cuts, axes=axes, px_per_mm=scale)
+    picture = FigureData(shown, field.x_px, field.y_px, name, units, title, cuts=field.cuts, axes=axes, px_per_mm=scale)
     return _cropped(draw(picture, _HALF, "png"))
 
 
 def status_map(field: Field, title: str) -> bytes:
     """Draw the state of each point; PNG."""
     names = {s.value: s.name.lower().replace("_", " ") for s in PointStatus}
-    drawn = Picture(field.status, field.x_px, field.y_px, "status", "1", title, cuts=field.cuts, flags=names)
+    drawn = FigureData(field.status, field.x_px, field.y_px, "status", "1", title, cuts=field.cuts, flags=names)
     return _cropped(draw(drawn, _HALF, "png"))
 
 
 def strain_values(strain: StrainField, k: int) -> Float:
-    """One component of a strain, NaN where there is none."""
+    """One component of a strain, NaN at points without strain."""
     return np.where(strain.valid, strain.strain[..., k], np.nan)
 
 
@@ -97,9 +97,9 @@ def region(
     Parameters
     ----------
     positions_px
-        (n, 2) positions of the points in the image; NaN where they have none.
+        (n, 2) positions of the points in the image, px; NaN for points without one.
     valid
-        (n,) True where they were measured.
+        (n,) True at measured points.
     outlines_px
         (m, 2) corners of each outline of the region that was asked for.
     """

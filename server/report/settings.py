@@ -1,21 +1,21 @@
-"""The analysis parameters: those of the reporting tables of the iDICs Good Practices Guide (2018)."""
+"""The analysis parameters: the reporting tables of the iDICs Good Practices Guide (2018)."""
 
 from __future__ import annotations
 
-from core.field.points.dense_record import METHOD
-from server.formats.version import software_version
-from server.report.geometry import Geometry
-from server.report.items import MEASURED, SETTINGS, Item, Value, one
-from server.report.records import SettingsRecord
-from server.report.source import Source
-from server.report.steps import Measured
+from stereorig.core.field.points.dense_record import METHOD
+from stereorig.server.formats.version import software_version
+from stereorig.server.report.geometry import Geometry
+from stereorig.server.report.items import MEASURED, SETTINGS, Item, Value, one
+from stereorig.server.report.records import ReportedSettings
+from stereorig.server.report.source import Source
+from stereorig.server.report.steps import MeasuredSteps
 
 _SHAPES = {
     "rigid": "plane patch, rigid motion (9 unknowns), projected by both calibrated cameras",
     "affine": "plane patch, rigid motion and in-plane stretch (12 unknowns), projected by both calibrated cameras",
     "quadratic": "patch of second order in shape and motion, projected by both calibrated cameras",
 }
-_FITS = {1: "planes", 2: "quadratics", "auto": "planes or, where one-sided, quadratics"}
+_FITS = {1: "planes", 2: "quadratics", "auto": "planes or, if one-sided, quadratics"}
 _TENSORS = {
     "green_lagrange": "Green-Lagrange, E = (C - I) / 2",
     "infinitesimal": "infinitesimal, symmetric part of the displacement gradient",
@@ -24,7 +24,7 @@ _TENSORS = {
 _REFERENCES = {
     "never": "the first for all steps (total)",
     "always": "the step before (incremental), reported as totals",
-    "auto": "the first, or a later one where that fails, reported as totals",
+    "auto": "the first, or a later one if that fails, reported as totals",
 }
 _CRITERION = (
     "zero-mean normalised sum of squared differences (ZNSSD), "
@@ -32,7 +32,7 @@ _CRITERION = (
 )
 
 
-def analysis(source: Source, measured: Measured, found: Geometry | None) -> list[Item]:
+def analysis(source: Source, measured: MeasuredSteps, found: Geometry | None) -> list[Item]:
     """Return the analysis parameters."""
     settings = source.settings
     scale = None if found is None else found.views["cam1"].mean_scale_mm_per_px
@@ -77,14 +77,14 @@ def analysis(source: Source, measured: Measured, found: Geometry | None) -> list
     ]
 
 
-def _dense(settings: SettingsRecord, distance: Value | None) -> list[Item]:
+def _dense(settings: ReportedSettings, distance: Value | None) -> list[Item]:
     if settings.dense_step_px is None:
         return []
-    comment = "distance of its vectors, which share most of their pixels; its files lie in the folder dense"
+    comment = "distance of its vectors, which share most of their pixels; its files are in the folder dense"
     return [one("dense", "Dense field", distance, comment=comment)]
 
 
-def _prefilter(settings: SettingsRecord) -> Value | None:
+def _prefilter(settings: ReportedSettings) -> Value | None:
     blur = settings.prefilter_px
     if blur is None:
         return None
@@ -92,12 +92,12 @@ def _prefilter(settings: SettingsRecord) -> Value | None:
     return Value(text, float(blur), SETTINGS)
 
 
-def _reference(settings: SettingsRecord) -> Value | None:
+def _reference(settings: ReportedSettings) -> Value | None:
     update = settings.reference_update
     return None if update is None else Value(_REFERENCES.get(update, update), None, SETTINGS)
 
 
-def _smoothing(measured: Measured) -> Value:
+def _smoothing(measured: MeasuredSteps) -> Value:
     smoothing = measured.steps[-1].summary.smoothing
     if smoothing is None:
         return Value("none", None, SETTINGS)
@@ -107,7 +107,7 @@ def _smoothing(measured: Measured) -> Value:
     return Value(text, float(smoothing.resolution_px), SETTINGS)
 
 
-def _shape_function(measured: Measured, settings: SettingsRecord) -> Value | None:
+def _shape_function(measured: MeasuredSteps, settings: ReportedSettings) -> Value | None:
     choice = measured.steps[-1].summary.patch
     name = choice.patch if choice else settings.patch
     if name is None:
@@ -116,12 +116,12 @@ def _shape_function(measured: Measured, settings: SettingsRecord) -> Value | Non
     return Value(f"{name}: {_SHAPES.get(name, '')}{asked}", None, SETTINGS)
 
 
-def _matched(measured: Measured) -> str:
+def _matched(measured: MeasuredSteps) -> str:
     others = sorted({s.summary.reference_step for s in measured.steps if s.summary.reference_step is not None})
     return "" if not others else f"matched against step {', '.join(map(str, others))}"
 
 
-def _points(measured: Measured) -> str:
+def _points(measured: MeasuredSteps) -> str:
     first, min_valid = measured.steps[0].summary, min(measured.steps, key=lambda s: s.summary.valid)
     return (
         f"{first.points} in the region; valid in the reference {first.valid}, "
@@ -129,7 +129,7 @@ def _points(measured: Measured) -> str:
     )
 
 
-def _region(settings: SettingsRecord) -> Value:
+def _region(settings: ReportedSettings) -> Value:
     region = settings.region
     parts: list[str] = []
     for outline in (region, *region.outlines):
@@ -145,7 +145,7 @@ def _region(settings: SettingsRecord) -> Value:
     return Value(", ".join(parts) or "the whole image", None, SETTINGS)
 
 
-def _strain_items(source: Source, measured: Measured) -> list[Item]:
+def _strain_items(source: Source, measured: MeasuredSteps) -> list[Item]:
     strain = next((s.strain for s in reversed(measured.steps) if s.strain), None)
     settings = source.settings.strain
     if strain is None:

@@ -1,4 +1,4 @@
-"""The sources of a report: result files, the records beside them, the calibration, the metadata."""
+"""The sources of a report: result files, their records, the calibration, the metadata."""
 
 from __future__ import annotations
 
@@ -10,32 +10,24 @@ from typing import Any
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from core.errors import InputError, StereorigError
-from core.names import CameraName
-from server.base.errors import NotFoundError
-from server.formats.calibrations.in_test import calibration_id_in, calibration_in
-from server.formats.calibrations.kept_checks import read_checks, with_checks
-from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
-from server.formats.files import known_sha256
-from server.formats.images import read_image
-from server.formats.results.folder import number_of, results_in
-from server.formats.results.reading import ResultHead, read_head
-from server.report.records import (
-    AnalysisRecord,
-    CameraMotionRecord,
-    RigRecord,
-    SettingsRecord,
-    StepRecord,
-    StepSummaryRecord,
-    SummaryRecord,
-    TestRecord,
-)
-from server.results.gauges.request import GaugeRequest
-from server.results.metadata import TestMetadata, parse_metadata
-from server.results.staleness import stale_results
-from server.results.steps import failed_steps
-from server.results.warnings.analysis import ResultWarning, analysis_warnings
-from server.store.durable import known_json
+from stereorig.core.errors import InputError, StereorigError
+from stereorig.core.names import CameraName
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.documents.steps import RigRecord, StepRecord
+from stereorig.server.documents.tests import AnalysisRecord, CameraMotion, StepOutcome, SummaryRecord, TestRecord
+from stereorig.server.formats.calibrations.in_test import calibration_id_in, calibration_in
+from stereorig.server.formats.calibrations.kept_checks import read_checks, with_checks
+from stereorig.server.formats.calibrations.recognise import LoadedCalibration, load_calibration
+from stereorig.server.formats.images import read_image
+from stereorig.server.formats.manifest import DamagedError, is_there, known_sha256
+from stereorig.server.formats.results.folder import number_of, results_in
+from stereorig.server.formats.results.reading import ResultHead, read_head
+from stereorig.server.report.records import ReportedSettings
+from stereorig.server.results.gauges.request import GaugeRequest
+from stereorig.server.results.metadata import TestMetadata, parse_metadata
+from stereorig.server.results.staleness import stale_results
+from stereorig.server.results.warnings.analysis import ResultWarning, analysis_warnings
+from stereorig.server.store.durable import known_json, known_record
 
 
 @dataclass(frozen=True)
@@ -49,13 +41,13 @@ class Source:
     heads
         Attributes of the files.
     test
-        The test's folder, None where the results are alone; ``test_record`` is its ``test.json``.
+        The test's folder, None for results outside a test; ``test_record`` is its ``test.json``.
     analysis
-        ``analysis.json`` of the service, or ``summary.json`` of ``stereorig measure``; empty without either.
+        ``analysis.json`` of the service; without one, as with results of ``stereorig measure``, its id is empty.
     steps
-        ``step.json`` of every file's step; empty where there is none.
+        ``step.json`` of every file's step; empty without a test.
     calibration, calibration_file
-        None where it was not found or is not that of the measurement.
+        None if it was not found or is not the measurement's.
     metadata
         Metadata stated by the operator.
     stale
@@ -63,11 +55,11 @@ class Source:
     doubts
         Warnings about inputs that were not found, and steps that failed.
     warnings
-        Failed checks and what else must be known before the results are used.
+        Failed checks and other warnings to know before the results are used.
     camera_motion
         Findings about the cameras, of the steps that have one.
     stored
-        Result files in the system frame, by step, where ``files`` are in another one.
+        Result files in the system frame, by step, if ``files`` are in another one.
     """
 
     files: dict[int, Path]
@@ -82,7 +74,7 @@ class Source:
     stale: list[str]
     doubts: list[str] = field(default_factory=list)
     warnings: list[ResultWarning] = field(default_factory=list)
-    camera_motion: dict[int, CameraMotionRecord] = field(default_factory=dict)
+    camera_motion: dict[int, CameraMotion] = field(default_factory=dict)
     stored: Mapping[int, Path] = field(default_factory=dict)
 
     def in_frame(self, files: Mapping[int, Path]) -> Source:
@@ -99,17 +91,17 @@ class Source:
     @property
     def reference_step(self) -> StepRecord:
         """The record of the reference."""
-        return self.steps.get(self.reference, StepRecord())
+        return self.steps.get(self.reference, StepRecord(n=self.reference))
 
     @property
     def rig(self) -> RigRecord:
         """The rig at the reference."""
-        return self.reference_step.rig
+        return self.reference_step.rig or RigRecord()
 
     @property
-    def settings(self) -> SettingsRecord:
+    def settings(self) -> ReportedSettings:
         """Settings of the analysis, from the files themselves."""
-        return SettingsRecord.model_validate(self.heads[max(self.heads)].settings)
+        return ReportedSettings.model_validate(self.heads[max(self.heads)].settings)
 
     @property
     def title(self) -> str:
@@ -117,7 +109,7 @@ class Source:
         return self.test_record.name or self.files[min(self.files)].absolute().parent.name
 
     def reference_image(self, cam: CameraName) -> NDArray[Any] | None:
-        """Image of the reference; None where it is gone or not the one that was measured."""
+        """Image of the reference; None if it is gone or was replaced since the measurement."""
         n = self.reference
         head = self.heads.get(n, self.heads[max(self.heads)])
         inputs = head.inputs_sha256
@@ -128,8 +120,10 @@ class Source:
             candidates += [named, self.files[n].parent / named.name]
         for path in candidates:
             try:
-                if path.is_file() and (sha256 is None or known_sha256(path) == sha256):
+                if is_there(path) and (sha256 is None or known_sha256(path) == sha256):
                     return read_image(path)
+            except DamagedError:
+                raise
             except (OSError, StereorigError):
                 continue
         return None
@@ -153,7 +147,7 @@ def find_source(
         One of a data folder's tests, and of a test's analyses; left out: the only test, the newest analysis with
         results.
     calibration
-        Its file, where it is not beside the results.
+        Its file, if it is not in the results' folder.
     metadata
         Metadata stated by the operator; left out: those kept with the test.
 
@@ -177,16 +171,18 @@ def find_source(
     folder = folder.absolute()
     heads = {n: read_head(path) for n, path in sorted(files.items())}
     home = folder.parent.parent if (folder.parent.parent / "steps").is_dir() else None
-    test_record, steps = TestRecord(), {n: StepRecord() for n in heads}
+    test_record, steps = TestRecord(id=""), {n: StepRecord(n=n) for n in heads}
     if home is not None:
-        test_record = TestRecord.model_validate(known_json(home / "test.json"))
-        steps = {n: StepRecord.model_validate(known_json(home / "steps" / f"{n:04d}" / "step.json")) for n in heads}
-    made = AnalysisRecord.model_validate(known_json(folder / "analysis.json") or known_json(folder / "summary.json"))
-    doubts = [
-        f"Step {n} could not be measured: {one.get('code', '')}: {one.get('cause', '')}"
-        for n, one in failed_steps(folder).items()
-    ]
-    loaded, file = _calibration(calibration, home, made, heads, doubts)
+        test_record = known_record(TestRecord, home / "test.json", id="")
+        steps = {n: known_record(StepRecord, home / "steps" / f"{n:04d}" / "step.json", n=n) for n in heads}
+    summary = known_record(SummaryRecord, folder / "summary.json")
+    doubts = [f"Step {n} could not be measured: {one.code}: {one.detail}" for n, one in summary.steps_failed.items()]
+    unknown = [str(n) for n, step in steps.items() if step.dz_mm is not None and None in step.dz_mm.values()]
+    if unknown:
+        doubts.append(f"Position unknown of the stage, which did not answer, at step {', '.join(unknown)}.")
+    if any("stage" in (s.simulated or ()) and not (s.rig and s.rig.simulated) for s in steps.values()):
+        doubts.append("The stage was simulated but the cameras are real: nothing was at its positions.")
+    loaded, file = _calibration(calibration, home, summary, heads, doubts)
     stated = parse_metadata(test_record.metadata, name="the metadata of the test") if metadata is None else metadata
     if loaded is not None and file is not None:
         loaded = _with_kept_checks(loaded, file, home, test_record)
@@ -195,7 +191,7 @@ def find_source(
         heads=heads,
         test=home,
         test_record=test_record,
-        analysis=made,
+        analysis=known_record(AnalysisRecord, folder / "analysis.json", id="", test_id=""),
         steps=steps,
         calibration=loaded,
         calibration_file=file,
@@ -203,13 +199,13 @@ def find_source(
         stale=stale_results(list(files.values()), list(heads.values())),
         doubts=doubts,
         warnings=[one for one in analysis_warnings(folder) if one.code != "steps_failed"],  # they are among the doubts
-        camera_motion=_camera_motion(folder, list(heads)),
+        camera_motion=_camera_motion(folder, list(heads), summary),
     )
 
 
 def _with_drawn_gauges(stated: TestMetadata, folder: Path, home: Path | None, doubts: list[str]) -> TestMetadata:
     """Add the gauges of the recipe, or those drawn over the test's results, where the metadata name none."""
-    drawn = known_json(folder / "summary.json").get("gauges")  # of what stereorig measure --recipe wrote
+    drawn = known_json(folder / "summary.json").get("gauges")  # written by stereorig measure --recipe
     if drawn is None and home is not None:
         drawn = known_json(home / "workspace.json").get("gauges")
     if stated.gauges is not None or drawn is None:
@@ -221,19 +217,16 @@ def _with_drawn_gauges(stated: TestMetadata, folder: Path, home: Path | None, do
         return stated
 
 
-def _camera_motion(folder: Path, numbers: list[int]) -> dict[int, CameraMotionRecord]:
+def _camera_motion(folder: Path, numbers: list[int], summary: SummaryRecord) -> dict[int, CameraMotion]:
     """Read the findings about the cameras: of a finished measurement, or of the steps there are so far."""
-    steps = SummaryRecord.model_validate(known_json(folder / "summary.json")).steps
-    if not steps:
-        own = ({"n": n, **known_json(folder / f"step_{n:04d}.json")} for n in numbers)
-        steps = [StepSummaryRecord.model_validate(one) for one in own]
+    steps = summary.steps or [known_record(StepOutcome, folder / f"step_{n:04d}.json", n=n) for n in numbers]
     return {s.n: s.camera_motion for s in steps if s.n in numbers and s.camera_motion is not None}
 
 
 def _with_kept_checks(
     loaded: LoadedCalibration, file: Path, home: Path | None, test_record: TestRecord
 ) -> LoadedCalibration:
-    """Add the checks made of a calibration since: beside its file, or beside the one that a test's is a copy of."""
+    """Add the later checks of a calibration, from its own folder, or from the original of a test's copy."""
     kept = read_checks(file, loaded.sha256)
     name = calibration_id_in(test_record.model_dump(), loaded.sha256)
     if home is not None and name:
@@ -287,12 +280,12 @@ def _one_analysis(test: Path, wanted: str | None) -> Path:
             raise NotFoundError(f"There is no analysis {wanted[:40]!r} in {test}.", kind="analysis")
         return there[wanted]
     finished = [path for path in there.values() if results_in(path)]
-    # `stereorig measure` puts its results beside the analyses
+    # `stereorig measure` writes its results next to the analyses
     return finished[-1] if finished else test / "exports" / "measure"
 
 
 def _calibration(
-    given: Path | None, test: Path | None, made: AnalysisRecord, heads: Mapping[int, ResultHead], doubts: list[str]
+    given: Path | None, test: Path | None, summary: SummaryRecord, heads: Mapping[int, ResultHead], doubts: list[str]
 ) -> tuple[LoadedCalibration | None, Path | None]:
     """Find the calibration that the results were measured with, by its checksum."""
     inputs = heads[max(heads)].inputs_sha256
@@ -300,7 +293,8 @@ def _calibration(
     candidates = [] if given is None else [given]
     if given is None:
         candidates += [] if test is None else [calibration_in(test, sha256)]
-        candidates += [] if made.calibration is None else [made.calibration.file]
+        named = summary.calibration.get("file")  # by stereorig measure
+        candidates += [Path(named)] if isinstance(named, str) else []
     for path in candidates:
         if not path.is_file():
             continue
@@ -311,7 +305,7 @@ def _calibration(
             raise InputError(
                 f"{given} is not the calibration that the results were measured with.",
                 code="calibration_changed",
-                remedy="Give the other one.",
+                remedy="Give the calibration that was measured with.",
             )
         doubts.append(f"{path.name} is not the calibration that was measured with; nothing is reported from it.")
     if given is not None:

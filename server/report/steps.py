@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from datetime import datetime
 
 import numpy as np
 
-from core.field.checks.epipolar_offset import EpipolarCheck
-from core.field.points.result import Field
-from core.settings import Coverage, CoverageFields
-from core.strain import StrainField
-from server.compute.strain import StrainSummary, summarise_strain
-from server.formats.calibrations.volume import rbe_of
-from server.formats.results.reading import read_field
-from server.formats.results.strain import read_strain
-from server.formats.results.summary import StepSummary, summarise
-from server.formats.results.uncertainty import Included, Statement, read_included
-from server.report.floor import LENGTHS, STRAINS, Floor, FloorKeeper, Quantity, reported_sigma, static_steps
-from server.report.records import CameraMotionRecord, QualityRecord
-from server.report.source import Source
+from stereorig.core.field.checks.epipolar_offset import EpipolarCheck
+from stereorig.core.field.points.result import Field
+from stereorig.core.names import CameraName
+from stereorig.core.settings import Coverage, CoverageFields
+from stereorig.core.strain import StrainField
+from stereorig.server.compute.strain import StrainSummary, summarise_strain
+from stereorig.server.documents.steps import StepQuality, StepRecord
+from stereorig.server.documents.tests import CameraMotion
+from stereorig.server.formats.calibrations.volume import rbe_of
+from stereorig.server.formats.results.reading import read_field
+from stereorig.server.formats.results.strain import read_strain
+from stereorig.server.formats.results.summary import ROWS_APART, StepSummary, summarise
+from stereorig.server.formats.results.uncertainty import Included, Statement, read_included
+from stereorig.server.report.floor import LENGTHS, STRAINS, Floor, FloorKeeper, Quantity, reported_sigma, static_steps
+from stereorig.server.report.source import Source
+from stereorig.server.results.channels import units_of
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class DrawnStep:
     """A step whose field is drawn."""
 
     n: int
@@ -33,23 +37,23 @@ class Shown:
 
 
 @dataclass(frozen=True)
-class StepFigures:
+class StepRow:
     """Figures of one step in the tables.
 
     Attributes
     ----------
-    n, label, load_n, channels
+    n, label, load_n, channels, channel_u, units
         As the step's record has them.
     seconds
-        Since the reference; None where no times are known.
+        Time since the reference, s; None if the times are not known.
     summary, strain
         As :func:`summarise` and :func:`summarise_strain` make them.
-    skew_ms, quality
-        Of the pair of images; None where they were not recorded.
+    skew_ms, skew_by, quality
+        Skew and quality of the pair of images; None if not recorded. ``skew_by``: uncertainty and source of the skew.
     static
         True if it counts as static.
     camera_motion
-        Whether a camera moved; None where that was not judged.
+        Finding about a motion of the cameras; None if it was not judged.
     """
 
     n: int
@@ -61,13 +65,21 @@ class StepFigures:
     summary: StepSummary
     strain: StrainSummary | None
     skew_ms: float | None
-    quality: QualityRecord | None
+    quality: StepQuality | None
     static: bool
-    camera_motion: CameraMotionRecord | None = None
+    camera_motion: CameraMotion | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+    channel_u: Mapping[str, float] = field(default_factory=dict)
+    skew_by: str | None = None
+
+    def temperature_c(self, cam: CameraName) -> float | None:
+        """Temperature that a camera reported, degrees Celsius; None if it reported none."""
+        image = getattr(self.quality, cam, None)
+        return None if image is None else image.temperature_c
 
     @property
     def cameras(self) -> str:
-        """Finding about the cameras in a word; empty where there is none."""
+        """Finding about the cameras in a word; empty if there is none."""
         if self.camera_motion is None:
             return ""
         return {True: "moved", False: "at rest", None: "not known"}[self.camera_motion.camera_moved]
@@ -92,7 +104,7 @@ class StepFigures:
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class MeasuredSteps:
     """Content of the result files.
 
     Attributes
@@ -112,13 +124,13 @@ class Measured:
     noise_grey
         Median noise of the reference image from the residuals of the matching.
     statement
-        What is stated beside uncertainties: the coverage factor, and what they include in all steps.
+        Statement with the uncertainties: the coverage factor, and the terms that they include in all steps.
     """
 
-    steps: list[StepFigures]
+    steps: list[StepRow]
     reference: Field
     reference_sys: Field
-    shown: list[Shown]
+    shown: list[DrawnStep]
     floor: dict[str, Floor]
     static: list[int]
     static_source: str
@@ -147,7 +159,7 @@ class Measured:
         return sorted({name for s in self.steps for name in s.channels})[:4]
 
     @property
-    def moved(self) -> list[StepFigures]:
+    def moved(self) -> list[StepRow]:
         """Steps with displacements."""
         return [s for s in self.steps if s.summary.displacement_mm]
 
@@ -159,37 +171,37 @@ class Measured:
         return next((s.n for s in self.steps if not s.summary.displacement_mm), None)
 
     @property
-    def camera_moved(self) -> list[StepFigures]:
+    def camera_moved(self) -> list[StepRow]:
         """Steps in which a camera is seen to have moved."""
         return [s for s in self.steps if s.camera_motion is not None and s.camera_motion.camera_moved]
 
     @property
     def worst_epipolar(self) -> EpipolarCheck | None:
-        """The step's check that is furthest off; None where none could be made."""
+        """The epipolar check with the largest offset of all steps; None if none could be made."""
         checks = [s.summary.epipolar_check for s in self.steps if s.summary.epipolar_check is not None]
         return max(checks, key=lambda c: c.offset_px, default=None)
 
 
-def read_steps(source: Source, coverage: CoverageFields | None = None) -> Measured:
+def read_steps(source: Source, coverage: CoverageFields | None = None) -> MeasuredSteps:
     """Read every result file once; at most three fields are held at a time, and the static steps' values.
 
     Parameters
     ----------
     source
-        Where they are.
+        Result files, records, calibration and metadata.
     coverage
-        Of the uncertainties that are stated; that of the metadata's gauges if left out or without a factor.
+        Coverage of the stated uncertainties; None or without a factor: the metadata's gauges'.
     """
     labels = {n: _label(source, n) for n in source.files}
     static, static_source = static_steps(source.metadata.static_steps, labels, source.reference)
     rbe = None if source.calibration is None else rbe_of(source.calibration)
     imported = source.calibration is not None and source.calibration.imported
     keeper = FloorKeeper()
-    figures: list[StepFigures] = []
+    figures: list[StepRow] = []
     included: list[Included] = []
     reference: Field | None = None
-    peak: Shown | None = None
-    last: Shown | None = None
+    peak: DrawnStep | None = None
+    last: DrawnStep | None = None
     height = -np.inf
     reported: dict[str, float | None] = {}
     loads = {n: _load(source, n) for n in source.files}
@@ -209,18 +221,18 @@ def read_steps(source: Source, coverage: CoverageFields | None = None) -> Measur
             reference = field
         if n == source.reference and len(source.files) > 1:
             continue
-        last = Shown(n, "the last step", field, strain)
+        last = DrawnStep(n, "the last step", field, strain)
         size = abs(loads[n] or 0.0) if by_load else step.max_displacement_mm
         if size is not None and size > height:
             why = "the step of maximum load" if by_load else "the step of maximum displacement"
-            height, peak = size, Shown(n, why, field, strain)
+            height, peak = size, DrawnStep(n, why, field, strain)
     assert reference is not None
     shown = [s for s in (peak, last) if s is not None]
     if len(shown) == 2 and shown[0].n == shown[1].n:
-        shown = [Shown(shown[0].n, f"{shown[0].why}, and the last", shown[0].field, shown[0].strain)]
+        shown = [DrawnStep(shown[0].n, f"{shown[0].why}, and the last", shown[0].field, shown[0].strain)]
     grey = reference.noise_grey[reference.valid]
     grey = grey[np.isfinite(grey)]
-    return Measured(
+    return MeasuredSteps(
         steps=figures,
         reference=reference,
         reference_sys=read_field(source.stored[source.reference]) if source.reference in source.stored else reference,
@@ -263,22 +275,36 @@ def _figures(
     *,
     static: bool,
     imported: bool,
-) -> StepFigures:
+) -> StepRow:
     record = source.steps[n]
-    return StepFigures(
+    return StepRow(
         n=n,
         label=label,
         load_n=_load(source, n),
         channels=record.channels,
         seconds=_seconds(source, n),
         captured_utc=record.captured_utc,
-        summary=summarise(field, rbe_px=rbe, reference=source.reference, imported=imported),
+        summary=summarise(
+            field,
+            rbe_px=rbe,
+            reference=source.reference,
+            imported=imported,
+            rows_apart=str(source.heads[n].attributes.get(ROWS_APART, "")),
+        ),
         strain=None if strain is None else summarise_strain(strain, field),
         skew_ms=record.skew_ms,
         quality=record.quality,
         static=static,
         camera_motion=source.camera_motion.get(n),
+        units=units_of(record.channels, record.channel_units),
+        channel_u=record.channel_u,
+        skew_by=_skew_by(record),
     )
+
+
+def _skew_by(record: StepRecord) -> str | None:
+    source, uncertainty = record.skew_source, record.skew_uncertainty_ms
+    return None if source is None or uncertainty is None else f"+- {uncertainty:.2g} ms by {source}"
 
 
 def _seconds(source: Source, n: int) -> float | None:
@@ -287,7 +313,7 @@ def _seconds(source: Source, n: int) -> float | None:
     if "import" in (one.source, two.source):
         return None  # the time of an import is not the time of the exposure
     begin, end = one.host_monotonic_ns, two.host_monotonic_ns
-    # the clock begins anew with the machine: only what also agrees with the order of the steps is used
+    # the clock starts again with the machine: it is used only if it also agrees with the order of the steps
     if begin is not None and end is not None and (end - begin) * (n - source.reference) >= 0:
         return (end - begin) / 1e9
     try:

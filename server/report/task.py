@@ -1,11 +1,11 @@
-"""A report as a task of the process beside the service."""
+"""A report as a task of the export process."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
-from core.settings import Coverage
+from stereorig.core.settings import Coverage
 
 NAME = "report.html"
 
@@ -19,9 +19,9 @@ def report_task(results: str, out: str, coverage: Coverage, framed: Sequence[str
         Its result files in the frame of the report; those stored if left out.
     """
     # matplotlib is loaded here alone
-    from server.formats.results.folder import number_of
-    from server.report.build import make_report
-    from server.report.source import find_source
+    from stereorig.server.formats.results.folder import number_of
+    from stereorig.server.report.build import make_report
+    from stereorig.server.report.source import find_source
 
     source = find_source(Path(results))
     if framed:

@@ -5,21 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from core.names import BUDGET
-from server.formats.gauges.readings import Number, StepReadings
-from server.formats.results.uncertainty import DISTRIBUTION, NOT_INCLUDED, SYSTEMATIC, Statement, percent
-from server.report.floor import STRAINS, UM
-from server.report.steps import Measured, StepFigures
+from stereorig.core.names import ALL_PARTS
+from stereorig.server.formats.gauges.readings import Number, StepReadings
+from stereorig.server.formats.results.uncertainty import DISTRIBUTION, NOT_INCLUDED, SYSTEMATIC, Statement, percent
+from stereorig.server.report.floor import STRAINS, UM
+from stereorig.server.report.steps import MeasuredSteps, StepRow
 
 #: of gauges' numbers, the factor to a unit that reads well
 _UNITS = {"mm": (1e3, UM), "1": (1e6, "microstrain"), "rad": (1e6, "microrad")}
-_ROUNDING = 1e-6  # of the whole: what rounding leaves of a part that is none
+_ROUNDING = 1e-6  # of the whole: a smaller part is zero but for rounding
 _LENGTHS = (("x_mm", "X"), ("y_mm", "Y"), ("z_mm", "Z"), ("u_mm", "U"), ("v_mm", "V"), ("w_mm", "W"))
 
 
 @dataclass(frozen=True)
-class Budget:
-    """One quantity's row of a budget table; its numbers are standard uncertainties (k = 1), None where not told apart.
+class BudgetRow:
+    """One quantity's row of a budget table; its numbers are standard uncertainties (k = 1), None if not separated.
 
     Attributes
     ----------
@@ -28,9 +28,9 @@ class Budget:
     label
         Its name.
     unit
-        Of its numbers.
+        Unit of its numbers.
     parts
-        In the order of :data:`core.names.BUDGET`.
+        In the order of :data:`stereorig.core.names.ALL_PARTS`.
     total
         The whole standard uncertainty.
     stated
@@ -45,8 +45,8 @@ class Budget:
     stated: float | None
 
 
-def sentence(measured: Measured) -> str:
-    """Return method, coverage factor, coverage and what is not included, as an auditor can quote it."""
+def sentence(measured: MeasuredSteps) -> str:
+    """Return method, coverage factor, coverage and the missing terms, as an auditor can quote it."""
     statement = measured.statement
     patch = measured.reference.patch
     shape = "quadratic-patch" if patch is not None and patch.patch == "quadratic" else "plane-patch"
@@ -69,13 +69,13 @@ def sentence(measured: Measured) -> str:
     )
 
 
-def field_budgets(measured: Measured) -> tuple[str, list[Budget]]:
+def field_budgets(measured: MeasuredSteps) -> tuple[str, list[BudgetRow]]:
     """Return which step the medians over the field are of, and a row for each quantity."""
     step = measured.moved[-1] if measured.moved else measured.steps[-1]
     return f"Step {step.n}", _of_step(step, measured.statement)
 
 
-def _of_step(step: StepFigures, statement: Statement) -> list[Budget]:
+def _of_step(step: StepRow, statement: Statement) -> list[BudgetRow]:
     rows = []
     for key, label in _LENGTHS:
         parts = step.summary.budget_median_mm.get(key)
@@ -91,9 +91,9 @@ def _of_step(step: StepFigures, statement: Statement) -> list[Budget]:
     return rows
 
 
-def gauge_budgets(step: StepReadings, statement: Statement) -> list[Budget]:
+def gauge_budgets(step: StepReadings, statement: Statement) -> list[BudgetRow]:
     """Return a row for each number of each gauge in a step that has a budget."""
-    rows: list[Budget] = []
+    rows: list[BudgetRow] = []
 
     def add(kind: str, gauge: str | None, values: Mapping[str, Number]) -> None:
         for name, number in values.items():
@@ -119,9 +119,9 @@ def _row(
     parts: Mapping[str, float | None],
     total: float | None,
     statement: Statement,
-) -> Budget:
-    each: Sequence[float | None] = [parts.get(name) for name in BUDGET]
+) -> BudgetRow:
+    each: Sequence[float | None] = [parts.get(name) for name in ALL_PARTS]
     whole = None if total is None else factor * total
     floor = 0.0 if whole is None else _ROUNDING * whole
     scaled = tuple(None if part is None else factor * part if factor * part > floor else 0.0 for part in each)
-    return Budget(key, label, unit, scaled, whole, None if whole is None else statement.k * whole)
+    return BudgetRow(key, label, unit, scaled, whole, None if whole is None else statement.k * whole)

@@ -3,34 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.boards import BoardTarget, detect_target
-from core.calibration.aspect_images import AspectMeasurement, measure_aspect_normal
-from core.calibration.checks.compare import (
+from stereorig.core.arrays import Float
+from stereorig.core.boards import BoardTarget, detect_target
+from stereorig.core.calibration.aspect_images import AspectMeasurement, measure_aspect_normal
+from stereorig.core.calibration.checks.compare import (
     CalibrationComparison,
     UncertainPair,
     common_points_mm,
     compare_calibrations,
     volume_grid_mm,
 )
-from core.calibration.checks.distance import MARK_SIGMA_PX, DistanceCheck, check_known_distance
-from core.calibration.checks.target_distance import check_target_images
-from core.calibration.result import COVARIANCE_NAMES
-from core.errors import CalibrationInputError, StereorigError
-from core.grid import GridView
-from core.target import GridTarget
-from server.formats.calibrations.native import covariance_in
-from server.formats.calibrations.programs.plausibility import image_sizes, shared_points
-from server.formats.calibrations.recognise import LoadedCalibration
-from server.formats.calibrations.volume import volume_of
-from server.formats.version import software_version
+from stereorig.core.calibration.checks.distance import MARK_SIGMA_PX, DistanceCheck, check_known_distance
+from stereorig.core.calibration.checks.target_distance import check_target_images
+from stereorig.core.calibration.result import COVARIANCE_NAMES
+from stereorig.core.errors import CalibrationInputError, StereorigError
+from stereorig.core.grid import GridView
+from stereorig.core.target import GridTarget
+from stereorig.server.formats.calibrations.native import parameters_in
+from stereorig.server.formats.calibrations.programs.plausibility import image_sizes, shared_points
+from stereorig.server.formats.calibrations.recognise import LoadedCalibration
+from stereorig.server.formats.calibrations.volume import volume_of
+from stereorig.server.formats.version import software_version
 
 KNOWN_DISTANCE = "known_distance"
 Images = tuple[NDArray[Any], NDArray[Any]]
@@ -45,10 +45,36 @@ class NamedImage:
 
 
 def uncertain_pair(loaded: LoadedCalibration) -> UncertainPair:
-    """Return a calibration's cameras with their covariance, where the file states it."""
-    found = covariance_in(loaded.details, name="calibration.json", pair=loaded.pair)
-    names, covariance = (COVARIANCE_NAMES, None) if found is None else found
-    return UncertainPair(loaded.pair, names, covariance)
+    """Return a calibration's cameras with their covariance and its causes, where the file states them."""
+    found = parameters_in(loaded.details, name="calibration.json", pair=loaded.pair)
+    if found is None:
+        return UncertainPair(loaded.pair, COVARIANCE_NAMES, None)
+    names = tuple(found.names)
+    shared: dict[str, Float] = {}
+    if found.by_cause is not None:
+        settings = loaded.details.get("settings")
+        # errors of single positions are new in each calibration
+        steps = isinstance(settings, Mapping) and settings.get("stage_step_sigma_mm") == 0.0
+        shared |= {c: L for c, L in found.roots().items() if c == "target" or (c == "stage" and steps)}
+    # an aspect ratio that is held has no part in the estimate: its correlations count as its own error
+    aspects = [k for k, n in enumerate(names) if n.endswith(".aspect") and found.covariance[k, k] > 0.0]
+    if aspects:
+        shared["aspect"] = found.covariance[:, aspects] / np.sqrt(np.diagonal(found.covariance)[aspects])
+    return UncertainPair(loaded.pair, names, found.covariance, shared)
+
+
+def _shared(a: LoadedCalibration, b: LoadedCalibration) -> set[str]:
+    """Names of the causes that both calibrations declare alike: one target, one stage, aspect ratios that were held."""
+    of_stage = ("moves", "stage_scale_sigma", "stage_step_sigma_mm", "axis_tilt_sigma_rad")
+    settings = [found.details.get("settings") for found in (a, b)]
+    found = set()
+    if a.details.get("target") == b.details.get("target") is not None:
+        found.add("target")
+    if all(isinstance(s, Mapping) for s in settings):
+        one, two = ({k: s.get(k) for k in of_stage} for s in settings if isinstance(s, Mapping))
+        found |= {"stage"} if one == two else set()
+    aspects = [[v for n, v in c.pair.values().items() if n.endswith(".aspect")] for c in (a, b)]
+    return found | ({"aspect"} if aspects[0] == aspects[1] else set())
 
 
 def distance_of_marks(
@@ -82,8 +108,10 @@ def distance_of_target(
     )
 
 
-def compare_loaded(a: LoadedCalibration, b: LoadedCalibration) -> CalibrationComparison:
+def compare_loaded(a: LoadedCalibration, b: LoadedCalibration, *, independent: bool = False) -> CalibrationComparison:
     """Compare two calibrations over the volume that both hold for.
+
+    Target, stage and held aspect ratios that both declare alike count as the same unless they are ``independent``.
 
     Raises
     ------
@@ -101,7 +129,10 @@ def compare_loaded(a: LoadedCalibration, b: LoadedCalibration) -> CalibrationCom
     volumes = volume_of(a), volume_of(b)
     grid = shared_points(a.pair, *sizes) if volumes[0] is None else volume_grid_mm(volumes[0], sizes[0])
     points = common_points_mm(grid, a.pair, b.pair, sizes, volume_a=volumes[0], volume_b=volumes[1])
-    return compare_calibrations(uncertain_pair(a), uncertain_pair(b), points)
+    same = set() if independent else _shared(a, b)
+    known = (uncertain_pair(c) for c in (a, b))
+    one, two = (replace(c, shared={n: L for n, L in c.shared.items() if n in same}) for c in known)
+    return compare_calibrations(one, two, points)
 
 
 def aspect_of_images(
@@ -114,7 +145,7 @@ def aspect_of_images(
     CalibrationInputError
         ``aspect_target`` for another target than a line grid; as :func:`measure_aspect_normal`.
     ImageError, TargetError
-        As :func:`core.boards.detect_target`, the image named.
+        As :func:`stereorig.core.boards.detect_target`, the image named.
     """
     if not isinstance(target, GridTarget):
         raise CalibrationInputError(
@@ -136,13 +167,13 @@ def aspect_of_images(
 
 
 def kept_distance(found: DistanceCheck, how: Mapping[str, object]) -> dict[str, object]:
-    """Return what is kept of a known distance: the finding, its numbers, what it was measured on, and when."""
+    """Return the stored record of a known distance: the finding, its numbers, the measured object, and the time."""
     made = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
     return {**plain(found), "measured_on": dict(how), "checked_utc": made, "software_version": software_version()}
 
 
 def plain(found: object) -> dict[str, Any]:
-    """Return a check's numbers as plain values: what is not known is null."""
+    """Return a check's numbers as plain values: unknown ones are null."""
     assert is_dataclass(found)
     assert not isinstance(found, type)
     return dict(_plain(asdict(found)))

@@ -1,4 +1,4 @@
-"""What was recorded with a step: channels, load, and its time since the reference."""
+"""Values recorded with a step: channels, load, and its time since the reference."""
 
 from __future__ import annotations
 
@@ -8,32 +8,38 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 
-from server.formats.channel_units import unit_of
-from server.formats.results.reading import read_head
-from server.store.durable import known_json
+from stereorig.server.formats.channel_units import unit_of
+from stereorig.server.formats.results.reading import read_head
+from stereorig.server.store.durable import known_json
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """What a step's record says beside its images.
+    """Channels, load and time that are recorded with a step's images.
 
     Attributes
     ----------
     channels
         Scalar readings by name.
+    units
+        Unit of each, as a load frame's record stated it, else as its name ends.
+    u
+        Standard uncertainty of those that the rig file names.
     load_n
-        Load in newtons; None where none was recorded.
+        Load in newtons; None if none was recorded.
     time_s
-        Seconds since the reference; None where either time is not known, as of imported images without their own.
+        Seconds since the reference; None if either time is not known, as with imported images without times.
     """
 
     channels: Mapping[str, float] = field(default_factory=dict)
     load_n: float | None = None
     time_s: float | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+    u: Mapping[str, float] = field(default_factory=dict)
 
 
 def recorded_with(home: Path, n: int, reference: int | None) -> Recorded:
-    """Return what was recorded with a step; nothing for results of no test.
+    """Return the values recorded with a step; empty for results that belong to no test.
 
     Parameters
     ----------
@@ -42,7 +48,7 @@ def recorded_with(home: Path, n: int, reference: int | None) -> Recorded:
     n
         Number of the step.
     reference
-        Of its reference; None: it is the reference.
+        Number of its reference; None: it is the reference.
     """
     steps = home.absolute().parent.parent / "steps"
     one = known_json(steps / f"{n:04d}" / "step.json") if steps.is_dir() else {}
@@ -50,12 +56,18 @@ def recorded_with(home: Path, n: int, reference: int | None) -> Recorded:
         return Recorded()
     first = one if reference in (None, n) else known_json(steps / f"{reference:04d}" / "step.json")
     begin, end = step_time(first), step_time(one)
-    channels = one.get("channels")
+    channels = _numbers(one.get("channels"))
     return Recorded(
-        {str(k): float(v) for k, v in channels.items()} if isinstance(channels, dict) else {},
+        channels,
         float(one["load_n"]) if isinstance(one.get("load_n"), int | float) else None,
         None if begin is None or end is None else (end - begin).total_seconds(),
+        units_of(channels, one.get("channel_units")),
+        _numbers(one.get("channel_u")),
     )
+
+
+def _numbers(found: object) -> dict[str, float]:
+    return {str(k): float(v) for k, v in found.items()} if isinstance(found, dict) else {}
 
 
 def has_more(result: Path, home: Path) -> bool:
@@ -74,9 +86,10 @@ def step_time(step: Mapping[str, object]) -> datetime | None:
         return None
 
 
-def units_of(names: Iterable[str]) -> dict[str, str]:
-    """Return the unit of each channel, by its name."""
-    return {name: unit_of(name) for name in sorted(names)}
+def units_of(names: Iterable[str], stated: object = None) -> dict[str, str]:
+    """Return the unit of each channel by its name: as a record stated it, else as the name ends."""
+    known = stated if isinstance(stated, dict) else {}
+    return {name: str(known.get(name) or unit_of(name)) for name in sorted(names)}
 
 
 def rising(times: Iterable[float | None]) -> list[float] | None:

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from core.errors import FileFormatError, InputError
-from core.orientation.matched import seen_by_camera2
-from server.formats.calibrations.programs.plausibility import Residual
-from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
-from server.results.provenance import calibration_of
-from server.results.steps import read_step
+from stereorig.core.errors import FileFormatError, InputError
+from stereorig.core.orientation.matched import seen_by_camera2
+from stereorig.server.formats.calibrations.programs.plausibility import Residual
+from stereorig.server.formats.calibrations.recognise import LoadedCalibration, load_calibration
+from stereorig.server.results.provenance import calibration_of
+from stereorig.server.results.steps import read_step
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def check_against(loaded: LoadedCalibration, files: Sequence[Path], measured_wit
         raise FileFormatError(
             f"{measured_with} is not the calibration that {files[0].name} was measured with.",
             code="calibration_changed",
-            remedy="Give that one.",
+            remedy="Give the calibration that the analysis was measured with.",
         )
     ok = step.valid
     if not ok.any():

@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import InputError
-from server.formats.results.netcdf import dataset_bytes
-from server.results.reader import Variable
+from stereorig.core.errors import InputError
+from stereorig.server.formats import csv_cells
+from stereorig.server.formats.results.netcdf import dataset_bytes
+from stereorig.server.results.reader import FileVariable
 
 FieldForm = Literal["json", "npy", "csv", "nc", "f32", "png"]
 MEDIA_TYPES: dict[FieldForm, str] = {
@@ -83,17 +84,17 @@ class FieldPart:
     Parameters
     ----------
     values
-        (r, c) or (r, c, ...); NaN where there is nothing.
+        (r, c) or (r, c, ...); NaN for missing values.
     rows, cols
         Indices of its rows and columns in the whole grid.
     position
         Gives (r, c) of ``x_px`` or ``y_px``: the points' positions in camera 1's reference image.
     note
-        What is stated beside the uncertainties: under a picture, and in a file.
+        Statement about the uncertainties: under a picture, and in a file.
     """
 
     name: str
-    variable: Variable
+    variable: FileVariable
     values: NDArray[Any]
     rows: NDArray[np.intp]
     cols: NDArray[np.intp]
@@ -116,8 +117,8 @@ def _range(indices: NDArray[np.intp]) -> str:
     return f"{int(indices[0])}:{int(indices[-1]) + 1}:{step}"
 
 
-def take(name: str, read: Callable[[str], Variable], part: Part, note: str = "") -> FieldPart:
-    """Take a part of a variable; ``note`` is stated beside the uncertainties.
+def take(name: str, read: Callable[[str], FileVariable], part: Part, note: str = "") -> FieldPart:
+    """Take a part of a variable; ``note`` is the statement about its uncertainties.
 
     Raises
     ------
@@ -130,7 +131,7 @@ def take(name: str, read: Callable[[str], Variable], part: Part, note: str = "")
         raise InputError(
             f"{name} has the shape {list(shape)}, not one value for each point of the grid.",
             code="field_not_scalar",
-            remedy="Take the result file for what is not over the grid.",
+            remedy="Take the result file for a variable that is not over the grid.",
         )
     rows, cols = part.slices(shape)
     return FieldPart(
@@ -171,13 +172,13 @@ def encode(part: FieldPart, form: FieldForm) -> bytes:
 
 
 def _csv(part: FieldPart) -> bytes:
-    """One line a point: row, col, x_px, y_px, then the value or values; empty where there is none."""
+    """One line a point: row, col, x_px, y_px, then the value or values; empty if it has none."""
     count = int(np.prod(part.values.shape[2:], dtype=int))
     flat = part.values.reshape(-1, count)
     names = [part.name] if part.values.ndim == 2 else [f"{part.name}_{k}" for k in range(count)]
     rows, cols = (grid.ravel() for grid in np.meshgrid(part.rows, part.cols, indexing="ij"))
     whole = not np.issubdtype(part.values.dtype, np.floating)
-    lines = [",".join(["row", "col", "x_px", "y_px", *names])]
+    lines = [csv_cells.row(["row", "col", "x_px", "y_px", *names]).rstrip("\n")]
     positions = (part.position(of).ravel() for of in ("x_px", "y_px"))
     for row, col, x, y, values in zip(rows, cols, *positions, flat, strict=True):
         texts = [str(int(v)) if whole else (repr(float(v)) if np.isfinite(v) else "") for v in values]
@@ -214,7 +215,7 @@ def _netcdf(part: FieldPart) -> bytes:
 
 
 def _png(part: FieldPart) -> bytes:
-    """Return a colour map with its colour bar, drawn fast; white where there is nothing."""
+    """Return a colour map with its colour bar, drawn fast; white at points without a value."""
     values = part.values.astype(float)
     if values.ndim > 2:
         raise InputError(

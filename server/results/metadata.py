@@ -1,7 +1,7 @@
 """Metadata of a test that no device reports: lenses, light, pattern, specimen, purpose.
 
-Nothing here is measured or guessed. An entry that was not stated is None, and a report lists it as not stated. Those of
-cameras and lenses come from the rig file and are kept with every captured step; those of a test take precedence.
+Nothing here is measured or guessed. An entry that was not stated is None, and a report lists it as not stated. Entries
+about cameras and lenses come from the rig file and are stored with every captured step; a test's own take precedence.
 """
 
 from __future__ import annotations
@@ -13,17 +13,15 @@ from typing import Annotated
 
 from pydantic import Field, StringConstraints, ValidationError
 
-from core.errors import FileFormatError
-from server.base.models import StepNumber
-from server.config.camera_metadata import Above, CameraMetadata, ClosedMetadata, Text
-from server.results.gauges.request import GaugeRequest
-from server.wording import problems_in
+from stereorig.core.errors import FileFormatError
+from stereorig.server.base.models import StepNumber
+from stereorig.server.config.camera_metadata import Above, CameraMetadata, ClosedMetadata, Text
+from stereorig.server.results.gauges.request import GaugeRequest
+from stereorig.server.wording import problems_in
 
 
 class TestMetadata(ClosedMetadata):
     """Metadata of one test."""
-
-    __test__ = False
 
     purpose: Text | None = Field(None, description="Purpose of the test.")
     laboratory: Text | None = Field(None, description="Laboratory, address.")
@@ -41,13 +39,13 @@ class TestMetadata(ClosedMetadata):
         examples=["matt white ground, black spray paint"],
     )
     pattern_feature_mm: Above | None = Field(
-        None, description="Size of the pattern's features as stated by the operator; a report measures it besides."
+        None, description="Size of the pattern's features as stated by the operator; a report also measures it."
     )
     pattern_feature_method: Text | None = Field(
         None, description="Source of pattern_feature_mm.", examples=["stamp of 0.18 mm dots"]
     )
     standoff_mm: Above | None = Field(
-        None, description="Distance from the lens to the specimen by a ruler; a report computes the pinhole's besides."
+        None, description="Distance from the lens to the specimen by a ruler; a report also computes the pinhole's."
     )
     frame_rate_hz: Above | None = Field(None, description="Rate at which the images were taken.")
     exposure_ms: Above | None = Field(None, description="Exposure of both cameras, where their records do not have it.")
@@ -82,7 +80,7 @@ def parse_metadata(document: Mapping[str, object], *, name: str) -> TestMetadata
     try:
         return TestMetadata.model_validate(dict(document))
     except ValidationError as error:
-        first = problems_in(error, TestMetadata)[0]
+        first = problems_in(error)[0]
         where = first.field or "file"
         raise FileFormatError(
             f"{name}: {where}: {first.problem}.",

@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from core.status import PointStatus
-from server.base.errors import NotFoundError
-from server.formats.results.derived import derived_names
-from server.formats.results.netcdf import opened
-from server.results.reader import Place, derived_variable, nearest_place
+from stereorig.core.status import PointStatus
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.formats.results.derived import derived_names
+from stereorig.server.formats.results.netcdf import opened
+from stereorig.server.results.reader import Place, derived_variable, nearest_place
 
 
 @dataclass
 class PointHistory:
-    """Columns over the steps; None where a number is missing, with the point's status beside it."""
+    """Columns over the steps; a missing number is None, and `status` holds the point's status."""
 
     units: str = "1"
     value: list[float | None] = field(default_factory=list)
@@ -65,7 +65,7 @@ def point_history(files: Sequence[Path], name: str, place: Place) -> PointHistor
 
 
 def _at(held: Mapping[str, Any], name: str, place: Place) -> tuple[float | None, str | None]:
-    """Return a variable's value at a point and its unit; no unit where there is no such variable."""
+    """Return a variable's value at a point and its unit; no unit if there is no such variable."""
     if name in held:
         variable = held[name]
         if len(variable.dimensions) != 2:

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from server.formats.calibrations.recognise import load_calibration
-from server.results.reader import read_point_positions
+from stereorig.server.formats.calibrations.recognise import load_calibration
+from stereorig.server.results.reader import read_point_positions
 
 
 def image_positions(result: Path, calibration: Path, cam: str) -> NDArray[np.float64]:
-    """Project each point, where it is at that step, into one camera's image.
+    """Project each point at its position in that step into one camera's image.
 
     Parameters
     ----------

@@ -6,13 +6,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-from server.formats.files import sha256_of
-from server.formats.version import software_version
-from server.results.channels import units_of
-from server.results.steps import Source, StepResult, statement_of
+from stereorig.server.formats.files import sha256_of
+from stereorig.server.formats.version import software_version
+from stereorig.server.results.steps import ExportSource, StepResult, statement_of
 
 
-def provenance(step: StepResult, source: Source, *, path: Path | None = None) -> dict[str, object]:
+def provenance(step: StepResult, source: ExportSource, *, path: Path | None = None) -> dict[str, object]:
     """Return the provenance that every export states: software, frame, settings, calibration, inputs; values are plain.
 
     Parameters
@@ -47,7 +46,9 @@ def provenance(step: StepResult, source: Source, *, path: Path | None = None) ->
         document["time_s"] = step.recorded.time_s
     if step.recorded.channels:
         document["channels"] = dict(step.recorded.channels)
-        document["channel_units"] = units_of(step.recorded.channels)
+        document["channel_units"] = dict(step.recorded.units)
+    if step.recorded.u:
+        document["channel_u"] = dict(step.recorded.u)
     if path is not None:
         document["result_file"] = path.name
         document["result_sha256"] = sha256_of(path)
@@ -60,7 +61,7 @@ def calibration_of(step: StepResult) -> str | None:
     return inputs.get("calibration")
 
 
-def notes_of(step: StepResult, source: Source) -> list[str]:
+def notes_of(step: StepResult, source: ExportSource) -> list[str]:
     """Return the lines that state a picture's provenance."""
     settings, strain = _json(step, "settings"), _json(step, "strain")
     parts = [
@@ -89,6 +90,6 @@ def notes_of(step: StepResult, source: Source) -> list[str]:
 
 
 def _json(step: StepResult, name: str) -> dict[str, Any]:
-    """An attribute that holds JSON; empty where there is none."""
+    """An attribute that holds JSON; empty if it is missing."""
     read: dict[str, Any] = json.loads(str(step.attributes.get(name, "{}")))
     return read

@@ -3,40 +3,43 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.settings import CoverageFields
-from core.status import PointStatus
-from server.base.errors import NotFoundError
-from server.formats.results.budgets import PointBudget, field_budgets, strain_budgets
-from server.formats.results.derived import DERIVED, derive, derived_names
-from server.formats.results.netcdf import opened
-from server.formats.results.reading import read_field
-from server.formats.results.strain import read_strain
-from server.formats.results.uncertainty import Included, Statement
+from stereorig.core.settings import CoverageFields
+from stereorig.core.status import PointStatus
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.documents.results import FieldVariable, Probe, ProbeValue, Uncertainty, ViewResiduals
+from stereorig.server.formats.results.budgets import PointBudget, field_budgets, strain_budgets
+from stereorig.server.formats.results.derived import DERIVED, derive, derived_names
+from stereorig.server.formats.results.netcdf import opened
+from stereorig.server.formats.results.reading import read_field
+from stereorig.server.formats.results.strain import read_strain
+from stereorig.server.formats.results.uncertainty import Included, Statement
+from stereorig.server.formats.results.variables import described
 
 _GRID = ("row", "col")
 
 
 @dataclass(frozen=True)
-class Variable:
+class FileVariable:
     """One variable of a result file.
 
     Attributes
     ----------
     values
-        As stored; NaN where there is no number.
+        As stored; NaN for missing numbers.
     units, long_name, dimensions
         As stored.
     flags
         Name of each value of a variable of states.
     parts
-        Names along the third axis, where the file has them.
+        Names along the third axis, if the file has them.
     """
 
     values: NDArray[Any]
@@ -47,10 +50,10 @@ class Variable:
     parts: tuple[str, ...] = ()
 
     @staticmethod
-    def of(variable: Any) -> Variable:
+    def of(variable: Any) -> FileVariable:
         """Read a variable of an open file."""
         parts = next((str(getattr(variable, a)) for a in ("comparisons", "components") if a in variable.ncattrs()), "")
-        return Variable(
+        return FileVariable(
             np.asarray(variable[...]),
             str(getattr(variable, "units", "1")),
             str(getattr(variable, "long_name", "")),
@@ -60,13 +63,13 @@ class Variable:
         )
 
 
-def derived_variable(held: Any, name: str) -> Variable:
-    """Return a variable that follows from those of an open file."""
-    return Variable(derive(held, name), *DERIVED[name], dimensions=_GRID)
+def derived_variable(held: Any, name: str) -> FileVariable:
+    """Return a derived variable, computed from an open file's."""
+    return FileVariable(derive(held, name), *DERIVED[name], dimensions=_GRID)
 
 
-def read_variable(path: Path, name: str) -> Variable:
-    """Read one variable, or what follows from those that the file has.
+def read_variable(path: Path, name: str) -> FileVariable:
+    """Read one variable, or compute it if it is derived from the file's.
 
     Raises
     ------
@@ -83,49 +86,37 @@ def read_variable(path: Path, name: str) -> Variable:
                 remedy="Use one of `available`.",
                 available=sorted(data.variables),
             )
-        return Variable.of(data.variables[name])
+        return FileVariable.of(data.variables[name])
 
 
-@dataclass(frozen=True)
-class VariableHead:
-    """Description of a variable, without its values.
-
-    Attributes
-    ----------
-    flags
-        Name of each value of a status.
-    comparisons
-        Of a correlation: which images its last axis compares.
-    """
-
-    name: str
-    units: str
-    long_name: str
-    dimensions: list[str]
-    shape: list[int]
-    flags: dict[str, str] | None
-    comparisons: list[str] | None
+def _described(
+    name: str, units: str, long_name: str, dimensions: Sequence[str], shape: Sequence[int], variable: Any = None
+) -> FieldVariable:
+    row, flags = described(name), None if variable is None else _flags(variable)
+    return FieldVariable(
+        name=name,
+        units=units,
+        long_name=long_name,
+        dimensions=list(dimensions),
+        shape=list(shape),
+        flags=None if flags is None else {str(value): word for value, word in flags.items()},
+        comparisons=str(variable.comparisons).split() if hasattr(variable, "comparisons") else None,
+        label=row.shown,
+        group=row.group,
+        kind=row.kind,
+        relative=row.relative,
+    )
 
 
-def list_variables(path: Path) -> list[VariableHead]:
+def list_variables(path: Path) -> list[FieldVariable]:
     """Return every variable of a result file, then those that follow from them."""
     with opened(path) as data:
         shape = list(data.variables["status"].shape)
-        derived = [
-            VariableHead(name, *DERIVED[name], list(_GRID), shape, None, None) for name in derived_names(data.variables)
-        ]
-        held = [
-            VariableHead(
-                name=name,
-                units=str(getattr(variable, "units", "1")),
-                long_name=str(getattr(variable, "long_name", "")),
-                dimensions=list(variable.dimensions),
-                shape=list(variable.shape),
-                flags=None if (flags := _flags(variable)) is None else {str(v): word for v, word in flags.items()},
-                comparisons=str(variable.comparisons).split() if "comparisons" in variable.ncattrs() else None,
-            )
-            for name, variable in data.variables.items()
-        ]
+        derived = [_described(name, *DERIVED[name], _GRID, shape) for name in derived_names(data.variables)]
+        held = []
+        for name, variable in data.variables.items():
+            units, long_name = (str(getattr(variable, of, none)) for of, none in (("units", "1"), ("long_name", "")))
+            held.append(_described(name, units, long_name, variable.dimensions, variable.shape, variable))
         return held + derived
 
 
@@ -147,7 +138,7 @@ def read_cut_pieces(path: Path) -> list[list[float]]:
 
 
 def read_point_positions(path: Path) -> NDArray[np.float64]:
-    """Return (rows, cols, 3) positions of the points at the step, mm; NaN where it was not measured."""
+    """Return (rows, cols, 3) positions of the points at the step, mm; NaN at points that were not measured."""
     with opened(path) as data:
         held = data.variables
         position = np.stack([held[f"{axis}_mm"][...] for axis in "xyz"], axis=-1)
@@ -155,29 +146,6 @@ def read_point_positions(path: Path) -> NDArray[np.float64]:
             position = position + np.stack([held[f"{axis}_mm"][...] for axis in "uvw"], axis=-1)
         measured = np.isin(held["status"][...], (PointStatus.OK, PointStatus.EXTRAPOLATED))
     return np.asarray(np.where(measured[..., None], position, np.nan), dtype=np.float64)
-
-
-@dataclass(frozen=True)
-class ViewResiduals:
-    """The residuals of one view of a calibration.
-
-    Attributes
-    ----------
-    found_px, residual_px
-        Rows of lines of pairs: where each intersection was found, and measured minus projected position; None: not
-        found.
-    """
-
-    name: str
-    camera: str
-    dz_mm: float | None
-    held_out: bool
-    rbe_px: float | None
-    raz_mm: float | None
-    nsce: float | None
-    found_px: list[Any]
-    residual_px: list[Any]
-    frame: int | None = None
 
 
 def read_residuals(path: Path) -> list[ViewResiduals]:
@@ -192,25 +160,13 @@ def read_residuals(path: Path) -> list[ViewResiduals]:
 
 
 @dataclass(frozen=True)
-class ProbeValue:
-    """A number, or several, of a point, with its standard and expanded uncertainty; None where it failed."""
-
-    value: Any
-    units: str
-    sigma: float | None = None
-    expanded: float | None = None
-    budget: dict[str, float | None] | None = None
-    not_included: str = ""
-
-
-@dataclass(frozen=True)
 class Place:
     """A point of the grid.
 
     Attributes
     ----------
     row, col
-        Of the point.
+        Indices of the point in the grid.
     distance_px
         From the pixel that was asked for, in camera 1's reference image.
     """
@@ -227,38 +183,18 @@ def nearest_place(x_px: NDArray[Any], y_px: NDArray[Any], at_px: tuple[float, fl
     return Place(row, col, float(distance[row, col]))
 
 
-@dataclass(frozen=True)
-class Probe:
-    """A measurement point with all that is known of it.
-
-    Attributes
-    ----------
-    distance_px
-        From the pixel that was asked for.
-    uncertainty
-        What its uncertainties are, see :class:`server.formats.results.uncertainty.Statement`.
-    """
-
-    row: int
-    col: int
-    distance_px: float
-    status: str
-    values: dict[str, ProbeValue]
-    uncertainty: dict[str, object]
-
-
 def probe_result(path: Path, x_px: float, y_px: float, asked: CoverageFields) -> Probe:
     """Return the point nearest to a pixel; the covariance is left out, it is read as a field."""
     with opened(path) as data:
         statement = Statement(Included.of(data), asked)
-        variables = {name: Variable.of(v) for name, v in data.variables.items() if v.dimensions[:2] == _GRID}
+        variables = {name: FileVariable.of(v) for name, v in data.variables.items() if v.dimensions[:2] == _GRID}
         variables |= {name: derived_variable(data.variables, name) for name in derived_names(data.variables)}
     place = nearest_place(variables["x_px"].values, variables["y_px"].values, (x_px, y_px))
     row, col = place.row, place.col
     budgets = _budgets_at(path, row, col)
 
-    def number(name: str, variable: Variable) -> ProbeValue:
-        value = ProbeValue(_number(variable.values[row, col]), variable.units)
+    def number(name: str, variable: FileVariable) -> ProbeValue:
+        value = ProbeValue(value=_number(variable.values[row, col]), units=variable.units)
         known = variables.get(f"sigma_{name}")
         sigma = None if known is None else _number(known.values[row, col])
         if sigma is None:
@@ -266,7 +202,8 @@ def probe_result(path: Path, x_px: float, y_px: float, asked: CoverageFields) ->
         expanded = statement.k * sigma if statement.expanded else None
         budget = budgets[name].at(0) if name in budgets else None
         lacking = statement.included.lacking
-        return replace(value, sigma=sigma, expanded=expanded, budget=budget, not_included=lacking)
+        more = {"sigma": sigma, "expanded": expanded, "budget": budget, "not_included": lacking}
+        return value.model_copy(update=more)
 
     return Probe(
         row=row,
@@ -274,7 +211,7 @@ def probe_result(path: Path, x_px: float, y_px: float, asked: CoverageFields) ->
         distance_px=place.distance_px,
         status=PointStatus(int(variables["status"].values[row, col])).name.lower(),
         values={n: number(n, v) for n, v in variables.items() if v.values.ndim <= 3 and not n.endswith("covariance")},
-        uncertainty=statement.document(),
+        uncertainty=Uncertainty.model_validate(statement.document()),
     )
 
 

@@ -1,4 +1,4 @@
-"""Comparison of a result with a repetition of it: equal to the last bit, or how far apart over the uncertainty."""
+"""Comparison of a result with a repetition of it: equal to the last bit, or their difference over the uncertainty."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from server.formats.environment import Change, Environment, changes_between
-from server.formats.results.netcdf import opened
+from stereorig.server.formats.environment import Change, Environment, changes_between
+from stereorig.server.formats.results.netcdf import opened
 
 Verdict = Literal["equal", "within", "differs"]
 
 #: largest difference that counts as within, in standard uncertainties: a repetition shares the images and so their
-#: noise; what is left is rounding, thousands of times smaller
+#: noise; only rounding remains, thousands of times smaller
 WITHIN_U = 0.1
-#: attributes that say when and by what a result was made, not what it is
+#: attributes about the origin of a result, not its content
 _ORIGIN = frozenset({"created", "source", "software_version", "environment"})
 #: attributes without which two results are not of the same thing
 _SAME = ("kind", "step", "frame", "settings", "inputs_sha256", "patch")
@@ -32,10 +32,10 @@ class VariableDifference:
     values
         Number of values that are not equal to the last bit.
     largest
-        Largest absolute difference, in ``units``; None where no value is known in both.
+        Largest absolute difference, in ``units``; None if no value is known in both.
     over_u
-        Largest difference over the standard uncertainty that was reported; of an uncertainty itself its relative
-        change; None for what has no uncertainty.
+        Largest difference over the reported standard uncertainty; for an uncertainty itself its relative
+        change; None for variables without an uncertainty.
     unmatched
         Number of values known in one of both results only.
     """
@@ -50,7 +50,7 @@ class VariableDifference:
 
 @dataclass(frozen=True)
 class StepRepetition:
-    """One step beside its repetition.
+    """Comparison of one step with its repetition.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class StepRepetition:
         ``equal``: every variable to the last bit. ``within``: the same points, and every difference at most
         ``WITHIN_U`` of its uncertainty. ``differs``: anything else.
     reasons
-        What makes it differ, in words.
+        Reasons why it differs, in words.
     differences
         Variables that are not equal.
     status_changed
@@ -111,7 +111,7 @@ def compare_results(before: Path, again: Path, n: int) -> StepRepetition:
 
 
 def changes_of(before: Path, again: Path) -> list[Change]:
-    """Return what is different in program, libraries and processor between the writing of two results."""
+    """Return the differences in program, libraries and processor between the writing of two results."""
     with opened(before) as a, opened(again) as b:
         one, two = (Environment.of(_text(data, "environment")) for data in (a, b))
         versions = _text(a, "software_version"), _text(b, "software_version")

@@ -12,13 +12,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from core.names import CAMERAS
-from server.formats.calibrations.in_test import LATER, calibration_in
-from server.formats.files import known_sha256
-from server.formats.results.folder import number_of, results_in
-from server.formats.results.reading import ResultHead
-from server.formats.results.settings import current_step
-from server.store.durable import UnchangedFiles, known_json
+from stereorig.core.names import CAMERAS
+from stereorig.server.formats.calibrations.in_test import LATER, calibration_in
+from stereorig.server.formats.files import sha256_of
+from stereorig.server.formats.manifest import DamagedError
+from stereorig.server.formats.results.folder import number_of, results_in
+from stereorig.server.formats.results.reading import ResultHead
+from stereorig.server.store.durable import UnchangedFiles, known_json
 
 #: checksums of steps, which are asked for again and again while an analysis runs
 _RECORDED = UnchangedFiles(2_000)
@@ -41,7 +41,7 @@ def stale_inputs(
     steps
         By step, by camera, the checksums that the analysis was made with.
     calibration, calibration_sha256
-        The calibration's file, None where it is not known, and its checksum.
+        The calibration's file, None if it is not known, and its checksum.
     reference
         The reference step's number.
     """
@@ -77,7 +77,7 @@ def stale_results(files: Sequence[Path], heads: Sequence[ResultHead], folder: Pa
     heads
         Attributes of each.
     folder
-        Of the measurement, where the files do not lie in it.
+        The measurement's folder, if the files are not in it.
     """
     folder = files[0].absolute().parent if folder is None else folder.absolute()
     summary = known_json(folder / "summary.json", {"steps": _number})
@@ -121,7 +121,7 @@ def _missing_results(folder: Path, summary: dict[str, Any]) -> list[str]:
 
 
 def _number(step: object) -> object:
-    return current_step(step)["n"] if isinstance(step, dict) else None
+    return step.get("n") if isinstance(step, dict) else None
 
 
 def _images(inputs: Mapping[str, str]) -> dict[str, str | None]:
@@ -132,11 +132,11 @@ def _images(inputs: Mapping[str, str]) -> dict[str, str | None]:
 def _changed(path: Path, sha256: str | None, input_name: str) -> list[str]:
     if not path.is_file():
         return [f"{input_name} is gone"]
-    return [] if sha256 is None or known_sha256(path) == sha256 else [f"{input_name} was replaced"]
+    return [] if sha256 is None or sha256_of(path) == sha256 else [f"{input_name} was replaced"]
 
 
 def _file_stat(path: Path) -> os.stat_result | None:
-    """Return what the system knows of a file; None where there is none."""
+    """Return the result of ``stat`` for a regular file; None if there is none."""
     try:
         found = os.stat(path)  # noqa: PTH116 - three of each of some thousand steps
     except OSError:
@@ -145,5 +145,8 @@ def _file_stat(path: Path) -> os.stat_result | None:
 
 
 def _recorded(mark: Path) -> dict[str, object] | None:
-    found = known_json(mark).get("sha256")
+    try:
+        found = known_json(mark).get("sha256")
+    except DamagedError:
+        return None
     return found if isinstance(found, dict) else None

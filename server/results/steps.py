@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,23 +10,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.common.factor import Causes
-from core.errors import FileFormatError, InputError
-from core.field.region.cuts import Cuts, from_arrays
-from core.settings import Coverage, CoverageFields
-from core.status import PointStatus
-from server.base.errors import NotFoundError
-from server.base.long_json import nothing
-from server.formats.results.derived import derived_names
-from server.formats.results.folder import home_of, number_of
-from server.formats.results.netcdf import opened
-from server.formats.results.reading import causes_of
-from server.formats.results.settings import current_inputs, current_settings
-from server.formats.results.uncertainty import Included, Statement
-from server.results.channels import Recorded, recorded_with
-from server.results.reader import Variable, derived_variable
-from server.results.uncertainty import COMMON_FACTOR, as_matrix, in_file, matrix_columns, with_intervals
-from server.store.durable import known_json
+from stereorig.core.common.factor import Causes
+from stereorig.core.errors import FileFormatError, InputError
+from stereorig.core.field.region.cuts import Cuts, from_arrays
+from stereorig.core.settings import Coverage, CoverageFields
+from stereorig.core.status import PointStatus
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.base.long_json import nothing
+from stereorig.server.formats.results.derived import derived_names
+from stereorig.server.formats.results.folder import home_of, number_of
+from stereorig.server.formats.results.netcdf import opened
+from stereorig.server.formats.results.reading import causes_of
+from stereorig.server.formats.results.uncertainty import Included, Statement
+from stereorig.server.results.channels import Recorded, recorded_with
+from stereorig.server.results.reader import FileVariable, derived_variable
+from stereorig.server.results.uncertainty import COMMON_FACTOR, as_matrix, in_file, matrix_columns, with_intervals
+from stereorig.server.store.durable import known_json
 
 ALWAYS = ("x_px", "y_px", "x_mm", "y_mm", "z_mm", "status")
 _GRID = ("row", "col")
@@ -48,15 +46,15 @@ class StepResult:
     cuts
         Cracks and borders of holes.
     included
-        What its uncertainties include.
+        The terms that its uncertainties include.
     causes
-        Of the columns of its common factors; None without any.
+        Cause of each column of its common factors; None without any.
     recorded
-        Channels and time, where the step is one of a test.
+        Channels and time, if the step is one of a test.
     """
 
     n: int
-    variables: dict[str, Variable]
+    variables: dict[str, FileVariable]
     attributes: dict[str, object]
     cuts: Cuts | None
     included: Included
@@ -76,7 +74,7 @@ class StepResult:
 
     @property
     def load_n(self) -> float | None:
-        """Load in newtons; None where it is not known."""
+        """Load in newtons; None if it is not known."""
         if self.recorded.load_n is not None:
             return self.recorded.load_n
         text = self.attributes.get("load_n")
@@ -89,7 +87,7 @@ class StepResult:
 
 
 @dataclass(frozen=True)
-class Source:
+class ExportSource:
     """Results to export, and their provenance.
 
     Attributes
@@ -101,17 +99,18 @@ class Source:
     title
         The test's name.
     image
-        Camera 1's reference image, where it is known.
+        Camera 1's reference image, if it is known.
     about
         Further entries for every export: ids of test, analysis and calibration.
     mask
-        Mask of the points, where there was one.
+        Mask of the points, if there was one.
     stale_reasons
         Inputs that are gone or were replaced since they were measured.
     coverage
-        Of the expanded uncertainties that stand beside the standard ones; one standard uncertainty: none do.
+        Coverage of the expanded uncertainties, which are added to the standard ones unless it is one standard
+        uncertainty.
     home
-        Folder of the results as they were measured, beside whose test's records they stand; None: each file's own.
+        Folder of the results as they were measured, in the folder of the test with its records; None: each file's own.
     """
 
     files: Sequence[Path]
@@ -131,7 +130,7 @@ def failed_steps(folder: Path) -> dict[str, dict[str, Any]]:
     return {n: one for n, one in failed.items() if isinstance(one, dict)} if isinstance(failed, dict) else {}
 
 
-def chosen(source: Source, steps: Sequence[int] | None) -> list[Path]:
+def chosen(source: ExportSource, steps: Sequence[int] | None) -> list[Path]:
     """Return the result files of the steps asked for; all if none are named.
 
     Raises
@@ -168,9 +167,9 @@ def read_step(
     Parameters
     ----------
     path
-        Of the file.
+        The result file.
     names
-        Variables to read; those of ``always`` are read in any case. None: all over the grid of points.
+        Variables to read, and ``always`` in any case. None: all over the grid of points.
     always
         Variables that the form needs: positions and status.
     home
@@ -202,15 +201,13 @@ def _read(path: Path, data: Any, names: Sequence[str] | None, always: Sequence[s
             available=sorted(over_grid),
         )
     wanted = set(over_grid) if names is None else {*always, *names}
-    variables = {name: as_matrix(name, Variable.of(data.variables[name])) for name in over_grid if name in wanted}
+    variables = {name: as_matrix(name, FileVariable.of(data.variables[name])) for name in over_grid if name in wanted}
     variables |= {name: derived_variable(data.variables, name) for name in derived}
     cuts = None
     if "cut_line" in data.variables:
         points = np.stack([np.asarray(data.variables[n][...], dtype=np.float64) for n in ("cut_x_px", "cut_y_px")], 1)
         cuts = from_arrays(points, np.asarray(data.variables["cut_line"][...], dtype=np.int32))
     attributes = {name: _plain(data.getncattr(name)) for name in data.ncattrs()}
-    for name, current in (("settings", current_settings), ("inputs_sha256", current_inputs)):
-        attributes[name] = json.dumps(current(json.loads(str(attributes.get(name, "{}")))))
     n = int(str(attributes.get("step", number_of(path))))
     causes = causes_in(data)
     if causes is not None:
@@ -223,7 +220,7 @@ def _read(path: Path, data: Any, names: Sequence[str] | None, always: Sequence[s
 
 
 def causes_in(data: Any) -> Causes | None:
-    """Return the causes of the columns of an open file's common factors; None where it has none."""
+    """Return the causes of the columns of an open file's common factors; None if it has none."""
     held = data.variables
     return causes_of(held, held[COMMON_FACTOR].shape[-1]) if COMMON_FACTOR in held else None
 
@@ -234,7 +231,7 @@ def _plain(value: object) -> object:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def each(source: Source, steps: Sequence[int] | None, names: Sequence[str] | None = None) -> Iterator[StepResult]:
+def each(source: ExportSource, steps: Sequence[int] | None, names: Sequence[str] | None = None) -> Iterator[StepResult]:
     """Read the chosen steps one after the other; a variable that only some steps have is no error.
 
     Raises
@@ -252,13 +249,13 @@ def each(source: Source, steps: Sequence[int] | None, names: Sequence[str] | Non
         yield with_coverage(read_step(path, wanted, home=source.home), source)
 
 
-def with_coverage(step: StepResult, source: Source) -> StepResult:
+def with_coverage(step: StepResult, source: ExportSource) -> StepResult:
     """Return a step with the expanded uncertainties that its source is asked for."""
     return replace(step, variables=with_intervals(step.variables, step.included, source.coverage))
 
 
-def statement_of(step: StepResult, source: Source) -> Statement:
-    """Return what is stated beside a step's uncertainties."""
+def statement_of(step: StepResult, source: ExportSource) -> Statement:
+    """Return the statement about a step's uncertainties."""
     return Statement(step.included, source.coverage)
 
 
@@ -302,7 +299,7 @@ def require_same_grid(step: StepResult, first: StepResult) -> None:
         )
 
 
-def columns_of(step: StepResult, *, matrices: bool = False) -> dict[str, Variable]:
+def columns_of(step: StepResult, *, matrices: bool = False) -> dict[str, FileVariable]:
     """Return a step's variables with one number a point each: comparisons separate.
 
     Parameters
@@ -310,7 +307,7 @@ def columns_of(step: StepResult, *, matrices: bool = False) -> dict[str, Variabl
     matrices
         Covariances (their upper triangle) and common factors too.
     """
-    flat: dict[str, Variable] = {}
+    flat: dict[str, FileVariable] = {}
     for name, variable in step.variables.items():
         values = variable.values
         entries = matrix_columns(name, variable)

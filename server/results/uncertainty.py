@@ -1,4 +1,4 @@
-"""Uncertainties of a step as exports hold them: expanded ones beside standard ones, matrices as columns."""
+"""Uncertainties of a step as exports hold them: standard and expanded ones, matrices as columns."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from core.settings import CoverageFields
-from server.formats.results.budgets import STRAIN_NAMES
-from server.formats.results.layout import COVARIANCE_NAMES, unpacked
-from server.formats.results.uncertainty import Included, Statement
-from server.results.reader import Variable, read_variable
+from stereorig.core.settings import CoverageFields
+from stereorig.server.formats.results.layout import COVARIANCE_NAMES, unpacked
+from stereorig.server.formats.results.uncertainty import Included, Statement
+from stereorig.server.formats.results.variables import EXPANDED, SIGMA, STRAIN_NAMES
+from stereorig.server.results.reader import FileVariable, read_variable
 
-SIGMA, EXPANDED = "sigma_", "expanded_"
 COMMON_FACTOR, COVARIANCES = "common_factor", ("covariance", "measured_covariance")
 
 
@@ -28,7 +27,7 @@ def in_file(name: str, asked: CoverageFields) -> str:
     return name
 
 
-def read_interval(path: Path, name: str, statement: Statement) -> Variable:
+def read_interval(path: Path, name: str, statement: Statement) -> FileVariable:
     """Read one variable; ``expanded_NAME`` as the statement's interval.
 
     Raises
@@ -43,13 +42,15 @@ def read_interval(path: Path, name: str, statement: Statement) -> Variable:
     return read if of_file == name else read_variable(path, name)
 
 
-def with_intervals(variables: dict[str, Variable], included: Included, asked: CoverageFields) -> dict[str, Variable]:
-    """Return variables with the expanded uncertainty beside each standard one, where one is asked for.
+def with_intervals(
+    variables: dict[str, FileVariable], included: Included, asked: CoverageFields
+) -> dict[str, FileVariable]:
+    """Return variables with the expanded uncertainty after each standard one, if one is asked for.
 
-    ``expanded_NAME`` is k times ``sigma_NAME``. The meaning of both says what they include.
+    ``expanded_NAME`` is k times ``sigma_NAME``. The meaning of both states the terms that they include.
     """
     statement = Statement(included, asked)
-    out: dict[str, Variable] = {}
+    out: dict[str, FileVariable] = {}
     for name, variable in variables.items():
         if not name.startswith(SIGMA):
             out[name] = variable
@@ -63,7 +64,7 @@ def with_intervals(variables: dict[str, Variable], included: Included, asked: Co
     return out
 
 
-def as_matrix(name: str, variable: Variable) -> Variable:
+def as_matrix(name: str, variable: FileVariable) -> FileVariable:
     """Return a covariance that its file holds as packed triangles as (r, c, n, n) matrices; other variables as is."""
     values = variable.values
     n = len(COVARIANCE_NAMES)
@@ -72,13 +73,13 @@ def as_matrix(name: str, variable: Variable) -> Variable:
     return replace(variable, values=unpacked(values, n).astype(values.dtype), dimensions=("row", "col", "i", "j"))
 
 
-def matrix_columns(name: str, variable: Variable) -> dict[str, Variable] | None:
+def matrix_columns(name: str, variable: FileVariable) -> dict[str, FileVariable] | None:
     """Return the entries of a covariance's upper triangle, or of a common factor, by name; None for other variables.
 
     Parameters
     ----------
     name
-        Of the variable in the result file.
+        Name of the variable in the result file.
     variable
         (r, c, n, n) covariance, or packed with the names of its parts; (r, c, n, k) factor.
     """
@@ -108,7 +109,9 @@ def _numbered(causes: Sequence[str], count: int) -> list[str]:
     return [f"{cause}_{k + 1}" for k, cause in enumerate(named)]
 
 
-def _columns(name: str, variable: Variable, values: NDArray[np.floating], each: Sequence[str]) -> dict[str, Variable]:
+def _columns(
+    name: str, variable: FileVariable, values: NDArray[np.floating], each: Sequence[str]
+) -> dict[str, FileVariable]:
     return {
         f"{name}_{one}": replace(variable, values=values[..., k], long_name=f"{variable.long_name}: {one}", parts=())
         for k, one in enumerate(each)

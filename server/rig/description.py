@@ -1,23 +1,33 @@
-"""Descriptions of the rig, its cameras and its stage: the API's replies, and what records keep of them.
+"""Descriptions of the rig, its cameras and its stage: the API's replies, and the parts that records keep of them.
 
-A device's own fields are declared by its driver's classes (`drivers.cameras.protocol`, `drivers.stages.protocol`).
+A device's own fields are declared by its driver's classes (`stereorig.drivers.cameras.protocol`,
+`stereorig.drivers.stages.protocol`).
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict
+from datetime import UTC, datetime
 from typing import Literal
 
 from pydantic import ConfigDict, Field
 
-from core.names import CameraName
-from drivers.cameras.protocol import CameraDescription, CameraIdentity, CameraSettings
-from drivers.stages.protocol import AxisDynamics, AxisIdentity, AxisLimits, AxisStatus, ControllerMessage, StageIdentity
-from server.base.models import Document, Reply, Reported
-from server.base.problem import JobProblem
-from server.config.camera_metadata import CameraMetadata
-from server.config.rig_file import CalibrationSection, CameraSection, TargetSection
-from server.jobs.hardware import Holder
+from stereorig.core.names import CameraName
+from stereorig.drivers.cameras.protocol import CameraDescription, CameraIdentity, CameraSettings
+from stereorig.drivers.stages.controllers import ControllerStatus, DeviceState
+from stereorig.drivers.stages.protocol import (
+    AxisDynamics,
+    AxisIdentity,
+    AxisLimits,
+    AxisStatus,
+    ControllerMessage,
+    StageIdentity,
+)
+from stereorig.server.base.models import Document, Reply, Reported
+from stereorig.server.base.problem import JobProblem, problem_of
+from stereorig.server.config.camera_metadata import CameraMetadata
+from stereorig.server.config.rig_file import CalibrationSection, CameraSection, TargetSection
+from stereorig.server.jobs.hardware import Holder
 
 # the rig file ------------------------------------------------------------------------------------------------------
 
@@ -44,11 +54,11 @@ class UsualPlan(CalibrationSection):
 
 
 class CameraDevice(Reported, CameraDescription):
-    """Identity and capabilities of a camera, as it reports them; ranges are null where it has no such setting."""
+    """Identity and capabilities of a camera, as it reports them; ranges are null if it has no such setting."""
 
 
 class CameraSettingsReply(Reported, CameraSettings):
-    """Settings as read back from a camera; null where it has no such setting."""
+    """Settings as read back from a camera; null if it has no such setting."""
 
 
 class CameraReply(Reply):
@@ -61,6 +71,12 @@ class CameraReply(Reply):
     )
     settings: CameraSettingsReply | None = Field(description="Its settings as read back; null while not connected.")
     fault: JobProblem | None = Field(None, description="Fault that keeps it from being used; null: none.")
+    state: DeviceState | None = Field(
+        None,
+        description="`looked_for`: it was not found yet; `lost`: it was, and is looked for again; null while the rig "
+        "is not open.",
+    )
+    since_utc: str | None = Field(None, description="Beginning of this state.")
     reconnections: int = Field(0, description="Number of times that it was lost and connected again.")
 
 
@@ -94,14 +110,30 @@ class StageIdentityReply(Reported, StageIdentity):
     axes: tuple[AxisIdentityReply, ...] = Field(description="The controller of each axis.")
 
 
+class ControllerReply(Reply):
+    """Connection of one motion controller."""
+
+    driver: str = Field(description="Protocol.", examples=["conex-cc"])
+    url: str = Field(description="Port or address that it is reached at; `sim`: it is simulated.")
+    axes: list[int] = Field(description="Axes that it moves.")
+    state: DeviceState = Field(
+        description="`looked_for`: it was not found yet; `lost`: it was, and is looked for again."
+    )
+    since_utc: str = Field(description="Beginning of this state.")
+    fault: JobProblem | None = Field(description="Reason why it cannot be used; null: none.")
+
+
 class StageReply(Reply):
     """The stage."""
 
-    driver: str = Field(description="Protocol of the controller.", examples=["esp301"])
+    driver: str | None = Field(description="Protocol of the controller; null without a stage.", examples=["esp301"])
     identity: StageIdentityReply | None = Field(
         description="Identity of the controller; null while it does not answer."
     )
-    axes: list[AxisReply] = Field(description="Every axis; empty while the controller does not answer.")
+    axes: list[AxisReply] = Field(description="Every axis whose controller answers.")
+    controllers: list[ControllerReply] = Field(
+        description="Connection of each controller; empty without a stage, and while the rig is not open."
+    )
     zero_mm: float = Field(description="Position of dZ = 0 of axes that have none of their own.")
     fault: JobProblem | None = Field(description="Fault that keeps it from being used; null: none.")
 
@@ -129,12 +161,13 @@ class RigReply(Reply):
     name: str = Field(description="Name of the rig.")
     description: str = Field(description="Free text of the rig file.")
     sim: bool = Field(description="True if it is a simulated rig.")
-    connected: bool = Field(description="True if cameras and stage are open.")
+    simulated: list[Literal["cam1", "cam2", "stage"]] = Field(description="Its simulated devices.")
+    connected: bool = Field(description="True if cameras and stage were found; one that was lost since has a fault.")
     fault: JobProblem | None = Field(description="Fault that keeps the rig from being used; null: none.")
     holder: Holder | None = Field(description="Holder of the hardware; null: it is free.")
     scene: SceneReply | None = Field(description="Scene of a simulated rig; null on a real one.")
-    trigger: Literal["free", "software", "hardware"] = Field(description="Source that starts the exposures.")
-    max_skew_ms: float = Field(description="A pair whose exposures began further apart is refused.")
+    trigger: Literal["free", "software", "hardware", "action"] = Field(description="Source that starts the exposures.")
+    max_skew_ms: float = Field(description="A pair whose exposures began at a larger distance is refused.")
     target: NominalTarget = Field(description="The grid.")
     calibration_plan: UsualPlan = Field(description="The usual plan of a calibration.")
     cameras: dict[CameraName, CameraReply] = Field(description="Both cameras, by name.")
@@ -143,7 +176,7 @@ class RigReply(Reply):
 
 # records -----------------------------------------------------------------------------------------------------------
 
-#: of the settings, what a step's record keeps
+#: settings that a step's record keeps
 _KEPT_SETTINGS = ("exposure_ms", "gain_db", "frame_rate_hz", "pixel_format")
 
 
@@ -163,13 +196,30 @@ class RigKept(Document):
     cameras: dict[CameraName, CameraKept]
 
 
+def controller_reply(status: ControllerStatus) -> ControllerReply:
+    """Return the reply of a controller's connection."""
+    return ControllerReply(
+        driver=status.driver,
+        url=status.url,
+        axes=list(status.axes),
+        state=status.state,
+        since_utc=utc_of(status.since_s),
+        fault=None if status.fault is None else problem_of(status.fault),
+    )
+
+
+def utc_of(unix_s: float) -> str:
+    """Return a time as the API shows times."""
+    return datetime.fromtimestamp(unix_s, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
 def identity_of(description: CameraDescription) -> dict[str, str]:
-    """Return who a camera is, for the records of what it took."""
+    """Return a camera's identity, for the records of its images."""
     return {name: getattr(description, name) for name in CameraIdentity.__dataclass_fields__}
 
 
 def kept_camera(settings: CameraSettings, metadata: CameraMetadata) -> CameraKept:
-    """Return what a step's record keeps of a camera; a fact that was not stated is not there."""
+    """Return the part of a camera's settings and metadata that a step's record keeps; without facts not stated."""
     has = asdict(settings)
     stated = metadata.model_dump(mode="json", exclude_none=True)
     return CameraKept.model_validate({**{name: has[name] for name in _KEPT_SETTINGS}, **stated})

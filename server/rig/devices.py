@@ -1,6 +1,6 @@
 """Devices connected to this machine: cameras by every driver, serial ports, and the faults of each.
 
-Each driver looks in a thread of its own and within a time limit, so that one that hangs or misses a library spoils
+Each driver searches in a thread of its own and within a time limit, so that one that hangs or lacks a library spoils
 nothing but its own part of the list. Nothing is opened, and no byte goes to a serial port: a device that no file names
 may be anything.
 """
@@ -16,15 +16,15 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from core.errors import StereorigError
-from core.names import CAMERAS
-from drivers.cameras.protocol import FoundDevice
-from drivers.registry import CAMERA_DRIVERS, discover_cameras
-from drivers.stages.serial_ports import discover_ports
-from server.base.models import always_there
-from server.rig import Rig
+from stereorig.core.errors import StereorigError
+from stereorig.core.names import CAMERAS
+from stereorig.drivers.cameras.protocol import FoundDevice
+from stereorig.drivers.registry import CAMERA_DRIVERS, discover_cameras
+from stereorig.drivers.stages.serial_ports import discover_ports
+from stereorig.server.base.models import always_there
+from stereorig.server.rig.rig import Rig
 
-#: name of the search for serial ports among those of the camera drivers
+#: name of the search for serial ports, in addition to the camera drivers' names
 SERIAL = "serial"
 
 
@@ -49,7 +49,7 @@ class DriverState(_Closed):
     )
     found: int = Field(description="Number of devices found.")
     problem: str | None = Field(description="Error of the search; null if there was none.")
-    remedy: str | None = Field(description="Remedy, such as what to install.")
+    remedy: str | None = Field(description="Remedy, such as packages to install.")
 
 
 class DeviceListing(_Closed):
@@ -73,15 +73,15 @@ class HeldDevice:
 
 
 def held_by(rig: Rig) -> list[HeldDevice]:
-    """Say what a running rig has open, without asking any device."""
-    if rig.fault is not None:
+    """Return the devices that a running rig has open, without asking any device."""
+    if not rig.is_open:
         return []
     held = []
     for cam in CAMERAS:
         section, shown = rig.config.camera(cam), rig.describe_camera(cam)
         device = shown.device
-        if device is None:  # closed in between
-            return []
+        if device is None:  # it was not found yet
+            continue
         fault = shown.fault
         held.append(
             HeldDevice(
@@ -90,11 +90,11 @@ def held_by(rig: Rig) -> list[HeldDevice]:
                 section.device or cam,
                 device.model,
                 device.serial,
-                None if fault is None else f"{fault.cause} {fault.remedy}".strip(),
+                None if fault is None else f"{fault.detail} {fault.remedy}".strip(),
             )
         )
-    held.append(HeldDevice("stage", SERIAL, rig.config.stage.url))
-    return held
+    stage = rig.config.stage
+    return held + [HeldDevice("stage", SERIAL, line.url) for line in (stage.lines(rig.config.axes) if stage else [])]
 
 
 class _Search:
@@ -113,7 +113,7 @@ class _Search:
     def _run(self) -> None:
         try:
             self._found = list(self._find())
-        except Exception as error:  # noqa: BLE001  # whatever a driver brings up is its own part of the list
+        except Exception as error:  # noqa: BLE001  # any error of a driver concerns its own part of the list alone
             self._error = error
         finally:
             self.done.set()
@@ -133,7 +133,7 @@ class _Search:
             return [], DriverState(name=self.name, state=state, found=0, problem=error.cause, remedy=error.remedy)
         problem = f"{type(error).__name__}: {error}"
         if isinstance(error, ImportError):
-            remedy = "Install what the message names."
+            remedy = "Install the package that the message names."
             return [], DriverState(name=self.name, state="missing", found=0, problem=problem, remedy=remedy)
         return [], DriverState(
             name=self.name, state="failed", found=0, problem=problem, remedy="Report this with the message above."
@@ -165,7 +165,7 @@ class DeviceFinder:
         self._searches: dict[str, _Search] = {}
 
     def find(self, *, timeout_s: float = 5.0, held: Iterable[HeldDevice] = ()) -> DeviceListing:
-        """List everything that shows itself within ``timeout_s`` seconds; ``held`` is what this service uses."""
+        """List every device found within ``timeout_s`` seconds; ``held`` are the devices that this service uses."""
         deadline = time.monotonic() + timeout_s
         with self._lock:
             searches = [self._search(name) for name in (*self._drivers, SERIAL)]
@@ -211,7 +211,7 @@ def _same_path(one: str, two: str) -> bool:
 
 
 def _listed(found: FoundDevice, holder: HeldDevice | None) -> ListedDevice:
-    # a driver that finds the camera in use cannot tell this service from another program
+    # a driver that finds the camera in use cannot distinguish this service from another program
     problem = found.problem if holder is None else holder.problem
     in_use_by = None if holder is None else holder.name
     return ListedDevice.model_validate(vars(found) | {"problem": problem, "in_use_by": in_use_by})

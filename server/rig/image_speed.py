@@ -6,11 +6,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from drivers.cameras.protocol import Frame, Pixels
+from stereorig.drivers.cameras.protocol import Frame
 
-_WINDOW_PX = 512
 # Below it the peak of the correlation is one of many
 _MIN_RESPONSE = 0.05
 _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-4)
@@ -31,12 +29,12 @@ class ImageMotion:
         return self.distance_px / self.seconds
 
     def within_px(self, skew_ms: float) -> float:
-        """Return how far it surely moved within a skew: what the noise of two frames can feign is taken off."""
+        """Return the least motion within a skew: the motion that the noise of two frames can feign is subtracted."""
         return max(0.0, self.distance_px - _NOISE_PX) * abs(skew_ms) / 1000.0 / self.seconds
 
 
 def image_motion(first: Frame, last: Frame) -> ImageMotion | None:
-    """Motion of the middle of the image between two exposures of one camera.
+    """Motion between two exposures of one camera, from the middle of its image.
 
     Returns
     -------
@@ -46,7 +44,7 @@ def image_motion(first: Frame, last: Frame) -> ImageMotion | None:
     seconds = (last.device_ns - first.device_ns) / 1e9
     if seconds <= 0.0 or first.pixels.shape != last.pixels.shape:
         return None
-    one, two = _middle(first.pixels), _middle(last.pixels)
+    one, two = (frame.pixels.astype(np.float32) for frame in (first, last))
     window = cv2.createHanningWindow((one.shape[1], one.shape[0]), cv2.CV_32F)
     (dx, dy), response = cv2.phaseCorrelate(one, two, window)
     if not response > _MIN_RESPONSE:
@@ -59,10 +57,3 @@ def image_motion(first: Frame, last: Frame) -> ImageMotion | None:
     except cv2.error:
         return None
     return ImageMotion(float(np.hypot(warp[0, 2], warp[1, 2])), seconds)
-
-
-def _middle(pixels: Pixels) -> NDArray[np.float32]:
-    rows, columns = pixels.shape
-    height, width = min(rows, _WINDOW_PX), min(columns, _WINDOW_PX)
-    top, left = (rows - height) // 2, (columns - width) // 2
-    return np.ascontiguousarray(pixels[top : top + height, left : left + width], dtype=np.float32)

@@ -43,7 +43,7 @@ class SharedReading(Generic[T]):
             value, error = self._last
         if error is not None:
             raise error
-        return value  # type: ignore[return-value]  # there is a value where there is no error
+        return value  # type: ignore[return-value]  # without an error there is a value
 
     def _take(self) -> None:
         taken: tuple[T, None] | tuple[None, BaseException]

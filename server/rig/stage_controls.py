@@ -1,4 +1,4 @@
-"""Operations of a stage besides motion: motors, velocities, messages, abort, the configuration state."""
+"""Operations of a stage other than motion: motors, velocities, messages, abort, the configuration state."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict
 
-from core.errors import DeviceError
-from drivers.stages.protocol import AxisState, Stage
-from server.rig.description import DynamicsReply, StageMessage
-from server.store.folder import now_utc
+from stereorig.core.errors import DeviceError
+from stereorig.drivers.stages.protocol import AxisState, Stage
+from stereorig.server.rig.description import DynamicsReply, StageMessage
+from stereorig.server.store.folder import now_utc
 
 _log = logging.getLogger("stereorig.rig")
 _KEPT = 200
@@ -52,7 +52,7 @@ class StageControls:
         return DynamicsReply.model_validate(asdict(self._stage().dynamics(axis)))
 
     def set_dynamics(self, axis: int, velocity_mm_s: float | None, acceleration_mm_s2: float | None) -> DynamicsReply:
-        """Set velocity, acceleration or both and return what was read back; on the owner thread, with the hold."""
+        """Set velocity, acceleration or both and return the values read back; on the owner thread, with the hold."""
         taken = self._stage().set_dynamics(axis, velocity_mm_s=velocity_mm_s, acceleration_mm_s2=acceleration_mm_s2)
         velocity, acceleration = self.dynamics.get(axis, (None, None))
         self.dynamics[axis] = (
@@ -71,7 +71,7 @@ class StageControls:
         return tuple(axis for axis in axes if stage.state(axis).state is AxisState.CONFIGURATION)
 
     def collect(self, stage: Stage, *, ask: bool = True) -> None:
-        """Take over what the controller had to say."""
+        """Read the controller's messages, log and keep them."""
         with self._collecting:
             for message in stage.errors(ask=ask):
                 _log.warning("stage, axis %s: %s (%s)", message.axis or "-", message.text, message.code)

@@ -39,9 +39,11 @@ async function open() {
   if (here.screen === "jobs") jobsLink.setAttribute("aria-current", "page");
   else jobsLink.removeAttribute("aria-current");
   document.title = `${SCREENS[here.screen][0]} · stereorig`;
-  // what was said or asked on another screen does not belong to this one
+  // notes and questions of another screen do not belong to this one
   if (here.screen !== shown) for (const old of part("notices").querySelectorAll(".notice.bad")) old.remove();
-  for (const dialog of document.querySelectorAll("dialog[open]:not([data-stays])")) /** @type {HTMLDialogElement} */ (dialog).dispatchEvent(new Event("cancel", { cancelable: true }));
+  for (const dialog of /** @type {NodeListOf<HTMLDialogElement>} */ (document.querySelectorAll("dialog[open]:not([data-stays])"))) {
+    dialog.dispatchEvent(new Event("cancel", { cancelable: true }));
+  }
   shown = here.screen;
   leave?.();
   leave = null;
@@ -68,7 +70,10 @@ async function stop() {
   stopButton.textContent = "STOPPING …";
   try {
     const answer = await api.post("/stage:stop");
-    notify(`The stop command was sent after ${num(answer.elapsed_ms, 3)} ms.${answer.cancelled_job ? " The job that moved the axis was cancelled." : ""}`, "good");
+    notify(
+      `The stop command was sent after ${num(answer.elapsed_ms, 3)} ms.${answer.cancelled_job ? " The job that moved the axis was cancelled." : ""}`,
+      "good",
+    );
   } catch (error) {
     notify(error);
   } finally {
@@ -86,7 +91,7 @@ const lost = h("div.banner", { hidden: true, role: "alert" });
 
 const dark = matchMedia("(prefers-color-scheme: dark)");
 function theme() {
-  // the first press always changes what is seen; the third goes back to the system's colours
+  // the first press always changes the colours; the third goes back to the system's colours
   const order = dark.matches ? ["", "light", "dark"] : ["", "dark", "light"];
   const now = document.documentElement.dataset.theme ?? "";
   const next = order[(order.indexOf(now) + 1) % 3];
@@ -111,11 +116,12 @@ function drawBar() {
 
 let escaped = -Infinity;
 // in the capture phase: the stop works wherever the focus is, in a drawing or a dialog too
-window.addEventListener("keydown", (event) => {
+const twice = (/** @type {KeyboardEvent} */ event) => {
   if (event.key !== "Escape") return;
   if (event.timeStamp - escaped < 1500) stop();
   escaped = event.timeStamp;
-}, true);
+};
+window.addEventListener("keydown", twice, true);
 window.addEventListener("stopstage", stop);
 
 const KEYS = [
@@ -140,7 +146,9 @@ const KEYS = [
 ];
 function showKeys() {
   const rows = KEYS.map(([keys, what]) => (what ? h("tr", h("td", h("kbd", keys)), h("td", what)) : h("tr", h("th", { colspan: 2, scope: "rowgroup" }, keys))));
-  return ask("Keys", h("div.scroll", { tabindex: 0, role: "region", "aria-label": "Keys and what they do" }, h("table.keys", h("tbody", rows))), [["Close", null]]);
+  return ask("Keys", h("div.scroll", { tabindex: 0, role: "region", "aria-label": "Keys and their actions" }, h("table.keys", h("tbody", rows))), [
+    ["Close", null],
+  ]);
 }
 const keysButton = h("button.plain", { type: "button", onclick: showKeys, "aria-label": "Keys", title: "Keys" }, "⌨");
 
@@ -158,7 +166,7 @@ function showJobs() {
   const share = total ? ` ${Math.floor((100 * done) / total)} %` : "";
   jobText.hidden = false;
   const text = `${job.kind}: ${stage ?? job.state}${share}${jobs.length > 1 ? ` (+${jobs.length - 1})` : ""}`;
-  jobText.title = text; // its end is cut off where there is little room
+  jobText.title = text; // its end is cut off if there is little room
   replace(jobText, badge(text, "busy"));
 }
 
@@ -189,7 +197,7 @@ async function showStage() {
     stageText.textContent = (stage.axes ?? [])
       .map((axis) => `${axis.cameras?.join("+") || `axis ${axis.axis}`} ${num(axis.position_mm, 5)} mm${axis.moving ? " ▸" : ""}`)
       .join("  ");
-    stageText.title = stage.fault ? stage.fault.cause ?? String(stage.fault) : "Stage position";
+    stageText.title = stage.fault ? stage.fault.detail : "Stage position";
   } catch {
     stageText.textContent = "stage: unknown";
   }
@@ -201,22 +209,32 @@ async function askForKey() {
   asking = true;
   const input = h("input", { type: "password", autocomplete: "current-password", required: true });
   const problem = h("div");
-  const dialog = h("dialog", { "aria-label": "Log in", "data-stays": true },
-    h("form", { method: "dialog", onsubmit: async (event) => {
-      event.preventDefault();
-      try {
-        await api.login(input.value.trim());
-        dialog.close();
-        asking = false;
-        begin();
-      } catch (error) {
-        replace(problem, problemText(error));
-      }
-    } },
-    h("h2", "This service requires a key"),
-    h("p.quiet", "An administrator makes one with ", h("code", "stereorig keys add NAME --role operator"), "."),
-    field("Key", input), problem,
-    h("div.row.end", h("button.primary", { type: "submit" }, "Log in"))));
+  const dialog = h(
+    "dialog",
+    { "aria-label": "Log in", "data-stays": true },
+    h(
+      "form",
+      {
+        method: "dialog",
+        onsubmit: async (event) => {
+          event.preventDefault();
+          try {
+            await api.login(input.value.trim());
+            dialog.close();
+            asking = false;
+            begin();
+          } catch (error) {
+            replace(problem, problemText(error));
+          }
+        },
+      },
+      h("h2", "This service requires a key"),
+      h("p.quiet", "An administrator makes one with ", h("code", "stereorig keys add NAME --role operator"), "."),
+      field("Key", input),
+      problem,
+      h("div.row.end", h("button.primary", { type: "submit" }, "Log in")),
+    ),
+  );
   dialog.addEventListener("cancel", (event) => event.preventDefault());
   modal(dialog, input);
 }
@@ -224,8 +242,14 @@ async function askForKey() {
 api.onConnection((state) => {
   if (state === "login") askForKey();
   lost.hidden = state !== "down";
-  if (state === "down") lost.textContent = "The service does not answer. The values shown may be out of date; the page continues by itself once the service answers.";
+  if (state === "down")
+    lost.textContent = "The service does not answer. The values shown may be out of date; the page continues by itself once the service answers.";
 });
+
+async function logOut() {
+  await api.remove("/session");
+  location.reload();
+}
 
 /** @type {number | undefined} */
 let ticking;
@@ -241,7 +265,7 @@ async function begin() {
     return;
   }
   if (who.name === "local") person.replaceChildren();
-  else replace(person, `${who.name} (${who.role}) `, h("button.plain", { type: "button", title: "Log out", onclick: async () => { await api.remove("/session"); location.reload(); } }, "⏏"));
+  else replace(person, `${who.name} (${who.role}) `, h("button.plain", { type: "button", title: "Log out", onclick: logOut }, "⏏"));
   events.start();
   clearInterval(ticking);
   ticking = setInterval(showStage, 1000);

@@ -6,9 +6,11 @@ calibrations, tests, steps and analyses can be lost at any time; it is rebuilt f
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import logging
+import os
 import queue
 import sqlite3
 import threading
@@ -17,15 +19,22 @@ from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from core.errors import StorageError
-from server.base.models import Ids
-from server.store.documents import JobRecord
+from stereorig.core.errors import StorageError
+from stereorig.server.base.models import Ids
+from stereorig.server.documents.jobs import JobRecord
+from stereorig.server.formats.manifest import kept
+from stereorig.server.store.reserved import Reserve
 
 T = TypeVar("T")
 #: kind, parent, id, document
 Entry = tuple[str, str, str, Mapping[str, object]]
 _log = logging.getLogger("stereorig.store")
 _PATIENCE_S = 30.0
+# on a full disk the stage must still move, and each move is on disk before it is acknowledged: the log of SQLite is
+# begun again after so many pages, for which it has disk, and the file has disk for some hundred further jobs
+_LOG_PAGES = 100
+_LOG_BYTES = 512 * 2**10
+_AHEAD_BYTES = 256 * 2**10
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS jobs (
     id TEXT PRIMARY KEY, state TEXT NOT NULL, document TEXT NOT NULL
@@ -37,6 +46,7 @@ CREATE TABLE IF NOT EXISTS entries (
     kind TEXT NOT NULL, parent TEXT NOT NULL, id TEXT NOT NULL, document TEXT NOT NULL, PRIMARY KEY (kind, parent, id)
 );
 CREATE TABLE IF NOT EXISTS counters (name TEXT PRIMARY KEY, value INTEGER NOT NULL);
+CREATE TABLE IF NOT EXISTS manifests (home TEXT PRIMARY KEY, number INTEGER NOT NULL, sha256 TEXT NOT NULL);
 CREATE INDEX IF NOT EXISTS jobs_by_state ON jobs (state);
 """
 
@@ -44,8 +54,8 @@ CREATE INDEX IF NOT EXISTS jobs_by_state ON jobs (state);
 class Catalog:
     """``catalog.sqlite`` with its one writer thread.
 
-    A file that SQLite cannot read is quarantined (``catalog.corrupt-<n>.sqlite``) and begun anew; ``was_reset`` is then
-    True.
+    A file that SQLite cannot read is quarantined (``catalog.corrupt-<n>.sqlite``) and replaced by an empty one;
+    ``was_reset`` is then True.
     """
 
     def __init__(self, path: Path) -> None:
@@ -58,6 +68,8 @@ class Catalog:
         self.write_failed = False
         #: called with a test's id before its steps or analyses are listed, so that the index is right about them
         self.before_parts: Callable[[str], None] | None = None
+        #: numbers and checksums of the newest manifests, by their folders: they go with the next transaction
+        self.unsettled: dict[str, tuple[int, str]] = {}
         self._sound = False
         self._opened: Future[None] = Future()
         self._thread = threading.Thread(target=self._run, name="catalog", daemon=True)
@@ -73,11 +85,13 @@ class Catalog:
         Raises
         ------
         StorageError
-            If it cannot be opened, nor begun anew.
+            If it can be neither opened nor replaced.
         """
         self._sound = sound
         self._thread.start()
         self._opened.result()
+        rows = self.transact(lambda c: c.execute("SELECT home, number, sha256 FROM manifests").fetchall())
+        kept.anchors.update({self.path.parent / home: (number, sha256) for home, number, sha256 in rows})
         return self
 
     def _open(self) -> sqlite3.Connection:
@@ -85,6 +99,7 @@ class Catalog:
         try:
             connection.execute("PRAGMA journal_mode=WAL")
             connection.execute("PRAGMA synchronous=FULL")
+            connection.execute(f"PRAGMA wal_autocheckpoint={_LOG_PAGES}")
             if not self._sound and connection.execute("PRAGMA quick_check").fetchone()[0] != "ok":
                 raise sqlite3.DatabaseError("quick_check failed")
             connection.executescript(_SCHEMA)
@@ -110,6 +125,7 @@ class Catalog:
         except (sqlite3.Error, OSError) as error:
             self._opened.set_exception(StorageError(f"The catalogue cannot be opened: {error}."))
             return
+        files, reserve = self._reserves()
         self._opened.set_result(None)
         while (item := self._work.get()) is not None:
             function, future = item
@@ -117,7 +133,12 @@ class Catalog:
                 connection.execute("BEGIN IMMEDIATE")
                 try:
                     result = function(connection)
+                    newest = dict(self.unsettled)
+                    rows = [(home, *manifest) for home, manifest in newest.items()]
+                    connection.executemany("INSERT OR REPLACE INTO manifests VALUES (?, ?, ?)", rows)
                     connection.execute("COMMIT")
+                    for home in [one for one, manifest in newest.items() if self.unsettled.get(one) == manifest]:
+                        del self.unsettled[home]
                 except BaseException:
                     # a full disk ends a transaction by itself, or leaves it open at its commit
                     if connection.in_transaction:
@@ -133,7 +154,23 @@ class Catalog:
                 future.set_exception(error)
             else:
                 future.set_result(result)
+                if reserve is not None:
+                    reserve.renew()
         connection.close()
+        for file in files:  # not before: a process that closes a file gives up every lock that it has on it
+            os.close(file)
+
+    def _reserves(self) -> tuple[list[int], Reserve | None]:
+        """Hold disk ahead of the file's end and of its log's; return the open files, and the reserve to be renewed."""
+        files: list[int] = []
+        try:
+            for path in (self.path.with_name(f"{self.path.name}-wal"), self.path):
+                files.append(os.open(path, os.O_WRONLY | os.O_CLOEXEC))
+            Reserve(files[0], _LOG_BYTES)
+            return files, Reserve(files[1], _AHEAD_BYTES)
+        except OSError as error:
+            _log.warning("the catalogue has no disk in reserve: %s", error.strerror)
+            return files, None
 
     def transact(self, function: Callable[[sqlite3.Connection], T]) -> T:
         """Run ``function`` in a transaction on the writer thread, and wait for its commit."""
@@ -153,6 +190,9 @@ class Catalog:
 
     def close(self) -> None:
         """Finish the queue and close."""
+        if self.unsettled and self.alive:
+            with contextlib.suppress(StorageError):  # the manifests are newer than the record, which is no damage
+                self.transact(lambda _: None)
         self._work.put(None)
         self._thread.join(timeout=30.0)
 
@@ -212,10 +252,12 @@ class Catalog:
 
     def put_entry(self, kind: str, parent: str, entry_id: str, document: Mapping[str, object]) -> None:
         """Insert or update an index entry (``calibration``, ``test``, ``step``, ``analysis``)."""
-        text = json.dumps(document)
-        self.transact(
-            lambda c: c.execute("INSERT OR REPLACE INTO entries VALUES (?, ?, ?, ?)", (kind, parent, entry_id, text))
-        )
+        self.put_entries(kind, parent, {entry_id: document})
+
+    def put_entries(self, kind: str, parent: str, documents: Mapping[str, Mapping[str, object]]) -> None:
+        """Insert or update index entries of a kind by their ids, in one transaction."""
+        rows = [(kind, parent, entry_id, json.dumps(document)) for entry_id, document in documents.items()]
+        self.transact(lambda c: c.executemany("INSERT OR REPLACE INTO entries VALUES (?, ?, ?, ?)", rows))
 
     def entries(
         self, kind: str, parent: str = "", *, after: str | None = None, limit: int | None = None
@@ -227,7 +269,7 @@ class Catalog:
         return [json.loads(row[0]) for row in rows]
 
     def entry(self, kind: str, parent: str, entry_id: str) -> dict[str, object] | None:
-        """Return one index entry; None where there is none."""
+        """Return one index entry; None if there is none."""
         self._complete(parent)
         query = "SELECT document FROM entries WHERE kind = ? AND parent = ? AND id = ?"
         row = self.transact(lambda c: c.execute(query, (kind, parent, entry_id)).fetchone())
@@ -240,7 +282,7 @@ class Catalog:
         return int(self.transact(lambda c: c.execute(query, (kind, parent)).fetchone()[0]))
 
     def last_entry(self, kind: str, parent: str = "") -> dict[str, object] | None:
-        """Return the index entry with the largest id; None where there is none."""
+        """Return the index entry with the largest id; None if there is none."""
         self._complete(parent)
         query = "SELECT document FROM entries WHERE kind = ? AND parent = ? ORDER BY id DESC LIMIT 1"
         row = self.transact(lambda c: c.execute(query, (kind, parent)).fetchone())
@@ -265,7 +307,7 @@ class Catalog:
         self.transact(write)
 
     def replace_tests(self, calibrations: list[Entry], tests: list[Entry], *, gone: set[str]) -> list[str]:
-        """Make the index hold exactly these calibrations, and these tests beside those that it has.
+        """Make the index hold exactly these calibrations; replace or add these tests, and keep the others.
 
         ``gone``: tests that it holds no longer. Returns the differences found.
         """

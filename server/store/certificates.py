@@ -1,6 +1,6 @@
 """Certificates on disk: a folder each with the page, and ``certificate.json`` as the last file, which makes it one.
 
-What a certificate rests on is protected from deletion until it is withdrawn; it is itself never changed or removed.
+The inputs of a certificate cannot be deleted until it is withdrawn; it is itself never changed or removed.
 """
 
 from __future__ import annotations
@@ -10,19 +10,19 @@ import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from core.errors import FileFormatError, StateError
-from server.base.errors import NotFoundError
-from server.formats.files import require_recorded
-from server.store.documents import CertificateRecord
-from server.store.durable import known_json, make_folder, read_record, write_bytes, write_json
-from server.store.folder import DataFolder, is_id, now_utc
+from stereorig.core.errors import FileFormatError, StateError
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.documents.made import CertificateRecord
+from stereorig.server.formats.manifest import checked_bytes, is_there
+from stereorig.server.store.durable import known_json, make_folder, read_record
+from stereorig.server.store.folder import DataFolder, is_id, now_utc
 
 _DOCUMENT, _PAGE, _WITHDRAWN = "certificate.json", "certificate.html", "withdrawn.json"
 
 
 @dataclass(frozen=True)
 class _Base:
-    """What a certificate rests on."""
+    """The inputs of a certificate."""
 
     test_id: str | None
     analysis_id: str | None
@@ -46,7 +46,7 @@ class CertificateStore:
     def __init__(self, folder: DataFolder) -> None:
         self._folder = folder
         self._root = folder.root / "certificates"
-        # each is read once, and never changed after: what it rests on is kept in memory
+        # each is read once, and never changed after: its inputs are kept in memory
         self._reading = threading.Lock()
         self._known: set[str] = set()
         self._in_force: dict[str, dict[str, _Base]] = {}  # by test and certificate
@@ -71,8 +71,8 @@ class CertificateStore:
             make_folder(self._root)
         path = self._root / certificate_id
         make_folder(path)
-        write_bytes(path / _PAGE, page, checksum=True)
-        write_json(path / _DOCUMENT, document, checksum=True)
+        self._folder.manifests.write(path / _PAGE, page, checksum=True)
+        self._folder.manifests.write_json(path / _DOCUMENT, document, checksum=True)
 
     def read(self, certificate_id: str) -> CertificateRecord:
         """Return a certificate.
@@ -85,27 +85,26 @@ class CertificateStore:
             ``checksum_mismatch`` if it is not as it was written.
         """
         path = self._root / certificate_id / _DOCUMENT
-        if not is_id(certificate_id, "v") or not path.is_file():
+        if not is_id(certificate_id, "v") or not is_there(path):
             raise NotFoundError(f"There is no certificate {certificate_id[:40]!r}.", kind="certificate")
-        require_recorded(path, f"certificate {certificate_id}", f"certificates/{certificate_id}")
         return read_record(CertificateRecord, path)
 
     def page(self, certificate_id: str) -> bytes:
         """Return the page as it was made; raises as :meth:`read`."""
         self.read(certificate_id)
         path = self._root / certificate_id / _PAGE
-        if not path.is_file():
+        if not is_there(path):
             raise FileFormatError(
                 f"The page of certificate {certificate_id} is missing.",
                 code="file_missing",
                 remedy="Restore it from a backup; certificate.json has all of its figures.",
             )
-        require_recorded(path, f"certificate {certificate_id}", f"certificates/{certificate_id}")
-        return path.read_bytes()
+        return checked_bytes(path)
 
     def withdrawn(self, certificate_id: str) -> Mapping[str, object] | None:
         """Return when, by whom and why a certificate was withdrawn; None: it was not."""
-        return known_json(self._root / certificate_id / _WITHDRAWN) or None
+        path = self._root / certificate_id / _WITHDRAWN
+        return known_json(path) or None if is_there(path) else None
 
     def withdraw(self, certificate_id: str, reason: str, by: str) -> None:
         """Withdraw a certificate; it stays, and protects nothing any more.
@@ -122,7 +121,9 @@ class CertificateStore:
                 code="certificate_withdrawn",
                 remedy="Nothing is left to do.",
             )
-        write_json(self._root / certificate_id / _WITHDRAWN, {"utc": now_utc(), "by": by, "reason": reason})
+        self._folder.manifests.write_json(
+            self._root / certificate_id / _WITHDRAWN, {"utc": now_utc(), "by": by, "reason": reason}
+        )
 
     def learn(self) -> None:
         """Read the certificates that were not read before; a service does it behind its start."""
@@ -141,7 +142,7 @@ class CertificateStore:
             try:
                 made_of = read_record(CertificateRecord, path).made_of
             except FileFormatError:
-                continue  # `verify` tells of one that is damaged; it must not keep everything from being deleted
+                continue  # `verify` reports a damaged one; it must not prevent every deletion
             self._known.add(certificate_id)
             if self.withdrawn(certificate_id) is None:
                 base = _Base(made_of.test_id, made_of.analysis_id, frozenset(made_of.steps))
@@ -150,7 +151,7 @@ class CertificateStore:
     def resting_on(self, kind: str, ids: Mapping[str, object]) -> str | None:
         """Return a certificate in force that rests on a test, step or analysis; None without one.
 
-        Its cost is that of the test's own certificates, however many the folder holds, and of those that are new.
+        It takes time for the test's own certificates and for new ones, however many the folder holds.
         """
         if kind not in ("test", "step", "analysis"):
             return None  # a test keeps its own copy of the calibration

@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 from dataclasses import asdict, dataclass
 
-from core.errors import StateError
-from server.formats.files import known_sha256, recorded_sha256
-from server.store.folder import now_utc
-from server.store.tests.tests import TestStore
+from stereorig.core.errors import StateError
+from stereorig.server.formats.manifest import known_sha256
+from stereorig.server.store.folder import now_utc
+from stereorig.server.store.tests.tests import TestStore
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ def content_of(tests: TestStore, test_id: str) -> Content:
     for analysis_id in tests.analyses.ids(test_id):
         for n in tests.analyses.finished_steps(test_id, analysis_id):
             path = tests.analyses.path(test_id, analysis_id) / f"step_{n:04d}.nc"
-            digest.update(f"{analysis_id} {n} {recorded_sha256(path) or known_sha256(path)}\n".encode())
+            digest.update(f"{analysis_id} {n} {known_sha256(path)}\n".encode())
             results += 1
     return Content(len(steps), results, digest.hexdigest())
 

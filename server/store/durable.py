@@ -1,7 +1,7 @@
 """Files that survive a kill at any instant.
 
 Every document of the data folder comes into being here: written under a temporary name in its own folder, fsynced,
-renamed, and the folder fsynced (:mod:`server.formats.files`). A file under its real name is complete.
+renamed, and the folder fsynced (:mod:`stereorig.server.formats.files`). A file under its real name is complete.
 """
 
 from __future__ import annotations
@@ -16,14 +16,15 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from core.errors import FileFormatError
-from server.base import long_json
-from server.base.json_values import without_nan
-from server.base.models import Document
-from server.formats import disk as _disk
-from server.formats import files
-from server.formats.files import fsync_path, storage_error
-from server.wording import problems_in
+from stereorig.core.errors import FileFormatError
+from stereorig.server.base import long_json
+from stereorig.server.base.json_values import without_nan
+from stereorig.server.base.models import Document
+from stereorig.server.formats import disk as _disk
+from stereorig.server.formats import files
+from stereorig.server.formats.files import fsync_path, storage_error
+from stereorig.server.formats.manifest import DamagedError, checked_bytes
+from stereorig.server.wording import problems_in
 
 Record = TypeVar("Record", bound=Document)
 
@@ -44,15 +45,20 @@ def make_folder(folder: Path) -> None:
 
 
 def write_bytes(path: Path, data: bytes, *, checksum: bool = False) -> str:
-    """Write ``data`` durably, with its checksum beside it if wanted; return its SHA-256 in hex."""
+    """Write ``data`` durably, with its ``.sha256`` file if wanted; return its SHA-256 in hex."""
     files.write_bytes(path, data, checksum=checksum)
     return hashlib.sha256(data).hexdigest()
 
 
 def write_json(path: Path, document: Any, *, checksum: bool = False) -> None:
-    """Write a JSON document durably, with its checksum beside it if wanted; NaN becomes null."""
+    """Write a JSON document durably, with its ``.sha256`` file if wanted; NaN becomes null."""
+    write_bytes(path, json_bytes(document), checksum=checksum)
+
+
+def json_bytes(document: Any) -> bytes:
+    """Return a JSON document as it is written; NaN becomes null."""
     text = json.dumps(without_nan(document), indent=1, ensure_ascii=False, allow_nan=False)
-    write_bytes(path, text.encode() + b"\n", checksum=checksum)
+    return text.encode() + b"\n"
 
 
 def read_json(path: Path, keep: Mapping[str, long_json.Keep] | None = None) -> dict[str, Any]:
@@ -63,15 +69,15 @@ def read_json(path: Path, keep: Mapping[str, long_json.Keep] | None = None) -> d
     path
         The file.
     keep
-        Of lists in it, what is kept of each entry; see :func:`server.base.long_json.loads`.
+        For long lists in it, the part of each entry to keep; see :func:`stereorig.server.base.long_json.loads`.
 
     Raises
     ------
     FileFormatError
-        If the file is missing, cut short or no object.
+        If the file is missing, cut short or no object; ``checksum_mismatch`` if it is not as it was written.
     """
     try:
-        document = long_json.loads(path.read_text(encoding="utf-8"), keep)
+        document = long_json.loads(checked_bytes(path).decode(), keep)
     except FileNotFoundError as error:
         raise FileFormatError(f"{path.name} is missing.", code="file_missing", file=path.name) from error
     except (OSError, ValueError) as error:
@@ -92,7 +98,7 @@ def record_of(kind: type[Record], document: object, path: Path) -> Record:
     try:
         return kind.model_validate(document)
     except ValidationError as error:
-        first = problems_in(error, kind)[0]
+        first = problems_in(error)[0]
         raise FileFormatError(f"{path.name} holds a wrong {first.field}: {first.problem}.", file=path.name) from error
 
 
@@ -107,7 +113,7 @@ _LARGE_BYTES = 40_000
 
 
 class UnchangedFiles:
-    """What was made of files, kept while they are not touched; shared by all who ask, so that nobody may change it.
+    """Objects made of files, kept while the files are not touched; callers share them and must not change them.
 
     Parameters
     ----------
@@ -123,7 +129,7 @@ class UnchangedFiles:
         self._lock = threading.Lock()
 
     def made_of(self, path: Path, read: Callable[[Path], Made]) -> Made:
-        """Return what ``read`` makes of a file, or what it made last, unless the file was touched since."""
+        """Return the object that ``read`` makes of a file, or the last one if the file was not touched since."""
         try:
             stat = path.stat()
         except OSError:
@@ -147,12 +153,28 @@ class UnchangedFiles:
 #: a summary of a hundred steps is two megabytes when read
 _LARGE_KEPT = 6
 kept_while_unchanged = UnchangedFiles(_LARGE_KEPT, least_bytes=_LARGE_BYTES).made_of
-"""Return what a function makes of a large file, see :meth:`UnchangedFiles.made_of`."""
+"""Return the object that a function makes of a large file, see :meth:`UnchangedFiles.made_of`."""
+
+
+def known_record(kind: type[Record], path: Path, **missing: object) -> Record:
+    """Read a record; with these entries alone if the file is missing or unreadable, see :func:`known_json`."""
+    try:
+        return kind.model_validate({**missing, **known_json(path)})
+    except ValidationError:
+        return kind.model_validate(missing)
 
 
 def known_json(path: Path, keep: Mapping[str, long_json.Keep] | None = None) -> dict[str, Any]:
-    """Read a JSON object; empty where the file is missing or damaged, for readers who can do without it."""
+    """Read a JSON object; empty if it is missing or unreadable, for readers that can do without it.
+
+    Raises
+    ------
+    DamagedError
+        If it is not as it was written, or was there and is gone.
+    """
     try:
         return read_json(path, keep)
+    except DamagedError:
+        raise
     except FileFormatError:
         return {}

@@ -9,20 +9,22 @@ import secrets
 import shutil
 import socket
 import threading
-from collections.abc import Set
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Self
 
-from core.errors import FileFormatError, StateError, StorageError
-from server.formats import disk as _disk
-from server.formats.files import fsync_path, storage_error
-from server.store.durable import read_json, write_bytes, write_json
+from stereorig.core.errors import FileFormatError, StateError, StorageError
+from stereorig.server.formats import disk as _disk
+from stereorig.server.formats.files import fsync_path, storage_error
+from stereorig.server.formats.manifest import kept
+from stereorig.server.store.durable import read_json, write_bytes, write_json
+from stereorig.server.store.manifests import Manifests, finish_renaming
 
-FORMAT = 1
+#: 2: each folder of data has a manifest
+FORMAT = 2
 #: begin of the name of a folder that something is opened into before it is shown; it ends in ``.part``
 STAGING = ".opening-"
-_ID = re.compile(r"[a-z]\d{6}-[0-9a-f]{6}")
+_ID = re.compile(r"[a-z][0-9]{6}-[0-9a-f]{6}")
 
 
 def now_utc() -> str:
@@ -73,15 +75,26 @@ class IdMaker:
 
 
 class DataFolder:
-    """A data folder; nothing is read or written there before :meth:`open`."""
+    """A data folder; nothing is read or written there before :meth:`open`.
 
-    def __init__(self, root: Path) -> None:
+    Parameters
+    ----------
+    root
+        The folder.
+    holder
+        Process that another service is asked to stop; by default this one.
+    """
+
+    def __init__(self, root: Path, *, holder: int | None = None) -> None:
+        self._holder = os.getpid() if holder is None else holder
         self.root = root.absolute()
         self.ids = IdMaker()
+        self.manifests = Manifests(self.root)
         self._lock_file: IO[str] | None = None
+        self._identity: tuple[int, int] | None = None
 
     def open(self) -> Self:
-        """Make it where there is none, lock and check it.
+        """Make the folder if it is missing, lock and check it.
 
         Raises
         ------
@@ -98,10 +111,13 @@ class DataFolder:
         except OSError as error:
             raise _unusable(self.root, error) from error
         self._take_lock()
+        kept.forget(self.root)
+        kept.owned.add(self.root)
         try:
             self._probe()
             self._check_format()
             self._remove_temporaries()
+            self._identity = _identity_of(self.root)
         except BaseException:
             self.close()
             raise
@@ -117,16 +133,44 @@ class DataFolder:
         """Folder of the tests."""
         return self.root / "tests"
 
+    def require_there(self) -> None:
+        """Raise an error if the folder that was opened is not under its name, or cannot be written to.
+
+        Raises
+        ------
+        StorageError
+            ``data_folder_gone``; ``data_folder_read_only``.
+        """
+        reason, read_only = "another folder has its name", False
+        try:
+            there = self._identity in (None, _identity_of(self.root))
+            read_only = bool(os.statvfs(self.root).f_flag & os.ST_RDONLY)
+        except OSError as error:
+            there, reason = False, error.strerror or str(error)
+        if not there:
+            raise StorageError(
+                f"The data folder is gone ({reason}).",
+                code="data_folder_gone",
+                remedy="Mount its disk or move the folder back to its place; the service continues by itself.",
+            )
+        if read_only:
+            raise StorageError(
+                "The data folder's disk is read-only.",
+                code="data_folder_read_only",
+                remedy="Check the disk, and mount it so that it can be written to; the service continues by itself.",
+            )
+
     def require_room(self, reserve_mib: float) -> None:
         """Raise an error for new work while the disk is nearly full: running work must still be able to end well.
 
         Raises
         ------
         StorageError
-            ``storage_full``, with the space that is left.
+            ``storage_full``, with the space that is left; as :meth:`require_there`.
         """
+        self.require_there()
         free_mib = self.free_mib()
-        if free_mib < reserve_mib:
+        if free_mib < reserve_mib or free_mib == 0.0:
             raise StorageError(
                 f"Only {free_mib:.0f} MiB are left on the data folder's disk, {reserve_mib:g} MiB are kept free.",
                 code="storage_full",
@@ -167,7 +211,7 @@ class DataFolder:
                 remedy="Give a folder on a local disk with --data.",
             )
         file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()}")
+        file.write(f"process {self._holder} on {socket.gethostname()}")
         file.flush()
         self._lock_file = file
 
@@ -186,35 +230,25 @@ class DataFolder:
 
     def _check_format(self) -> None:
         path = self.root / "format.json"
-        if not path.exists():
-            write_json(path, {"format": FORMAT, "written_by": "stereorig"})
-            return
-        check_format(path)
+        if path.exists():
+            check_format(path)
+            if read_json(path)["format"] == FORMAT:
+                return
+        # the number comes first: a program that knows of no manifests would write past them
+        write_json(path, {"format": FORMAT, "written_by": "stereorig"})
 
     def _remove_temporaries(self) -> None:
-        # what a kill left half written; those of tests and trash are removed where they are read (`indexing.build`)
+        # half-written files of a killed program; `indexing.build` removes a test's and the trash's
         for path in self.root.glob(f"{STAGING}*.part"):
             shutil.rmtree(path, ignore_errors=True)
-        remove_temporaries(self.root, beside={self.tests, self.root / "trash"})
+        finish_renaming(self.root, beside={self.tests, self.root / "trash"})
 
     def close(self) -> None:
         """Release the lock."""
         if self._lock_file is not None:
+            kept.forget(self.root)
             self._lock_file.close()
             self._lock_file = None
-
-
-def remove_temporaries(root: Path, *, beside: Set[Path] = frozenset()) -> None:
-    """Remove the files that a kill left half written, but for those in the folders ``beside``.
-
-    Nothing may write there meanwhile. Only names that `server.formats.files.written_temporary` makes are removed.
-    """
-    left = {str(path) for path in beside}
-    for folder, folders, names in os.walk(root):  # rglob takes twice as long
-        folders[:] = [name for name in folders if os.path.join(folder, name) not in left]  # noqa: PTH118
-        for name in names:
-            if name.startswith(".") and name.endswith(".part"):
-                Path(folder, name).unlink(missing_ok=True)
 
 
 def is_in_use(root: Path) -> bool:
@@ -233,6 +267,11 @@ def _keeps_out(path: Path) -> bool:
         except OSError:
             return False
     return False
+
+
+def _identity_of(folder: Path) -> tuple[int, int]:
+    found = folder.stat()
+    return found.st_dev, found.st_ino
 
 
 def _make_with_parents(folder: Path) -> None:

@@ -14,13 +14,14 @@ from pathlib import Path
 
 from pydantic import Field
 
-from core.errors import FileFormatError, InputError, StorageError
-from server.base.errors import NotFoundError
-from server.base.models import Document
-from server.formats.files import fsync_path, known_sha256
-from server.store.durable import make_folder, read_record, record_of, write_bytes, write_json
-from server.store.folder import is_id, now_utc
-from server.store.tests.tests import TestStore
+from stereorig.core.errors import FileFormatError, InputError, StorageError
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.base.models import Document
+from stereorig.server.formats.files import fsync_path, sha256_of
+from stereorig.server.formats.manifest import is_there
+from stereorig.server.store.durable import make_folder, read_record, record_of, write_bytes
+from stereorig.server.store.folder import is_id, now_utc
+from stereorig.server.store.tests.tests import TestStore
 
 FOLDER = "models"
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
@@ -36,7 +37,7 @@ class ModelRecord(Document):
     name: str = Field(description="The file's name as it was given.")
     file: str = Field(description="The file's name as it is kept.")
     files: dict[str, str] = Field(description="SHA-256 of each file, heavy data of XDMF among them.")
-    reading: dict[str, object] = Field(description="How it is read and where it lies: unit, displacement, time, align.")
+    reading: dict[str, object] = Field(description="Reading options and placement: unit, displacement, time, align.")
     unit: str = Field(description="Unit of its positions.")
     displacement: str = Field(description="Name of the array of displacements.")
     nodes: int = Field(description="Nodes.")
@@ -75,14 +76,17 @@ class ModelStore:
             If there is none with this id.
         """
         path = self._tests.path(test_id) / FOLDER / model_id if is_id(model_id, "m") else None
-        if path is None or not (path / "model.json").is_file():
+        if path is None or not is_there(path / "model.json"):
             raise NotFoundError(f"Test {test_id} has no model {model_id[:40]!r}.", kind="model")
         return path
 
     def ids(self, test_id: str) -> list[str]:
         """Ids of a test's models, in the order of their making."""
-        found = (self._tests.path(test_id) / FOLDER).glob("m*/model.json")
-        return sorted(p.parent.name for p in found if is_id(p.parent.name, "m"))
+        home = self._tests.path(test_id)
+        listed = self._tests.folders.data.manifests.under(home, FOLDER)
+        there = [path.relative_to(home).as_posix() for path in (home / FOLDER).glob("m*/model.json")]
+        names = {name.split("/")[1] for name in (*listed, *there)}  # one that was lost is named when it is read
+        return sorted(name for name in names if is_id(name, "m"))
 
     def read(self, test_id: str, model_id: str) -> ModelRecord:
         """Return ``model.json``."""
@@ -99,11 +103,11 @@ class ModelStore:
         path, record = self.path(test_id, model_id), self.read(test_id, model_id)
         for name, sha256 in record.files.items():
             held = path / check_file_name(name)
-            if not held.is_file() or known_sha256(held) != sha256:
+            if not is_there(held) or sha256_of(held) != sha256:
                 raise FileFormatError(
                     f"{name} of model {model_id} does not match its checksum.",
                     code="checksum_mismatch",
-                    remedy="Give the model anew; measured data are not touched.",
+                    remedy="Give the model again; measured data are not touched.",
                     file=f"{FOLDER}/{model_id}/{name}",
                 )
         return path / check_file_name(record.file)
@@ -132,7 +136,7 @@ class ModelStore:
             try:
                 sha256 = {name: write_bytes(path / name, held.read_bytes()) for name, held in files.items()}
                 made = {"id": model_id, "test_id": test_id, "created_utc": now_utc(), **document, "files": sha256}
-                write_json(path / "model.json", made)
+                self._tests.folders.data.manifests.write_json(path / "model.json", made)
             except StorageError:
                 shutil.rmtree(path, ignore_errors=True)
                 raise
@@ -142,6 +146,7 @@ class ModelStore:
         """Remove a model; comparisons that were read are not kept, and nothing measured changes."""
         with self._lock:
             path = self.path(test_id, model_id)
+            self._tests.folders.data.manifests.strike(path.parent.parent, [f"{FOLDER}/{model_id}/model.json"])
             (path / "model.json").unlink()  # from now on it is none
             fsync_path(path)
             shutil.rmtree(path, ignore_errors=True)

@@ -10,14 +10,14 @@ import contextlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from core.errors import FileFormatError, StateError
-from server.base.errors import NotFoundError
-from server.base.problem import RESTART, problem_of
-from server.formats.files import require_recorded
-from server.formats.images import GrayImage, encode_tiff
-from server.store.documents import MadeRecord, failure_state
-from server.store.durable import make_folder, read_json, record_of, write_bytes, write_json
-from server.store.folder import DataFolder, is_id, now_utc
+from stereorig.core.errors import FileFormatError, StateError
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.base.problem import RESTART, problem_of
+from stereorig.server.documents.made import MadeRecord, failure_state
+from stereorig.server.formats.images import GrayImage, encode_tiff
+from stereorig.server.formats.manifest import is_there, require_sound
+from stereorig.server.store.durable import make_folder, read_json, record_of, write_bytes
+from stereorig.server.store.folder import DataFolder, is_id, now_utc
 
 
 class NoiseStore:
@@ -48,7 +48,7 @@ class NoiseStore:
             If there is none with this id.
         """
         path = self._root / noise_id if is_id(noise_id, "n") else None
-        if path is None or not (path / "plan.json").is_file():
+        if path is None or not is_there(path / "plan.json"):
             raise NotFoundError(f"There is no noise measurement {noise_id[:40]!r}.", kind="noise")
         return path
 
@@ -64,7 +64,7 @@ class NoiseStore:
         path = self._root / noise_id
         make_folder(path)
         make_folder(path / "frames")
-        write_json(path / "plan.json", {"id": noise_id, "created_utc": now_utc(), **plan})
+        self._folder.manifests.write_json(path / "plan.json", {"id": noise_id, "created_utc": now_utc(), **plan})
         return noise_id
 
     def put_frame(self, noise_id: str, index: int, cam: str, image: GrayImage) -> dict[str, str]:
@@ -76,20 +76,24 @@ class NoiseStore:
         self, noise_id: str, frames: Sequence[Mapping[str, str]], entries: Mapping[str, object]
     ) -> None:
         """Write ``frames.json``: every frame with camera and checksum, and the cameras' settings."""
-        write_json(self.path(noise_id) / "frames.json", {**entries, "frames": frames})
+        self._folder.manifests.write_json(self.path(noise_id) / "frames.json", {**entries, "frames": frames})
 
     def put_failure(self, noise_id: str, problem: Mapping[str, object]) -> None:
         """Record the reason why there are no models."""
-        write_json(self.path(noise_id) / "failure.json", problem)
+        self._folder.manifests.write_json(self.path(noise_id) / "failure.json", problem)
+
+    def take_over(self, noise_id: str) -> None:
+        """List the files that a worker wrote into the folder of a noise measurement."""
+        path = self.path(noise_id)
+        self._folder.manifests.take_over(path, [path / "noise.json"])
 
     def read(self, noise_id: str) -> MadeRecord:
         """Return plan, models and state (``unfinished``, ``cancelled``, ``failed``, ``complete``)."""
         path = self.path(noise_id)
         document: dict[str, object] = {"id": noise_id, "state": "unfinished", "plan": read_json(path / "plan.json")}
-        if (path / "noise.json").exists():
-            require_recorded(path / "noise.json", f"noise measurement {noise_id}", f"noise/{noise_id}")
+        if is_there(path / "noise.json"):
             document = {**read_json(path / "noise.json"), **document, "state": "complete", "problem": None}
-        elif (path / "failure.json").exists():
+        elif is_there(path / "failure.json"):
             problem = read_json(path / "failure.json")
             document |= {"state": failure_state(problem), "problem": problem}
         return record_of(MadeRecord, document, path / "plan.json")
@@ -103,11 +107,11 @@ class NoiseStore:
             ``noise_not_complete`` if it is not there.
         """
         path = self.path(noise_id) / "noise.json"
-        if not path.is_file():
+        if not is_there(path):
             raise StateError(
                 f"Noise measurement {noise_id} is {self.read(noise_id).state}.",
                 code="noise_not_complete",
                 remedy="Wait for its job, or measure again.",
             )
-        require_recorded(path, f"noise measurement {noise_id}", f"noise/{noise_id}")
+        require_sound(path)
         return path

@@ -5,12 +5,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping
 
-from core.errors import InputError
-from server.base.errors import NotFoundError
-from server.formats.files import fsync_path
-from server.store.documents import RecipeRecord
-from server.store.durable import make_folder, read_record, record_of, write_json
-from server.store.folder import DataFolder, is_id, now_utc
+from stereorig.core.errors import InputError
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.documents.made import RecipeRecord
+from stereorig.server.formats.files import fsync_path
+from stereorig.server.formats.manifest import is_there
+from stereorig.server.store.durable import make_folder, read_record, record_of
+from stereorig.server.store.folder import DataFolder, is_id, now_utc
 
 
 class RecipeStore:
@@ -39,7 +40,7 @@ class RecipeStore:
             If there is none with this id.
         """
         path = self._root / f"{recipe_id}.json"
-        if not is_id(recipe_id, "r") or not path.is_file():
+        if not is_id(recipe_id, "r") or not is_there(path):
             raise NotFoundError(f"There is no recipe {recipe_id[:40]!r}.", kind="recipe")
         return read_record(RecipeRecord, path)
 
@@ -73,7 +74,7 @@ class RecipeStore:
                 "recipe": recipe,
             }
             path = self._root / f"{document['id']}.json"
-            write_json(path, document)
+            self._folder.manifests.write_json(path, document)
         return record_of(RecipeRecord, document, path)
 
     def update(self, recipe_id: str, changes: Mapping[str, object]) -> RecipeRecord:
@@ -84,13 +85,14 @@ class RecipeStore:
                 self._check_name(str(changes["name"]))
             document = {**before.plain(), **changes, "changed_utc": now_utc()}
             path = self._root / f"{recipe_id}.json"
-            write_json(path, document)
+            self._folder.manifests.write_json(path, document)
         return record_of(RecipeRecord, document, path)
 
     def remove(self, recipe_id: str) -> None:
-        """Remove a recipe; what was made of it stays."""
+        """Remove a recipe; tests and analyses that took it stay."""
         with self._lock:
             self.read(recipe_id)
+            self._folder.manifests.strike(self._root, [f"{recipe_id}.json"])
             (self._root / f"{recipe_id}.json").unlink()
             fsync_path(self._root)
 

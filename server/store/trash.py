@@ -7,6 +7,7 @@ that half of something never comes back.
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,18 +15,22 @@ from typing import Literal
 
 from pydantic import ValidationError
 
-from core.errors import FileFormatError, StateError, StorageError
-from server.base.errors import NotFoundError
-from server.formats import disk as _disk
-from server.formats.files import fsync_path, storage_error
-from server.store.documents import TrashEntry
-from server.store.durable import make_folder, read_json, write_json
-from server.store.folder import DataFolder, is_id, now_utc
-from server.store.tests.steps import MAX_STEPS, deleted_mark
+from stereorig.core.errors import FileFormatError, StateError, StorageError
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.documents.made import TrashEntry
+from stereorig.server.formats import disk as _disk
+from stereorig.server.formats.files import fsync_path, storage_error
+from stereorig.server.formats.manifest import NAME, entries_in
+from stereorig.server.store.durable import make_folder, read_json, write_json
+from stereorig.server.store.folder import DataFolder, is_id, now_utc
+from stereorig.server.store.manifests import Manifests
+from stereorig.server.store.tests.steps import MAX_STEPS, deleted_mark
 
 Kind = Literal["test", "step", "analysis", "calibration", "noise"]
 _CONTENT = "content"
 _DOOMED = "removing"
+#: for a step or analysis in the trash: its former entries of the test's manifest
+_FILES = "files.json"
 
 
 class Trash:
@@ -35,10 +40,13 @@ class Trash:
     ----------
     root
         The data folder.
+    manifests
+        Its manifests, if it is open.
     """
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, manifests: Manifests | None = None) -> None:
         self._data = root
+        self._manifests = manifests or Manifests(root)
         self.root = root / "trash"
         self._sizes: dict[str, int] = {}
 
@@ -76,7 +84,7 @@ class Trash:
             try:
                 entry = self.entry(trash_id)
             except NotFoundError:
-                continue  # emptied meanwhile
+                continue  # emptied since
             except FileFormatError as error:
                 entry = TrashEntry(id=trash_id, kind="unknown", name=error.cause)
             if trash_id not in self._sizes:  # nothing changes in the trash, and a test has thousands of files
@@ -115,17 +123,34 @@ class Trash:
             make_folder(entry)
             document = {"kind": kind, **ids, "name": name, "deleted_utc": now_utc(), "deleted_by": by, "why": why}
             write_json(entry / "trash.json", document)
+            home = original.parent.parent
+            part = None
+            if kind in ("step", "analysis") and (home / NAME).exists():
+                part = home, self._manifests.under(home, original.relative_to(home).as_posix())
+                write_json(entry / _FILES, {"files": self._manifests.plain(*part)})
             if kind == "step":
                 # its number stays taken: results and notes refer to it
                 write_json(deleted_mark(original), {"trash_id": trash_id})
+            if part is not None:
+                self._manifests.replace(*part, [deleted_mark(original)] if kind == "step" else [])
             _move(original, entry / _CONTENT)
         except StorageError:
             if original.exists():
+                with contextlib.suppress(StorageError):
+                    self._relist(kind, original, entry)
                 shutil.rmtree(entry, ignore_errors=True)
-                if kind == "step":
-                    deleted_mark(original).unlink(missing_ok=True)
             raise
         return trash_id
+
+    def _relist(self, kind: str, original: Path, entry: Path) -> None:
+        """List the restored files again, with the entries from before the deletion."""
+        home = original.parent.parent
+        if (entry / _FILES).is_file():
+            mark = {deleted_mark(original).relative_to(home).as_posix(): None} if kind == "step" else {}
+            self._manifests.change(home, {**entries_in(read_json(entry / _FILES)["files"]), **mark})
+        if kind == "step":
+            deleted_mark(original).unlink(missing_ok=True)
+            fsync_path(original.parent)  # a mark that came back would be listed nowhere in the trash
 
     def restore(self, trash_id: str) -> TrashEntry:
         """Move an entry's content back to its original path; return the entry.
@@ -152,8 +177,8 @@ class Trash:
                 remedy="Restore the test first.",
             )
         _move(self.root / trash_id / _CONTENT, original)
-        if entry.kind == "step":
-            deleted_mark(original).unlink(missing_ok=True)
+        if entry.kind in ("step", "analysis"):
+            self._relist(entry.kind, original, self.root / trash_id)
         shutil.rmtree(self.root / trash_id, ignore_errors=True)
         return entry
 
@@ -181,7 +206,7 @@ class Trash:
         for entry in sorted(self.root.glob("x*")):
             if is_id(entry.name, "x") and not (entry / _CONTENT).exists():
                 shutil.rmtree(entry, ignore_errors=True)
-                done.append(f"removed what was left of trash/{entry.name}")
+                done.append(f"removed the rest of trash/{entry.name}")
         return done
 
     def original(self, kind: object, ids: Mapping[str, object]) -> Path:
@@ -203,7 +228,7 @@ class Trash:
                 return folder
             if kind == "analysis" and is_id(analysis, "a"):
                 return folder / "analyses" / analysis
-            if kind == "step" and n.isdecimal() and int(n) <= MAX_STEPS:
+            if kind == "step" and n.isascii() and n.isdecimal() and int(n) <= MAX_STEPS:
                 return folder / "steps" / f"{int(n):04d}"
         raise _unreadable()
 
@@ -232,5 +257,5 @@ def _size_bytes(folder: Path) -> int:
         try:
             total += path.lstat().st_size
         except OSError:
-            continue  # gone meanwhile
+            continue  # removed since
     return total

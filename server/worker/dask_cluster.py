@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import pickle
 import secrets
+import socket
 import threading
 import time
 from collections.abc import Callable
@@ -17,17 +17,18 @@ from concurrent.futures import InvalidStateError
 from pathlib import Path
 from typing import Any, Literal
 
-from core.errors import Cancelled, InputError, MeasurementError
-from server.formats.files import make_folder, written_temporary
-from server.worker import dask_task
-from server.worker.executor import TaskExecutor, TaskFuture, WorkerDiedError
-from server.worker.tasks import StepTask
+from stereorig.core.errors import Cancelled, InputError, MeasurementError
+from stereorig.server.formats.files import make_folder, written_temporary
+from stereorig.server.formats.manifest import checked_bytes
+from stereorig.server.worker import dask_task
+from stereorig.server.worker.executor import FileTask, TaskExecutor, TaskFuture, WorkerDiedError
 
 _log = logging.getLogger("stereorig.cluster")
 
 _CONNECT_S = 10.0
 _ATTEMPTS = 4
 _COUNT_S = 1.0
+_LOOK_S = 2.0
 Images = Literal["path", "scatter"]
 
 
@@ -48,7 +49,7 @@ class ClusterFuture(TaskFuture):
         self._stop = stop
 
     def request_stop(self) -> None:
-        """End it: at once for whoever waits, and on its worker at its next check."""
+        """End it: at once for its waiters, and on its worker at its next check."""
         if not self.stop_requested.is_set():
             self.stop_requested.set()
             self._stop(self)
@@ -94,6 +95,7 @@ class ClusterExecutor(TaskExecutor):
         self._running: dict[str, ClusterFuture] = {}
         self._closed = False
         self._workers, self._count_again = 0, 0.0
+        self._away, self._look_again = "", 0.0
 
     def _connected(self) -> Any:
         with self._lock:
@@ -124,17 +126,20 @@ class ClusterExecutor(TaskExecutor):
         return max(self._at_least, self._workers)
 
     @property
-    def shares_files(self) -> bool:
-        """True if the workers see the service's data folder."""
-        return self._images == "path"
+    def away(self) -> str:
+        """Reason why no task can run now: the scheduler does not answer."""
+        client = self._client
+        if client is not None and client.status == "running":
+            return ""
+        if time.monotonic() > self._look_again:
+            self._look_again = time.monotonic() + _LOOK_S
+            self._away = _refusal(self._scheduler)
+        return self._away
 
     def _on_event(self, event: tuple[Any, dict[str, Any]]) -> None:
         report = event[1]
         future = self._running.get(report["task"])
-        if future is not None and "call" in report:
-            if future.on_call is not None:
-                future.on_call(pickle.loads(report["call"]))
-        elif future is not None and future.on_progress is not None:
+        if future is not None and future.on_progress is not None:
             future.on_progress(report["phase"], int(report["done"]), int(report["total"]))
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> ClusterFuture:
@@ -154,7 +159,7 @@ class ClusterExecutor(TaskExecutor):
     def _launch(self, future: ClusterFuture, fn: Callable[..., Any], args: tuple[Any, ...], attempt: int) -> None:
         client = self._connected()
         head = (future.name, self._topic, self._threads, fn)
-        with_files = self._images == "scatter" and len(args) == 1 and isinstance(args[0], StepTask)
+        with_files = self._images == "scatter" and len(args) == 1 and isinstance(args[0], FileTask)
         more: dict[str, Any] = {"key": f"stereorig-{future.name}-{attempt}", "pure": False}
         if with_files:
             contents = {path: _content(client, path) for path in args[0].files()}
@@ -173,7 +178,7 @@ class ClusterExecutor(TaskExecutor):
         attempt: int,
         folder: Path | None,
     ) -> None:
-        """Called by Dask, in a thread of its own, when a task has ended in whatever way."""
+        """Called by Dask, in a thread of its own, when a task has succeeded, failed or was lost."""
         if future.done():
             return
         try:
@@ -189,7 +194,7 @@ class ClusterExecutor(TaskExecutor):
             elif isinstance(error, self._dask.scheduler.KilledWorker):
                 self._settle(future, error=WorkerDiedError(f"Workers of the cluster died on a step: {error}."))
             elif attempt < _ATTEMPTS and not future.stop_requested.is_set() and not self._closed:
-                # what it needed lay on a worker that is gone
+                # its data were on a worker that is gone
                 _log.warning("a task was lost with its worker's data; it is sent again")
                 self._launch(future, fn, args, attempt + 1)
             else:
@@ -200,7 +205,7 @@ class ClusterExecutor(TaskExecutor):
     def _settle(self, future: ClusterFuture, *, result: Any = None, error: BaseException | None = None) -> None:
         self._running.pop(future.name, None)
         future.remote = None  # lets the cluster forget the result
-        with contextlib.suppress(InvalidStateError):  # it was stopped meanwhile
+        with contextlib.suppress(InvalidStateError):  # it was stopped since
             if error is not None:
                 future.set_exception(error)
             else:
@@ -219,7 +224,7 @@ class ClusterExecutor(TaskExecutor):
             threading.Thread(target=cancel_remote, name="stop on the cluster", daemon=True).start()
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:  # noqa: ARG002
-        """Stop what runs and leave the cluster, which stays."""
+        """Stop running tasks and disconnect from the cluster, which continues."""
         self._closed = True
         for future in list(self._running.values()):
             future.request_stop()
@@ -230,13 +235,23 @@ class ClusterExecutor(TaskExecutor):
                 client.close(timeout=2)
 
 
+def _refusal(scheduler: str) -> str:
+    """Return why a scheduler takes no connection; empty if it does."""
+    host, _, port = scheduler.removeprefix("tcp://").rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=1.0).close()
+    except OSError as error:
+        return f"The Dask scheduler of [compute] does not answer ({error.strerror or error})."
+    return ""
+
+
 def _content(client: Any, path: Path) -> Any:
     """A file's content on the cluster; the same content is sent once."""
-    return client.scatter(path.read_bytes(), hash=True, direct=False)
+    return client.scatter(checked_bytes(path), hash=True, direct=False)
 
 
 def _keep(folder: Path, answer: Any, written: dict[str, bytes]) -> Any:
-    """Write what a worker without our disk has made; the result last, with its checksum."""
+    """Write the files of a worker without our disk; the result last, with its checksum."""
     for name, content in written.items():
         make_folder((folder / name).parent)
         with written_temporary(folder / name, checksum=name.endswith(".nc")) as temporary:

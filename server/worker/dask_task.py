@@ -1,16 +1,14 @@
 """Tasks on a Dask worker: the same task functions as in the service's own worker, one at a time in a process.
 
-Where the worker shares no disk with the service, a step comes with the content of its files and its result goes back as
-content; here it lies in a folder of its own meanwhile.
+If the worker shares no disk with the service, a step comes with the content of its files and its result is returned as
+content; in between both are files in a folder of the worker's own.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import importlib
 import os
-import pickle
 import tempfile
 import threading
 import time
@@ -19,11 +17,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from server.formats.results.folder import DENSE
-from server.worker import process as worker_process
-from server.worker.kernel_compiler import compiled_aside
-from server.worker.process import TaskChannel
-from server.worker.tasks import StepTask, files_of
+from stereorig.server.worker import process as worker_process
+from stereorig.server.worker.executor import FileTask
+from stereorig.server.worker.kernel_compiler import compiled_aside
+from stereorig.server.worker.process import TaskChannel
 
 _REPORT_S = 0.2
 _MAX_STOPPED = 10_000
@@ -33,7 +30,7 @@ _ready = False
 
 
 def stop(name: str) -> None:
-    """Let a task that runs here end; harmless where it does not."""
+    """Let a task that runs here end; harmless if it runs elsewhere."""
     _stopped[name] = None
     while len(_stopped) > _MAX_STOPPED:
         _stopped.popitem(last=False)
@@ -53,10 +50,6 @@ class _Channel(TaskChannel):
     def cancelled(self) -> bool:
         return self._name in _stopped
 
-    def call(self, task: object) -> bool:
-        self._report_progress({"task": self._name, "call": pickle.dumps(task)})
-        return True
-
     def progress(self, phase: str, done: int, total: int) -> None:
         now = time.monotonic()
         if phase != self._phase or now >= self._next:
@@ -70,9 +63,9 @@ def run(name: str, topic: str, threads: int, function: Callable[..., Any], *args
     Parameters
     ----------
     name
-        Of the task, for :func:`stop` and for its progress.
+        Name of the task, for :func:`stop` and for its progress.
     topic
-        Where its progress is reported.
+        Topic of the cluster's events to which its progress is reported.
     threads
         Kernel threads of this worker.
     """
@@ -94,10 +87,12 @@ def _prepare(threads: int) -> None:
     global _ready
     if _ready:
         return
-    cv2 = importlib.import_module("cv2")
+    import cv2
+
+    from stereorig.core.threads import available_threads, set_threads
+
     cv2.setNumThreads(1)
-    kernels = importlib.import_module("core.threads")
-    kernels.set_threads(min(threads, kernels.available_threads()))
+    set_threads(min(threads, available_threads()))
     _ready = True
 
 
@@ -105,16 +100,16 @@ def run_with_files(
     name: str,
     topic: str,
     threads: int,
-    function: Callable[[StepTask], Any],
-    task: StepTask,
+    function: Callable[[FileTask], Any],
+    task: FileTask,
     contents: dict[Path, bytes],
 ) -> tuple[Any, dict[str, bytes]]:
-    """Run a step with the content of its files; return the function's answer, and the files that it wrote.
+    """Run a task with the content of its files; return the function's answer, and the files that it wrote.
 
     Parameters
     ----------
     contents
-        By path on the service's machine, every file that the step reads.
+        By path on the service's machine, every file that the task reads.
     """
     root = _folder() / hashlib.sha256(str(task.folder).encode()).hexdigest()[:24]
     folder = root / "results"
@@ -127,23 +122,17 @@ def run_with_files(
             else f"{hashlib.sha256(str(path).encode()).hexdigest()[:16]}-{path.name}"
         )
         target = there[path] = (folder if path.parent == task.folder else root) / name
-        # the reference's files are the same each time: what is there is not written again
+        # the reference's files are the same each time: a file that is there is not written again
         if not target.exists() or target.stat().st_size != len(content) or target.read_bytes() != content:
             temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
             temporary.write_bytes(content)
             temporary.replace(target)
     moved = task.moved(folder, there)
     answer = run(name, topic, threads, function, moved)
-    written = {}
-    names = [*reversed(files_of(task.step.n, "step" if task.against is None else "head"))]  # the result last
-    if task.against is None:
-        names.insert(0, f"{DENSE}/{names[-1]}")
-    for file in names:
-        if (folder / file).is_file():
-            written[file] = (folder / file).read_bytes()
-    with contextlib.suppress(OSError):  # read once
-        for image in set(moved.step.files) - set(moved.reference.files):
-            image.unlink(missing_ok=True)
+    written = {file: (folder / file).read_bytes() for file in task.results() if (folder / file).is_file()}
+    with contextlib.suppress(OSError):
+        for read in moved.read_once():
+            read.unlink(missing_ok=True)
     return answer, written
 
 

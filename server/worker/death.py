@@ -65,7 +65,7 @@ def _oom_kills(path: Path) -> int | None:
 
 
 def resident_mib(pid: int) -> float | None:
-    """Memory that a process holds; None where it is not known, as when it has ended."""
+    """Memory that a process holds, MiB; None if it is not known, as when it has ended."""
     try:
         return float(psutil.Process(pid).memory_info().rss) / 2**20 or None
     except psutil.Error:
@@ -80,7 +80,7 @@ def cause_of_death(exit_code: int | None, *, out_of_memory: bool, memory_mib: fl
     exit_code
         As `multiprocessing` has it: negative for a signal.
     out_of_memory
-        True if the kernel killed for want of memory meanwhile.
+        True if the kernel killed a process for want of memory at that time.
     memory_mib
         Memory that it held at the last reading.
     """

@@ -18,12 +18,12 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from typing import Any
 
-from core.compiling import COMPILING
-from core.errors import Cancelled
-from server.base.logs import about, current_ids
-from server.worker.death import MemoryWatch, cause_of_death, resident_mib
-from server.worker.executor import TaskExecutor, TaskFuture, WorkerDiedError
-from server.worker.process import serve
+from stereorig.core.compiling import COMPILING
+from stereorig.core.errors import Cancelled
+from stereorig.server.base.logs import about, current_ids
+from stereorig.server.worker.death import MemoryWatch, cause_of_death, resident_mib
+from stereorig.server.worker.executor import TaskExecutor, TaskFuture, WorkerDiedError
+from stereorig.server.worker.process import serve
 
 _log = logging.getLogger("stereorig.worker")
 
@@ -39,7 +39,7 @@ class _Task:
     function: Callable[..., Any]
     args: tuple[Any, ...]
     kwargs: dict[str, object]
-    #: what its log lines name
+    #: ids for its log lines
     ids: dict[str, str] = field(default_factory=current_ids)
 
 
@@ -51,7 +51,8 @@ class ComputeWorker(TaskExecutor):
     threads
         Kernel threads inside the process; by default one per core.
     warm_up
-        ``"module:function"`` that the process calls with ``threads`` before its first task.
+        Function that the process calls with ``threads`` before its first task. Its module is imported before the
+        numbers of threads are set: it must not load the numerical libraries itself.
     patience_s
         How long a cancelled task may take to stop before its process is ended.
     lowered
@@ -59,7 +60,12 @@ class ComputeWorker(TaskExecutor):
     """
 
     def __init__(
-        self, *, threads: int | None = None, warm_up: str | None = None, patience_s: float = 0.5, lowered: bool = True
+        self,
+        *,
+        threads: int | None = None,
+        warm_up: Callable[[int], None] | None = None,
+        patience_s: float = 0.5,
+        lowered: bool = True,
     ) -> None:
         self._lowered = lowered
         self._threads = threads or len(os.sched_getaffinity(0))
@@ -81,7 +87,7 @@ class ComputeWorker(TaskExecutor):
         self._started = False
 
     def start(self) -> None:
-        """Spawn the process and warm it up, without waiting for it; nothing where that was done before."""
+        """Spawn the process and warm it up, without waiting for it; does nothing if that was done before."""
         with self._state_lock:
             self._start_once()
 
@@ -113,7 +119,7 @@ class ComputeWorker(TaskExecutor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:  # noqa: ARG002
-        """End the process; running and waiting tasks are cancelled, whatever the value of ``cancel_futures``."""
+        """End the process; running and waiting tasks are cancelled, even if ``cancel_futures`` is False."""
         with self._state_lock:
             self._closing.set()
             self._tasks.put(None)
@@ -204,7 +210,8 @@ class ComputeWorker(TaskExecutor):
             if process.is_alive():
                 process.kill()
                 process.join()
-            process.close()
+            with contextlib.suppress(ValueError):  # its end was taken note of elsewhere
+                process.close()
 
     def _work_on(self, task: _Task) -> None:
         try:
@@ -214,7 +221,7 @@ class ComputeWorker(TaskExecutor):
         else:
             task.future.set_result(result)
         if self._process is None and not self._closing.is_set():
-            self._spawn()  # only now: whoever waits for the task does not wait for that
+            self._spawn()  # only now: the caller that waits for the task need not wait for the new process
 
     def _exchange(self, task: _Task) -> Any:
         if self._process is None or not self._process.is_alive():
@@ -253,8 +260,6 @@ class ComputeWorker(TaskExecutor):
             self._note(message)
             if message[0] == "progress" and message[1] == task.id and task.future.on_progress is not None:
                 task.future.on_progress(*message[2:])
-            elif message[0] == "call" and message[1] == task.id and task.future.on_call is not None:
-                task.future.on_call(message[2])
             elif message[0] == "result" and message[1] == task.id:
                 return message[2]
             elif message[0] == "error" and message[1] == task.id:
@@ -293,15 +298,3 @@ class ComputeWorker(TaskExecutor):
             out_of_memory=out_of_memory,
             memory_mib=held_mib,
         )
-
-
-def make_worker(threads: int | None, *, lowered: bool = True) -> ComputeWorker:
-    """Make the worker of a service, not yet started; one whose answers are waited for is not ``lowered``."""
-    return ComputeWorker(threads=threads, warm_up="server.worker.tasks:warm_up", lowered=lowered)
-
-
-def start_worker(threads: int | None) -> ComputeWorker:
-    """Start the worker of a service; its process loads and warms the kernels while the service goes on starting."""
-    worker = make_worker(threads)
-    worker.start()
-    return worker

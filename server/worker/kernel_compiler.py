@@ -8,7 +8,6 @@ digits from its own repetition.
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
 import pickle
 import subprocess
@@ -16,16 +15,17 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from core.compiling import compile_elsewhere, no_collection
-from server.base.priority import end_with_parent
+from stereorig.core.compiling import ENTRIES, compile_elsewhere, no_collection
+from stereorig.core.lazy import load_module
+from stereorig.server.base.priority import end_with_parent
 
 _DONE = b"\n"
 
 
 class KernelCompiler:
-    """A process that compiles what it is asked for, started with the first question.
+    """A process that compiles kernels on request, started with the first one.
 
-    One for several kernels: what they share is compiled once.
+    One process serves several kernels: their common parts are compiled once.
     """
 
     def __init__(self) -> None:
@@ -85,18 +85,16 @@ def _start() -> subprocess.Popen[bytes]:
 
 
 def main() -> int:
-    """Compile what the parent asks for, until it asks no more."""
+    """Compile the kernels that the parent asks for, until it closes the pipe."""
     end_with_parent()
-    from core.matching.kernels.naming import ENTRIES
-
     with no_collection():
         while True:
             try:
                 module, name, arguments = pickle.load(sys.stdin.buffer)
             except EOFError:
                 return 0
-            importlib.import_module(module)
-            ENTRIES[module, name].compile(arguments)
+            load_module(module)
+            ENTRIES[module, name].compiled.compile(arguments)
             sys.stdout.buffer.write(_DONE)
             sys.stdout.buffer.flush()
 

@@ -6,8 +6,8 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from server.worker.embedded import ComputeWorker
-from server.worker.executor import TaskExecutor, TaskFuture
+from stereorig.server.worker.embedded import ComputeWorker
+from stereorig.server.worker.executor import TaskExecutor, TaskFuture
 
 
 class WorkerPool(TaskExecutor):

@@ -10,7 +10,6 @@ import contextlib
 import copy
 import faulthandler
 import gc
-import importlib
 import logging
 import os
 import signal
@@ -21,24 +20,24 @@ from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
 from typing import Any
 
-from core.compiling import COMPILING, report_compiling
-from core.errors import Cancelled
-from server.base.library_threads import one_library_thread
-from server.base.memory import settle
-from server.base.priority import end_with_parent, lower_worker
-from server.worker.kernel_compiler import compiled_aside
+from stereorig.core.compiling import COMPILING, report_compiling
+from stereorig.core.errors import Cancelled
+from stereorig.server.base.library_threads import one_library_thread
+from stereorig.server.base.memory import settle
+from stereorig.server.base.priority import end_with_parent, lower_worker
+from stereorig.server.worker.kernel_compiler import compiled_aside
 
 _log = logging.getLogger("stereorig.worker")
 _current: TaskChannel | None = None
 
 
 class TaskChannel:
-    """A running task's way back to whoever asked for it: progress out, cancellation in.
+    """A running task's channel to its caller: progress out, cancellation in.
 
     Attributes
     ----------
     keeps_going
-        True where the next task comes to this process too, so that it can be begun before it is asked for.
+        True if the next task comes to this process too, so that it can be begun before it is asked for.
     """
 
     def __init__(
@@ -55,20 +54,13 @@ class TaskChannel:
         return self._cancel is not None and self._cancel.is_set()
 
     def check(self) -> None:
-        """Raise :class:`core.errors.Cancelled` if the task should stop."""
+        """Raise :class:`stereorig.core.errors.Cancelled` if the task should stop."""
         if self.cancelled:
             raise Cancelled("The computation was cancelled.")
 
     def progress(self, phase: str, done: int, total: int) -> None:
         """Report progress."""
         self._send(("progress", self._task_id, phase, done, total))
-
-    def call(self, task: object) -> bool:
-        """Tell the service of a task that other workers may help with; return False where nobody hears it."""
-        if self._task_id == 0:
-            return False
-        self._send(("call", self._task_id, task))
-        return True
 
 
 def current_task() -> TaskChannel:
@@ -104,7 +96,7 @@ def serve(
     connection: Connection,
     cancel: Event,
     threads: int,
-    warm_up: str | None,
+    warm_up: Callable[[int], None] | None,
     log_level: int = logging.WARNING,
     lowered: bool = True,
 ) -> None:
@@ -126,10 +118,9 @@ def serve(
     logging.getLogger().addHandler(LogHandler(send))
     logging.getLogger().setLevel(max(log_level, logging.INFO))  # below it, libraries log every detail
     if warm_up is not None:
-        module, name = warm_up.split(":")
         try:
             with compiled_aside(), report_compiling(lambda: send(("compiling",))):
-                getattr(importlib.import_module(module), name)(threads)
+                warm_up(threads)
         except Exception:  # noqa: BLE001 - the first task will report the error to its caller
             _log.exception("warming up failed")
     settle()
@@ -153,7 +144,7 @@ def serve(
         else:
             send(("result", task_id, result))
         _current = result = args = kwargs = None
-        # by number, what a task leaves in circles is little to the collector; by size it is images
+        # a task's reference cycles are few objects, which the collector would leave, but large: they hold images
         gc.collect()
 
 

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
 
-from core.errors import Cancelled
-from server.worker.embedded import ComputeWorker
-from server.worker.executor import TaskFuture
+from stereorig.core.errors import Cancelled
+from stereorig.server.worker.embedded import ComputeWorker
+from stereorig.server.worker.executor import TaskFuture
 
 _REST_AFTER_S = 60.0
 

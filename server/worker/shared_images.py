@@ -1,6 +1,6 @@
-"""Images in memory that the service shares with its worker, where a pipe takes five times as long.
+"""Images in memory that the service shares with its worker; a pipe takes five times as long.
 
-One sender and one reader take turns: the next images overwrite the last ones, which the reader copied meanwhile.
+One sender and one reader take turns: the next images overwrite the last ones, which the reader has copied by then.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ _ALIGNED = 64  # bytes
 
 @dataclass(frozen=True)
 class Placed:
-    """Where images lie, for a process of the same user on the same machine.
+    """Places of images in shared memory, for a process of the same user on the same machine.
 
     Attributes
     ----------
     file, size
         The shared memory's file and its length, bytes.
     images
-        Of each image the first byte, shape and type.
+        First byte, shape and type of each image.
     """
 
     file: str
@@ -44,7 +44,7 @@ class Placed:
         return tuple(np.ndarray(shape, kind, memory, first).copy() for first, shape, kind in self.images)
 
 
-_mapped: tuple[tuple[str, int], mmap.mmap] | None = None  # kept: to map it anew costs as much as to copy
+_mapped: tuple[tuple[str, int], mmap.mmap] | None = None  # kept: mapping it again costs as much as copying
 
 
 class SharedImages:

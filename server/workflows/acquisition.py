@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
-from server.base.models import Ids
-from server.jobs.idempotency import RequestMark
-from server.jobs.job import Job, Phase
-from server.workflows.service import Service
+from stereorig.server.base.models import Ids
+from stereorig.server.jobs.idempotency import RequestMark
+from stereorig.server.jobs.job import Job, Phase
+from stereorig.server.workflows.service import Service
 
 
 def begin_acquisition(
@@ -24,9 +24,9 @@ def begin_acquisition(
     request: RequestMark,
     on_cancel: Callable[[Job], None] | None = None,
 ) -> Ids:
-    """Make what ``create`` makes and the job that fills it; return both ids.
+    """Create an entry by ``create`` and the job that fills it; return both ids.
 
-    Every phase and ``on_end`` are called with the job and the id of what was made; see :meth:`Jobs.submit`.
+    Every phase and ``on_end`` are called with the job and the id of the new entry; see :meth:`Jobs.submit`.
     """
     made: dict[str, str] = {}
 

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import time
 
-from core.errors import MeasurementError, StereorigError
-from server.base.metrics import timed_capture
-from server.base.problem import JobProblem, problem_of
-from server.jobs.idempotency import RequestMark
-from server.jobs.job import Job, Phase
-from server.store.documents import BurstIndex, StepMetadata, StepRecord
-from server.workflows.capture import commit_pair
-from server.workflows.service import Service
+from stereorig.core.errors import MeasurementError, StereorigError
+from stereorig.server.base.metrics import timed_capture
+from stereorig.server.base.problem import JobProblem, problem_of
+from stereorig.server.documents.steps import BurstIndex, StepMetadata, StepRecord
+from stereorig.server.jobs.idempotency import RequestMark
+from stereorig.server.jobs.job import Job, Phase
+from stereorig.server.workflows.capture import commit_pair
+from stereorig.server.workflows.service import Service
 
 _POLL_S = 0.02
-#: what one pair can suffer and the next be spared; anything else ends the burst
+#: errors that may spoil one pair and not the next; any other ends the burst
 _OF_THE_PAIR = frozenset({"skew_too_large", "pair_incomplete", "frame_incomplete"})
 
 
@@ -40,7 +40,7 @@ def start_burst(
     Raises
     ------
     BusyError
-        Somebody has the cameras.
+        A job or another client has the cameras.
     StorageError
         ``storage_full``.
     """
@@ -85,7 +85,7 @@ def _run(
     if problems:
         first, why = problems[0]
         raise BurstIncompleteError(
-            f"{len(problems)} of {count} steps were not taken; the first, number {first}: {why.cause}",
+            f"{len(problems)} of {count} steps were not taken; the first, number {first}: {why.detail}",
             failed=[index for index, _ in problems],
         )
     return result
@@ -102,14 +102,14 @@ def _take(
     first_ns: int | None,
 ) -> StepRecord:
     service.require_room()
-    captured, positions_mm = service.rig.pair.capture(frames, job.check), service.rig.positions_mm()
+    captured, positions = service.rig.pair.capture(frames, job.check), service.rig.known_positions()
     since_ns = 0 if first_ns is None else captured.host_ns - first_ns
     burst = burst_index.model_copy(update={"since_first_ms": round(since_ns / 1e6, 3)})
-    return commit_pair(service, test_id, metadata.model_copy(update={"burst": burst}), captured, positions_mm)
+    return commit_pair(service, test_id, metadata.model_copy(update={"burst": burst}), captured, positions)
 
 
 def _wait_until(job: Job, moment: float) -> None:
-    """Wait, and check every 20 ms for the burst's end; one that is late goes on at once."""
+    """Wait, and check every 20 ms for the burst's end; return at once if the moment has passed."""
     while True:
         job.check()
         left = moment - time.monotonic()

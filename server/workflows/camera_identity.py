@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from core.errors import CameraError
-from core.names import CAMERAS
-from server.store.durable import read_json
+from stereorig.core.errors import CameraError
+from stereorig.core.names import CAMERAS
+from stereorig.server.store.durable import read_json
 
 Identities = Mapping[str, object]
 
 
 def calibrated_cameras(calibration: Path) -> Identities | None:
-    """Return model and serial number of each camera from a calibration.json; None where it does not say."""
+    """Return model and serial number of each camera from a calibration.json; None if it has none."""
     provenance = read_json(calibration).get("provenance")
     cameras = provenance.get("cameras") if isinstance(provenance, dict) else None
     return cameras if isinstance(cameras, dict) else None
@@ -56,5 +56,5 @@ def check_same_cameras(calibration: Path, cameras: Identities | None, images: st
 
 def _serial(identities: Identities, cam: str) -> str | None:
     record = identities.get(cam)
-    serial = record.get("serial") if isinstance(record, Mapping) else None
+    serial = record.get("serial") if isinstance(record, Mapping) else getattr(record, "serial", None)
     return serial if isinstance(serial, str) and serial else None

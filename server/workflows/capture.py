@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from core.errors import ImageError
-from core.names import CAMERAS, CameraName
-from server.base.metrics import timed_capture
-from server.formats.calibrations.recognise import load_calibration
-from server.formats.images import GrayImage, decode, encode_tiff
-from server.results.images.quality import ImageQuality, image_quality, pair_quality, quality_warning
-from server.rig.cameras import CapturedPair
-from server.store.documents import StepMetadata, StepRecord
-from server.store.folder import now_utc
-from server.store.indexing.entries import step_entry
-from server.workflows.camera_identity import check_same_cameras
-from server.workflows.service import Service
+from stereorig.core.errors import ImageError, StageError
+from stereorig.core.names import CAMERAS, CameraName
+from stereorig.drivers.acquisition.simultaneity import in_words
+from stereorig.server.base.metrics import timed_capture
+from stereorig.server.cell.images import images as read_images
+from stereorig.server.documents.steps import StepMetadata, StepRecord
+from stereorig.server.formats.calibrations.recognise import load_calibration
+from stereorig.server.formats.images import GrayImage, encode_tiff
+from stereorig.server.results.images.quality import ImageQuality, image_quality, pair_quality, quality_warning
+from stereorig.server.rig.cameras import CapturedPair
+from stereorig.server.store.folder import now_utc
+from stereorig.server.store.indexing.entries import step_entry
+from stereorig.server.workflows.camera_identity import check_same_cameras
+from stereorig.server.workflows.channels.reading import StepChannels
+from stereorig.server.workflows.service import Service
 
 #: a camera further from its calibrated position than this is off: 10 um of 400 mm change the scale by 2.5e-5
 OFF_ZERO_MM = 0.01
+_AT_ONCE = 2  # the next pairs are still being recorded, or the page is looked at
 
 
 @timed_capture("capture")
@@ -28,21 +34,44 @@ def capture_step(service: Service, test_id: str, metadata: StepMetadata, *, fram
     """Capture a pair and commit it as the test's next step; returns ``step.json``."""
     service.require_room()
     with service.hardware.hold("the capture of a step", test_id=test_id):
-        captured, positions_mm = service.hardware.call(
-            lambda: (service.rig.pair.capture(frames), service.rig.positions_mm())
+        captured, positions = service.hardware.call(
+            lambda: (service.rig.pair.capture(frames), service.rig.known_positions())
         )
-        return commit_pair(service, test_id, metadata, captured, positions_mm)
+        return commit_pair(service, test_id, metadata, captured, positions)
+
+
+class NewStep(NamedTuple):
+    """A captured pair that becomes a step; ``channels`` at its exposure, None: those that are read now."""
+
+    metadata: StepMetadata
+    captured: CapturedPair
+    channels: StepChannels | None = None
 
 
 def commit_pair(
-    service: Service, test_id: str, metadata: StepMetadata, captured: CapturedPair, positions_mm: dict[int, float]
+    service: Service,
+    test_id: str,
+    metadata: StepMetadata,
+    captured: CapturedPair,
+    positions: Mapping[int, float | StageError],
 ) -> StepRecord:
-    """Judge a captured pair and commit it as the test's next step; with the hold. Returns ``step.json``.
+    """Judge a captured pair and commit it as the test's next step, see `commit_pairs`."""
+    (step,) = commit_pairs(service, test_id, [NewStep(metadata, captured)], positions)
+    return step
+
+
+def commit_pairs(
+    service: Service, test_id: str, new: Sequence[NewStep], positions: Mapping[int, float | StageError]
+) -> Iterator[StepRecord]:
+    """Judge captured pairs and commit them as the test's next steps; with the hold. Each ``step.json`` that is durable.
 
     Parameters
     ----------
-    positions_mm
-        Of the stage, read back as the pair was taken, by axis.
+    new
+        Pairs of one size, of the same cameras with the same settings.
+    positions
+        Stage position by axis in mm, read back as the pairs were taken, or the error if one is not known; empty on a
+        rig without a stage.
 
     Raises
     ------
@@ -53,55 +82,97 @@ def commit_pair(
     StorageError
         It is not on disk.
     """
-    rig = service.rig
-    sizes: dict[str, list[int]] = {cam: [*reversed(captured.pixels[cam].shape)] for cam in CAMERAS}
-    _check_sizes(service, test_id, sizes)
+    identities, rig = service.rig.identities(), service.rig.record().plain()
+    _check_sizes(service, test_id, _sizes(new[0].captured))
     if service.tests.is_calibrated(test_id):
-        check_same_cameras(service.tests.calibration_file(test_id), rig.identities(), "The step")
+        check_same_cameras(service.tests.calibration_file(test_id), identities, "The step")
+    service.channels.attend(test_id)
+
+    def judged(one: NewStep) -> tuple[dict[str, bytes], dict[str, Any]]:
+        images: dict[str, bytes] = {cam: encode_tiff(one.captured.pixels[cam]) for cam in CAMERAS}
+        return images, _document(service, one, positions, {"cameras": identities, "rig": rig})
+
+    if len(new) == 1:
+        whole = [judged(new[0])]
+    else:
+        with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="pairs") as pool:
+            whole = list(pool.map(judged, new))
+    while whole:
+        steps = _announce(service, test_id, service.tests.steps.add_some(test_id, whole))
+        whole = whole[len(steps) :]
+        yield from steps
+
+
+def _sizes(captured: CapturedPair) -> dict[str, list[int]]:
+    return {cam: [*reversed(captured.pixels[cam].shape)] for cam in CAMERAS}
+
+
+def _document(
+    service: Service, new: NewStep, positions: Mapping[int, float | StageError], known_rig: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return ``step.json`` of a pair, without number and checksums."""
+    rig, captured, metadata = service.rig, new.captured, new.metadata
     depth = {cam: 16 if captured.scale > 1 else captured.bit_depth[cam] for cam in CAMERAS}
     rated = {cam: image_quality(captured.pixels[cam], depth[cam]) for cam in CAMERAS}
     quality = pair_quality(*rated.values())
-    dz: dict[str, float] = {cam: rig.dz_of(cam, positions_mm[rig.config.camera(cam).stage_axis]) for cam in CAMERAS}
-    warnings = off_zero_warnings(rig.config.calibration.moves, dz)
+    known = {
+        cam: position for cam in CAMERAS if (position := positions.get(rig.config.camera(cam).stage_axis)) is not None
+    }
+    dz = {cam: None if isinstance(p, StageError) else rig.dz_of(cam, p) for cam, p in known.items()}
+    warnings = off_zero_warnings(rig.config.calibration.moves, {cam: mm for cam, mm in dz.items() if mm is not None})
     if warnings and rig.config.calibration.moves != "target":
-        quality["code"] = "cameras_off_zero"  # whatever else is wrong with the pair, this one cannot be seen in it
-    quality |= {"skew_ms": captured.skew_ms, "max_skew_ms": rig.config.rig.skew_bound_ms, "pairs": captured.pair_counts}
+        quality["code"] = "cameras_off_zero"  # overrides other codes: the pair itself cannot show this one
+    lost = {cam: error.cause for cam, error in known.items() if isinstance(error, StageError)}
+    warnings += [
+        f"Position unknown of {' and '.join(cam for cam in lost if lost[cam] == cause)}: {cause}"
+        for cause in dict.fromkeys(lost.values())
+    ]
+    quality |= {**captured.skew, "max_skew_ms": rig.config.rig.skew_bound_ms, "pairs": captured.pair_counts}
     for cam in CAMERAS:
         quality[cam] |= captured.settings[cam] | {"frames": captured.frame_counts[cam]}
-    document = {
+    document: dict[str, Any] = {
         **metadata.plain(),
         "source": "capture",
         "captured_utc": now_utc(),
         "host_monotonic_ns": captured.host_ns,
-        "skew_ms": captured.skew_ms,
+        **captured.skew,
         "image_speed_px_s": captured.image_speed_px_s,
-        "cameras": rig.identities(),
-        "rig": rig.record().plain(),
+        **known_rig,
         "frames": captured.frames,
         "grey_scale": captured.scale,
         "bit_depth": captured.bit_depth,
         "frame_sequence": captured.sequence,
-        "dz_mm": dz,
-        "warnings": warnings + _quality_warnings(rated),
+        "dz_mm": dz or None,
+        "simulated": rig.config.simulated,
+        "warnings": warnings + _quality_warnings(rated) + skew_warnings(captured, rig.config.rig.skew_bound_ms),
         "scene": None if rig.scene is None else rig.scene.model_dump(),
         "quality": quality,
-        "image_size_px": sizes,
+        "image_size_px": _sizes(captured),
     }
-    images: dict[str, bytes] = {cam: encode_tiff(captured.pixels[cam]) for cam in CAMERAS}
-    return _announce(service, test_id, service.tests.steps.add(test_id, images, document))
+    exposed_s = captured.host_ns / 1e9 if captured.exposed_s is None else captured.exposed_s
+    channels = service.channels.at(exposed_s) if new.channels is None else new.channels
+    return document | channels.with_step(metadata, document["warnings"])
 
 
 def off_zero_warnings(moves: str, dz_mm: Mapping[str, float]) -> list[str]:
-    """Return what to warn of where a stage is off the calibrated place; empty where it is there, or moves nothing."""
-    worst = max(dz_mm, key=lambda cam: abs(dz_mm[cam]))
-    if moves == "free" or abs(dz_mm[worst]) <= OFF_ZERO_MM:
+    """Return a warning if a stage is off the calibrated place; empty if it is there, or moves nothing."""
+    worst = max(dz_mm, key=lambda cam: abs(dz_mm[cam]), default=None)
+    if worst is None or moves == "free" or abs(dz_mm[worst]) <= OFF_ZERO_MM:
         return []
     who = {
-        "cameras": f"{worst} stands at dZ = {dz_mm[worst]:+.3f} mm: the calibration holds at dZ = 0",
-        "both_cameras": f"The cameras stand at dZ = {dz_mm[worst]:+.3f} mm: the calibrated volume moved with them",
-        "target": f"The stage stands at dZ = {dz_mm[worst]:+.3f} mm: a specimen on it is off the calibrated place",
+        "cameras": f"{worst} is at dZ = {dz_mm[worst]:+.3f} mm: the calibration holds at dZ = 0",
+        "both_cameras": f"The cameras are at dZ = {dz_mm[worst]:+.3f} mm: the calibrated volume moved with them",
+        "target": f"The stage is at dZ = {dz_mm[worst]:+.3f} mm: a specimen on it is off the calibrated place",
     }[moves]
     return [f"{who}. POST /stage/moves with dz_mm 0 for both cameras takes it back."]
+
+
+def skew_warnings(captured: CapturedPair, max_skew_ms: float) -> list[str]:
+    """Return a warning if the pair may have more skew than is allowed, as far as is known."""
+    if captured.skew_ms + captured.skew_uncertainty_ms <= max_skew_ms:
+        return []
+    skew = f"{captured.skew_ms:.3g} ms ({in_words(captured.skew_source, captured.skew_uncertainty_ms)})"
+    return [f"A skew of {skew} does not show that the pair keeps the limit of {max_skew_ms:g} ms."]
 
 
 def _quality_warnings(rated: Mapping[CameraName, ImageQuality]) -> list[str]:
@@ -115,17 +186,18 @@ def import_step(service: Service, test_id: str, data: dict[str, bytes], metadata
     Raises
     ------
     ImageError
-        A file is no gray or RGB image, or its size is not that of the test's calibration or other images;
+        A file is no gray or RGB image, or its size differs from the test's calibration or other images;
         ``image_blank``, ``same_image``.
     """
     service.require_room()
-    decoded = {cam: decode(data[cam], name=f"the image of {cam}") for cam in CAMERAS}
+    read = read_images(service.cell, {f"the image of {cam}": data[cam] for cam in CAMERAS})
+    decoded = dict(zip(CAMERAS, read.values(), strict=True))
     images: dict[str, GrayImage] = {cam: decoded[cam].pixels for cam in CAMERAS}
     grey_from = {cam: made.grey_from for cam, made in decoded.items() if made.grey_from is not None}
     sizes: dict[str, list[int]] = {cam: [*reversed(images[cam].shape)] for cam in CAMERAS}
     _check_sizes(service, test_id, sizes)
     _check_content(images)
-    depth = {cam: 8 * images[cam].dtype.itemsize for cam in CAMERAS}
+    depth = {cam: decoded[cam].bit_depth for cam in CAMERAS}
     rated = {cam: image_quality(images[cam], depth[cam]) for cam in CAMERAS}
     document = {
         **metadata.plain(),
@@ -139,7 +211,7 @@ def import_step(service: Service, test_id: str, data: dict[str, bytes], metadata
         **({"grey_from": grey_from} if grey_from else {}),
     }
     data = {cam: encode_tiff(images[cam]) for cam in CAMERAS}
-    return _announce(service, test_id, service.tests.steps.add(test_id, data, document))
+    return _announce(service, test_id, [service.tests.steps.add(test_id, data, document)])[0]
 
 
 def _check_content(images: dict[str, GrayImage]) -> None:
@@ -180,10 +252,11 @@ def _check_sizes(service: Service, test_id: str, sizes: dict[str, list[int]]) ->
             )
 
 
-def _announce(service: Service, test_id: str, step: StepRecord) -> StepRecord:
-    entry = step_entry(step)
-    service.catalog.put_entry("step", test_id, f"{step.n:04d}", entry)
-    job = {} if step.burst is None else {"job_id": step.burst.job_id}
-    service.hub.publish("step", {"test_id": test_id, **entry, **job})
+def _announce(service: Service, test_id: str, steps: list[StepRecord]) -> list[StepRecord]:
+    entries = {f"{step.n:04d}": step_entry(step) for step in steps}
+    service.catalog.put_entries("step", test_id, entries)
+    for step, entry in zip(steps, entries.values(), strict=True):
+        job = {} if step.burst is None else {"job_id": step.burst.job_id}
+        service.hub.publish("step", {"test_id": test_id, **entry, **job})
     service.jobs.step_committed(test_id)
-    return step
+    return steps

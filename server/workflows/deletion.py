@@ -1,18 +1,18 @@
-"""Deleting: into the trash, never what a job or a capture is using."""
+"""Deleting: into the trash, never data that a job or a capture is using."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from core.errors import StateError, StereorigError
-from server.base.models import Ids
-from server.jobs.job import ACTIVE
-from server.store.documents import TrashEntry
-from server.store.indexing.entries import calibration_entry, entries_of_test
-from server.store.indexing.lost_jobs import LostJobs
-from server.store.trash import Kind
-from server.workflows.service import Service
+from stereorig.core.errors import StateError, StereorigError
+from stereorig.server.base.models import Ids
+from stereorig.server.documents.made import TrashEntry
+from stereorig.server.jobs.job import ACTIVE
+from stereorig.server.store.indexing.entries import calibration_entry, entries_of_test
+from stereorig.server.store.indexing.lost_jobs import LostJobs
+from stereorig.server.store.trash import Kind
+from stereorig.server.workflows.service import Service
 
 
 def delete(service: Service, kind: Kind, ids: Ids, *, by: str) -> TrashEntry:
@@ -21,7 +21,7 @@ def delete(service: Service, kind: Kind, ids: Ids, *, by: str) -> TrashEntry:
     Parameters
     ----------
     kind, ids
-        As of `server.store.trash.Trash.put`.
+        As of `stereorig.server.store.trash.Trash.put`.
     by
         Who asks.
 
@@ -50,7 +50,7 @@ def delete(service: Service, kind: Kind, ids: Ids, *, by: str) -> TrashEntry:
 
 
 def restore(service: Service, trash_id: str) -> TrashEntry:
-    """Move something back from the trash; return what it is; errors as `server.store.trash.Trash.restore`."""
+    """Move an entry back from the trash; return it; errors as `stereorig.server.store.trash.Trash.restore`."""
     with service.tests.still():
         entry = service.trash.restore(trash_id)
     if entry.calibration_id is not None and entry.kind == "calibration":
@@ -70,7 +70,7 @@ def _name(service: Service, kind: Kind, ids: Ids) -> str:
         try:
             return str(service.tests.read(str(ids["test_id"])).name or "")
         except StereorigError:
-            return ""  # what is damaged can be deleted too
+            return ""  # damaged data can be deleted too
     if kind == "step":
         try:
             return str(service.tests.steps.read(str(ids["test_id"]), int(ids["n"])).document.label or "")

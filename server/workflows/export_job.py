@@ -7,18 +7,18 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from server.exports.request import ExportRequest
-from server.formats.results.folder import home_of
-from server.jobs.job import Job, Phase
-from server.workflows.analysis.framed import file_in, variable_of_frame
-from server.workflows.service import Service
-from server.workflows.waiting import result_of
+from stereorig.server.exports.request import ExportRequest
+from stereorig.server.formats.results.folder import home_of
+from stereorig.server.jobs.job import Job, Phase
+from stereorig.server.workflows.analysis.framed import file_in, variable_of_frame
+from stereorig.server.workflows.service import Service
+from stereorig.server.workflows.waiting import result_of
 
 
 def start_export(
     service: Service, test_id: str, analysis_id: str, files: Sequence[Path], request: ExportRequest, frame: str | None
 ) -> Job:
-    """Begin an export of an analysis' result files as a job; ``GET /jobs/{id}/file`` answers with what it made.
+    """Begin an export of an analysis' result files as a job; ``GET /jobs/{id}/file`` answers with the file.
 
     Raises
     ------

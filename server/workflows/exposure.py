@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import CameraError, InputError, StateError
-from core.names import CameraName
-from drivers.cameras.protocol import CameraSettings
-from server.workflows.service import Service
+from stereorig.core.errors import CameraError, InputError, StateError
+from stereorig.core.names import CameraName
+from stereorig.drivers.cameras.protocol import CameraSettings
+from stereorig.server.workflows.service import Service
 
 #: of full scale: noise of five standard deviations stays below saturation, and most of the range is used
 LEVEL = 0.8
@@ -57,9 +57,9 @@ class FoundExposure:
 def set_exposure(
     service: Service, cam: CameraName, level: float, shortest_ms: float | None = None, longest_ms: float | None = None
 ) -> tuple[CameraSettings, FoundExposure]:
-    """Search and set a camera's exposure; with the hold. Returns its settings as read back, and what was found.
+    """Search and set a camera's exposure; with the hold. Returns its settings as read back, and the found exposure.
 
-    The exposure that it had is set again where none is found.
+    If none is found, the former exposure is set again.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def set_exposure(
     StateError
         As :func:`search_exposure`.
     CameraError
-        What the camera brings up.
+        The camera's own errors.
     """
     unit = service.rig.pair.units[cam]
     had, known = unit.settings.exposure_ms, unit.description.exposure_range_ms
@@ -81,12 +81,12 @@ def set_exposure(
         )
     low, high = known
     # a longer one would slow the pairs down, and a camera whose frames stay out counts as lost
-    if unit.trigger != "software" and unit.rate_hz is not None:
+    if unit.trigger in ("free", "hardware") and unit.rate_hz is not None:
         high = min(high, _OF_A_PERIOD * 1000.0 / unit.rate_hz)
     low, high = max(low, shortest_ms or low), min(high, longest_ms or high)
     if low > high:
         raise InputError(
-            f"{cam} can be exposed for {known[0]:g} to {min(known[1], high):.4g} ms; nothing of it lies within the "
+            f"{cam} can be exposed for {known[0]:g} to {min(known[1], high):.4g} ms; nothing of it is within the "
             "limits given.",
             code="out_of_range",
             remedy="Give other limits.",
@@ -101,7 +101,7 @@ def set_exposure(
     try:
         found = search_exposure(cam, picture, had, (low, high), level)
     except (CameraError, StateError):
-        with contextlib.suppress(CameraError):  # the error to tell is the first one
+        with contextlib.suppress(CameraError):  # the first error is the one to raise
             service.rig.configure(cam, CameraSettings(exposure_ms=had))
         raise
     return unit.settings, found
@@ -159,11 +159,11 @@ def search_exposure(
             short = wanted
             guess = wanted * min(level / max(seen.level, 1e-6), _LARGEST_STEP)
         if long / short < _NARROW:
-            # steps of the exposure, or a gamma's jump, leave no better one; else the light changes meanwhile
+            # steps of the exposure, or a gamma's jump, leave no better one; else the light changed during the search
             if not seen.clipped and abs(seen.level / level - 1.0) <= _UNSTEADY:
                 return FoundExposure(exposure_ms, seen, tried)
             break
-        # a limit itself is tried once the guess lies beyond it
+        # a limit itself is tried once the guess is beyond it
         inside = short < guess < long or guess <= low == short or guess >= high == long
         wanted = min(max(guess, low), high) if inside else float(np.sqrt(short * long))
     raise StateError(

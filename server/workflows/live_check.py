@@ -5,14 +5,15 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
-from core.errors import MeasurementError, StateError
-from server.rig.cameras import CapturedPair
-from server.rig.shared import SharedReading
-from server.store.folder import now_utc
-from server.worker.tasks import LiveCheckTask, LiveFinding, check_live
-from server.workflows.calibration.review import newest_accepted
-from server.workflows.calibration.sequence import way_back
-from server.workflows.service import Service
+from stereorig.core.errors import MeasurementError, StateError
+from stereorig.server.compute.functions import check_live
+from stereorig.server.compute.tasks import LiveCheckTask, LiveFinding
+from stereorig.server.rig.cameras import CapturedPair
+from stereorig.server.rig.shared import SharedReading
+from stereorig.server.store.folder import now_utc
+from stereorig.server.workflows.calibration.review import newest_accepted
+from stereorig.server.workflows.calibration.sequence import way_back
+from stereorig.server.workflows.service import Service
 
 _PAIR_S = 5.0
 _PATIENCE_S = 30.0
@@ -20,7 +21,7 @@ _PATIENCE_S = 30.0
 
 @dataclass(frozen=True)
 class LiveCheck:
-    """A finding, of which calibration, and when; its level is ``off_zero`` or ``busy``, too, where none was made."""
+    """A finding, its calibration's id and its time; the level is ``off_zero`` or ``busy`` if no check was made."""
 
     calibration_id: str
     finding: LiveFinding
@@ -37,7 +38,7 @@ class LiveChecks:
     def __call__(self) -> LiveCheck:
         """Return the check of the newest accepted calibration by a live pair.
 
-        Its ``level`` is ``off_zero`` where a stage stands elsewhere, ``busy`` while jobs compute: then nothing was
+        Its ``level`` is ``off_zero`` if a stage is not at dZ = 0, ``busy`` while jobs compute: then nothing was
         checked.
 
         Raises
@@ -45,7 +46,7 @@ class LiveChecks:
         StateError
             ``no_calibration_accepted``, ``camera_busy``.
         CameraError
-            What the cameras bring up.
+            The cameras' own errors.
         """
         return self._shared()
 
@@ -60,7 +61,7 @@ class LiveChecks:
             text = str(back["text"]).split(":")[0] + ": the calibration holds at dZ = 0"
             return LiveFinding("off_zero", text)
         if service.jobs.active_count() or not service.worker.ready.is_set():
-            return LiveFinding("busy", "a job is running, or the computation starts; the check goes on after it")
+            return LiveFinding("busy", "a job is running, or the computation starts; the check continues after it")
         pixels = self._pair().pixels
         file = service.calibrations.path(calibration_id) / "calibration.json"
         task = LiveCheckTask(file, (pixels["cam1"], pixels["cam2"]))
@@ -75,7 +76,7 @@ class LiveChecks:
         return found
 
     def _pair(self) -> CapturedPair:
-        """Take a pair as a live view does: without the hold, and given up where none comes."""
+        """Take a pair as a live view does: without the hold; give up if none comes."""
         given_up = time.monotonic() + _PAIR_S
 
         def check() -> None:

@@ -11,11 +11,11 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from core.errors import DeviceError, StereorigError
-from drivers.stages.protocol import AxisState
-from server.formats.version import software_version
-from server.worker.death import resident_mib
-from server.workflows.service import Service
+from stereorig.core.errors import DeviceError, StereorigError
+from stereorig.drivers.stages.protocol import AxisState
+from stereorig.server.formats.version import software_version
+from stereorig.server.worker.death import resident_mib
+from stereorig.server.workflows.service import Service
 
 _log = logging.getLogger("stereorig.metrics")
 _MIB = 2**20
@@ -132,12 +132,14 @@ class StateCollector(Collector):
         positions = GaugeMetricFamily("stereorig_axis_position_mm", "Position that was read back.", labels=["axis"])
         states = GaugeMetricFamily("stereorig_axis_state", "1 for the state the axis is in.", labels=["axis", "state"])
         try:
-            for axis in self._service.rig.describe_stage().axes:
+            shown = self._service.rig.describe_stage()
+            for axis in shown.axes:
                 number = str(axis.axis)
                 positions.add_metric([number], axis.position_mm)
                 for state in AxisState:
                     states.add_metric([number, state.value], axis.state is state)
-            answers.add_metric([], self._service.rig.fault is None)
+            if self._service.config.stage is not None:
+                answers.add_metric([], shown.fault is None)
         except DeviceError:
             answers.add_metric([], 0)
         yield from (answers, positions, states)

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from core.names import CAMERAS
-from server.base.models import Ids
-from server.jobs.idempotency import RequestMark
-from server.jobs.job import Job
-from server.worker.tasks import NoiseTask, fit_noise
-from server.workflows.acquisition import begin_acquisition
-from server.workflows.service import Service
-from server.workflows.waiting import run_task
+from stereorig.core.names import CAMERAS
+from stereorig.server.base.models import Ids
+from stereorig.server.compute.functions import fit_noise
+from stereorig.server.compute.tasks import NoiseTask
+from stereorig.server.jobs.idempotency import RequestMark
+from stereorig.server.jobs.job import Job
+from stereorig.server.workflows.acquisition import begin_acquisition
+from stereorig.server.workflows.service import Service
+from stereorig.server.workflows.waiting import run_task
 
 
-def begin(service: Service, frames: int, label: str, request: RequestMark) -> Ids:
+def begin(service: Service, frames: int, label: str, request: RequestMark, *, even: bool = False) -> Ids:
     """Make a noise measurement and its job; return both ids.
 
     Raises
     ------
     BusyError
-        Somebody has the cameras.
+        A job or another client has the cameras.
     StorageError
         ``storage_full``.
     """
@@ -36,15 +37,15 @@ def begin(service: Service, frames: int, label: str, request: RequestMark) -> Id
         "a noise measurement",
         "noise_id",
         create=create,
-        hardware=lambda job, noise_id: take_frames(service, job, noise_id, frames),
+        hardware=lambda job, noise_id: take_frames(service, job, noise_id, frames, even=even),
         compute=lambda job, noise_id: fit(service, job, noise_id),
         on_end=lambda job, noise_id, state: close(service, job, noise_id, state),
         request=request,
     )
 
 
-def take_frames(service: Service, job: Job, noise_id: str, frames: int) -> dict[str, object]:
-    """Hardware phase: ``frames`` pairs on disk, none averaged."""
+def take_frames(service: Service, job: Job, noise_id: str, frames: int, *, even: bool = False) -> dict[str, object]:
+    """Hardware phase: ``frames`` pairs on disk, none averaged; ``even`` if they show an even field."""
     rig = service.rig
     taken = []
     for index in range(frames):
@@ -56,6 +57,7 @@ def take_frames(service: Service, job: Job, noise_id: str, frames: int) -> dict[
     entries = {
         "bit_depth": {cam: captured.bit_depth[cam] for cam in CAMERAS},
         "settings": {cam: asdict(rig.pair.units[cam].settings) for cam in CAMERAS},
+        **({"even": True} if even else {}),
     }
     service.noise.put_frames_done(noise_id, taken, entries)
     job.progress("frames", frames, frames)
@@ -64,7 +66,9 @@ def take_frames(service: Service, job: Job, noise_id: str, frames: int) -> dict[
 
 def fit(service: Service, job: Job, noise_id: str) -> dict[str, object]:
     """Compute phase: ``noise.json`` is there when this returns."""
-    return dict(run_task(service.worker, job, fit_noise, NoiseTask(str(service.noise.path(noise_id)))))
+    found = dict(run_task(service.worker, job, fit_noise, NoiseTask(str(service.noise.path(noise_id)))))
+    service.noise.take_over(noise_id)
+    return found
 
 
 def close(service: Service, job: Job, noise_id: str, state: str) -> None:

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from core.errors import ImageError, StateError
-from server.base.models import Ids
-from server.formats.calibrations.recognise import load_calibration
-from server.jobs.idempotency import RequestMark
-from server.store.documents import TestRecord
-from server.store.indexing.entries import test_entry
-from server.workflows.calibration.review import LATEST, check_not_discarded, newest_accepted
-from server.workflows.camera_identity import check_same_cameras
-from server.workflows.service import Service
+from stereorig.core.errors import ImageError, StateError
+from stereorig.server.base.models import Ids
+from stereorig.server.documents.tests import TestRecord
+from stereorig.server.formats.calibrations.recognise import load_calibration
+from stereorig.server.formats.manifest import checked_bytes
+from stereorig.server.jobs.idempotency import RequestMark
+from stereorig.server.store.indexing.entries import test_entry
+from stereorig.server.workflows.calibration.review import LATEST, check_not_discarded, newest_accepted
+from stereorig.server.workflows.camera_identity import check_same_cameras
+from stereorig.server.workflows.service import Service
 
 
 def create(service: Service, wanted: Mapping[str, object], request: RequestMark) -> Ids:
@@ -58,7 +59,7 @@ def calibration_asked(service: Service, asked: str) -> tuple[str, Path]:
     StateError
         ``calibration_not_complete``, ``calibration_discarded`` or ``no_calibration_accepted``.
     """
-    calibration_id = newest_accepted(service) if asked in LATEST else asked
+    calibration_id = newest_accepted(service) if asked == LATEST else asked
     path = service.calibrations.path(calibration_id) / "calibration.json"
     state = service.calibrations.read(calibration_id).state
     if state != "complete":
@@ -93,7 +94,7 @@ def give_calibration(service: Service, test_id: str, asked: str, *, in_force: bo
     """
     calibration_id, path = calibration_asked(service, asked)
     _check_fits(service, test_id, calibration_id, path)
-    return service.tests.keep_calibration(test_id, calibration_id, path.read_bytes(), in_force=in_force)
+    return service.tests.keep_calibration(test_id, calibration_id, checked_bytes(path), in_force=in_force)
 
 
 def _check_fits(service: Service, test_id: str, calibration_id: str, path: Path) -> None:
@@ -103,7 +104,7 @@ def _check_fits(service: Service, test_id: str, calibration_id: str, path: Path)
         step = service.tests.steps.read(test_id, n).document
         for cam, size in step.image_size_px.items():
             of = sizes.get(cam)
-            if of is not None and list(of) != size:
+            if of is not None and of != size:
                 raise ImageError(
                     f"Step {n}'s image of {cam} is {size[0]} x {size[1]} px, calibration {calibration_id} is for "
                     f"{of[0]} x {of[1]} px.",

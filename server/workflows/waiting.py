@@ -7,10 +7,9 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from typing import Any, Self
 
-from core.errors import Cancelled
-from server.jobs.job import Job
-from server.worker.executor import Progress, TaskExecutor, TaskFuture
-from server.worker.helpers import Helpers
+from stereorig.core.errors import Cancelled
+from stereorig.server.jobs.job import Job
+from stereorig.server.worker.executor import Progress, TaskExecutor, TaskFuture
 
 _STOPPING_S = 3.0  # the worker ends a task within a second, by force if need be
 
@@ -19,28 +18,31 @@ def run_task(
     executor: TaskExecutor, job: Job, function: Callable[..., Any], *args: Any, progress: Progress | None = None
 ) -> Any:
     """Run ``function(*args)`` outside; progress goes to the job, the job's cancellation to the task."""
-    helpers = Helpers(executor)
-    future = executor.submit(function, *args)
-    helpers.hear(future)
-    return result_of(future, job, progress, helpers)
+    report_away(executor, job)
+    return result_of(executor.submit(function, *args), job, progress, executor)
 
 
-def result_of(future: TaskFuture, job: Job, progress: Progress | None = None, helpers: Helpers | None = None) -> Any:
-    """Wait for a task that was begun for a job; progress goes to the job, the job's cancellation to the task."""
+def report_away(executor: TaskExecutor, job: Job) -> None:
+    """Have a job show that its executor is away, if it is."""
+    if away := executor.away:
+        job.await_part(f"waiting: {away}")
+
+
+def result_of(
+    future: TaskFuture, job: Job, progress: Progress | None = None, executor: TaskExecutor | None = None
+) -> Any:
+    """Wait for a task that was begun for a job; progress goes to the job, the job's cancellation to the task.
+
+    With an ``executor`` the job shows while that is away.
+    """
     future.on_progress = progress or job.progress
-
-    def stop() -> None:
-        future.request_stop()
-        if helpers is not None:
-            helpers.stop()
-
-    with job.waiting(stop):
+    with job.waiting(future.request_stop):
         while not future.done():
             if job.cancelled:  # also where it was just before the future was known
-                stop()
+                future.request_stop()
             wait([future], timeout=0.05)
-            if helpers is not None:
-                helpers.look(busy=1)
+            if executor is not None:
+                report_away(executor, job)
         try:
             return future.result()
         except CancelledError:
@@ -60,9 +62,9 @@ def run_side_by_side(
     Parameters
     ----------
     tasks
-        Each task's number, and what makes its argument.
+        Each task's number, and a function that makes its argument.
     ended
-        Called with the number and the future of each that has ended; what it raises ends them all.
+        Called with the number and the future of each that has ended; an exception from it ends them all.
     progress
         Called with a task's number, its stage and the share of it that is done.
     """
@@ -91,7 +93,6 @@ class SideBySide:
     def __init__(self, executor: TaskExecutor, job: Job, progress: Callable[[int, str, float], None]) -> None:
         self._executor, self._job, self._progress = executor, job, progress
         self.running: dict[TaskFuture, int] = {}
-        self._helpers = Helpers(executor)
         self._waiting = contextlib.ExitStack()
 
     @property
@@ -106,7 +107,6 @@ class SideBySide:
         future.on_progress = lambda phase, done, of: self._progress(
             number, phase, min(done / of, 1.0) if of > 0 else 0.0
         )
-        self._helpers.hear(future)
         self.running[future] = number
         return future
 
@@ -119,23 +119,23 @@ class SideBySide:
             The job is to stop.
         """
         self._job.check()
-        self._helpers.look(busy=len(self.running))
+        report_away(self._executor, self._job)
         finished, _ = wait(list(self.running), timeout=0.05, return_when=FIRST_COMPLETED)
         for one in finished:
             self._job.check()
-            future: TaskFuture = one  # type: ignore[assignment]  # wait() forgets what it was given
+            future: TaskFuture = one  # type: ignore[assignment]  # wait() drops the futures' type
             yield self.running.pop(future), future
 
     def _stop(self) -> None:
         for future in list(self.running):
             future.request_stop()
-        self._helpers.stop()
 
     def __enter__(self) -> Self:
         self._waiting.enter_context(self._job.waiting(self._stop))
+        report_away(self._executor, self._job)
         return self
 
     def __exit__(self, *_: object) -> None:
         with self._waiting:
             self._stop()
-            wait(list(self.running), timeout=_STOPPING_S)  # what a job leaves running would write after its end
+            wait(list(self.running), timeout=_STOPPING_S)  # a task that still runs would write after the job's end

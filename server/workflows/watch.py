@@ -1,7 +1,7 @@
 """Watch mode: a step at each change of a channel that a script posts.
 
-What is watched lies in the test's folder, and what a change is compared with is the channel's value in the newest step
-that bears it: both outlive a restart, and a reading that asked for a step and got an error asks again.
+The watched channel is stored in the test's folder, and a change is measured from the channel's value in the newest step
+that has one: both outlive a restart, and a reading that asked for a step and got an error asks again.
 """
 
 from __future__ import annotations
@@ -10,25 +10,25 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from core.errors import StateError
-from server.base.errors import NotFoundError
-from server.store.documents import StepMetadata, Watched, WatchRecord
-from server.store.durable import read_json, read_record, write_json
-from server.store.folder import now_utc
-from server.workflows.capture import capture_step
-from server.workflows.service import Service
+from stereorig.core.errors import StateError
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.documents.steps import StepMetadata, Watched, WatchRecord
+from stereorig.server.store.durable import read_json, read_record, write_json
+from stereorig.server.store.folder import now_utc
+from stereorig.server.workflows.capture import capture_step
+from stereorig.server.workflows.service import Service
 
 #: watched like any channel, and kept in the steps' own field
 LOAD = "load_n"
 
 
 def value_of(step: StepMetadata, channel: str) -> float | None:
-    """Value of a channel in a step's document, or in a reading's; None where it has none."""
+    """Value of a channel in a step's document, or in a reading's; None if it has none."""
     return step.load_n if channel == LOAD else step.channels.get(channel)
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ReadingOutcome:
     """Outcome of a reading.
 
     Parameters
@@ -37,7 +37,7 @@ class Outcome:
         ``first`` reading of the channel or ``changed`` enough: a step was taken. ``below_threshold`` or
         ``channel_absent``: none was.
     value, last_value
-        Of the watched channel, now and at the step that it is compared with.
+        Value of the watched channel now, and at the step that it is compared with.
     n
         Number of the step that was taken.
     """
@@ -64,12 +64,12 @@ class Watches:
     def begin(
         self, test_id: str, settings: Mapping[str, object], allow: Callable[[WatchRecord | None], None] | None = None
     ) -> WatchRecord:
-        """Watch a channel from now on, in place of what was watched before.
+        """Watch a channel from now on, in place of the one watched before.
 
         Parameters
         ----------
         allow
-            Is given what is watched now, None for nothing, and raises where that must not be replaced.
+            Called with the present watch, None if there is none; raises an error if it must not be replaced.
         """
         with self._turn(test_id):
             if allow is not None:
@@ -96,12 +96,12 @@ class Watches:
         return read_record(WatchRecord, path)
 
     def read(self, test_id: str) -> WatchRecord:
-        """Return what is watched, and what the next reading is compared with.
+        """Return the watch with its channel's last value and step, which the next reading is compared with.
 
         Raises
         ------
         NotFoundError
-            If nothing ever was.
+            If the test was never watched.
         """
         watch = self._record(test_id)
         last = self._last(test_id, watch.channel)
@@ -109,7 +109,7 @@ class Watches:
         return watch.model_copy(update={"last_value": value, "last_step": n})
 
     def _last(self, test_id: str, channel: str) -> tuple[int, float] | None:
-        """Newest step that bears a channel, and its value; read once until there are other steps."""
+        """Newest step that has a value of a channel, and the value; kept until there are other steps."""
         mark = self._service.tests.steps.mark(test_id)
         known = self._known.get((test_id, channel))
         if known is None or known[0] != mark:
@@ -125,7 +125,7 @@ class Watches:
                 return n, value
         return None
 
-    def reading(self, test_id: str, metadata: StepMetadata) -> Outcome:
+    def reading(self, test_id: str, metadata: StepMetadata) -> ReadingOutcome:
         """Take a step if the watched channel has changed enough.
 
         Parameters
@@ -157,11 +157,11 @@ class Watches:
             value, last = value_of(metadata, channel), self._last(test_id, channel)
             last_value = None if last is None else last[1]
             if value is None:
-                return Outcome("channel_absent", None, last_value)
+                return ReadingOutcome("channel_absent", None, last_value)
             change = None if last_value is None else abs(value - last_value)
             if change is not None and (change < threshold or change == 0.0):
-                return Outcome("below_threshold", value, last_value)
+                return ReadingOutcome("below_threshold", value, last_value)
             why = Watched(channel=channel, value=value, last_value=last_value, threshold=threshold)
             taken = metadata.model_copy(update={"label": metadata.label or watch.label or "", "watch": why})
             step = capture_step(self._service, test_id, taken, frames=watch.frames)
-            return Outcome("first" if last is None else "changed", value, last_value, step.n)
+            return ReadingOutcome("first" if last is None else "changed", value, last_value, step.n)

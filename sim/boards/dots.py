@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from sim.boards.pattern import (
+from stereorig.core.arrays import Float
+from stereorig.sim.boards.pattern import (
     BEHIND,
     BOARD,
     FAR_MM,
@@ -21,7 +21,7 @@ from sim.boards.pattern import (
     plate_share,
     soft_step,
 )
-from sim.texture import Texture
+from stereorig.sim.texture import Texture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class DotsTexture(Texture):
     hollow: NDArray[np.int64]
 
     def paint(self, s_mm: Float, t_mm: Float, out: Float) -> None:
-        """Write the brightness of material points into ``out`` (n,), which stays as it is where they are NaN."""
+        """Write the brightness of material points into ``out`` (n,); NaN points leave their element as it is."""
         _dots(self.parameters, self.nodes_mm, self.hollow, s_mm, t_mm, out)
 
 
@@ -56,15 +56,15 @@ def dots_board(
     Parameters
     ----------
     pitch_mm, errors_mm, margin_mm
-        As of :func:`sim.boards.squares.squares_board`; ``errors_mm`` moves whole dots, the margin
-        lies about the outermost dots.
+        As in :func:`stereorig.sim.boards.squares.squares_board`; ``errors_mm`` moves whole dots, the margin is about
+        the outermost dots.
     dot_mm
         Diameter of a dot.
     asymmetric
-        Rows lie a pitch apart, dots of one row two pitches, odd rows are shifted by one.
+        Rows are a pitch apart, dots of one row two pitches, odd rows are shifted by one.
     marks
-        Three dots are rings of half the inner diameter: three corners of a rectangle about the centre, which tell how
-        the board is turned.
+        Three dots are rings of half the inner diameter: three corners of a rectangle about the centre, which show the
+        board's rotation.
     edge_mm
         Softness of the edges (sd of the Gaussian); a 150th of the pitch by default.
     """
@@ -106,7 +106,7 @@ def _dots(par: Float, errors: Float, hollow: NDArray[np.int64], s: Float, t: Flo
             continue
         a, b = sk * per_mm + centre_a, tk * per_mm + centre_b
         cover = 0.0
-        # an asymmetric grid's nearest dot may lie in either of the two rows about the point
+        # an asymmetric grid's nearest dot may be in either of the two rows about the point
         first = int(np.floor(b)) if asymmetric else int(np.floor(b + 0.5))
         for j in range(first, first + (2 if asymmetric else 1)):
             shift = float(j % 2) if asymmetric else 0.0

@@ -20,7 +20,7 @@ class Squares:
     squares
         (rows + 1, columns + 1) ``WHITE``, ``BLACK``, or the number of the marker in a white square.
     markers
-        (n, m, m) cells of the markers with their black borders, 1 is black; m is 1 where there are none.
+        (n, m, m) cells of the markers with their black borders, 1 is black; m is 1 without markers.
     """
 
     squares: NDArray[np.int64]

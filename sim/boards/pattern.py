@@ -1,4 +1,4 @@
-"""What the prints of all boards share: a white plate of finite size, soft edges, the field of points.
+"""Common parts of the prints of all boards: a white plate of finite size, soft edges, the field of points.
 
 A printed pattern is ink on a plate. Its edges are softened by a Gaussian of ``edge_mm``, so that the textures have no
 resolution, and their finest features are known.
@@ -14,10 +14,10 @@ from typing import Final
 import numpy as np
 from numba import njit
 
-from core.arrays import Float
+from stereorig.core.arrays import Float
 
-BOARD: Final = 3  # kind of texture, after those of `sim.texture`
-INK, PAPER, BEHIND = 0.06, 0.80, 0.25  # brightness of ink, plate and what is behind it
+BOARD: Final = 3  # kind of texture, after those in `stereorig.sim.texture`
+INK, PAPER, BEHIND = 0.06, 0.80, 0.25  # brightness of ink, plate and background
 REACH_SD: Final = 5.0  # a soft edge ends here, with 3e-7 left
 FAR_MM: Final = 1e9
 ROOT_HALF: Final = 0.7071067811865476

@@ -12,14 +12,14 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Float
-from core.cameras.camera import Camera, RigidTransform
-from sim.boards.target import SimTarget
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.sim.boards.target import SimTarget
 
 _TILT_DEG: Final = 40.0
 _ROLL_DEG: Final = 35.0
 _DISTANCE: Final = 0.15
-_INSIDE: Final = 0.01  # of the image, that a board keeps free at its borders
+_INSIDE: Final = 0.01  # share of the image that a board keeps free at its borders
 _DRAWS: Final = 200
 _HALVINGS: Final = 12
 _MOST: Final = 1_000_000
@@ -59,7 +59,7 @@ def hand_pose(
     number
         0, 1, 2 ...; the same number is the same pose.
     seed
-        Of the sequence.
+        Seed of the sequence.
     """
     if not 0 <= number <= _MOST:
         raise ValueError(f"hand must be a number from 0 to {_MOST}, got {number}")

@@ -12,9 +12,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from sim.boards.markers import Squares
-from sim.boards.pattern import (
+from stereorig.core.arrays import Float
+from stereorig.sim.boards.markers import Squares
+from stereorig.sim.boards.pattern import (
     BEHIND,
     BOARD,
     FAR_MM,
@@ -26,7 +26,7 @@ from sim.boards.pattern import (
     plate_share,
     soft_step,
 )
-from sim.texture import Texture
+from stereorig.sim.texture import Texture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,14 +36,14 @@ class SquaresTexture(Texture):
     Attributes
     ----------
     squares, markers
-        See :class:`sim.boards.markers.Squares`.
+        See :class:`stereorig.sim.boards.markers.Squares`.
     """
 
     squares: NDArray[np.int64]
     markers: NDArray[np.int64]
 
     def paint(self, s_mm: Float, t_mm: Float, out: Float) -> None:
-        """Write the brightness of material points into ``out`` (n,), which stays as it is where they are NaN."""
+        """Write the brightness of material points into ``out`` (n,); NaN points leave their element as it is."""
         _squares(self.parameters, self.nodes_mm, self.squares, self.markers, s_mm, t_mm, out)
 
 
@@ -72,7 +72,7 @@ def squares_board(
     marker_mm
         Side of a marker; 0: there are none.
     edge_mm
-        Softness of the edges (sd of the Gaussian); by default a 150th of the pitch, less where markers are fine.
+        Softness of the edges (sd of the Gaussian); by default a 150th of the pitch, less for fine markers.
     """
     rows, columns = errors_mm.shape[:2]
     cell = marker_mm / squares.markers.shape[1] if marker_mm else pitch_mm
@@ -171,7 +171,7 @@ def _squares(
             out[k] = behind + (paper + (ink - paper) * v - behind) * plate
             continue
         if par[8] > 0.0:
-            # the exact place of what the maker printed here: a fixed point, as errors are small against the pitch
+            # the exact material point that the maker printed here: a fixed point, as errors are small against the pitch
             ex, ey = _error_at(errors, a - 1.0, b - 1.0)
             ex, ey = _error_at(errors, a - 1.0 - ex * per_mm, b - 1.0 - ey * per_mm)
             a -= ex * per_mm

@@ -1,4 +1,4 @@
-"""The calibration target of a simulated rig: its nominal description, and what the maker made of it."""
+"""The calibration target of a simulated rig: its nominal description, and the maker's errors."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from core.arrays import Float
-from sim.boards.dots import dots_board
-from sim.boards.markers import charuco_squares, checkerboard_squares
-from sim.boards.pattern import field_points
-from sim.boards.squares import squares_board
-from sim.surface import Surface, bowl, flat
-from sim.texture import Texture, line_grid
+from stereorig.core.arrays import Float
+from stereorig.sim.boards.dots import dots_board
+from stereorig.sim.boards.markers import charuco_squares, checkerboard_squares
+from stereorig.sim.boards.pattern import field_points
+from stereorig.sim.boards.squares import squares_board
+from stereorig.sim.surface import Surface, bowl, flat
+from stereorig.sim.texture import Texture, line_grid
 
 TARGET_KINDS: Final = ("line_grid", "checkerboard", "charuco", "circles", "circles_asymmetric")
 _CHROME, _BACKLIT = 0.03, 0.9
@@ -31,7 +31,7 @@ class SimTarget:
     kind
         One of :data:`TARGET_KINDS`.
     pitch_mm, lines, line_width_mm, dark_lines
-        The line grid's, see :func:`sim.texture.line_grid`.
+        The line grid's, see :func:`stereorig.sim.texture.line_grid`.
     size, marker_mm, dictionary
         A board's: (columns, rows) of inner corners or dots, side and dictionary of ChArUco's markers.
     node_tolerance_mm
@@ -42,7 +42,7 @@ class SimTarget:
         Rise of the bent board at half the longer side of its field of points, positive away from the viewer.
     dot_mm, margin_mm, edge_mm
         Diameter of a dot (half the pitch if None), white margin (one pitch if None), softness of the edges (see
-        `sim.boards.squares` if None).
+        `stereorig.sim.boards.squares` if None).
     marks
         Three dots of a symmetric grid are rings.
     """
@@ -88,7 +88,7 @@ class SimTarget:
         return self.surface().positions(xy)
 
     def errors_mm(self, seed: int) -> Float:
-        """Maker's errors (rows, columns, 2) of a seed, the pitch's apart."""
+        """Maker's errors (rows, columns, 2) for a seed, without the pitch's error."""
         columns, rows = self.lines if self.kind == "line_grid" else self.size
         tolerance = self.node_tolerance_mm
         return np.random.default_rng(seed).uniform(-tolerance, tolerance, (rows, columns, 2))

@@ -28,7 +28,7 @@ class SimClock:
 
 
 @dataclass(frozen=True)
-class Segment:
+class Ramp:
     """A stretch of constant acceleration, from ``start_s`` on for ``duration_s``."""
 
     start_s: float
@@ -48,7 +48,7 @@ class Segment:
 class Profile:
     """Segments one after the other; at rest at ``goal_mm`` from ``end_s`` on."""
 
-    segments: tuple[Segment, ...]
+    segments: tuple[Ramp, ...]
     goal_mm: float
     end_s: float
 
@@ -74,9 +74,9 @@ def trapezoid(start_mm: float, goal_mm: float, now_s: float, velocity_mm_s: floa
     lead = sign * peak * ramp_s / 2
     return Profile(
         (
-            Segment(now_s, ramp_s, start_mm, 0.0, sign * ramp_mm_s2),
-            Segment(now_s + ramp_s, cruise_s, start_mm + lead, sign * peak, 0.0),
-            Segment(now_s + ramp_s + cruise_s, ramp_s, goal_mm - lead, sign * peak, -sign * ramp_mm_s2),
+            Ramp(now_s, ramp_s, start_mm, 0.0, sign * ramp_mm_s2),
+            Ramp(now_s + ramp_s, cruise_s, start_mm + lead, sign * peak, 0.0),
+            Ramp(now_s + ramp_s + cruise_s, ramp_s, goal_mm - lead, sign * peak, -sign * ramp_mm_s2),
         ),
         goal_mm,
         now_s + 2 * ramp_s + cruise_s,
@@ -88,7 +88,7 @@ def brake(position_mm: float, velocity_now_mm_s: float, now_s: float, ramp_mm_s2
     duration = abs(velocity_now_mm_s) / ramp_mm_s2
     goal = position_mm + velocity_now_mm_s * duration / 2
     ramp = -math.copysign(ramp_mm_s2, velocity_now_mm_s)
-    return Profile((Segment(now_s, duration, position_mm, velocity_now_mm_s, ramp),), goal, now_s + duration)
+    return Profile((Ramp(now_s, duration, position_mm, velocity_now_mm_s, ramp),), goal, now_s + duration)
 
 
 @dataclass
@@ -131,7 +131,7 @@ class SimAxis:
     clock
         Shared by all axes of one controller.
     velocity_mm_s, acceleration_mm_s2
-        Of moves, until changed.
+        Velocity and acceleration of moves, until changed.
     resolution_mm
         One encoder count.
     start_mm
@@ -193,7 +193,7 @@ class SimAxis:
                 self._profile = brake(self._motor_mm, velocity, now, self.acceleration_mm_s2)
 
     def cut(self) -> None:
-        """Stand still at once, as with the motor switched off."""
+        """Stop at once, as with the motor switched off."""
         with self._lock:
             self._advance()
             self._profile = Profile((), self._motor_mm, -math.inf)

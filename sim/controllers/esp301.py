@@ -16,10 +16,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Unpack
 
-from sim.controllers.axis import SimAxis, Trouble
-from sim.controllers.wire import Motion, WireAxis, WireController
+from stereorig.sim.controllers.axis import SimAxis, Trouble
+from stereorig.sim.controllers.wire import Motion, WireAxis, WireController
 
-_COMMAND = re.compile(r"(\d*)([A-Z]{2})(.*)")
+_COMMAND = re.compile(r"([0-9]*)([A-Z]{2})(.*)")
 _LONGEST_LINE = 80
 _TICK_S = 400e-6  # one servo cycle, the unit of the time stamps in the error queue
 
@@ -89,7 +89,7 @@ class _Axis(WireAxis):
 
 @dataclass(frozen=True)
 class _Setting:
-    """A value that a command shows and sets: its name, of motor or axis, and the error where it is refused."""
+    """A value that a command shows and sets: its name, on motor or axis, and the error for a refused value."""
 
     name: str
     allowed: Callable[[_Axis, float], bool] = lambda _axis, _value: True
@@ -120,7 +120,7 @@ class SimESP301(WireController):
     axes
         Number of axes, 1 to 3.
     motion
-        See `sim.controllers.wire.Motion`.
+        See `stereorig.sim.controllers.wire.Motion`.
     """
 
     terminator = b"\r"
@@ -311,5 +311,5 @@ class SimESP301(WireController):
             return str(axis.unit)
         if int(parameter) not in _UNITS:
             raise _Refusal(1, number)
-        axis.unit = int(parameter)  # as with the real one, the stage stays where it is and its numbers change
+        axis.unit = int(parameter)  # as with the real controller, the stage stays in place and its numbers change
         return None

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Unpack
 
-from core.errors import StageError
-from sim.controllers.esp301 import SimESP301
-from sim.controllers.smc100 import Model, SimSMC100
-from sim.controllers.wire import Motion
+from stereorig.core.errors import StageError
+from stereorig.sim.controllers.esp301 import SimESP301
+from stereorig.sim.controllers.smc100 import Model, SimSMC100
+from stereorig.sim.controllers.wire import Motion
 
 
 def make_controller(driver: str, axes: Sequence[int], **motion: Unpack[Motion]) -> SimESP301 | SimSMC100:
@@ -21,7 +21,7 @@ def make_controller(driver: str, axes: Sequence[int], **motion: Unpack[Motion]) 
     axes
         Axis numbers; addresses for the SMC100 and the CONEX-CC.
     **motion
-        See `sim.controllers.wire.Motion`.
+        See `stereorig.sim.controllers.wire.Motion`.
     """
     if driver == "esp301":
         return SimESP301(axes=max(axes), **motion)

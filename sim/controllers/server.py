@@ -11,10 +11,11 @@ import selectors
 import socket
 import threading
 import tty
+from collections.abc import Iterator
 from types import TracebackType
 from typing import Literal, Self
 
-from sim.controllers.wire import WireController
+from stereorig.sim.controllers.wire import WireController
 
 _LONGEST_LINE = 4096
 
@@ -49,7 +50,7 @@ class ControllerServer:
         self._thread = threading.Thread(target=self._run, name="simulated controller", daemon=True)
 
     def start(self) -> Self:
-        """Open the line and answer on it, at `url`; OSError where the port cannot be had."""
+        """Open the line and answer on it, at `url`; OSError if the port cannot be had."""
         if self._transport == "socket":
             self._listener = socket.create_server(("127.0.0.1", self._port))
             self._selector.register(self._listener, selectors.EVENT_READ)
@@ -134,18 +135,23 @@ class ControllerServer:
             return
         buffer = self._buffers[fd]
         buffer += data
-        end = self.controller.terminator
-        while (at := buffer.find(end)) >= 0:
-            line = bytes(buffer[:at])
-            del buffer[: at + len(end)]
+        for line in self._lines(buffer):
             reply = self.controller.take_line(line)
             if reply:
                 self._send(fd, reply)
         if len(buffer) > _LONGEST_LINE:
             buffer.clear()
 
+    def _lines(self, buffer: bytearray) -> Iterator[bytes]:
+        """Cut whole command lines off the front of a buffer."""
+        end = self.controller.terminator
+        while (at := buffer.find(end)) >= 0:
+            line = bytes(buffer[:at])
+            del buffer[: at + len(end)]
+            yield line
+
     def _send(self, fd: int, data: bytes) -> None:
-        # a client that went away meanwhile is dropped at the next read
+        # a client that has left is dropped at the next read
         with contextlib.suppress(OSError):
             os.write(fd, data)
 

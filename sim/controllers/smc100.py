@@ -1,8 +1,8 @@
 """A simulated chain of SMC100CC, SMC100PP or CONEX-CC controllers: one axis an address, states, letters, fault bits.
 
 State numbers, letters and texts are the manual's. Only the first command on a line is carried out, as with the real
-one. In CONFIGURATION state limits and the largest velocity and acceleration are those of the flash memory, which
-leaving that state writes; elsewhere velocity, acceleration and limits are working values.
+one. In CONFIGURATION state limits and the largest velocity and acceleration are the flash memory's, which leaving that
+state writes; elsewhere velocity, acceleration and limits are working values.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, Unpack
 
-from sim.controllers.axis import SimAxis, Trouble
-from sim.controllers.wire import Motion, WireAxis, WireController
+from stereorig.sim.controllers.axis import SimAxis, Trouble
+from stereorig.sim.controllers.wire import Motion, WireAxis, WireController
 
-_COMMAND = re.compile(r"(\d*)(FRM|FRS|QIL|[A-Z]{2})(\?|[A-Z@]$|[-+.\dEe]*)")
+_COMMAND = re.compile(r"([0-9]*)(FRM|FRS|QIL|[A-Z]{2})(\?|[A-Z@]$|[-+.0-9Ee]*)")
 
 _TEXTS = {
     "@": "No error.",
@@ -81,6 +81,7 @@ class _Unit(WireAxis):
     state: int = 0x0A
     errors: int = 0
     letter: str = "@"
+    loop: str = "1"
 
     def __post_init__(self) -> None:
         self.stored_low_mm, self.stored_high_mm = self.low_mm, self.high_mm
@@ -103,7 +104,7 @@ class SimSMC100(WireController):
     model
         Model that each controller reports.
     motion
-        See `sim.controllers.wire.Motion`.
+        See `stereorig.sim.controllers.wire.Motion`.
     """
 
     terminator = b"\r\n"
@@ -137,6 +138,8 @@ class SimSMC100(WireController):
             "ID": lambda _u, _p: "SIM-TRA25CC",
             "VE": lambda _u, _p: f" {self.model} {_VERSIONS[self.model]}",
         }
+        if model == "CONEX-CC":
+            self._words["SC"] = lambda unit, _p: unit.loop
 
     def axis(self, number: int) -> SimAxis:
         """Give access to an axis and its faults."""

@@ -1,4 +1,4 @@
-"""The wire side of a simulated controller: command lines in, replies out, a log of what came, and line faults."""
+"""The wire side of a simulated controller: command lines in, replies out, a log of received lines, and line faults."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Self, TypedDict, Unpack
 
-from sim.controllers.axis import SimAxis, SimClock
+from stereorig.sim.controllers.axis import SimAxis, SimClock
 
 
 @dataclass
@@ -68,7 +68,7 @@ class Motion(TypedDict, total=False):
     velocity_mm_s, acceleration_mm_s2
         Power-on values, 10 and 40; up to four and ten times as much can be set.
     time_scale
-        Factor by which the axes run faster than real ones; the reported speeds stay those of the stage.
+        Factor by which the axes run faster than real ones; the reported speeds are the stage's.
     start_mm
         Positions of the axes at power-on, from home.
     """

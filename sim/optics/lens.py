@@ -1,13 +1,13 @@
 """The simulated cameras' own lens: OpenCV's pinhole with rational and tangential distortion, there and back.
 
-It shares nothing with `core.cameras.lens` and the fit, so that images and truth of a simulated rig do not inherit a
-fault of theirs:
+It shares nothing with `stereorig.core.cameras.lens` and the fit, so that images and truth of a simulated rig do not
+inherit a fault of theirs:
 
     x_d = x N / D + 2 p1 x y + p2 (r^2 + 2 x^2),  y_d = y N / D + p1 (r^2 + 2 y^2) + 2 p2 x y,
     N = 1 + k1 r^2 + k2 r^4 + k3 r^6,  D = 1 + k4 r^2 + k5 r^4 + k6 r^6,
     x_img = fx x_d + cx,  y_img = fy y_d + cy.
 
-The way back is Newton's method, point by point, in `sim.optics.ray`.
+The way back is Newton's method, point by point, in `stereorig.sim.optics.ray`.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Float
-from core.cameras.camera import Camera
-from core.cameras.lens import LensModel, MappedPoints, OpenCVLens, SeidelLens
-from sim.optics.ray import RATIONAL, SEIDEL, scattered_rays
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.cameras.lens import LensModel, MappedPoints, OpenCVLens, SeidelLens
+from stereorig.sim.optics.ray import RATIONAL, SEIDEL, scattered_rays
 
 LENS_KEYS: Final = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimLens:
-    """A lens of the simulated world; it has the interface of `core.cameras.lens.LensModel`.
+    """A lens of the simulated world; it has the interface of `stereorig.core.cameras.lens.LensModel`.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class SimLens:
 
     @cached_property
     def r2_max(self) -> float:
-        """Largest r^2 up to which the image radius grows with r, infinite where it always does."""
+        """Largest r^2 up to which the image radius grows with r, infinite if it always does."""
         num = np.polynomial.Polynomial([1.0, self.k1, self.k2, self.k3])
         den = np.polynomial.Polynomial([1.0, self.k4, self.k5, self.k6])
         # d(r N/D)/dr D^2 = N D + 2 u (N' D - N D'), u = r^2
@@ -122,7 +122,7 @@ class SimLens:
 
 
 def lens_from_table(table: Mapping[str, Any]) -> SimLens:
-    """Read ``fx_px`` ... ``k6`` of a camera's table; KeyError or ValueError where one is missing or no number."""
+    """Read ``fx_px`` ... ``k6`` of a camera's table; KeyError or ValueError if one is missing or no number."""
     values = {}
     for name in LENS_KEYS:
         value = float(table[name] if name in LENS_KEYS[:4] else table.get(name, 0.0))
@@ -135,7 +135,7 @@ def lens_from_table(table: Mapping[str, Any]) -> SimLens:
 
 
 def core_lens(lens: SimLens) -> LensModel:
-    """Return the lens as the core's class, where that holds all its terms; else itself."""
+    """Return the lens as the core's class, if that holds all its terms; else itself."""
     known = {field.name for field in fields(OpenCVLens)}
     values = {name: getattr(lens, name) for name in LENS_KEYS}
     if any(value != 0.0 and name not in known for name, value in values.items()):
@@ -144,7 +144,7 @@ def core_lens(lens: SimLens) -> LensModel:
 
 
 def flat_lens(lens: LensModel) -> Float:
-    """Flat (16,) form for `sim.optics.ray`: kind, fx, fy, skew, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, largest r^2, 0.
+    """Flat (16,) form for `.optics.ray`: kind, fx, fy, skew, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, largest r^2, 0.
 
     The paper's lens has ``kappa phd^2`` in place of k1. Only attributes are read, never the core's flat form.
     """

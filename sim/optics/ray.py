@@ -1,7 +1,7 @@
 """Rays of image points, written for whole lattices of sample points and for single ones.
 
 The paper's lens, Eqs. (8), (7), (5) backwards, in closed form, and OpenCV's rational one by Newton's method; checked
-against `core.cameras.lens` and OpenCV by the tests, and sharing nothing with them.
+against `stereorig.core.cameras.lens` and OpenCV by the tests, and sharing nothing with them.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numba import njit
 
-from core.arrays import Float
+from stereorig.core.arrays import Float
 
 SEIDEL: Final = 0.0
 RATIONAL: Final = 1.0
@@ -24,7 +24,7 @@ _SHRINK: Final = 0.98
 def rays(lens: Float, x0: float, y0: float, step: float, nx: Float, ny: Float) -> None:
     """Write the directions (nx, ny, 1) of the points (x0 + i step, y0 + j step) into (rows, columns); NaN: no ray.
 
-    ``lens`` is the flat form of :func:`sim.optics.lens.flat_lens`.
+    ``lens`` is the flat form of :func:`stereorig.sim.optics.lens.flat_lens`.
     """
     fx, fy, skew, cx, cy, k1 = lens[1], lens[2], lens[3], lens[4], lens[5], lens[6]
     columns = nx.shape[1]

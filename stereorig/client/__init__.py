@@ -1,9 +1,11 @@
-"""The service from Python: :class:`stereorig.Client` and :class:`stereorig.AsyncClient`, and the forms of what is sent.
+"""The service from Python: :class:`stereorig.Client` and :class:`stereorig.AsyncClient`, and their requests' models.
 
-What the methods take and return are the models of the API; a parameter, its bounds and its default stand there once.
+The methods take and return the models of the API, which define each parameter, its bounds and its default once.
 """
 
-from server.api.models import (
+from stereorig.client.asynchronous import AsyncAnalysis, AsyncClient, AsyncTest
+from stereorig.client.synchronous import Analysis, Client, Test
+from stereorig.server.api.models import (
     AnalysisReply,
     AnalysisRequest,
     CalibrationReply,
@@ -19,9 +21,7 @@ from server.api.models import (
     TestReply,
     TestRequest,
 )
-from server.results.gauges.request import GaugeRequest
-from stereorig.client.asynchronous import AsyncAnalysis, AsyncClient, AsyncTest
-from stereorig.client.synchronous import Analysis, Client, Test
+from stereorig.server.results.gauges.request import GaugeRequest
 
 __all__ = [
     "Analysis",

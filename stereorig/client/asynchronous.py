@@ -1,4 +1,4 @@
-"""The service from a program with an event loop; each method does what the one of :class:`Client` does."""
+"""The service from a program with an event loop; each method is the counterpart of one of :class:`Client`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,12 @@ from typing import TYPE_CHECKING, Any, Self
 
 import httpx
 
-from server.api.models import (
+from stereorig.client import datasets, operations
+from stereorig.client.errors import checked, no_answer
+from stereorig.client.operations import Ask, Operation, Result, request_of
+from stereorig.client.progress import Progress, shown
+from stereorig.client.settings import options_of
+from stereorig.server.api.models import (
     AnalysisReply,
     AnalysisRequest,
     CalibrationReply,
@@ -24,22 +29,17 @@ from server.api.models import (
     TestReply,
     TestRequest,
 )
-from server.api.models.calibrations import CalibrationEntry
-from server.api.models.channels import ChannelsImported
-from server.api.models.tests import StepEntry, TestEntry
-from server.results.gauges.request import GaugeRequest
-from stereorig.client import datasets, operations
-from stereorig.client.errors import checked, no_answer
-from stereorig.client.operations import Ask, Operation, Result, request_of
-from stereorig.client.progress import Progress, shown
-from stereorig.client.settings import options_of
+from stereorig.server.api.models.calibrations import CalibrationEntry
+from stereorig.server.api.models.channels import ChannelsImported, ChannelsPreview
+from stereorig.server.api.models.tests import StepEntry, TestEntry
+from stereorig.server.results.gauges.request import GaugeRequest
 
 if TYPE_CHECKING:
     import xarray
 
 
 class AsyncClient:
-    """A service, and what can be asked of it; a context manager that closes its connections.
+    """A running service and its operations; a context manager that closes its connections.
 
     Parameters
     ----------
@@ -48,10 +48,10 @@ class AsyncClient:
     key
         A key that ``stereorig keys add`` made; none is needed on the loopback address.
     progress
-        Bars while jobs run: True, False; None: in a terminal or a notebook, where rich is installed; or a function,
-        called with the job.
+        Bars while jobs run: True, False; None: in a terminal or a notebook, if rich is installed; or a function, called
+        with the job.
     timeout_s
-        Seconds after which a service that does not answer is given up.
+        Seconds without an answer after which a request fails.
     transport
         Carries the requests; the network when left out.
     """
@@ -112,10 +112,12 @@ class AsyncClient:
         body = request_of(CalibrationRequest, request, plan)
         return await self._watched("Calibration", lambda on: operations.calibrate(body, accept, on))
 
-    async def import_calibration(self, path: str | Path, *, label: str = "", accept: bool = False) -> CalibrationReply:
+    async def import_calibration(
+        self, path: str | Path, *, label: str = "", accept: bool = False, unit: str | None = None
+    ) -> CalibrationReply:
         """Do as :meth:`Client.import_calibration`."""
         file = Path(path)
-        return await self._run(operations.import_calibration(file.name, file.read_bytes(), label, accept))
+        return await self._run(operations.import_calibration(file.name, file.read_bytes(), label, accept, unit))
 
     async def calibrations(self, *, accepted: bool | None = None, state: str | None = None) -> list[CalibrationEntry]:
         """Do as :meth:`Client.calibrations`."""
@@ -193,15 +195,13 @@ class AsyncClient:
 
 
 class AsyncTest:
-    """A test of a service: its steps, and what is measured of them.
+    """A test of a service: its steps, and their analyses.
 
     Attributes
     ----------
     id
         Its id.
     """
-
-    __test__ = False  # not one of pytest's
 
     def __init__(self, client: AsyncClient, test_id: str) -> None:
         self._client, self.id = client, test_id
@@ -238,10 +238,15 @@ class AsyncTest:
         file = Path(path)
         return await self._client._run(operations.import_channels(self.id, file.name, file.read_bytes(), options))
 
+    async def preview_channels(self, path: str | Path, **options: Any) -> ChannelsPreview:
+        """Do as :meth:`Test.preview_channels`."""
+        file = Path(path)
+        return await self._client._run(operations.preview_channels(self.id, file.name, file.read_bytes(), options))
+
     async def live(self, **settings: Any) -> dict[str, Any]:
         """Begin a live measurement: ``points=[{"name": "p1", "xy_px": [210, 180]}]``, ``extensometers``, ``areas``.
 
-        Takes what the API's ``POST /tests/{id}/live`` does, and returns its state.
+        Takes the parameters of the API's ``POST /tests/{id}/live``, and returns its state.
         """
         return await self._client._run(operations.begin_live(self.id, settings))
 
@@ -271,7 +276,7 @@ class AsyncTest:
 
 
 class AsyncAnalysis:
-    """What was measured of a test's steps.
+    """The results of one measurement of a test's steps.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Results as data sets of xarray, which is imported where one is asked for."""
+"""Results as data sets of xarray, which is imported at the first request for one."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from core.errors import StateError
-from server.api.models import GaugesReply
+from stereorig.core.errors import StateError
+from stereorig.server.api.models import GaugesReply
 
 if TYPE_CHECKING:
     import xarray
@@ -71,7 +71,7 @@ def extensometers(reply: GaugesReply) -> xarray.Dataset:
         numbers = [[gauge.values.get(quantity) for gauge in one.extensometers] for one in steps]
         units = next((n.units for row in numbers for n in row if n is not None), "1")
         for prefix, part in (("", "value"), ("sigma_", "sigma")):
-            # what is measured against the reference is zero there, by definition
+            # quantities that are measured against the reference are zero there, by definition
             at_rest = 0.0 if quantity in _AGAINST_REFERENCE else np.nan
             table = np.array(
                 [

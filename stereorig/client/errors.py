@@ -1,4 +1,4 @@
-"""What the service answers when it refuses, as the project's own errors: the same codes, causes and remedies."""
+"""Refusals of the service as the project's own errors: the same codes, causes and remedies."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from importlib import resources
 
 import httpx
 
-from core import errors
-from core.errors import InputError, StateError, StereorigError, StorageError
+from stereorig.core import errors
+from stereorig.core.errors import InputError, StateError, StereorigError, StorageError
 
 #: of codes that several classes share, and of a newer service's
 _BY_STATUS: dict[int, type[StereorigError]] = {404: InputError, 405: InputError, 413: InputError, 415: InputError}
 _BY_STATUS |= {422: InputError, 507: StorageError}
-_MEMBERS = frozenset({"type", "title", "status", "detail", "cause", "code", "remedy", "context"})
+_MEMBERS = frozenset({"type", "title", "status", "detail", "code", "remedy", "context"})
 
 
 @functools.cache
 def _kinds() -> dict[str, type[StereorigError]]:
     """Return the class of each code, from the list that the service itself shows at ``/problems``."""
-    text = resources.files("server").joinpath("static/problems.json").read_text(encoding="utf-8")
+    text = resources.files("stereorig.server").joinpath("static/problems.json").read_text(encoding="utf-8")
     return {code: getattr(errors, one["kind"]) for code, one in json.loads(text).items()}
 
 
@@ -42,7 +42,7 @@ def error_of(problem: Mapping[str, object], *, status: int = 409) -> StereorigEr
     held = problem.get("context")
     context = dict(held) if isinstance(held, Mapping) else {k: v for k, v in problem.items() if k not in _MEMBERS}
     return kind(
-        str(problem.get("detail") or problem.get("cause") or "The service gave no reason."),
+        str(problem.get("detail") or "The service gave no reason."),
         code=code,
         remedy=str(problem.get("remedy") or "Look at the service's log."),
         **{str(name): value for name, value in context.items() if name not in ("code", "remedy", "cause")},
@@ -55,7 +55,7 @@ def checked(response: httpx.Response) -> httpx.Response:
     Raises
     ------
     StereorigError
-        Of the class, with the code, cause and remedy that the service gave.
+        An error of the class, with the code, cause and remedy that the service gave.
     """
     if response.is_success:
         return response

@@ -16,8 +16,10 @@ from uuid import uuid4
 import httpx
 from pydantic import BaseModel, ValidationError
 
-from core.errors import InputError, StorageError
-from server.api.models import (
+from stereorig.client.errors import error_of
+from stereorig.client.progress import OnProgress
+from stereorig.core.errors import InputError, StorageError
+from stereorig.server.api.models import (
     AnalysisAccepted,
     AnalysisRequest,
     AnalysisStepList,
@@ -34,21 +36,19 @@ from server.api.models import (
     TestReply,
     TestRequest,
 )
-from server.api.models.calibrations import CalibrationEntry, CalibrationList
-from server.api.models.channels import ChannelsImported
-from server.api.models.jobs import JobStepList
-from server.api.models.tests import StepEntry, StepList, TestEntry, TestList
-from server.base.models import Listing
-from server.results.gauges.request import GaugeRequest
-from server.wording import problems_in
-from stereorig.client.errors import error_of
-from stereorig.client.progress import OnProgress
+from stereorig.server.api.models.calibrations import CalibrationEntry, CalibrationList
+from stereorig.server.api.models.channels import ChannelsImported, ChannelsPreview
+from stereorig.server.api.models.jobs import JobStepList
+from stereorig.server.api.models.tests import StepEntry, StepList, TestEntry, TestList
+from stereorig.server.base.models import Listing
+from stereorig.server.results.gauges.request import GaugeRequest
+from stereorig.server.wording import problems_in
 
 Model = TypeVar("Model", bound=BaseModel)
 Result = TypeVar("Result")
 Page = TypeVar("Page", bound=Listing)
 Thing = TypeVar("Thing")
-#: seconds that one request waits for a job; shorter where somebody looks at its progress
+#: seconds that one request waits for a job; shorter if a function receives its progress
 _WAIT_S, _LOOK_S = 30.0, 0.5
 #: steps of a page of gauge readings
 _GAUGE_STEPS = 500
@@ -72,14 +72,14 @@ class Ask:
 
     @property
     def options(self) -> dict[str, Any]:
-        """What httpx sends with it."""
+        """Arguments for httpx."""
         headers = {} if self.key is None else {"Idempotency-Key": self.key}
         whole = {"params": dict(self.params), "json": self.json, "files": self.files, "data": self.data}
         return {name: value for name, value in whole.items() if value is not None} | {"headers": headers}
 
 
 Operation = Generator[Ask, httpx.Response, Result]
-#: an operation with a job in it, told of the job's progress
+#: an operation that waits for a job and reports the job's progress
 Watched = Callable[[OnProgress | None], Operation[Result]]
 
 
@@ -98,7 +98,7 @@ def request_of(model: type[Model], given: Model | None, named: Mapping[str, Any]
     try:
         return model.model_validate(dict(named))
     except ValidationError as error:
-        text = " ".join(str(one) for one in problems_in(error, model)[:3])
+        text = " ".join(str(one) for one in problems_in(error)[:3])
         raise InputError(text, code="invalid_request", remedy="Correct the values named above.") from error
 
 
@@ -151,7 +151,7 @@ def ended(job: JobReply, on_progress: OnProgress | None = None) -> Operation[Job
     if job.state == "succeeded":
         return job
     problem = {} if job.problem is None else job.problem.model_dump()
-    if job.state == "cancelled":  # whatever the cancelling stopped, a motion for example
+    if job.state == "cancelled":  # the reason for the cancelling, a stopped motion for example
         problem["code"] = "cancelled"
     raise error_of({"code": f"job_{job.state}", "detail": f"The {job.kind} is {job.state}.", **problem})
 
@@ -185,9 +185,12 @@ def calibrate(request: CalibrationRequest, accept: bool, on_progress: OnProgress
     return (yield from review(begun.calibration_id, "accepted" if accept else None))
 
 
-def import_calibration(name: str, content: bytes, label: str, accept: bool) -> Operation[CalibrationReply]:
+def import_calibration(
+    name: str, content: bytes, label: str, accept: bool, unit: str | None
+) -> Operation[CalibrationReply]:
     """Import another program's calibration."""
-    sent = Ask("POST", "/calibrations:import", files={"file": (name, content)}, data={"label": label}, key=uuid4().hex)
+    data = {"label": label, **({} if unit is None else {"unit": unit})}
+    sent = Ask("POST", "/calibrations:import", files={"file": (name, content)}, data=data, key=uuid4().hex)
     made = _read((yield sent), CalibrationReply)
     return (yield from review(made.id, "accepted" if accept else None))
 
@@ -261,10 +264,18 @@ def import_step(test_id: str, images: tuple[bytes, bytes], form: Mapping[str, An
 
 def import_channels(test_id: str, name: str, content: bytes, options: Mapping[str, Any]) -> Operation[ChannelsImported]:
     """Import a load frame's CSV and align it with the steps."""
+    return _read((yield _record(test_id, "import", name, content, options)), ChannelsImported)
+
+
+def preview_channels(test_id: str, name: str, content: bytes, options: Mapping[str, Any]) -> Operation[ChannelsPreview]:
+    """Return the effect that an import of a load frame's CSV would have."""
+    return _read((yield _record(test_id, "preview", name, content, options)), ChannelsPreview)
+
+
+def _record(test_id: str, action: str, name: str, content: bytes, options: Mapping[str, Any]) -> Ask:
     sent = {option: str(value) for option, value in options.items() if value is not None}
     files = {"file": (name, content)}
-    answer = yield Ask("POST", f"/tests/{test_id}/channels:import", files=files, data=sent, key=uuid4().hex)
-    return _read(answer, ChannelsImported)
+    return Ask("POST", f"/tests/{test_id}/channels:{action}", files=files, data=sent, key=uuid4().hex)
 
 
 def begin_live(test_id: str, body: Mapping[str, Any]) -> Operation[dict[str, Any]]:
@@ -349,7 +360,7 @@ def gauges(path: str, request: GaugeRequest) -> Operation[GaugesReply]:
 
 
 def saved(path: str, into: Path, params: Mapping[str, Any]) -> Operation[Path]:
-    """Write what a GET answers into a file."""
+    """Write the answer of a GET into a file."""
     try:
         into.parent.mkdir(parents=True, exist_ok=True)
         yield Ask("GET", path, params=params, into=into)

@@ -6,23 +6,23 @@ import contextlib
 import importlib.util
 from collections.abc import Callable, Iterator
 
-from core.errors import StateError
-from server.api.models import JobReply
+from stereorig.core.errors import StateError
+from stereorig.server.api.models import JobReply
 
 #: called with a job whenever it was asked for
 OnProgress = Callable[[JobReply], None]
-#: True: a bar; False: nothing; None: a bar where rich is installed and somebody looks; or a function of one's own
+#: True: a bar; False: nothing; None: a bar if rich is installed and the output is shown; or a function of the caller's
 Progress = bool | None | OnProgress
 
 
 @contextlib.contextmanager
 def shown(progress: Progress, title: str) -> Iterator[OnProgress | None]:
-    """Yield what is called with a job's documents until it has ended; None where nobody looks.
+    """Yield a function that takes a job's documents until it has ended; None if no progress is shown.
 
     Raises
     ------
     StateError
-        ``progress_unavailable`` where a bar is asked for and rich is not installed.
+        ``progress_unavailable`` if a bar is asked for and rich is not installed.
     """
     if callable(progress):
         yield progress

@@ -1,4 +1,4 @@
-"""How the connections of both clients are made."""
+"""Creation of both clients' connections."""
 
 from __future__ import annotations
 

@@ -8,7 +8,12 @@ from typing import TYPE_CHECKING, Any, Self
 
 import httpx
 
-from server.api.models import (
+from stereorig.client import datasets, operations
+from stereorig.client.errors import checked, no_answer
+from stereorig.client.operations import Ask, Operation, Result, request_of
+from stereorig.client.progress import Progress, shown
+from stereorig.client.settings import options_of
+from stereorig.server.api.models import (
     AnalysisReply,
     AnalysisRequest,
     CalibrationReply,
@@ -24,22 +29,17 @@ from server.api.models import (
     TestReply,
     TestRequest,
 )
-from server.api.models.calibrations import CalibrationEntry
-from server.api.models.channels import ChannelsImported
-from server.api.models.tests import StepEntry, TestEntry
-from server.results.gauges.request import GaugeRequest
-from stereorig.client import datasets, operations
-from stereorig.client.errors import checked, no_answer
-from stereorig.client.operations import Ask, Operation, Result, request_of
-from stereorig.client.progress import Progress, shown
-from stereorig.client.settings import options_of
+from stereorig.server.api.models.calibrations import CalibrationEntry
+from stereorig.server.api.models.channels import ChannelsImported, ChannelsPreview
+from stereorig.server.api.models.tests import StepEntry, TestEntry
+from stereorig.server.results.gauges.request import GaugeRequest
 
 if TYPE_CHECKING:
     import xarray
 
 
 class Client:
-    """A service, and what can be asked of it; a context manager that closes its connections.
+    """A running service and its operations; a context manager that closes its connections.
 
     Parameters
     ----------
@@ -48,10 +48,10 @@ class Client:
     key
         A key that ``stereorig keys add`` made; none is needed on the loopback address.
     progress
-        Bars while jobs run: True, False; None: in a terminal or a notebook, where rich is installed; or a function,
-        called with the job.
+        Bars while jobs run: True, False; None: in a terminal or a notebook, if rich is installed; or a function, called
+        with the job.
     timeout_s
-        Seconds after which a service that does not answer is given up.
+        Seconds without an answer after which a request fails.
     transport
         Carries the requests; the network when left out.
     """
@@ -81,7 +81,7 @@ class Client:
         self.close()
 
     def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """Send any request of the API, with a path below ``/api/v1``, for what has no method here.
+        """Send any request of the API, with a path below ``/api/v1``, for operations without a method here.
 
         Raises
         ------
@@ -119,7 +119,7 @@ class Client:
         Parameters
         ----------
         request
-            The plan as a whole; or by its parameters' names. The rig file gives what is left out.
+            The plan as a whole; or by its parameters' names. Values that are left out come from the rig file.
         accept
             Accept it, so that new tests take it. A calibration that fails its verdict raises before.
 
@@ -131,10 +131,12 @@ class Client:
         body = request_of(CalibrationRequest, request, plan)
         return self._watched("Calibration", lambda on: operations.calibrate(body, accept, on))
 
-    def import_calibration(self, path: str | Path, *, label: str = "", accept: bool = False) -> CalibrationReply:
-        """Import ``calibration.json`` or another program's calibration of a stereo pair."""
+    def import_calibration(
+        self, path: str | Path, *, label: str = "", accept: bool = False, unit: str | None = None
+    ) -> CalibrationReply:
+        """Import ``calibration.json`` or another program's calibration of a stereo pair, its lengths in ``unit``."""
         file = Path(path)
-        return self._run(operations.import_calibration(file.name, file.read_bytes(), label, accept))
+        return self._run(operations.import_calibration(file.name, file.read_bytes(), label, accept, unit))
 
     def calibrations(self, *, accepted: bool | None = None, state: str | None = None) -> list[CalibrationEntry]:
         """List calibrations, oldest first; the one in force is the last of ``accepted=True``."""
@@ -222,15 +224,13 @@ class Client:
 
 
 class Test:
-    """A test of a service: its steps, and what is measured of them.
+    """A test of a service: its steps, and their analyses.
 
     Attributes
     ----------
     id
         Its id.
     """
-
-    __test__ = False  # not one of pytest's
 
     def __init__(self, client: Client, test_id: str) -> None:
         self._client, self.id = client, test_id
@@ -267,10 +267,15 @@ class Test:
         file = Path(path)
         return self._client._run(operations.import_channels(self.id, file.name, file.read_bytes(), options))
 
+    def preview_channels(self, path: str | Path, **options: Any) -> ChannelsPreview:
+        """Return the effect of :meth:`import_channels` with these options: columns, steps, doubts; nothing changes."""
+        file = Path(path)
+        return self._client._run(operations.preview_channels(self.id, file.name, file.read_bytes(), options))
+
     def live(self, **settings: Any) -> dict[str, Any]:
         """Begin a live measurement: ``points=[{"name": "p1", "xy_px": [210, 180]}]``, ``extensometers``, ``areas``.
 
-        Takes what the API's ``POST /tests/{id}/live`` does, and returns its state.
+        Takes the parameters of the API's ``POST /tests/{id}/live``, and returns its state.
         """
         return self._client._run(operations.begin_live(self.id, settings))
 
@@ -285,7 +290,7 @@ class Test:
         return self._client._run(operations.stop_live(self.id))
 
     def measure(self, request: AnalysisRequest | None = None, **settings: Any) -> Analysis:
-        """Measure the steps, and wait for it; with ``follow=True`` it goes on with each step that lands.
+        """Measure the steps, and wait for it; with ``follow=True`` it continues with each new step.
 
         Parameters
         ----------
@@ -295,7 +300,7 @@ class Test:
         Raises
         ------
         StereorigError
-            ``steps_failed`` and others; what was measured can be read all the same (:meth:`analyses`).
+            ``steps_failed`` and others; the steps that were measured can be read all the same (:meth:`analyses`).
         """
         body = request_of(AnalysisRequest, request, settings)
         analysis = self._client._watched("Measurement", lambda on: operations.measure(self.id, body, on))
@@ -311,7 +316,7 @@ class Test:
 
 
 class Analysis:
-    """What was measured of a test's steps.
+    """The results of one measurement of a test's steps.
 
     Attributes
     ----------
@@ -328,7 +333,7 @@ class Analysis:
         return self._client._run(operations.get(self._path, AnalysisReply))
 
     def finish(self) -> JobReply:
-        """Let an analysis that follows its test measure what there is, and end."""
+        """Let an analysis that follows its test measure the steps there are, and end."""
         return self._client._watched("Measurement", lambda on: operations.finish(self._path, on))
 
     def dataset(self, step: int | None = None) -> xarray.Dataset:

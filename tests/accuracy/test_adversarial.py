@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from core.errors import SeedError
-from core.field.region.repeats import repeats
-from core.field.seeding.seeds import Seed
-from core.measure import MeasureOptions, ReferencePair
-from sim.render import render
-from sim.texture import dots, speckle
+from stereorig.core.errors import SeedError
+from stereorig.core.field.region.repeats import repeats
+from stereorig.core.field.seeding.seeds import Seed
+from stereorig.core.measure import MeasureOptions, ReferencePair
+from stereorig.sim.render import render
+from stereorig.sim.texture import dots, speckle
 from tests.bench.accuracy.adversarial_scenes import Pictures
 from tests.support import field_bench as bench
 
@@ -29,6 +29,8 @@ CASES = {
     "patches in camera 2": lambda p: p.patches_one(0.2),
     "shines through": lambda p: p.shines_through(0.25),
     "noise": lambda p: p.noise(15.0),
+    "dead pixels": lambda p: p.dead_pixels(0.01),
+    "fixed pattern": lambda p: p.fixed_pattern(3.0, 2.0),
     "over-exposed": lambda p: p.overexposed(1.4),
 }
 
@@ -57,7 +59,7 @@ def test_no_wrong_point_is_valid(pictures, name):
     if v.any():
         assert np.linalg.norm(error[v], axis=-1).max() < 0.5 * PX_MM
         assert np.abs(error / field.sigma_mm[..., 3:])[v].max() < 6.0
-    if name in ("blur", "noise"):
+    if name in ("blur", "noise", "fixed pattern"):
         assert v.mean() > 0.99
 
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from core.calibration.aspect import block_ratios, measure_aspect
-from core.calibration.aspect_images import measure_aspect_normal
-from core.errors import CalibrationInputError
-from core.grid import GridView, detect_grid
+from stereorig.core.calibration.aspect import block_ratios, measure_aspect
+from stereorig.core.calibration.aspect_images import measure_aspect_normal
+from stereorig.core.errors import CalibrationInputError
+from stereorig.core.grid import GridView, detect_grid
 from tests.support.grid_images import PAPER_TARGET, grid_image, paper_camera, truth_px
 
 TRUE_ASPECT = 0.9617

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from core.calibration import CalibrationOptions, CalibrationResult, CalibrationView, NominalCamera, calibrate
-from core.calibration.uncertainty import point_derivatives
+from stereorig.core.calibration import CalibrationOptions, CalibrationResult, CalibrationView, NominalValues, calibrate
+from stereorig.core.calibration.uncertainty import point_derivatives
 from tests.support.calibration_truth import Array, Grid, nodes
 
 GRID = Grid(pitch_mm=1.55, lines=(7, 7), node_tolerance_mm=4e-3)
@@ -41,7 +41,7 @@ def drawn_views(rng: np.random.Generator, tilt_rad: float) -> list[CalibrationVi
 
 
 def calibrated(views: list[CalibrationView], tilt_rad: float) -> CalibrationResult:
-    nominals = tuple(NominalCamera(SIZE, FOCAL_PX, STANDOFF_MM, sign * GAMMA_DEG) for sign in (-1.0, 1.0))
+    nominals = tuple(NominalValues(SIZE, FOCAL_PX, STANDOFF_MM, sign * GAMMA_DEG) for sign in (-1.0, 1.0))
     options = CalibrationOptions(lens="paper", axis_tilt_sigma_rad=tilt_rad)
     return calibrate(views, GRID, (nominals[0], nominals[1]), options)
 

@@ -10,7 +10,7 @@ import llvmlite.binding as llvm
 import numpy as np
 import pytest
 
-from core.arrays import Float
+from stereorig.core.arrays import Float
 from tests.bench.speed import layout, worker
 from tests.bench.speed import page as bench_page
 from tests.bench.speed.assembly import HERE, count_loop, innermost_loops
@@ -286,20 +286,27 @@ def test_page_holds_what_was_measured(tmp_path: Path, monkeypatch: pytest.Monkey
                 beside.outcomes.setdefault(scene, []).extend(
                     Outcome(other, t, 9900, took * slower / t, took * slower, worse) for t in (1, 2)
                 )
+    (tmp_path / "explanation").mkdir()
+    marks = "<!-- measured: begin -->\n<!-- measured: end -->\n"
+    (tmp_path / "explanation" / "performance.md").write_text(f"# Performance\n\n{marks}\nKept.\n")
     page = bench_page.write_page(report).read_text()
-    assert "| speed over the peer's: cubic single, 33 px, 1 thread | 12 |  |  |  |" in page
+    assert page.endswith("\n\nKept.\n")
     assert "| speed over the peer's: cubic single, 33 px, 2 threads | 12 |  | at least 10 | yes |" in page
     assert "| speed over the peer's: cubic sequence, 33 px, 2 threads | 12 |  | at least 30 | **no** |" in page
     assert "| speed over the peer's: 9,900 points, cubic single, 33 px, 2 threads | 12 |  | at least 5 | yes |" in page
-    assert "| the same, steps after the first alone | 24 |  |  |  |" in page
-    assert "| speed over al-dic-3d's: cubic sequence, 33 px, 2 threads | 24 |  |  |  |" in page
     assert "| 9,900 points: cubic single, 33 px, 2 threads | 0.2 | s | at most 0.12 | **no** |" in page
     assert "worst of u, v, w: cubic sequence, 33 px, 2 threads | 0.5 |  | at most 1 | yes |" in page
     assert "| motion, cubic, 33 px, 2 threads | 65,400 | points/s | at least 120,000 | **no** |" in page
     assert "| motion, cubic, 21 px, 2 threads | 65,400 | points/s | at least 200,000 | **no** |" in page
-    assert "| pyvale | tuned sequence, 33 px | 2 | 12.00 | 9,900 | 4,120 | 2 |" in page
-    assert "| al-dic-3d | local sequence, 33 px | 2 | 24.00 | 9,900 | 2,060 | 2 |" in page
-    assert "**al-dic-3d** 4.5.6: " in page
+    tables = {path.stem: path.read_text() for path in (tmp_path / "explanation" / "performance").iterdir()}
+    assert '"speed over the peer\'s: cubic single, 33 px, 1 thread",12,,,' in tables["targets"]
+    assert '"speed over al-dic-3d\'s: cubic sequence, 33 px, 2 threads",24,,,' in tables["targets"]
+    assert '"the same, steps after the first alone",24,,,' in tables["targets"]
+    assert '"motion, cubic, 33 px, 2 threads","65,400",points/s,"at least 120,000",no' in tables["targets"]
+    assert 'pyvale,"tuned sequence, 33 px",2,12.00,"9,900","4,120",2,' in tables["peers_1"]
+    assert 'al-dic-3d,"local sequence, 33 px",2,24.00,"9,900","2,060",2,' in tables["peers_2"]
+    assert "# **al-dic-3d** 4.5.6: " in tables["peers_1"]
+    every = "".join(tables.values())
     for name in ("bench_peer_speed", "bench_peer_accuracy", "bench_costs", "bench_iterations", "bench_parts"):
-        assert f"figures/{name}.png" in page
+        assert f"figures/{name}.png" in every
         assert (tmp_path / "figures" / f"{name}.png").stat().st_size > 5000

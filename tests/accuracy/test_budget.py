@@ -11,31 +11,31 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from core.calibration import COVARIANCE_NAMES, CalibrationOptions, CalibrationView, NominalCamera
-from core.calibration.expect import expect
-from core.calibration.fit.adjust import adjust, expected_covariance
-from core.calibration.fit.layout import camera_of
-from core.calibration.fit.named import named_by_cause, named_derivatives, parameter_names
-from core.calibration.fit.problem import started
-from core.calibration.prepare import problem_of
-from core.cameras.camera import TEN_PARAMETER_NAMES, Camera
-from core.cameras.stereo import StereoPair
-from core.common.budget import budget_of, budget_of_difference
-from core.common.derivatives import Estimator, measured_derivatives
-from core.common.factor import Causes, ParameterCovariance, factor_of, joined
-from core.errors import CalibrationInputError
-from core.field.common import with_common_parts
-from core.field.points.images import MeasureImage
-from core.field.points.result import References
-from core.gauge.area import area_statistics
-from core.gauge.extensometer import extensometer
-from core.gauge.reading import difference
-from core.gauge.rigid import rigid_motion, without_rigid_motion
-from core.measure import MeasureOptions, PreviousStep, ReferencePair
-from core.names import BUDGET, CAMERAS, CAUSES
-from core.target import GridTarget
-from server.formats.results.reading import read_field
-from server.formats.results.writing import Provenance, write_field
+from stereorig.core.calibration import COVARIANCE_NAMES, CalibrationOptions, CalibrationView, NominalValues
+from stereorig.core.calibration.expect import expect
+from stereorig.core.calibration.fit.adjust import adjust, expected_covariance
+from stereorig.core.calibration.fit.layout import camera_of
+from stereorig.core.calibration.fit.named import named_by_cause, named_derivatives, parameter_names
+from stereorig.core.calibration.fit.problem import started
+from stereorig.core.calibration.prepare import problem_of
+from stereorig.core.cameras.camera import TEN_PARAMETER_NAMES, Camera
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.common.budget import budget_of, budget_of_difference
+from stereorig.core.common.derivatives import Estimator, measured_derivatives
+from stereorig.core.common.factor import Causes, ParameterCovariance, factor_of, joined
+from stereorig.core.errors import CalibrationInputError
+from stereorig.core.field.common import with_common_parts
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.result import References
+from stereorig.core.gauge.area import area_statistics
+from stereorig.core.gauge.extensometer import extensometer
+from stereorig.core.gauge.reading import difference
+from stereorig.core.gauge.rigid import rigid_motion, without_rigid_motion
+from stereorig.core.measure import MeasureOptions, PreviousStep, ReferencePair
+from stereorig.core.names import BUDGET, CAMERAS, CAUSES
+from stereorig.core.target import GridTarget
+from stereorig.server.formats.results.reading import read_field
+from stereorig.server.formats.results.writing import Provenance, write_field
 from tests.accuracy.test_common_part import SHARED, measured_numerically, moved_field
 from tests.bench.accuracy.coverage import Grid
 from tests.support.calibrated_volume import covariance
@@ -66,7 +66,7 @@ def _views(rng: Any, *, stage: Array | None = None, nodes: Array | None = None, 
 @pytest.mark.deep
 def test_each_causes_part_of_the_calibrations_covariance_is_what_it_does_alone() -> None:
     rng = np.random.default_rng(4)
-    nominals = tuple(NominalCamera(RIG[0].size_px, 3535.0, 357.0, a) for a in (-12.5, 12.5))
+    nominals = tuple(NominalValues(RIG[0].size_px, 3535.0, 357.0, a) for a in (-12.5, 12.5))
     options = CalibrationOptions(
         lens="paper", stage_scale_sigma=SCALE, stage_step_sigma_mm=STEP_MM, axis_tilt_sigma_rad=TILT
     )
@@ -391,7 +391,7 @@ def test_a_wrong_pitch_scales_the_targets_plane_and_beyond_it_as_far_as_the_stag
 ) -> None:
     pitch = 2e-5
     target = GridTarget(pitch_mm=8.0, lines=(11, 11), line_width_mm=0.3, pitch_scale_sigma=pitch)
-    one, two = (NominalCamera((1024, 1024), 3535.0, 357.0, angle) for angle in (-12.5, 12.5))
+    one, two = (NominalValues((1024, 1024), 3535.0, 357.0, angle) for angle in (-12.5, 12.5))
     options = CalibrationOptions(lens="paper", stage_scale_sigma=stage_scale)
     planned = expect((0.0, 10.0, 20.0), target, (one, two), options)
     source = ParameterCovariance(planned.pair, tuple(planned.parameters), planned.covariance, planned.by_cause)

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from core.calibration import COVARIANCE_NAMES, CalibrationOptions, calibrate
+from stereorig.core.calibration import COVARIANCE_NAMES, CalibrationOptions, calibrate
 from tests.bench.accuracy.line_grid_covariance import detections, normalised_squares
 from tests.support.calibration_truth import HELD, NOMINAL, PAPER, Array, Grid, make_views, nodes, project
 
@@ -17,7 +17,7 @@ SCALE = np.array([1.0, 1.0, 1.0, 1e-9, 1e-4, 1e-4, 1e-4, 1e-2, 1e-2, 1e-1])
 
 
 # the axes are exact here, and the parameters those of the paper
-EXACT = CalibrationOptions(axis_tilt_sigma_rad=0.0, lens="paper")
+EXACT = CalibrationOptions(axis_tilt_sigma_rad=0.0, stage_scale_sigma=0.0, aspect_sigma=0.0, lens="paper")
 
 
 def truth_vector() -> Array:
@@ -35,7 +35,7 @@ def ten_of(result: object) -> Array:
 def test_the_minimum_is_the_one_a_brute_force_solver_finds() -> None:
     """All 20 + 162 unknowns at once with differences, on the projection written apart."""
     tolerance, sigma = 0.004, 0.0022
-    grid = Grid(node_tolerance_mm=tolerance)
+    grid = Grid(node_tolerance_mm=tolerance, pitch_scale_sigma=0.0)
     error = np.random.default_rng(5).uniform(-tolerance, tolerance, (9, 9, 2))
     views = make_views((0.0, 2.0, 5.0), grid=grid, error_mm=error, seed=5)
     result = calibrate(views, grid, NOMINAL, EXACT)
@@ -75,7 +75,7 @@ def test_the_minimum_is_the_one_a_brute_force_solver_finds() -> None:
 
 
 def monte_carlo(tolerance: float, runs: int, degree: int | None) -> tuple[Array, list[Array], list[Array], Array]:
-    grid = Grid(node_tolerance_mm=tolerance)
+    grid = Grid(node_tolerance_mm=tolerance, pitch_scale_sigma=0.0)
     found, claimed, shapes = [], [], []
     points = np.stack(np.meshgrid(*[np.linspace(-4, 4, 3)] * 2, [-1.0, 1.0]), -1).reshape(-1, 3)
     seen = [project(c, *points[:, :2].T, 0.0, points[:, 2]) for c in PAPER]

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from core.calibration import CalibrationOptions, CalibrationView, NominalCamera, calibrate
-from core.calibration.fit.adjust import adjust
-from core.calibration.fit.layout import camera_of
-from core.calibration.fit.named import named_covariance, parameter_names
-from core.calibration.fit.problem import started
-from core.calibration.prepare import problem_of
-from core.calibration.uncertainty import volume_uncertainty
-from core.cameras.stereo import StereoPair
-from core.common.factor import ParameterCovariance, factor_of
+from stereorig.core.calibration import CalibrationOptions, CalibrationView, NominalValues, calibrate
+from stereorig.core.calibration.fit.adjust import adjust
+from stereorig.core.calibration.fit.layout import camera_of
+from stereorig.core.calibration.fit.named import named_covariance, parameter_names
+from stereorig.core.calibration.fit.problem import started
+from stereorig.core.calibration.prepare import problem_of
+from stereorig.core.calibration.uncertainty import volume_uncertainty
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.common.factor import ParameterCovariance, factor_of
 from tests.bench.accuracy.calibration_beside import CASES, HALF, NOT_ABOVE, compare
 from tests.support.calibration_rigs import (
     LENSES,
@@ -47,14 +47,14 @@ WITHIN = 0.02
 
 
 @pytest.fixture(scope="module")
-def seen() -> tuple[list[CalibrationView], tuple[NominalCamera, NominalCamera], OpenCVResult]:
+def seen() -> tuple[list[CalibrationView], tuple[NominalValues, NominalValues], OpenCVResult]:
     if not mrcal_is_there():
         missing(PACKAGES)
     rng = np.random.default_rng(4)
     cameras = ordinary_pair(LENSES["pinhole"])
     points = made(checkerboard().points_mm(), rng)
     views = views_of_poses(cameras, points, hand_held(rng, cameras, points, 12), rng, NOISE_PX)
-    nominal = NominalCamera(cameras[0].size_px, 3700.0)
+    nominal = NominalValues(cameras[0].size_px, 3700.0)
     return views, (nominal, nominal), stereo_calibrate(views, checkerboard().points_mm(), cameras[0].size_px)
 
 
@@ -73,7 +73,7 @@ def lengths_agree(source: ParameterCovariance, points: Array, theirs: MrcalResul
 
 
 def test_covariances_are_those_of_mrcal_under_opencvs_lens(
-    seen: tuple[list[CalibrationView], tuple[NominalCamera, NominalCamera], OpenCVResult],
+    seen: tuple[list[CalibrationView], tuple[NominalValues, NominalValues], OpenCVResult],
 ) -> None:
     views, nominals, start = seen
     board = checkerboard()
@@ -96,7 +96,7 @@ def test_covariances_are_those_of_mrcal_under_opencvs_lens(
 
 
 def test_covariances_are_those_of_mrcal_of_a_pinhole(
-    seen: tuple[list[CalibrationView], tuple[NominalCamera, NominalCamera], OpenCVResult],
+    seen: tuple[list[CalibrationView], tuple[NominalValues, NominalValues], OpenCVResult],
 ) -> None:
     views, nominals, start = seen
     board = checkerboard()

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from core.errors import CalibrationError
-from core.measure import MeasureOptions
-from core.orientation import Repair, changes_between, repair_orientation
+from stereorig.core.errors import CalibrationError
+from stereorig.core.measure import MeasureOptions
+from stereorig.core.orientation import RepairedPair, changes_between, repair_orientation
 from tests.support.bumped_rig import (
     CAM1,
     CAM2,
@@ -25,7 +25,7 @@ from tests.support.bumped_rig import (
 from tests.support.independent_rig import PlainCamera
 
 
-def left(repair: Repair, one: PlainCamera, two: PlainCamera) -> tuple[float, float]:
+def left(repair: RepairedPair, one: PlainCamera, two: PlainCamera) -> tuple[float, float]:
     """Epipolar offset of true points, px rms, and false strain of the specimen at rest, microstrain."""
     xy1 = grid().xy_px.reshape(-1, 2)
     true = pose_points(one, 0, xy1)

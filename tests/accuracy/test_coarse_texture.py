@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.errors import InputError
-from core.matching import MatchOptions, fit_motion, prepare
-from core.matching.geometry import covariance_xyzuvw, motion_geometry
+from stereorig.core.errors import InputError
+from stereorig.core.matching import MatchOptions, fit_motion, prepare
+from stereorig.core.matching.geometry import covariance_xyzuvw, motion_geometry
 from tests.support.matching_scene import Plane, Texture, digitise, paper_pair, render, true_g, true_w
 
 SUBSET = 33

@@ -12,24 +12,24 @@ import pytest
 import xarray as xr
 from scipy.spatial.transform import Rotation
 
-from core.calibration import COVARIANCE_NAMES
-from core.cameras.camera import TEN_PARAMETER_NAMES, Camera
-from core.cameras.stereo import StereoPair
-from core.common.factor import FINE, KEPT, Causes, ParameterCovariance, common_factor, fewest_columns
-from core.errors import CalibrationInputError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels
-from core.gauge.align import align_3_2_1, align_plane, aligned
-from core.gauge.area import area_statistics
-from core.gauge.extensometer import extensometer
-from core.gauge.rigid import rigid_motion, without_rigid_motion
-from core.names import CAUSES
-from core.strain import StrainOptions, surface_strain
-from core.strain.mean import mean_strain_sigma
-from server.formats.results.layout import unpacked
-from server.formats.results.reading import read_field
-from server.formats.results.strain import read_strain
-from server.formats.results.writing import Provenance, write_field
+from stereorig.core.calibration import COVARIANCE_NAMES
+from stereorig.core.cameras.camera import TEN_PARAMETER_NAMES, Camera
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.common.factor import FINE, KEPT, Causes, ParameterCovariance, common_factor, fewest_columns
+from stereorig.core.errors import CalibrationInputError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.gauge.align import align_3_2_1, align_plane, aligned
+from stereorig.core.gauge.area import area_statistics
+from stereorig.core.gauge.extensometer import extensometer
+from stereorig.core.gauge.rigid import rigid_motion, without_rigid_motion
+from stereorig.core.names import CAUSES
+from stereorig.core.strain import StrainOptions, surface_strain
+from stereorig.core.strain.mean import mean_strain_sigma
+from stereorig.server.formats.results.layout import unpacked
+from stereorig.server.formats.results.reading import read_field
+from stereorig.server.formats.results.strain import read_strain
+from stereorig.server.formats.results.writing import Provenance, write_field
 from tests.support.calibrated_volume import covariance
 from tests.support.field_bench import pair
 from tests.support.gauge_field import SUBSET, make_field

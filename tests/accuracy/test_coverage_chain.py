@@ -13,7 +13,7 @@ from tests.bench.coverage.chain import run
 from tests.bench.coverage.coverage import append, kept, replicate, wanted
 from tests.bench.coverage.draw import drawn
 from tests.bench.coverage.figures import TILTED, Kept, figures_of, read_figures, write_figures
-from tests.bench.coverage.page import text
+from tests.bench.coverage.page import notes, rows
 from tests.bench.coverage.pooled import WHITE, mean, pooled
 from tests.bench.coverage.score import MEAN, OFF, SHAPE, scored
 from tests.bench.coverage.strata import CONTROLS, MAIN, STRATA, Stratum
@@ -86,12 +86,15 @@ def test_a_stratum_drawn_anew_takes_the_place_of_its_kept_figures_and_no_other(t
     write_figures(shown, again)
     assert again.read_text() == path.read_text()
     shown.strata[two.name] = figures_of(two, [{"seed": 0, "cells": newer, "reasons": []}], "2026-02-02")
-    lines = text(shown).splitlines()
+    found = {what: value for what, value, *_ in rows(shown)}
     # by motion: 90 % of the kept one with the scatter of two equal replicates, 97 % of the new one without any
-    assert "| shape | 90.0 +- 0.0 (1.10) | 97.0 (0.90) |" in lines
-    assert "| w | 92.0 (1.20) | 99.0 (0.80) |" in lines
-    (days,) = (line for line in lines if line.startswith("Strata drawn on"))
-    assert days.startswith(f"Strata drawn on 2026-02-02: {two.name}. Strata drawn on 2026-01-01, with the program of")
+    of = {s.name: [v for what, v in found.items() if what.startswith(f"{s.name}: shape, ")] for s in (one, two)}
+    assert of == {one.name: ["90.0", "0.0", "1.10"], two.name: ["97.0", "0.90"]}
+    assert [found[f"{s.name}: all motions, w, squared error over variance"] for s in (one, two)] == ["1.20", "0.80"]
+    assert [line for line in notes(shown) if line.startswith("Drawn on")] == [
+        f"Drawn on 2026-01-01, with the program of that day: {one.name}.",
+        f"Drawn on 2026-02-02, with the program of that day: {two.name}.",
+    ]
 
 
 #: the same pictures under the same seed: a negative control scores the replicates of the main strata anew

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.dense.field import dense_motion, dense_shape
-from core.field.points.images import MeasureImage
-from core.field.points.result import Field
-from core.field.region.region import PointGrid
-from core.measure import MeasureOptions, ReferencePair
-from sim.truth import Truth
+from stereorig.core.dense.field import dense_motion, dense_shape
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureOptions, ReferencePair
+from stereorig.sim.truth import Truth
 from tests.support import field_bench as bench
 from tests.support.cut_scenes import below, opened, reference, true_uvw
 from tests.support.relief_rig import PLATEAU, Body, Feature, Texture, two_cameras
@@ -61,7 +61,7 @@ def errors(fields: list[Field], truth: Truth) -> NDArray[np.float64]:
     return np.stack([np.concatenate([f.xyz_mm - truth.xyz_mm, f.uvw_mm - truth.uvw_mm], axis=-1) for f in fields])
 
 
-def test_a_dense_field_has_the_ordinary_ones_noise_and_less_bias() -> None:
+def test_a_dense_field_has_the_ordinary_ones_noise_and_neither_has_plane_patches_bias() -> None:
     runs, at_points, at_vectors = plates()
     ordinary = errors([run[1] for run in runs], at_points)
     dense = errors([run[3] for run in runs], at_vectors)
@@ -70,9 +70,8 @@ def test_a_dense_field_has_the_ordinary_ones_noise_and_less_bias() -> None:
     assert (random[1] < 1.12 * random[0]).all()
     assert (random[1] > 0.88 * random[0]).all()
     bias = [abs(float(np.nanmean(e[..., 5]))) for e in (ordinary, dense)]
-    # plane patches flatten the deflection by half its curvature times their second moment, some 0.12 um
-    assert bias[0] > 8e-5
-    assert bias[1] < 3e-5
+    # plane patches flatten the deflection by half its curvature times their second moment, some 0.12 um: taken off
+    assert max(bias) < 3e-5
 
 
 def test_reported_uncertainty_holds_for_dense_vectors() -> None:

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.cameras.lens import SeidelLens
-from core.cameras.stereo import StereoPair
-from core.field.checks.epipolar_offset import check_epipolar
-from core.field.points.result import Field
-from core.measure import MeasureOptions, measure_shape
-from server.cli import main
-from server.formats.images import write_image
+from stereorig.core.cameras.lens import SeidelLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.checks.epipolar_offset import check_epipolar
+from stereorig.core.field.points.result import Field
+from stereorig.core.measure import MeasureOptions, measure_shape
+from stereorig.server.cli import main
+from stereorig.server.formats.images import write_image
 from tests.support.field_bench import grid, pair, take
 
 

@@ -7,21 +7,21 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from core.calibration import CalibrationOptions, CalibrationResult, CalibrationView, NominalCamera, calibrate
-from core.calibration.expect import Expectation, expect
-from core.common.factor import ParameterCovariance
-from core.field.common import with_common_parts
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels
-from core.field.region.region import PointGrid
-from core.gauge.area import area_statistics
-from core.gauge.extensometer import extensometer
-from core.measure import MeasureOptions, ReferencePair
-from core.names import CAMERAS
-from core.plan.quantities import PlannedQuantity, planned_quantities
-from core.plan.settings import PlannedMeasurement
-from core.strain import StrainOptions, surface_strain
-from core.target import GridTarget
+from stereorig.core.calibration import CalibrationOptions, CalibrationResult, CalibrationView, NominalValues, calibrate
+from stereorig.core.calibration.expect import Expectation, expect
+from stereorig.core.common.factor import ParameterCovariance
+from stereorig.core.field.common import with_common_parts
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.gauge.area import area_statistics
+from stereorig.core.gauge.extensometer import extensometer
+from stereorig.core.measure import MeasureOptions, ReferencePair
+from stereorig.core.names import CAMERAS
+from stereorig.core.plan.quantities import PlannedQuantity, planned_quantities
+from stereorig.core.plan.settings import PlannedMeasurement
+from stereorig.core.strain import StrainOptions, surface_strain
+from stereorig.core.target import GridTarget
 from tests.support.independent_rig import PlainCamera, Waves, exposed, picture
 
 SIZE = (240, 240)
@@ -66,7 +66,7 @@ def calibrated(rig: Rig) -> tuple[CalibrationResult, Expectation]:
     rng = np.random.default_rng(20)
     target = GridTarget(pitch_mm=rig.pitch_mm, lines=(11, 11), line_width_mm=0.05, pitch_scale_sigma=2e-5)
     nominals = tuple(
-        NominalCamera(SIZE, phd_px=rig.phd_px, standoff_mm=rig.standoff_mm, angle_deg=0.5 * sign * rig.angle_deg)
+        NominalValues(SIZE, phd_px=rig.phd_px, standoff_mm=rig.standoff_mm, angle_deg=0.5 * sign * rig.angle_deg)
         for sign in (-1.0, 1.0)
     )
     assert len(nominals) == 2

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from core.calibration.volume import CalibratedVolume, calibrated_volume
-from core.field.checks.extrapolated import mark_extrapolated
-from core.field.region.region import PointGrid
-from core.measure import MeasureOptions, measure_motion
-from core.status import PointStatus
-from core.target import GridTarget
-from server.cli import main
-from server.formats.calibrations.recognise import load_calibration
-from server.formats.calibrations.volume import volume_of
-from server.formats.images import write_image
+from stereorig.core.calibration.volume import CalibratedVolume, calibrated_volume
+from stereorig.core.field.checks.extrapolated import mark_extrapolated
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureOptions, measure_motion
+from stereorig.core.status import PointStatus
+from stereorig.core.target import GridTarget
+from stereorig.server.cli import main
+from stereorig.server.formats.calibrations.recognise import load_calibration
+from stereorig.server.formats.calibrations.volume import volume_of
+from stereorig.server.formats.images import write_image
 from tests.support.calibrated_volume import POSITIONS, TARGET, content
 from tests.support.field_bench import SIZE, pair, take
 

@@ -7,12 +7,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from core.cameras.camera import RigidTransform
-from core.field.points.features import detect
-from core.field.region.region import PointGrid
-from core.field.seeding.scattered_matches import scattered_motion
-from core.field.seeding.stretched import stretched_features, stretches
-from core.measure import MeasureOptions, ReferencePair
+from stereorig.core.cameras.camera import RigidTransform
+from stereorig.core.field.points.features import detect
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.field.seeding.scattered_matches import scattered_motion
+from stereorig.core.field.seeding.stretched import stretched_features, stretches
+from stereorig.core.measure import MeasureOptions, ReferencePair
 from tests.bench.accuracy.paper_rig import Rig, plane_scene, true_points, turn
 from tests.bench.speed.scene import rig_of_size
 

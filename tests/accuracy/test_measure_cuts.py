@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.cameras.stereo import StereoPair
-from core.field.points.result import Field
-from core.field.region.cuts import Cuts
-from core.field.region.find_visible import with_visibility
-from core.field.region.line_crossings import squared_distance
-from core.field.region.region import PointGrid
-from core.matching.fit import fit_motion
-from core.matching.options import MatchOptions
-from core.measure import MeasureOptions, ReferencePair
-from core.status import PointStatus
-from core.threads import available_threads, set_threads, threads
-from sim.catalog import make_scene
-from sim.panel import CrackedPanel
-from sim.rig import SimRig
-from sim.truth import truth_at
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.core.field.region.find_visible import with_visibility
+from stereorig.core.field.region.line_crossings import squared_distance
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.matching.fit import fit_motion
+from stereorig.core.matching.options import MatchOptions
+from stereorig.core.measure import MeasureOptions, ReferencePair
+from stereorig.core.status import PointStatus
+from stereorig.core.threads import available_threads, set_threads, threads
+from stereorig.sim.catalog import make_scene
+from stereorig.sim.panel import CrackedPanel
+from stereorig.sim.rig import SimRig
+from stereorig.sim.truth import truth_at
 from tests.accuracy import test_measure_crack as panel
 from tests.support import field_bench as bench
 from tests.support.cut_scenes import STILL, below, opened, reference, true_uvw

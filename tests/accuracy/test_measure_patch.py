@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.field.growth.grow import Attempts, grow
-from core.field.points.fitter import PointFits
-from core.measure import MeasureOptions, measure_shape
-from core.status import PointStatus
+from stereorig.core.field.growth.grow import Attempts, grow
+from stereorig.core.field.points.fitter import PointFits
+from stereorig.core.measure import MeasureOptions, measure_shape
+from stereorig.core.status import PointStatus
 from tests.support.field_bench import grid, pair, take, truth
 from tests.support.field_bench import scene as scene_of
 

@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from core.errors import Cancelled, ImageError, InputError, RegionError, SeedError
-from core.field.points import fitter
-from core.field.points.result import Field
-from core.field.seeding.scattered_matches import refuse_swapped
-from core.field.seeding.seeds import Seed
-from core.measure import MeasureOptions, ReferencePair, measure_motion, measure_shape
-from core.noise import NoiseModel
-from core.progress import Cancel
-from core.status import PointStatus
-from sim.rig import SimRig
-from sim.truth import Truth
+from stereorig.core.errors import Cancelled, ImageError, InputError, RegionError, SeedError
+from stereorig.core.field.points import fitter
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.seeding.scattered_matches import refuse_swapped
+from stereorig.core.field.seeding.seeds import Seed
+from stereorig.core.measure import MeasureOptions, ReferencePair, measure_motion, measure_shape
+from stereorig.core.noise import NoiseModel
+from stereorig.core.progress import Cancel
+from stereorig.core.status import PointStatus
+from stereorig.sim.rig import SimRig
+from stereorig.sim.truth import Truth
 from tests.support.field_bench import Images, grid, pair, scene, take, truth
 from tests.support.requirements import ROOT
 

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.cameras.stereo import StereoPair
-from core.errors import ImageError
-from core.field.points.result import Field
-from core.field.region.region import PointGrid
-from core.measure import MeasureOptions, ReferencePair
-from server.formats.calibrations.recognise import parse_calibration
-from server.formats.images import read_image
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import ImageError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureOptions, ReferencePair
+from stereorig.server.formats.calibrations.recognise import parse_calibration
+from stereorig.server.formats.images import read_image
 
 pytestmark = pytest.mark.specimen
 

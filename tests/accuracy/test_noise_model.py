@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import fourier_shift, gaussian_filter
 
-from core.errors import ImageError, InputError
-from core.noise import NoiseModel, measure_noise, rows_looked_at
-from sim.sensor import Sensor
+from stereorig.core.errors import ImageError, InputError
+from stereorig.core.noise import NoiseModel, measure_noise, rows_looked_at
+from stereorig.sim.sensor import Sensor
 
 SENSORS = {
     "read noise rules, 8 bit": Sensor(),

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.matching import MatchOptions, fit_shape, prepare
-from core.noise import NoiseModel
+from stereorig.core.matching import MatchOptions, fit_shape, prepare
+from stereorig.core.noise import NoiseModel
 from tests.support.matching_scene import Plane, Texture, paper_pair, render, true_w
 
 SIZE = 260

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy.ndimage import correlate1d, gaussian_filter
 
-from core.errors import InputError, RegionError
-from core.field.region.region import PointGrid
-from core.matching import MatchOptions, fit_motion, fit_shape, prepare
-from core.matching.blur import Blur, spread_of
-from core.matching.filters import derivative
-from core.matching.slopes import slope_filter
-from core.measure import MeasureOptions, ReferencePair, measure_shape
-from core.noise import NoiseModel
-from core.status import PointStatus
+from stereorig.core.errors import InputError, RegionError
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.matching import MatchOptions, fit_motion, fit_shape, prepare
+from stereorig.core.matching.blur import Blur, spread_of
+from stereorig.core.matching.filters import derivative
+from stereorig.core.matching.slopes import slope_filter
+from stereorig.core.measure import MeasureOptions, ReferencePair, measure_shape
+from stereorig.core.noise import NoiseModel
+from stereorig.core.status import PointStatus
 from tests.support import field_bench
 from tests.support.matching_scene import Plane, Texture, digitise, paper_pair, render, true_g, true_w
 
@@ -39,7 +39,7 @@ def scene():
 @pytest.mark.parametrize(
     ("sd", "noise", "known"), [(0.5, 2.0, True), (1.0, 6.0, False), (1.0, 2.0, True), (2.0, 6.0, True)]
 )
-def test_told_is_the_scatter(sd, noise, known):
+def test_reported_uncertainty_is_the_scatter(sd, noise, known):
     pair, clean, xy, w, G = scene()
     model = NoiseModel(coefficients=(noise**2 + 1.0 / 12.0, 0.0, 0.0)) if known else None
     rng = np.random.default_rng(11)

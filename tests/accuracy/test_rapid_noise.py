@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
-from core.field.points.shared_pixels import SharedPixels
+from stereorig.core.field.points.shared_pixels import SharedPixels
 from tests.bench.accuracy.rapid_noise import observed_over_reported, window_slope
 
 SUBSET, STEP = 33, 11  # a subset of 3 x 3 steps, drawn as sums of white cells

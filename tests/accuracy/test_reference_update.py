@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.cameras.camera import RigidTransform
-from core.errors import SeedError
-from core.field.points.assemble import assemble
-from core.field.points.fitter import PointFits
-from core.field.points.images import MeasureImage
-from core.field.points.result import Field
-from core.field.region.region import PointGrid
-from core.field.sequence.compose import Totals, common_share, follow, since, totals_of
-from core.measure import MeasureOptions, PreviousStep, ReferencePair
-from core.status import PointStatus
+from stereorig.core.cameras.camera import RigidTransform
+from stereorig.core.errors import SeedError
+from stereorig.core.field.points.assemble import assemble
+from stereorig.core.field.points.fitter import PointFits
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.field.sequence.compose import Totals, common_share, follow, since, totals_of
+from stereorig.core.measure import MeasureOptions, PreviousStep, ReferencePair
+from stereorig.core.status import PointStatus
 from tests.bench.accuracy.paper_rig import turn
 from tests.support import field_bench
 from tests.support import sequence_bench as bench
@@ -280,7 +280,7 @@ def test_a_reference_that_nothing_is_left_of_is_refused() -> None:
     gone = moving_measured("never")[1]
     empty = np.full(gone.shape, PointStatus.LOW_CORRELATION, np.int8)
     field = Field(**{**gone.__dict__, "status": empty})
-    from core.field.sequence.segment import begin_segment
+    from stereorig.core.field.sequence.segment import begin_segment
 
     with pytest.raises(SeedError, match="step 1"):
         begin_segment(

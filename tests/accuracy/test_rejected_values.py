@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from core.measure import MeasureOptions, ReferencePair
-from server.formats.results.writing import Provenance, write_field
+from stereorig.core.measure import MeasureOptions, ReferencePair
+from stereorig.server.formats.results.writing import Provenance, write_field
 from tests.support import field_bench as bench
 
 MOTION = (0.02, -0.013, 0.03, 0.0006, -0.0004, 0.001)

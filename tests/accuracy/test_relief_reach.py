@@ -6,12 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from core.field.points import features, fitter
-from core.field.points.result import Field
-from core.field.region.region import PointGrid
-from core.measure import MeasureOptions, ReferencePair, measure_shape
-from server.formats.results.summary import summarise
-from tests.support.relief_rig import HOLE, PLATEAU, WIRE, Body, Feature, Texture, trace, two_cameras
+from stereorig.core.field.points import features, fitter
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureOptions, ReferencePair, measure_shape
+from stereorig.core.status import PointStatus
+from stereorig.server.formats.results.summary import summarise
+from tests.support.relief_rig import CYLINDER, HOLE, PLATEAU, RIDGE, WIRE, Body, Feature, Texture, trace, two_cameras
 from tests.support.relief_truth import Part
 
 SUBSET_PX = 21
@@ -80,6 +81,21 @@ def test_what_lies_behind_a_wire_is_not_delivered_before_it() -> None:
     assert (found.face < -1).sum() > 100
     assert found.wrong == 0
     assert found.share > 0.99
+
+
+def test_right_points_of_a_face_that_bends_and_beside_edges_are_kept_and_as_precise_as_reported() -> None:
+    forms = (
+        Feature(CYLINDER, (-6.0, 0.0), (4.0, 5.0), 6.0, np.radians(40.0)),
+        Feature(RIDGE, (6.0, 0.0), (3.0, 5.0), 2.0, np.radians(35.0)),
+    )
+    part = Part(two_cameras((280, 200)), (Body(forms, texture=Texture(wavelength_mm=0.7)),))
+    grid = PointGrid.rectangle(20.0, 20.0, 260.0, 176.0, spacing_px=6.0)
+    field = measure_shape(part.pair, *part.images(), grid, OPTIONS)
+    found = part.beside_truth(field, grid, SUBSET_PX)
+    assert found.share > 0.99
+    assert found.wrong == 0
+    assert (field.status == PointStatus.NEIGHBOUR_MISMATCH).mean() < 0.05
+    assert 0.9 < np.sqrt(np.mean(found.error_sigmas[field.valid] ** 2)) < 1.2  # the largest of three
 
 
 def test_a_given_seed_adds_to_the_automatic_ones(steps: Part, images: tuple[np.ndarray, np.ndarray]) -> None:

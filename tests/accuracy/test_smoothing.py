@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.errors import InputError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels
-from core.field.region.cuts import Cuts
-from core.field.smoothed import smoothed_displacement
-from core.gauge.area import area_statistics
-from core.gauge.extensometer import extensometer
-from core.strain import StrainOptions, surface_strain
+from stereorig.core.arrays import Float
+from stereorig.core.errors import InputError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.core.field.smoothed import smoothed_displacement
+from stereorig.core.gauge.area import area_statistics
+from stereorig.core.gauge.extensometer import extensometer
+from stereorig.core.strain import StrainOptions, surface_strain
 from tests.support.gauge_field import STEP, SUBSET, make_field, pixel_noise
 
 
@@ -99,7 +99,7 @@ def test_a_lone_line_of_points_keeps_its_values():
 
 @pytest.mark.normal_depth("3-1")
 @pytest.mark.parametrize(("window", "order"), [(3, 1), (5, 2), (9, 2)])
-def test_told_is_the_scatter(window, order):
+def test_reported_uncertainty_is_the_scatter(window, order):
     """Points, differences, mean, extensometer and strain of smoothed fields against 600 fields of pixel noise."""
     failed = np.zeros((14, 17), bool)
     failed[5:8, 9:11] = True

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from core.field.smoothed import smoothed_displacement
-from core.strain import StrainOptions, surface_strain
-from core.strain.mean import mean_strain_sigma
+from stereorig.core.field.smoothed import smoothed_displacement
+from stereorig.core.strain import StrainOptions, surface_strain
+from stereorig.core.strain.mean import mean_strain_sigma
 from tests.support.gauge_field import SUBSET, make_field, pixel_noise, surface
 
 TURN = Rotation.from_rotvec([0.1, -0.2, 0.4]).as_matrix()
@@ -21,7 +21,7 @@ TURN = Rotation.from_rotvec([0.1, -0.2, 0.4]).as_matrix()
     ("tensor", "window", "order", "smooth"),
     [("green_lagrange", 5, 1, 0), ("hencky", 7, 2, 0), ("infinitesimal", 3, 1, 0), ("green_lagrange", 5, 1, 3)],
 )
-def test_told_is_the_scatter(tensor, window, order, smooth):
+def test_reported_uncertainty_is_the_scatter(tensor, window, order, smooth):
     failed = np.zeros((14, 17), bool)
     failed[6:8, 4:6] = True
     # small strain assumes small rotations; how the others' frames turn under noise does not enter

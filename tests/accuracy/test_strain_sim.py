@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from core.cameras.camera import RigidTransform
-from core.measure import MeasureOptions, ReferencePair
-from core.status import PointStatus
-from core.strain import StrainField, StrainOptions, surface_strain
-from sim.render import RenderOptions, render
-from sim.scene import UPRIGHT, Scene
-from sim.surface import flat
-from sim.texture import speckle
+from stereorig.core.cameras.camera import RigidTransform
+from stereorig.core.measure import MeasureOptions, ReferencePair
+from stereorig.core.status import PointStatus
+from stereorig.core.strain import StrainField, StrainOptions, surface_strain
+from stereorig.sim.render import RenderOptions, render
+from stereorig.sim.scene import UPRIGHT, Scene
+from stereorig.sim.surface import flat
+from stereorig.sim.texture import speckle
 from tests.support import cut_scenes
 from tests.support import field_bench as bench
 from tests.support.strain_fields import turned

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import correlate, uniform_filter
 
-from core.field.points.patch import asked_for
-from core.field.points.shared_pixels import SharedPixels
-from core.strain import StrainOptions, surface_strain
+from stereorig.core.field.points.patch import asked_for
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.strain import StrainOptions, surface_strain
 from tests.support.strain_fields import make_field, plane, turned
 
 SUBSET, STEP, SHAPE = 21, 8, (17, 19)

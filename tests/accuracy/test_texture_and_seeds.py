@@ -10,11 +10,11 @@ import httpx
 import numpy as np
 import pytest
 
-from core.cameras.camera import Camera
-from core.cameras.stereo import StereoPair
-from core.field.seeding.seeds import Seed, seeds_of
-from server.formats.results.settings import stored_settings
-from server.results.images.texture import errors_at, speckle_quality
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.seeding.seeds import Seed, seeds_of
+from stereorig.server.formats.results.layout import stored_settings
+from stereorig.server.results.images.texture import errors_at, speckle_quality
 from tests.support.service_rig import SMALL, new_test, true_cameras
 
 pytestmark = pytest.mark.timeout(180)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from server.workflows.service import Service
+from stereorig.server.workflows.service import Service
 from tests.support import results_page
 from tests.support.page_audit import AXE_STYLES, Audit, auditor
 from tests.support.page_bench import Watched, watched

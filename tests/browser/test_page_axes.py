@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from core.strain import StrainOptions, surface_strain
-from server.formats.results.writing import Provenance, write_field
-from server.store.indexing.entries import analysis_entry
+from stereorig.core.strain import StrainOptions, surface_strain
+from stereorig.server.formats.results.writing import Provenance, write_field
+from stereorig.server.store.indexing.entries import analysis_entry
 from tests.support import results_page
 from tests.support.gauge_field import SUBSET, make_field
 from tests.support.page_bench import Watched, watched

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from core.names import CameraName
-from server.config.rig_file import parse_config
-from server.workflows.service import Service
+from stereorig.core.names import CameraName
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.workflows.service import Service
 from tests.support.page_bench import Watched, watched
 from tests.support.service_rig import SMALL, wait_for_job, wait_for_rig
 
@@ -144,7 +144,7 @@ def test_a_scene_without_a_grid_is_refused_with_cause_and_remedy(page: Watched, 
         progress = shown.locator('[data-role="progress"]')
         expect(progress.locator(".problem")).to_be_visible(timeout=SLOW)
         problem = client.get(f"{API}/calibrations/{newest(client)}").json()["problem"]
-        expect(progress).to_contain_text(problem["cause"])
+        expect(progress).to_contain_text(problem["detail"])
         expect(progress).to_contain_text(problem["remedy"])
         expect(progress).to_contain_text(problem["code"])
         # and it is in the list as what it is

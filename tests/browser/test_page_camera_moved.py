@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from playwright.sync_api import expect
 
-from core.cameras.camera import Camera
-from server.config.rig_file import parse_config
-from server.workflows.service import Service
+from stereorig.core.cameras.camera import Camera
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.workflows.service import Service
 from tests.support.page_bench import Watched
 from tests.support.service_rig import SMALL, new_test, true_cameras, wait_for_job, wait_for_rig
 

@@ -24,10 +24,10 @@ import xarray
 from PIL import Image
 from playwright.sync_api import Locator, Page, expect
 
-from core.cameras.camera import Camera
-from server.config.rig_file import parse_config
-from server.formats.results.netcdf import library
-from server.workflows.service import Service
+from stereorig.core.cameras.camera import Camera
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.formats.results.netcdf import library
+from stereorig.server.workflows.service import Service
 from tests.support.page_audit import in_every_size
 from tests.support.page_bench import Watched
 from tests.support.page_editor import Editor
@@ -399,12 +399,12 @@ def test_a_calibration_that_is_refused(page: Watched, client: httpx.Client, fini
     refused = client.get(f"{API}/calibrations").json()["calibrations"][-1]
     assert refused["state"] == "failed"
     problem = client.get(f"{API}/calibrations/{refused['id']}").json()["problem"]
-    for part in ("cause", "remedy", "code"):
+    for part in ("detail", "remedy", "code"):
         expect(progress).to_contain_text(problem[part])
     expect(shown.locator("tr", has_text=refused["id"])).to_contain_text("failed")
     # it cannot be accepted, and no test can be made with it
     panel = shown.locator("section.panel", has=shown.get_by_role("heading", name=refused["id"]))
-    expect(panel).to_contain_text(problem["cause"])
+    expect(panel).to_contain_text(problem["detail"])
     expect(panel.get_by_role("button", name="Accept")).to_have_count(0)
     page.open("#/test")
     choice = shown.get_by_label("Calibration", exact=True)
@@ -435,7 +435,7 @@ def test_a_camera_lost_in_mid_run(page: Watched, client: httpx.Client, service: 
         # the rig's screen states it as well, and continues by itself once the camera is there again
         go(shown, "Rig", "tiny rig")
         box = shown.get_by_role("region", name="cam2", exact=True)
-        for part in ("cause", "remedy", "code"):
+        for part in ("detail", "remedy", "code"):
             fault = client.get(f"{API}/rig").json()["cameras"]["cam2"]["fault"]
             expect(box.get_by_role("alert")).to_contain_text(fault[part])
         expect(shown.get_by_text("without cam2", exact=True)).to_be_visible()

@@ -33,7 +33,7 @@ class Served:
         self.url = ""
 
     def start(self) -> str:
-        command = [sys.executable, "-m", "server.cli", "serve", "--config", str(self.folder / "rig.toml")]
+        command = [sys.executable, "-m", "stereorig.server.cli", "serve", "--config", str(self.folder / "rig.toml")]
         self.process = subprocess.Popen(
             [*command, "--port", "0", "--data", str(self.folder / "data")],
             cwd=ROOT,
@@ -170,7 +170,7 @@ def test_two_windows_do_not_overwrite_each_other(chromium: Browser, served: Serv
         saved(first)
         second.get_by_label("Subset", exact=True).fill("25")
         told = second.locator('[data-role="saved"]')
-        expect(told).to_contain_text("Changed in another window meanwhile.")
+        expect(told).to_contain_text("Changed in another window since.")
         assert served.workspace(TEST)["settings"]["subset_px"] == 23  # type: ignore[index]
         told.get_by_role("button", name="Keep this one").click()
         expect(told).to_have_text("Saved with the test.")

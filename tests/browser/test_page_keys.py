@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
-from server.config.rig_file import parse_config
-from server.workflows.service import Service
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.workflows.service import Service
 from tests.support.page_bench import FOCUS, UNREACHED, Watched, tabbed
 from tests.support.page_editor import asked
 from tests.support.service_rig import SMALL, plate_test

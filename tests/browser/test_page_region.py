@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
-from server.config.rig_file import parse_config
-from server.workflows.service import Service
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.workflows.service import Service
 from tests.support.page_bench import Watched
 from tests.support.page_editor import HEIGHT, WIDTH, Editor, posted
 from tests.support.service_rig import SMALL, plate_test

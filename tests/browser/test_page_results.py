@@ -15,15 +15,15 @@ import xarray
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
-from core.cameras.camera import Camera
-from server.exports.mesh import triangles_of
-from server.formats.calibrations.recognise import load_calibration
-from server.formats.results.netcdf import library
-from server.formats.results.reading import read_field, read_head
-from server.formats.results.writing import Provenance, write_field
-from server.report.source import find_source
-from server.store.indexing.entries import analysis_entry
-from sim.plate import CircularPlate
+from stereorig.core.cameras.camera import Camera
+from stereorig.server.exports.mesh import triangles_of
+from stereorig.server.formats.calibrations.recognise import load_calibration
+from stereorig.server.formats.results.netcdf import library
+from stereorig.server.formats.results.reading import read_field, read_head
+from stereorig.server.formats.results.writing import Provenance, write_field
+from stereorig.server.report.source import find_source
+from stereorig.server.store.indexing.entries import analysis_entry
+from stereorig.sim.plate import CircularPlate
 from tests.support import results_page
 from tests.support.page_bench import UNREACHED, Watched, tabbed, watched
 from tests.support.results_page import (
@@ -1016,3 +1016,21 @@ def test_a_step_is_compared_with_a_model_on_the_page(page: Watched, bench: Bench
     assert panel.locator("table").filter(has_text="Where the model is refuted").locator("tbody tr").count() == len(
         said["refuted"]
     )
+
+
+def test_an_evaluation_is_run_on_the_page(page: Watched, bench: Bench) -> None:
+    at = shown(page, bench)
+    at.get_by_text("Evaluations", exact=True).click()
+    panel = at.locator('[data-role="evaluations"]')
+    panel.locator('[data-setting="variable"]').fill("w_mm")
+    panel.locator('[data-setting="upper"]').fill("0.05")
+    panel.locator('[data-setting="step"]').fill("2")
+    panel.get_by_role("button", name="Evaluate").click()
+    body = {"settings": {"variable": "w_mm", "upper": 0.05, "step": 2}}
+    found = bench.client.post(f"{bench.path()}/evaluations/conformity", json=body, timeout=60.0).json()["document"]
+    expect(panel.locator('[data-role="evaluation-verdict"]')).to_contain_text(found["verdict"])
+    assert panel.locator("rect").count() == len(found["histogram"]["counts"])
+    page.sound()
+    panel.locator('[data-setting="upper"]').fill("")
+    panel.get_by_role("button", name="Evaluate").click()
+    expect(panel).to_contain_text("needs lower, upper or both")

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, expect
 
-from server.formats.images import decode
-from server.http.access import KeyFile
-from server.workflows.service import Service
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.formats.images import decode
+from stereorig.server.http.access import KeyFile
+from stereorig.server.workflows.service import Service
+from tests.service.test_rig_comes_up import Bench, states, until_connected
 from tests.support.page_bench import Watched, watched
 from tests.support.service_rig import served, true_cameras
+from tests.support.stage_service import rig_text, wait_until
 from tests.support.tiny_rig import TINY
 
 pytestmark = pytest.mark.timeout(180)
@@ -239,3 +243,43 @@ def test_where_keys_are_needed_the_page_asks_for_one(chromium: Browser, service:
         image = page.page.get_by_alt_text("Live view of cam1", exact=True)
         page.page.wait_for_function("image => image.naturalWidth === 160", arg=image.element_handle())
         page.sound(401)
+
+
+@pytest.mark.fault(61)
+def test_a_device_that_comes_late_or_is_lost_is_shown_as_it_is(
+    chromium: Browser, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    bench = Bench(monkeypatch, {"stage": ("esp301", (1, 2))})
+    bench.off("cam2")
+    with (
+        bench.serve(parse_config(rig_text(url=f'"{bench.url()}"')), tmp_path / "data") as client,
+        watched(chromium, str(client.base_url).rstrip("/")) as made,
+    ):
+        until_connected(client, "cam1")
+        shown = made.open()
+        late = shown.get_by_role("region", name="cam2", exact=True)
+        controllers = shown.locator('[data-role="controllers"]')
+        expect(late).to_contain_text("looked for")
+        expect(controllers).to_contain_text("looked for")
+        bench.on("cam2")
+        bench.on("stage")
+        # its settings and their ranges were not known when the page was opened
+        expect(late.get_by_label("Exposure")).to_have_value("10")
+        expect(late).to_contain_text("0.01 to 1000 ms")
+        expect(late.get_by_role("img", name="Histogram of cam2")).to_be_visible()
+        expect(controllers).to_contain_text("connected")
+        bench.off("cam2")
+        expect(late).to_contain_text("lost since")
+        for cam in ("cam1", "cam2"):  # none of its figures passes for a present one
+            box = shown.get_by_role("region", name=cam, exact=True)
+            expect(box.get_by_role("img", name=f"Histogram of {cam}")).to_be_hidden()
+            expect(box.locator('[data-role="focus"]')).not_to_contain_text("at the peak")
+        bench.on("cam2")
+        expect(shown.get_by_text("ready", exact=True)).to_be_visible()
+        bench.off("stage")
+        wait_until(lambda: states(client)["stage1"] == "lost")
+        expect(shown.get_by_text("without the stage")).to_be_visible()
+        expect(controllers).to_contain_text("lost since")
+        bench.on("stage")
+        expect(controllers).to_contain_text("connected")
+        made.sound(503)

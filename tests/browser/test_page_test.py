@@ -15,11 +15,18 @@ import numpy as np
 import pytest
 from playwright.sync_api import Locator, expect
 
-from core.cameras.camera import Camera
-from core.cameras.stereo import StereoPair
-from core.settings import DENSE_STEP_PX, SMOOTHING_WINDOW, SPACING_PX, STRAIN_WINDOW, SUBSET_PX
-from server.config.rig_file import parse_config
-from server.workflows.service import Service
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.settings import (
+    DEFAULT_MAX_SIGMA_PX,
+    DENSE_STEP_PX,
+    SMOOTHING_WINDOW,
+    SPACING_PX,
+    STRAIN_WINDOW,
+    SUBSET_PX,
+)
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.workflows.service import Service
 from tests.support.page_bench import Watched
 from tests.support.page_editor import HEIGHT, WIDTH, Editor, asked
 from tests.support.service_rig import SMALL, new_test, true_cameras, wait_for_job
@@ -250,7 +257,20 @@ def test_a_load_frames_record_gives_the_steps_their_channels_by_time(
     send.click()
     beside = panel.locator(".field", has=shown.get_by_label("File of the record")).get_by_role("alert")
     expect(beside).to_have_text("Choose the record's file.")
+    # a file that leaves something open is shown with what is read in it, and with a field that answers
+    unsure = tmp_path / "unsure.csv"
+    unsure.write_text("Probe;P-07\nZeit;Kraft\ns;kN\n0,5;1\n1,5;OVER\n0,5;3\n1,5;4\n", encoding="utf-16")
+    panel.get_by_label("File of the record").set_input_files(unsure)
+    seen = panel.locator('[data-role="preview"]')
+    expect(seen).to_contain_text("left out: 1 line above the table")
+    expect(seen.locator(".problem").nth(0)).to_contain_text("2 segments")
+    expect(seen.locator(".problem").nth(1)).to_contain_text("'OVER' in line 5")
+    expect(seen.get_by_role("row").filter(has_text="kraft_kn")).to_contain_text("kN")
+    panel.get_by_label("Part of the record").select_option("2")
+    expect(seen.locator(".problem")).to_have_count(1)
     panel.get_by_label("File of the record").set_input_files(record)
+    expect(seen).to_contain_text("no line left out")
+    expect(panel.get_by_label("Part of the record")).to_have_count(0)
     panel.get_by_label("At step").fill("7")
     panel.get_by_label("Time of the record").fill("5")
     send.click()
@@ -390,6 +410,7 @@ def test_each_field_of_a_measurement_says_its_error_beside_itself_and_nothing_is
         return measure.locator(".field", has=shown.get_by_label(label, exact=True)).get_by_role("alert")
 
     # the limits are those of the settings
+    expect(measure.get_by_label("Largest sigma of a match", exact=True)).to_have_value(str(DEFAULT_MAX_SIGMA_PX))
     for label, limits in (
         ("Subset", SUBSET_PX),
         ("Spacing", SPACING_PX),

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
 
-from server.demo.process import running_service
+from stereorig.server.demo.process import running_service
 from tests.support.page_bench import Watched, watched
 from tests.support.page_editor import Editor
 from tests.support.plate_truth import check_plate_field

@@ -11,10 +11,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from core.errors import CameraError
-from core.names import CAMERAS
-from drivers.acquisition.pairing import TimePairing
-from drivers.cameras.protocol import CameraSettings, FrameGrabber, FrameStatus, TriggerMode
+from stereorig.core.errors import CameraError
+from stereorig.core.names import CAMERAS
+from stereorig.drivers.acquisition.pairing import TimePairing
+from stereorig.drivers.cameras.protocol import CameraSettings, FrameGrabber, FrameStatus, TriggerMode
 from tests.support.camera_bench import (
     LOSSES,
     SPOILS,
@@ -62,6 +62,13 @@ def _make(name: str) -> CameraBench:
         from tests.support.aravis_bench import AravisBench
 
         return AravisBench()
+    if name == "pylon":
+        from tests.support import pylon_bench
+
+        lacking = pylon_bench.what_is_missing()
+        if lacking is not None:
+            missing(lacking)
+        return pylon_bench.PylonBench()
     raise AssertionError(name)
 
 
@@ -127,6 +134,12 @@ def _rising(numbers: Sequence[int]) -> bool:
     return all(later > earlier for earlier, later in pairwise(numbers))
 
 
+def _size(grabber: FrameGrabber) -> tuple[int, int]:
+    """Width and height of the image with the settings that the contract begins with."""
+    region = grabber.configure(CameraSettings()).region_px
+    return grabber.describe().image_size_px if region is None else region[2:]
+
+
 def _inside(low_high: tuple[float, float]) -> float:
     """A value well inside a range that may span decades."""
     low, high = low_high
@@ -189,11 +202,11 @@ def test_a_setting_that_the_device_does_not_have_is_named(bench: CameraBench) ->
 def test_free_run_delivers_at_its_rate_in_order(bench: CameraBench) -> None:
     with opened(bench, "cam1") as grabber:
         here = grabber.describe()
+        columns, rows = _size(grabber)
         grabber.arm()
         begin = time.monotonic_ns()
         frames = [frame for frame in frames_of(grabber, 22) if frame.status is FrameStatus.OK][2:]
         end = time.monotonic_ns()
-        columns, rows = here.image_size_px
         for frame in frames:
             assert frame.pixels.shape == (rows, columns)
             assert frame.bit_depth in here.bit_depths
@@ -223,12 +236,12 @@ def test_a_region_is_cut_out_of_the_whole_image(bench: CameraBench) -> None:
     if region is None:
         pytest.skip(f"the cameras of {bench.name} deliver the whole image only")
     with opened(bench, "cam1") as grabber:
+        columns, rows = _size(grabber)
         taken = grabber.configure(CameraSettings(region_px=region))
         assert taken.region_px == region
         grabber.arm()
         assert frames_of(grabber, 2)[-1].pixels.shape == (region[3], region[2])
         grabber.disarm()
-        columns, rows = grabber.describe().image_size_px
         grabber.configure(CameraSettings(region_px=(0, 0, columns, rows)))
         grabber.arm()
         assert frames_of(grabber, 2)[-1].pixels.shape == (rows, columns)

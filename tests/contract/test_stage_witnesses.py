@@ -1,23 +1,33 @@
 """Drivers that others wrote, driving our simulated controllers: independent witnesses of the wire protocols.
 
 PyMeasure's ESP300 over pyvisa and pyvisa-py, on a socket and on a pty; hvl_ccb's NewportSMC100PP over pyserial on a
-pty. Where one of them disagrees with a simulator, the manual says who is right.
+pty; newportxps on the XPS of our tests; Zaber's and PI's own libraries on the controllers of our
+tests, and a library of Thorlabs' messages. Where one of them
+disagrees with a simulator, the manual says who is right.
 """
 
 from __future__ import annotations
 
 import importlib
 import logging
+import re
+import threading
+import time
 from collections.abc import Iterator
 from types import ModuleType
 from typing import Any, Literal
 
 import pytest
 
-from sim.controllers.esp301 import SimESP301
-from sim.controllers.server import ControllerServer
-from sim.controllers.smc100 import SimSMC100
+from stereorig.sim.controllers.esp301 import SimESP301
+from stereorig.sim.controllers.server import ControllerServer
+from stereorig.sim.controllers.smc100 import SimSMC100
+from tests.support.fake_kinesis import FakeKinesis
+from tests.support.fake_pi import FakePI
+from tests.support.fake_xps import FakeXPS
+from tests.support.fake_zaber import FakeZaber
 from tests.support.requirements import missing
+from tests.support.stage_bench import Server
 
 # PyMeasure's own words about its driver
 pytestmark = pytest.mark.filterwarnings("ignore:It is not known whether this device support SCPI:FutureWarning")
@@ -148,7 +158,7 @@ def test_pymeasure_reads_errors_in_the_manuals_words(esp: tuple[Any, SimESP301])
 def test_every_error_text_of_the_simulator_is_pymeasures(esp: tuple[Any, SimESP301]) -> None:
     from pymeasure.instruments.newport.esp300 import AxisError, GeneralError
 
-    from sim.controllers.esp301 import _AXIS_TEXTS, _TEXTS
+    from stereorig.sim.controllers.esp301 import _AXIS_TEXTS, _TEXTS
 
     slips = {"EMERGENCY SOP ACTIVATED": "EMERGENCY STOP ACTIVATED"}  # the witness' spelling, the manual's
     for code, text in _TEXTS.items():
@@ -313,7 +323,7 @@ def test_hvl_ccb_is_told_when_motor_power_was_cut(smc: tuple[SimSMC100, str]) ->
 
 def test_every_letter_and_bit_of_the_simulator_is_hvl_ccbs() -> None:
     newport = witness("hvl_ccb.dev.newport", "hvl_ccb")
-    from sim.controllers.smc100 import _BITS, _TEXTS
+    from stereorig.sim.controllers.smc100 import _BITS, _TEXTS
 
     letters = newport.NewportSMC100PPSerialCommunication.ControllerErrors
     assert {error.value: error.message for error in letters} == _TEXTS
@@ -326,8 +336,8 @@ def test_every_letter_and_bit_of_the_simulator_is_hvl_ccbs() -> None:
 
 def test_the_drivers_states_and_bits_are_hvl_ccbs() -> None:
     newport = witness("hvl_ccb.dev.newport", "hvl_ccb")
-    from drivers.stages.protocol import AxisState
-    from drivers.stages.smc100 import _POSITIONER_ERRORS, _STATES
+    from stereorig.drivers.stages.makers.smc100 import _POSITIONER_ERRORS, _STATES
+    from stereorig.drivers.stages.protocol import AxisState
 
     ours = {
         "NO_REF": AxisState.NOT_HOMED,
@@ -346,3 +356,214 @@ def test_the_drivers_states_and_bits_are_hvl_ccbs() -> None:
         text = error.message.lower().replace("end of turn", "end of run").replace("timeout", "time out")
         text = text.removesuffix(" detection").replace("80w", "80 w")
         assert _POSITIONER_ERRORS[11 - error.value].lower() == text
+
+
+# XPS driven by newportxps -----------------------------------------------------------------------------------------
+
+
+def test_newportxps_homes_moves_and_aborts_on_the_xps_of_our_tests() -> None:
+    controllers = witness("newportxps.XPS_C8_drivers", "newportxps")
+    fake = FakeXPS(time_scale=20.0)
+    xps = controllers.XPS()
+    try:
+        one, two = (xps.TCP_ConnectToServer("127.0.0.1", fake.port, 20) for _ in range(2))
+        assert xps.FirmwareVersionGet(one)[1] == "XPS-D Firmware V1.4.1"
+        assert xps.errorcodes["-22"] == "Not allowed action"
+        assert xps.GroupHomeSearch(one, "Group1")[0] == -22  # it must be initialised first
+        assert xps.GroupInitialize(one, "Group1")[0] == 0
+        assert xps.GroupStatusGet(one, "Group1") == [0, 42]
+        assert xps.GroupHomeSearch(one, "Group1")[0] == 0  # it answers when home is found
+        assert xps.GroupStatusGet(one, "Group1") == [0, 11]
+        assert xps.PositionerUserTravelLimitsGet(one, "Group1.Pos") == [0, -50.0, 50.0]
+        assert xps.GroupMoveAbsolute(one, "Group1.Pos", [5.25])[0] == 0
+        assert xps.GroupPositionCurrentGet(one, "Group1.Pos", 1) == [0, pytest.approx(5.25, abs=1e-4)]
+        answers: list[int] = []
+        move = threading.Thread(target=lambda: answers.append(xps.GroupMoveAbsolute(one, "Group1.Pos", [45.0])[0]))
+        move.start()
+        while xps.GroupStatusGet(two, "Group1")[1] != 44:
+            time.sleep(0.001)
+        assert xps.GroupMoveAbort(two, "Group1")[0] == 0
+        move.join(5.0)
+        assert answers == [-27]
+        assert fake.axes["Group1"].true_position_mm() < 40.0
+        assert xps.GroupMotionDisable(one, "Group1")[0] == 0
+        assert xps.GroupKill(one, "Group1")[0] == 0
+        for connection in (one, two):
+            xps.TCP_CloseSocket(connection)
+    finally:
+        fake.close()
+
+
+# Zaber devices driven by Zaber's own library ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("device", [{}, {"one_device": True}, {"firmware": "6.33"}], ids=str)
+def test_zabers_library_homes_moves_stops_and_reads_what_the_fake_device_says(device: dict[str, Any]) -> None:
+    zaber = witness("zaber_motion.ascii", "zaber-motion")
+    errors = witness("zaber_motion", "zaber-motion")
+    controller = FakeZaber(time_scale=50.0, start_mm=3.0, **device)
+    with (
+        ControllerServer(controller, "socket") as server,
+        zaber.Connection.open_tcp("127.0.0.1", int(server.url.rpartition(":")[2])) as line,
+    ):
+        first, *others = line.detect_devices(identify_devices=False)
+        assert len(others) == (0 if device.get("one_device") else 1)
+        axis = first.get_axis(1)
+        assert not axis.is_homed()
+        axis.home()
+        assert axis.is_homed()
+        assert controller.true_position_mm(1) == pytest.approx(0.0, abs=1e-9)
+        axis.move_absolute(100_000)
+        assert axis.get_position() == 100_000
+        assert controller.true_position_mm(1) == pytest.approx(100_000 * FakeZaber.mm, abs=1e-9)
+        axis.settings.set("maxspeed", 40_000)
+        assert controller.axis(1).velocity_mm_s == pytest.approx(40_000 / 1.6384 * FakeZaber.mm)
+        for refused in (lambda: axis.move_absolute(1e8), lambda: axis.settings.set("maxspeed", 4e9)):
+            with pytest.raises(errors.exceptions.BadDataException):
+                refused()
+        axis.driver_disable()
+        assert axis.warnings.get_flags() == {zaber.WarningFlags.DRIVER_DISABLED_NO_FAULT}
+        axis.driver_enable()
+        axis.move_absolute(1_000_000, wait_until_idle=False)
+        axis.stop()
+        assert not axis.is_busy()
+        assert controller.true_position_mm(1) < 39.0
+        axis.move_absolute(0)
+        controller.axis(1).faults.jam_mm = (-5.0, 20.0)
+        with pytest.raises(errors.exceptions.MovementFailedException, match="Stalled and Stopped"):
+            axis.move_absolute(1_100_000)
+        axis.warnings.clear_flags()
+        assert axis.warnings.get_flags() == set()
+
+
+def test_the_drivers_warnings_are_zabers() -> None:
+    zaber = witness("zaber_motion.ascii", "zaber-motion")
+    from stereorig.drivers.stages.makers.zaber import _MOTOR_OFF, _NO_REFERENCE, _TEXTS
+
+    theirs = {value for name, value in vars(zaber.WarningFlags).items() if name.isupper()}
+    assert {*_TEXTS, *_MOTOR_OFF, *_NO_REFERENCE} <= theirs
+    flags = zaber.WarningFlags
+    assert {flags.NO_REFERENCE_POSITION, flags.DEVICE_NOT_HOMED} == _NO_REFERENCE
+
+
+# PI's controller driven by PI's own library ----------------------------------------------------------------------
+
+
+def test_pipython_starts_references_moves_and_stops_the_fake_controller() -> None:
+    pipython = witness("pipython", "pipython")
+    gateway = witness("pipython.pidevice.interfaces.pisocket", "pipython").PISocket
+    tools = witness("pipython.pitools", "pipython")
+    del pipython.GCSDevice.__del__  # it closes again what is closed
+    controller = FakePI(time_scale=50.0, start_mm=3.0)
+    with Server(controller, "socket") as server:
+        device = pipython.GCSDevice(gateway=gateway("127.0.0.1", int(server.url.rpartition(":")[2])))
+        try:
+            assert "C-884" in device.qIDN()
+            assert device.axes == ["1", "2"]
+            tools.startup(device, refmodes="FRF")
+            assert dict(device.qFRF()) == {"1": True, "2": True}
+            assert controller.true_position_mm(1) == pytest.approx(0.0, abs=1e-9)
+            assert (device.qTMN("1")["1"], device.qTMX("1")["1"], device.qPUN("1")["1"]) == (-50.0, 50.0, "MM")
+            device.MOV("1", 5.25)
+            tools.waitontarget(device, "1")
+            assert device.qPOS("1")["1"] == pytest.approx(5.25, abs=1e-4)
+            device.VEL("1", 2.5)
+            assert controller.axis(1).velocity_mm_s == 2.5
+            for refused, code in ((lambda: device.VEL("1", 1e4), 8), (lambda: device.MOV("1", 500), 7)):
+                with pytest.raises(pipython.GCSError) as caught:
+                    refused()
+                assert caught.value.val == code
+            for halt in (lambda: device.HLT("1", noraise=True), lambda: device.StopAll(noraise=True)):
+                device.MOV("1", 40)
+                assert device.IsMoving("1")["1"]
+                halt()
+                tools.waitonready(device)
+                while device.IsMoving("1")["1"]:
+                    pass
+                assert controller.true_position_mm(1) < 39.0
+            device.SVO("1", 0)
+            with pytest.raises(pipython.GCSError) as caught:
+                device.MOV("1", 0)
+            assert caught.value.val == 5
+        finally:
+            device.close()
+
+
+def test_the_drivers_error_codes_are_pis() -> None:
+    codes = witness("pipython.pidevice.gcserror", "pipython")
+    from stereorig.drivers.stages.makers.pi import _ERRORS, _STOPPED, _UNKNOWN_COMMAND
+
+    assert (_STOPPED, _UNKNOWN_COMMAND) == (codes.E10_PI_CNTR_STOP, codes.E2_PI_CNTR_UNKNOWN_COMMAND)
+    words = {"out_of_limits": "limits", "out_of_range": "range|limits", "not_homed": "unreferenced", "motor_off": "off"}
+    for number, (_, code) in _ERRORS.items():
+        theirs = codes.translate_error(number)
+        assert f"{number}" in theirs or "Unknown" not in theirs
+        assert code not in words or re.search(words[code], theirs.lower()), theirs
+
+
+# Thorlabs' controller and thorlabs-apt-protocol ------------------------------------------------------------------
+
+
+def test_the_messages_of_the_kinesis_driver_are_those_of_the_protocol_library() -> None:
+    theirs = witness("thorlabs_apt_protocol", "thorlabs-apt-protocol")
+    from stereorig.drivers.registry import make_stage
+    from stereorig.drivers.stages.protocol import AxisOptions
+
+    controller = FakeKinesis(time_scale=50.0, start_mm=3.0)
+    options = {1: AxisOptions(soft_limits_mm=(-50.0, 50.0), mm_per_step=FakeKinesis.mm, velocity_mm_s=2.5)}
+    with Server(controller, "socket") as server:
+        stage = make_stage("kinesis", server.url, options)
+        stage.open()
+        stage.enable(1)
+        stage.home(1)
+        stage.move_to(1, -12.5)
+        stage.stop()
+        stage.abort()
+        stage.close()
+    there = (0x50, 0x01)
+    speeds = theirs.mot_set_velparams(*there, 1, 0, 3054, 559241)  # 40 mm/s^2 and 2.5 mm/s in a KDC101's units
+    known = {
+        message.hex()
+        for message in (
+            theirs.hw_stop_updatemsgs(*there),
+            theirs.hw_req_info(*there),
+            theirs.mot_req_velparams(*there, 1),
+            speeds,
+            theirs.mot_req_dcstatusupdate(*there, 1),
+            theirs.mod_set_chanenablestate(*there, 1, 1),
+            theirs.mod_set_chanenablestate(*there, 1, 2),
+            theirs.mot_move_home(*there, 1),
+            theirs.mot_move_absolute(*there, 1, -125_000),
+            theirs.mot_move_stop(*there, 1, 2),
+            theirs.mot_move_stop(*there, 1, 1),
+        )
+    }
+    assert {entry.text for entry in controller.received} == known
+
+
+def test_the_protocol_library_reads_what_the_fake_kinesis_controller_answers() -> None:
+    theirs = witness("thorlabs_apt_protocol", "thorlabs-apt-protocol")
+    controller = FakeKinesis(time_scale=50.0, start_mm=3.0)
+    there = (0x50, 0x01)
+
+    def ask(message: bytes) -> dict[str, Any]:
+        unpacker = theirs.Unpacker(on_error="raise")
+        unpacker.feed(controller.take_line(message.hex().encode()))
+        return {found.msg: found for found in unpacker}
+
+    assert ask(theirs.hw_req_info(*there))["hw_get_info"].serial_number == 27000001
+    ask(theirs.mod_set_chanenablestate(*there, 1, 1))
+    ask(theirs.mot_move_home(*there, 1))
+    state = ask(theirs.mot_req_dcstatusupdate(*there, 1))["mot_get_dcstatusupdate"]
+    assert (state.homing, state.homed, state.channel_enabled) == (True, False, True)
+    while controller.axis(1).moving:
+        time.sleep(0.001)
+    ended = ask(theirs.mot_req_dcstatusupdate(*there, 1))
+    assert "mot_move_homed" in ended
+    ask(theirs.mot_move_absolute(*there, 1, 400_000))
+    state = ask(theirs.mot_req_dcstatusupdate(*there, 1))["mot_get_dcstatusupdate"]
+    assert state.moving_forward
+    assert state.position > 0
+    assert "mot_move_stopped" in ask(theirs.mot_move_stop(*there, 1, 2))
+    speeds = ask(theirs.mot_req_velparams(*there, 1))["mot_get_velparams"]
+    assert speeds.max_velocity == pytest.approx(10.0 / FakeKinesis.mm * 65536 * 2048 / 6e6, rel=1e-6)

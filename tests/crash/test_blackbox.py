@@ -11,8 +11,8 @@ import pytest
 import tifffile
 import xarray
 
-from core.cameras.camera import ELEVEN_PARAMETER_NAMES
-from server.cli import main
+from stereorig.core.cameras.camera import ELEVEN_PARAMETER_NAMES
+from stereorig.server.cli import main
 from tests.support.independent_rig import FLAT, LineGrid, PlainCamera, Waves, render
 
 deg = np.deg2rad

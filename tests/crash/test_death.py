@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from server.worker import death
-from server.worker.death import MemoryWatch, cause_of_death, resident_mib
+from stereorig.server.worker import death
+from stereorig.server.worker.death import MemoryWatch, cause_of_death, resident_mib
 
 
 @pytest.mark.parametrize(

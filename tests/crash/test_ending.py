@@ -6,10 +6,8 @@ import contextlib
 import json
 import os
 import shutil
-import signal
 import socket
 import subprocess
-import sys
 import threading
 import time
 from argparse import ArgumentParser
@@ -18,15 +16,16 @@ from configparser import ConfigParser
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 
-from server.cli.operation.serve import add_arguments
-from server.http.systemd import Notifier
-from sim.controllers.registry import make_controller
-from sim.controllers.server import ControllerServer
+from stereorig.server.cli.operation.serve import add_arguments
+from stereorig.server.http.systemd import Notifier
+from stereorig.sim.controllers.registry import make_controller
+from stereorig.sim.controllers.server import ControllerServer
+from tests.bench.reliability.processes import process_of, serving
+from tests.support.patience import busy
 from tests.support.requirements import ROOT, missing
-from tests.support.stage_service import API, rig_text, wait_until
+from tests.support.stage_service import API, wait_until
 
 UNIT = ROOT / "deploy" / "stereorig.service"
 
@@ -64,57 +63,22 @@ def listener(tmp_path: Path) -> Iterator[Listener]:
     made.close()
 
 
-@contextlib.contextmanager
-def serving(folder: Path, url: str, **environment: str) -> Iterator[tuple[subprocess.Popen[str], httpx.Client]]:
-    (folder / "rig.toml").write_text(rig_text(url=f'"{url}"', velocity_mm_s="0.05"))
-    with (folder / "log").open("w") as log:
-        process = subprocess.Popen(
-            [
-                sys.executable,
-                "-m",
-                "server.cli",
-                "serve",
-                "--config",
-                str(folder / "rig.toml"),
-                "--port",
-                "0",
-                "--data",
-                str(folder / "data"),
-                "--log-format",
-                "json",
-                "--log-level",
-                "info",
-            ],
-            cwd=ROOT,
-            stdout=subprocess.PIPE,
-            stderr=log,
-            text=True,
-            start_new_session=True,
-            env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
-        )
-    try:
-        assert process.stdout is not None
-        base = next((word for word in process.stdout.readline().split() if word.startswith("http://")), None)
-        assert base is not None, (folder / "log").read_text()
-        with httpx.Client(base_url=base, timeout=60.0, trust_env=False) as client:
-            wait_until(lambda: client.get(f"{API}/rig").json()["connected"], 60.0)
-            yield process, client
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
-
-
 @pytest.mark.fault(27)
 def test_the_stage_is_stopped_first_and_all_has_ended_in_a_few_seconds(tmp_path: Path, listener: Listener) -> None:
     controller = make_controller("esp301", (1, 2), time_scale=1.0)
     with (
         ControllerServer(controller) as server,
-        serving(tmp_path, server.url, NOTIFY_SOCKET=str(listener.path), WATCHDOG_USEC="400000") as (process, client),
+        serving(
+            tmp_path,
+            server.url,
+            options=("--log-format", "json", "--log-level", "info"),
+            NOTIFY_SOCKET=str(listener.path),
+            WATCHDOG_USEC="400000",
+        ) as (process, client),
     ):
         ready = listener.times("READY=1")
         assert len(ready) == 1
-        job = client.post(f"{API}/stage/home").json()["job"]
+        job = client.post(f"{API}/stage:home").json()["job"]
         wait_until(lambda: client.get(f"{API}/jobs/{job['id']}").json()["state"] == "succeeded", 60.0)
         wait_until(lambda: len(listener.times("WATCHDOG=1")) >= 5, 60.0)
         # two streams that would outlast everything, one of them unread, and a connection that does nothing
@@ -129,17 +93,17 @@ def test_the_stage_is_stopped_first_and_all_has_ended_in_a_few_seconds(tmp_path:
         process.terminate()
         wait_until(lambda: any(entry.text == "ST" for entry in controller.received[known:]), 20.0)
         stopped = next(entry.at_s for entry in controller.received[known:] if entry.text == "ST")
-        assert process.wait(timeout=60.0) == 0
+        assert process.wait(timeout=240.0) == 0
         took_s = time.monotonic() - asked
         for stream in streams:
             stream.close()
         # the limit of a stop is 50 ms; here the machine may be busy with other tests
-        assert stopped - asked < 1.0
+        assert stopped - asked < 1.0 * busy()
         assert not controller.axis(1).moving
         assert controller.true_position_mm(1) < 4.5
         # no motion began after it
         assert not any(entry.text.startswith(("1PA", "2PA")) for entry in controller.received[known:])
-        assert took_s < 20.0
+        assert took_s < 20.0 * busy()
         (ending,) = listener.times("STOPPING=1")
         assert ending >= ready[0]
     lines = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
@@ -147,38 +111,27 @@ def test_the_stage_is_stopped_first_and_all_has_ended_in_a_few_seconds(tmp_path:
     assert [line["state"] for line in lines if line.get("job_id") == job["id"] and "state" in line][-1] == "interrupted"
 
 
-def test_the_watchdog_is_not_told_that_it_lives_when_a_part_has_died(tmp_path: Path) -> None:
-    # within this process, where a part can be ended on its own
-    from server.api.app import create_app
-    from server.http.server import OrderlyServer
-    from server.workflows.service import Service
-    from tests.support.service_rig import tiny_config
-
-    heard = Listener(tmp_path / "notify")
-    service = Service(tiny_config(), tmp_path / "data").start()
-    inlet = socket.socket()
-    inlet.bind(("127.0.0.1", 0))
-    notifier = Notifier({"NOTIFY_SOCKET": str(heard.path), "WATCHDOG_USEC": "200000"})
-    server = OrderlyServer(create_app(service, close_service=False), service, notifier=notifier)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [inlet]}, daemon=True)
-    thread.start()
-    try:
-        wait_until(lambda: len(heard.times("WATCHDOG=1")) >= 3, 60.0)
-        service.catalog._work.put(None)  # its thread ends, as if an error had ended it
-        wait_until(lambda: not service.catalog.alive)
-        time.sleep(0.3)  # what was under way
-        known = len(heard.times("WATCHDOG=1"))
-        time.sleep(1.0)
-        assert len(heard.times("WATCHDOG=1")) == known
-    finally:
-        server.should_exit = True
-        thread.join(20.0)
-        inlet.close()
-        service.close()
-        heard.close()
+@pytest.mark.parametrize("part", ["rig", "web"])
+def test_the_watchdog_is_not_notified_while_a_process_does_not_answer(
+    tmp_path: Path, listener: Listener, part: str
+) -> None:
+    with ControllerServer(make_controller("esp301", (1, 2), time_scale=1.0)) as server:
+        notify = {"NOTIFY_SOCKET": str(listener.path), "WATCHDOG_USEC": "200000"}
+        with serving(tmp_path, server.url, **notify) as (process, _):
+            wait_until(lambda: len(listener.times("WATCHDOG=1")) >= 3, 60.0)
+            held = process_of(process, part)
+            held.suspend()
+            try:
+                time.sleep(0.3)  # a notification may be under way
+                known = len(listener.times("WATCHDOG=1"))
+                time.sleep(1.0)
+                assert len(listener.times("WATCHDOG=1")) == known
+            finally:
+                held.resume()
+            wait_until(lambda: len(listener.times("WATCHDOG=1")) > known, 60.0)
 
 
-def test_where_nobody_listens_nothing_is_said(tmp_path: Path, listener: Listener) -> None:
+def test_without_a_listener_a_notifier_does_nothing(tmp_path: Path, listener: Listener) -> None:
     for environment in ({}, {"NOTIFY_SOCKET": str(tmp_path / "nobody"), "WATCHDOG_USEC": "1000"}):
         notifier = Notifier(environment)
         notifier.ready("x")
@@ -224,7 +177,7 @@ def test_the_unit_says_what_the_service_does() -> None:
     # our own end takes up to 3 s for requests and a few more for jobs and worker
     assert float(section["TimeoutStopSec"]) >= 20.0
     assert section["KillMode"] == "mixed"
-    from server.base.priority import _SERVICE_NICE
+    from stereorig.server.base.priority import _SERVICE_NICE
 
     assert int(section["Nice"]) == int(section["LimitNICE"]) == _SERVICE_NICE
     assert section["OOMPolicy"] == "continue"  # the worker's death is not the service's

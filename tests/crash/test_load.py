@@ -12,6 +12,7 @@ import pytest
 
 from tests.bench.reliability.load import Load, lines, percentile
 from tests.bench.reliability.load_page import BEGIN, END, PAGE
+from tests.support.patience import busy
 from tests.support.requirements import ROOT
 
 SECONDS = 24.0
@@ -36,7 +37,7 @@ def test_captures_readers_slow_streams_an_analysis_and_stops_at_once(
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=280,
+        timeout=1200,
         check=False,
         start_new_session=True,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
@@ -48,15 +49,15 @@ def test_captures_readers_slow_streams_an_analysis_and_stops_at_once(
     # strictly: nothing lost, no client turned away, no stream dropped
     assert load.lost == []
     assert load.wrong == []
-    assert len(load.captures) >= 30
-    assert all(n > 10_000 for n in load.streamed.values())
+    assert len(load.captures) >= 30 / busy()
+    assert all(n > 10_000 / busy() for n in load.streamed.values())
     assert len(load.streamed) == 2
     assert load.results > 0
     # no step kept in memory: one pair holds half a MiB, and several dozen were taken
     assert load.growth_mib(1) < 24.0
     # generously: other tests run at the same time
-    assert load.latency(0.5) < 1000.0
-    assert percentile([ms for _, ms in load.stops], 0.5) < 1000.0
+    assert load.latency(0.5) < 1000.0 * busy()
+    assert percentile([ms for _, ms in load.stops], 0.5) < 1000.0 * busy()
 
 
 def test_the_page_has_a_place_for_the_figures() -> None:

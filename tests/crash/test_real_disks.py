@@ -17,18 +17,20 @@ from typing import Any
 
 import pytest
 
-from core.errors import StateError, StorageError
-from server.jobs.job import Phase
-from server.store.catalog import Catalog
-from server.store.documents import JobRecord, Progress
-from server.store.folder import DataFolder
+from stereorig.core.errors import StateError, StorageError
+from stereorig.server.documents.jobs import JobRecord, Progress
+from stereorig.server.jobs.idempotency import RequestMark
+from stereorig.server.jobs.job import Job, Phase
+from stereorig.server.store.catalog import Catalog
+from stereorig.server.store.folder import DataFolder
 from tests.support.job_bench import Bench
+from tests.support.patience import Deadline
 from tests.support.requirements import ROOT, missing
 from tests.support.service_rig import TINY
 
 
 def record(job_id: str, **more: Any) -> JobRecord:
-    progress = Progress(stage="", done=0, total=0, eta_s=None)
+    progress = Progress(phase="", done=0, total=0, eta_s=None)
     fields = {"id": job_id, "kind": "analysis", "state": "running", "subject": {}, "progress": progress}
     return JobRecord.model_validate({**fields, "created_utc": "2026-03-01T12:00:00Z", **more})
 
@@ -45,7 +47,7 @@ def run_with_mounts(script: str, folder: Path) -> dict[str, Any]:
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=560,
+        timeout=1800,
         check=False,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )
@@ -62,9 +64,9 @@ data = folder / "data"
 data.mkdir()
 subprocess.run(["mount", "-t", "tmpfs", "-o", "size=5m", "tmpfs", str(data)], check=True)
 
-from server.config.rig_file import load_config
-from server.workflows.service import Service
-from server.store.verify import verify
+from stereorig.server.config.rig_file import load_config
+from stereorig.server.workflows.service import Service
+from stereorig.server.store.verify import verify
 from tests.support.service_rig import new_test, served, wait_for_job, wait_for_rig
 from tests.support.copied_tests import write_test_folder
 
@@ -116,7 +118,7 @@ print(json.dumps(out))
 
 
 @pytest.mark.fault(3)
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(1800)
 def test_a_disk_that_fills_up_while_it_captures_and_analyses(tmp_path: Path) -> None:
     out = run_with_mounts(FULL, tmp_path)
     assert out["step"][:2] == [507, "storage_full"]
@@ -133,25 +135,113 @@ def test_a_disk_that_fills_up_while_it_captures_and_analyses(tmp_path: Path) -> 
     assert out["after"] == 201
 
 
+TO_THE_LAST_BYTE = """
+import json, subprocess, sys, time
+from pathlib import Path
+
+folder = Path(sys.argv[1])
+data = folder / "data"
+data.mkdir()
+subprocess.run(["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", str(data)], check=True)
+
+from stereorig.server.config.rig_file import load_config
+from stereorig.server.workflows.service import Service
+from tests.support.patience import Deadline
+from tests.support.service_rig import new_test, served, wait_for_job, wait_for_rig
+
+def fill():
+    with open(data / "ballast", "ab", buffering=0) as file:
+        for size in (65536, 4096):
+            try:
+                while file.write(bytes(size)) == size:
+                    pass
+            except OSError:
+                pass
+    assert service.folder.free_mib() == 0.0
+
+service = Service(load_config(folder / "rig.toml"), data).start()
+out = {}
+try:
+    with served(service) as client:
+        wait_for_rig(client)
+        service.worker.ready.wait(240)
+        api = "/api/v1"
+        test_id = new_test(client)
+        fill()
+        ready = client.get("/readyz")
+        out["ready"] = [ready.status_code, [r["code"] for r in ready.json()["reasons"]]]
+        out["capture"] = client.post(f"{api}/tests/{test_id}/steps", json={}).json()["code"]
+        moves = []
+        for k in range(120):
+            key = {"Idempotency-Key": f"m{k}"} if k % 2 else {}
+            body = {"positions_mm": {"1": 0.1 + 0.01 * (k % 3)}}
+            answer = client.post(f"{api}/stage/moves", json=body, headers=key)
+            if answer.status_code != 202:
+                moves.append([answer.status_code, answer.json()["code"]])
+                continue
+            ended = wait_for_job(client, answer.json()["job"])
+            moves.append([answer.status_code, ended["state"]])
+            if key:
+                again = client.post(f"{api}/stage/moves", json=body, headers=key).json()["job"]["id"]
+                assert again == answer.json()["job"]["id"]
+        out["moves"] = sorted({tuple(move) for move in moves})
+        homed = client.post(f"{api}/stage:home", json={"axes": [1]})
+        out["home"] = [homed.status_code, wait_for_job(client, homed.json()["job"])["state"]]
+        out["listed"] = len(client.get(f"{api}/jobs?limit=200").json()["jobs"])
+        last = homed.json()["job"]["id"]
+        deadline = Deadline(30.0)  # a line is written once its answer is sent
+        while deadline.left:
+            written = (data / "audit.log").read_bytes()
+            out["audit"] = [written.count(b"/api/v1/stage"), written.count(bytes(1))]
+            if out["audit"][0] == 181:
+                break
+        (data / "ballast").unlink()
+        again = client.post(f"{api}/tests/{test_id}/steps", json={})
+        out["again"] = [again.status_code, client.get("/readyz").status_code]
+finally:
+    service.close()
+service = Service(load_config(folder / "rig.toml"), data).start()
+try:
+    out["kept"] = service.jobs.document(last).state
+finally:
+    service.close()
+print(json.dumps(out))
+"""
+
+
+@pytest.mark.fault(3)
+@pytest.mark.timeout(1800)
+def test_on_a_disk_without_a_byte_the_stage_moves_and_each_change_has_its_audit_line(tmp_path: Path) -> None:
+    out = run_with_mounts(TO_THE_LAST_BYTE, tmp_path)
+    assert out["ready"] == [503, ["storage_full"]]
+    assert out["capture"] == "storage_full"
+    assert out["moves"] == [[202, "succeeded"]]
+    assert out["home"] == [202, "succeeded"]
+    assert out["audit"] == [120 + 60 + 1, 0]
+    assert out["listed"] == 120 + 1
+    assert out["again"] == [201, 200]
+    assert out["kept"] == "succeeded", "what the disk had no room for is written once there is some"
+
+
 READ_ONLY = """
 import json, subprocess, sys
 from pathlib import Path
 
 folder = Path(sys.argv[1])
 data = folder / "data"
-from server.store.catalog import Catalog
-from server.store.folder import DataFolder
+from stereorig.server.store.catalog import Catalog
+from stereorig.server.store.folder import DataFolder
 
 opened = DataFolder(data).open()
 Catalog(data / "catalog.sqlite").open().close()
 opened.close()
 subprocess.run(["mount", "--bind", str(data), str(data)], check=True)
 subprocess.run(["mount", "-o", "remount,ro,bind", str(data)], check=True)
-command = [sys.executable, "-m", "server.cli"]
+command = [sys.executable, "-m", "stereorig.server.cli"]
 serve = subprocess.run([*command, "serve", "--config", str(folder / "rig.toml"), "--port", "0", "--data", str(data)],
-                       capture_output=True, text=True, timeout=120)
-looked = subprocess.run([*command, "verify", str(data), "--json"], capture_output=True, text=True, timeout=120)
-mended = subprocess.run([*command, "repair", str(data)], capture_output=True, text=True, timeout=120)
+                       capture_output=True, text=True, timeout=600)
+looked = subprocess.run([*command, "verify", str(data), "--json"], capture_output=True, text=True, timeout=600)
+mended = subprocess.run([*command, "repair", str(data)], capture_output=True, text=True, timeout=600)
 out = {"serve": [serve.returncode, serve.stdout, serve.stderr], "repair": [mended.returncode, mended.stderr]}
 print(json.dumps({**out, "verify": [looked.returncode, json.loads(looked.stdout)]}))
 """
@@ -189,7 +279,7 @@ def test_a_disk_without_locks_is_refused_and_not_taken_for_one_in_use(
 
 
 @pytest.mark.fault(8)
-def test_a_disk_whose_locks_keep_nobody_out_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_whose_locks_do_not_exclude_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fcntl, "flock", lambda *_: None)
     with pytest.raises(StorageError) as caught:
         DataFolder(tmp_path / "data").open()
@@ -245,8 +335,8 @@ def test_a_job_that_ended_with_the_disk_full_never_reads_as_running(
     monkeypatch.undo()
     other = bench.jobs.submit("analysis", "an analysis", {}, [Phase("compute", lambda _: None)])
     bench.end_of(other)
-    deadline = time.monotonic() + 20.0
-    while bench.catalog.job(job.id).state != "succeeded" and time.monotonic() < deadline:  # type: ignore[union-attr]
+    deadline = Deadline(20.0)
+    while bench.catalog.job(job.id).state != "succeeded" and deadline.left:  # type: ignore[union-attr]
         time.sleep(0.005)
     assert bench.catalog.job(job.id).state == "succeeded", "written once there is room"  # type: ignore[union-attr]
     bench.close()
@@ -269,3 +359,34 @@ def test_a_catalogue_whose_commit_failed_works_again_once_there_is_room(tmp_path
     catalog.put_job(record("j999999-abcdef"))
     assert catalog.job("j999999-abcdef") == record("j999999-abcdef")
     catalog.close()
+
+
+@pytest.mark.fault(3)
+def test_a_stage_moves_though_no_disk_takes_its_record_but_a_key_is_kept_or_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(tmp_path)
+
+    def full(*_: object) -> None:
+        raise StorageError("No space left.", code="storage_full")
+
+    def submit(key: str | None) -> Job:
+        sent, phase = RequestMark("moves", key, "x"), Phase("hardware", lambda _: {"axes": {}})
+        return bench.jobs.submit("move", "a move", {}, [phase], request=sent, without_disk=True)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(bench.catalog, "put_job", full)
+        job = submit(None)
+        while bench.jobs.is_active(job.id):
+            time.sleep(0.005)
+        assert bench.jobs.document(job.id).state == "succeeded"
+        with pytest.raises(StorageError):
+            submit("a key")
+        assert bench.jobs.active_count() == 0
+    other = submit("a key")
+    bench.end_of(other)
+    deadline = Deadline(20.0)
+    while bench.catalog.job(job.id) is None and deadline.left:
+        time.sleep(0.005)
+    assert bench.catalog.job(job.id).state == "succeeded"  # type: ignore[union-attr]
+    bench.close()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -12,12 +14,22 @@ import httpx
 import pytest
 
 from tests.support.copied_tests import CONFIG, write_test_folder
+from tests.support.patience import Deadline
 from tests.support.requirements import ROOT
 from tests.support.service_rig import TINY
 
 
 def start(tmp_path: Path) -> tuple[subprocess.Popen[str], httpx.Client]:
-    command = [sys.executable, "-m", "server.cli", "serve", "--config", str(tmp_path / "rig.toml"), "--port", "0"]
+    command = [
+        sys.executable,
+        "-m",
+        "stereorig.server.cli",
+        "serve",
+        "--config",
+        str(tmp_path / "rig.toml"),
+        "--port",
+        "0",
+    ]
     process = subprocess.Popen(
         [*command, "--data", str(tmp_path / "data")],
         cwd=ROOT,
@@ -62,8 +74,8 @@ def test_killed_while_it_analyses_and_captures(tmp_path: Path) -> None:
         body = {"region": {"rectangle": [25, 25, 130, 115]}, "subset_px": 21, "spacing_px": 2}
         accepted = client.post(f"{test}/analyses", json=body).json()
         url = f"{test}/analyses/{accepted['analysis_id']}"
-        deadline = time.monotonic() + 240
-        while len(client.get(url).json()["steps_finished"]) < 2 and time.monotonic() < deadline:
+        deadline = Deadline(240.0)
+        while len(client.get(url).json()["steps_finished"]) < 2 and deadline.left:
             time.sleep(0.02)
         announced = client.get(url).json()["steps_finished"]
         new = client.post("/tests", json={"name": "new"}).json()["id"]
@@ -74,8 +86,8 @@ def test_killed_while_it_analyses_and_captures(tmp_path: Path) -> None:
         process.kill()
         process.communicate()
         client.close()
-    deadline = time.monotonic() + 10
-    while any(is_running(pid) for pid in children) and time.monotonic() < deadline:
+    deadline = Deadline(10.0)
+    while any(is_running(pid) for pid in children) and deadline.left:
         time.sleep(0.05)
     assert not any(is_running(pid) for pid in children)
 
@@ -97,9 +109,9 @@ def test_killed_while_it_analyses_and_captures(tmp_path: Path) -> None:
         # a new analysis can start at once, and comes to its end
         fresh = client.post(f"{test}/analyses", json={**body, "spacing_px": 20, "steps": [0, 1]})
         assert fresh.status_code == 202, fresh.text
-        deadline = time.monotonic() + 240
+        deadline = Deadline(240.0)
         while (new_job := client.get(f"/jobs/{fresh.json()['job']['id']}").json())["state"] in ("queued", "running"):
-            assert time.monotonic() < deadline, new_job
+            assert deadline.left, new_job
             time.sleep(0.02)
         assert new_job["state"] == "succeeded", new_job["problem"]
         rest = client.post(f"{url}:continue", headers={"Idempotency-Key": "rest"})
@@ -109,25 +121,25 @@ def test_killed_while_it_analyses_and_captures(tmp_path: Path) -> None:
             == (rest.json()["job"]["id"])
         )
         kept = shown["steps_finished"]
-        deadline = time.monotonic() + 240
-        while len(client.get(url).json()["steps_finished"]) < len(kept) + 1 and time.monotonic() < deadline:
+        deadline = Deadline(240.0)
+        while len(client.get(url).json()["steps_finished"]) < len(kept) + 1 and deadline.left:
             time.sleep(0.02)
         finished = client.get(url).json()["steps_finished"]
         assert len(finished) > len(kept)
         assert finished == list(range(len(finished)))
-        assert client.post(f"/jobs/{rest.json()['job']['id']}/cancel").status_code == 202
+        assert client.post(f"/jobs/{rest.json()['job']['id']}:cancel").status_code == 202
         again = client.post(f"{test}/analyses", json={**body, "steps": [1]})
         assert again.status_code == 202
-        assert client.post(f"/jobs/{again.json()['job']['id']}/cancel").status_code == 202
-        deadline = time.monotonic() + 60
+        assert client.post(f"/jobs/{again.json()['job']['id']}:cancel").status_code == 202
+        deadline = Deadline(60.0)
         for ending in (rest, again):  # what still runs may be writing
             while client.get(f"/jobs/{ending.json()['job']['id']}").json()["finished_utc"] is None:
-                assert time.monotonic() < deadline
+                assert deadline.left
                 time.sleep(0.02)
         assert not list((tmp_path / "data").rglob(".*.part"))
     finally:
         process.terminate()
-        _, errors = process.communicate(timeout=20)
+        _, errors = process.communicate(timeout=240)
         client.close()
     assert process.returncode == 0
     assert errors == ""
@@ -142,7 +154,7 @@ def test_a_second_service_on_the_same_folder_ends_and_names_the_first(tmp_path: 
             [
                 sys.executable,
                 "-m",
-                "server.cli",
+                "stereorig.server.cli",
                 "serve",
                 "--config",
                 str(tmp_path / "rig.toml"),
@@ -165,5 +177,52 @@ def test_a_second_service_on_the_same_folder_ends_and_names_the_first(tmp_path: 
         assert client.get(f"/tests/{test_id}").status_code == 200
     finally:
         process.kill()
+        process.communicate()
+        client.close()
+
+
+@pytest.mark.fault(1)
+@pytest.mark.fault(2)
+def test_killed_while_a_recording_is_saved_no_acknowledged_step_is_lost(tmp_path: Path) -> None:
+    (tmp_path / "rig.toml").write_text(CONFIG)
+    process, client = start(tmp_path)
+    try:
+        deadline = Deadline(60.0)
+        while not client.get("/rig").json()["connected"] and deadline.left:
+            time.sleep(0.05)
+        test = f"/tests/{client.post('/tests', json={'name': 'kill'}).json()['id']}"
+        for after_s in (2.5, 10.0, 40.0):  # longer if a busy machine looked only after the last pair was saved
+            job = client.post(f"{test}/record", json={"before_s": 0.5, "after_s": after_s}).json()["job"]["id"]
+            time.sleep(0.5)
+            client.post(f"{test}/record:trigger").raise_for_status()
+            deadline = Deadline(60.0)
+            listed: list[dict[str, object]] = []
+            while len(listed) < 20 and deadline.left:
+                shown = client.get(f"/jobs/{job}").json()
+                listed = shown["result"]["steps"]
+            if shown["state"] == "running":
+                break
+        assert shown["state"] == "running", "it was still being saved"
+        for pid in [process.pid, *children_of(process.pid)]:  # the rig's process and the service's too
+            os.kill(pid, signal.SIGKILL)
+    finally:
+        process.kill()
+        process.communicate()
+        client.close()
+    process, client = start(tmp_path)
+    try:
+        kept = {step["n"]: step for step in client.get(test).json()["steps"]}
+        assert len(listed) >= 20
+        assert 0 in kept
+        for one in listed:
+            step = client.get(f"{test}/steps/{one['n']}").json()
+            assert (step["sha256"], step["burst"]["job_id"]) == (one["sha256"], job)
+            assert one["n"] in kept
+        for n in kept:  # those that nobody acknowledged are whole, or not there
+            for cam in ("cam1", "cam2"):
+                content = client.get(f"{test}/steps/{n}/{cam}").content
+                assert hashlib.sha256(content).hexdigest() == client.get(f"{test}/steps/{n}").json()["sha256"][cam]
+    finally:
+        process.terminate()
         process.communicate()
         client.close()

@@ -22,9 +22,9 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from server.config.rig_file import parse_config
-from server.jobs.idempotency import OneEffect
-from server.store.verify import verify
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.jobs.idempotency import OneEffect
+from stereorig.server.store.verify import verify
 from tests.bench.reliability.torture_lab import RIG, Pictures
 from tests.support.service_model import Lab, Modelled, Request, Trashed, copy_folder
 from tests.support.service_rig import true_cameras

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.bench.years.soak import growth, run, verdicts
+from tests.support.patience import busy
 
 
 def _series(slope: float, noise: float, seed: int) -> list[tuple[float, float]]:
@@ -42,7 +43,7 @@ def test_growth_during_the_warm_up_does_not_count() -> None:
 def test_a_minute_of_work_leaves_nothing_open(tmp_path: Path) -> None:
     soak = run(tmp_path, 60.0, page=False)
     assert soak.wrong == []
-    assert soak.done["captures"] > 30
-    assert soak.done["exports"] > 2
+    assert soak.done["captures"] > 30 / busy()
+    assert soak.done["exports"] > 2 / busy()
     grown = {one.name for one in verdicts(soak) if one.verdict == "grows"}
     assert not grown & {"open files", "threads"}

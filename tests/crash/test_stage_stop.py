@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
-import signal
+import socket
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import httpx
+import psutil
 import pytest
 
-from sim.controllers.registry import make_controller
-from sim.controllers.server import ControllerServer
+from stereorig.sim.controllers.registry import make_controller
+from stereorig.sim.controllers.server import ControllerServer
+from tests.bench.reliability.processes import finished, serving, start_long_move
 from tests.bench.reliability.stage_stop import StopTimes
 from tests.support.requirements import ROOT
-from tests.support.stage_service import API, rig_text, wait_until
+from tests.support.stage_service import API, wait_until
 
 LIMIT_MS = 50.0
 STOPS = 200
@@ -61,60 +58,9 @@ def test_a_stop_under_full_load_is_on_the_wire_within_50_ms_at_p99(
     assert times.percentile(0.5) <= LIMIT_MS / 2, rows
 
 
-@contextlib.contextmanager
-def serving(folder: Path, url: str, driver: str) -> Iterator[tuple[subprocess.Popen[str], httpx.Client]]:
-    (folder / "rig.toml").write_text(rig_text(driver=f'"{driver}"', url=f'"{url}"', velocity_mm_s="0.05"))
-    process = subprocess.Popen(
-        [
-            sys.executable,
-            "-m",
-            "server.cli",
-            "serve",
-            "--config",
-            str(folder / "rig.toml"),
-            "--port",
-            "0",
-            "--data",
-            str(folder / "data"),
-            "--record",
-            str(folder / "wire.txt"),
-        ],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    try:
-        assert process.stdout is not None
-        line = process.stdout.readline()
-        base = next((word for word in line.split() if word.startswith("http://")), None)
-        assert base is not None, process.communicate()[1]
-        with httpx.Client(base_url=base, timeout=60.0, trust_env=False) as client:
-            wait_until(lambda: client.get(f"{API}/rig").json()["connected"], 60.0)
-            yield process, client
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
-
-
-def finished(client: httpx.Client, answer: httpx.Response) -> dict[str, Any]:
-    assert answer.status_code == 202, answer.text
-    url = f"{API}/jobs/{answer.json()['job']['id']}"
-    end = time.monotonic() + 60.0
-    while (job := client.get(url).json())["state"] not in ("succeeded", "failed", "cancelled", "interrupted"):
-        assert time.monotonic() < end
-        time.sleep(0.01)
-    found: dict[str, Any] = job
-    return found
-
-
-def start_long_move(client: httpx.Client, controller: Any) -> str:
-    answer = client.post(f"{API}/stage/moves", json={"positions_mm": {"1": 5.0}})
-    assert answer.status_code == 202, answer.text
-    wait_until(lambda: controller.axis(1).moving)
-    return str(answer.json()["job"]["id"])
+def open_at(client: httpx.Client) -> bool:
+    """True once the stage is open, which may be after the cameras."""
+    return client.get(f"{API}/stage").status_code == 200
 
 
 @pytest.mark.fault(27)
@@ -123,26 +69,36 @@ def test_a_service_that_ends_or_dies_in_mid_move_leaves_nothing_moving(tmp_path:
     controller = make_controller(driver, (1, 2), time_scale=1.0)
     with ControllerServer(controller) as server:
         with serving(tmp_path, server.url, driver) as (process, client):
-            assert finished(client, client.post(f"{API}/stage/home"))["state"] == "succeeded"
+            assert finished(client, client.post(f"{API}/stage:home"))["state"] == "succeeded"
             # asked to end: it stops the stage before anything else
             job = start_long_move(client, controller)
             process.terminate()
             wait_until(lambda: not controller.axis(1).moving, 3.0)
-            assert process.wait(timeout=20.0) == 0
+            assert process.wait(timeout=240.0) == 0
             assert controller.true_position_mm(1) < 4.5
         with serving(tmp_path, server.url, driver) as (process, client):
             assert client.get(f"{API}/jobs/{job}").json()["state"] == "interrupted"
+            wait_until(lambda: open_at(client), 30.0)
             # what became of the reference in between only the SMC100 can say
             states = [axis["state"] for axis in client.get(f"{API}/stage").json()["axes"]]
             assert states == (["not_homed"] * 2 if driver == "esp301" else ["ready"] * 2)
-            assert finished(client, client.post(f"{API}/stage/home"))["state"] == "succeeded"
+            assert finished(client, client.post(f"{API}/stage:home"))["state"] == "succeeded"
             job = start_long_move(client, controller)
+            others = psutil.Process(process.pid).children(recursive=True)
             process.kill()
             process.wait()
-            assert controller.axis(1).moving  # no client could stop it
+            # the rig process stops the stage when the first process dies
+            wait_until(lambda: not controller.axis(1).moving, 3.0)
+            assert psutil.wait_procs(others, 60.0)[1] == []  # none is left that could stop the next move
+            # as if all had died at once, with the power
+            host, port = server.url.removeprefix("socket://").split(":")
+            with socket.create_connection((host, int(port))) as line:
+                line.sendall(f"1PA{controller.axis(1).encoder_mm + 4.0:.3f}\r\n".encode())
+                wait_until(lambda: controller.axis(1).moving, 3.0)
         with serving(tmp_path, server.url, driver) as (_, client):
-            # opening did
-            assert not controller.axis(1).moving
+            # opening did, which the cameras are not kept waiting for
+            wait_until(lambda: open_at(client), 30.0)
+            wait_until(lambda: not controller.axis(1).moving, 3.0)
             assert controller.true_position_mm(1) < 4.9, "the move ended by itself before the service was back"
             assert client.get(f"{API}/jobs/{job}").json()["state"] == "interrupted"
             axis = client.get(f"{API}/stage").json()["axes"][0]

@@ -19,6 +19,7 @@ import pytest
 from tests.bench.reliability import torture_page
 from tests.bench.reliability.torture import ACTS, Outcome, Running, children_of, is_there, summary, torture
 from tests.bench.reliability.torture_lab import Lab, Pictures
+from tests.support.patience import busy
 
 #: the issue's demand
 READY_S = 5.0
@@ -41,9 +42,9 @@ def test_killed_at_any_instant_it_loses_nothing_and_is_soon_ready(tmp_path: Path
     assert sum(outcome.kills.values()) == kills
     assert outcome.counts["steps"] > kills
     # nothing of a killed service lives on beside the next one
-    assert statistics.median(outcome.left_s) < 1.0
+    assert statistics.median(outcome.left_s) < 1.0 * busy()
     # on a machine that has other things to do, what counts is the processor time that a start takes
-    assert statistics.median(start["ready_s"] for start in outcome.forked) < READY_S
+    assert statistics.median(start["ready_s"] for start in outcome.forked) < READY_S * busy()
     cold = [min(start["ready_s"], max(start["service_cpu_s"], start["worker_cpu_s"])) for start in outcome.cold]
     assert not cold or statistics.median(cold) < READY_S, outcome.cold
 

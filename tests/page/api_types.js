@@ -1,4 +1,4 @@
-// Writes types/openapi.d.ts, the API's models for the page's checker, from docs/openapi.json.
+// Writes types/openapi.d.ts, the API's models for the page's checker, from build/openapi.json, which `make check-page` writes.
 import { readFileSync, writeFileSync } from "node:fs";
 import openapiTS, { astToString } from "openapi-typescript";
 
@@ -10,8 +10,10 @@ function closed(schema) {
   if (schema === null || typeof schema !== "object") return schema;
   const { additionalProperties, ...rest } = schema;
   const own = Object.fromEntries(Object.entries(rest).map(([name, value]) => [name, closed(value)]));
-  return additionalProperties === undefined || (additionalProperties === true && schema.properties) ? own : { ...own, additionalProperties: closed(additionalProperties) };
+  return additionalProperties === undefined || (additionalProperties === true && schema.properties)
+    ? own
+    : { ...own, additionalProperties: closed(additionalProperties) };
 }
 
-const description = closed(JSON.parse(readFileSync(at("../../docs/openapi.json"), "utf8")));
+const description = closed(JSON.parse(readFileSync(at("../../build/openapi.json"), "utf8")));
 writeFileSync(at("types/openapi.d.ts"), astToString(await openapiTS(description, { defaultNonNullable: false })));

@@ -11,19 +11,20 @@ import time
 import pytest
 from numba import njit
 
-from core.compiling import COMPILING, NotCompiledError, no_collection, refuse_compiling
-from core.errors import Cancelled
-from server.compute import background_compilation
-from server.compute.background_compilation import BackgroundCompilation, KernelsAside
-from server.worker.embedded import ComputeWorker
+from stereorig.core.compiling import COMPILING, NotCompiledError, no_collection, refuse_compiling
+from stereorig.core.errors import Cancelled
+from stereorig.server.compute import background_compilation
+from stereorig.server.compute.background_compilation import BackgroundCompilation, KernelsAside
+from stereorig.server.compute.functions import warm_up
+from stereorig.server.worker.embedded import ComputeWorker
 from tests.support import worker_functions
 
 WOULD_COMPILE = """
 import sys
 import numpy as np
-from core.compiling import report_compiling
-from core.matching.fit import fit_motion
-from core.matching.options import MatchOptions
+from stereorig.core.compiling import report_compiling
+from stereorig.core.matching.fit import fit_motion
+from stereorig.core.matching.options import MatchOptions
 from tests.support.matching_scene import paper_pair
 
 compiled = []
@@ -36,11 +37,11 @@ print(len(compiled))
 
 @pytest.fixture(autouse=True)
 def two_processors(monkeypatch):
-    monkeypatch.setattr("core.threads.available_threads", lambda: 2)
+    monkeypatch.setattr("stereorig.core.threads.available_threads", lambda: 2)
 
 
 @pytest.mark.deep
-def test_what_it_compiled_nobody_compiles_again(tmp_path, monkeypatch):
+def test_a_compiled_kernel_is_not_compiled_again(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
     with BackgroundCompilation("auto") as compilation:
         compilation.start()
@@ -134,7 +135,7 @@ def test_the_collector_goes_on_after_compiling():
 @pytest.mark.deep
 def test_a_worker_with_no_kernels_is_ready_at_once_and_its_first_measurement_compiles_nothing(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
-    with ComputeWorker(threads=2, warm_up="server.worker.tasks:warm_up") as worker:
+    with ComputeWorker(threads=2, warm_up=warm_up) as worker:
         seen = []
         first = worker.submit(worker_functions.compiled_while_waiting)
         first.on_progress = lambda *report: seen.append(report)

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 import stereorig
-from server.config.rig_file import parse_config
-from server.workflows.service import Service
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.workflows.service import Service
 from tests.support.document_scripts import WRITTEN, one_block, run
 from tests.support.service_rig import SMALL, served, true_cameras, wait_for_rig
 

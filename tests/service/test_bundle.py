@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 import struct
@@ -10,17 +11,21 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import h5py
+import numpy as np
 import pytest
 
-from core.errors import StereorigError
-from server.cli.main import main
-from server.config.rig_file import parse_config
-from server.formats import disk
-from server.store.bundle.pack import pack
-from server.store.bundle.unpack import unpack
-from server.store.folder import DataFolder
-from server.store.verify import verify
-from server.workflows.service import Service
+from stereorig.core.errors import StereorigError
+from stereorig.server.cell.cell import Cell
+from stereorig.server.cli.main import main
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.formats import disk
+from stereorig.server.store.bundle.pack import pack
+from stereorig.server.store.bundle.unpack import OpenedTest
+from stereorig.server.store.bundle.unpack import unpack as unpack_in
+from stereorig.server.store.folder import DataFolder
+from stereorig.server.store.verify import verify
+from stereorig.server.workflows.service import Service
 from tests.support.faulty_disk import WAYS, FaultyDisk, Way
 from tests.support.measured_test import API, measured_test
 from tests.support.service_rig import SMALL, served
@@ -41,6 +46,20 @@ def bundle(measured: tuple[Path, str, str], tmp_path_factory: pytest.TempPathFac
     path = tmp_path_factory.mktemp("packed") / "test.zip"
     pack(measured[0], measured[1], path, licence="https://creativecommons.org/licenses/by/4.0/")
     return path
+
+
+CELL = Cell()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_cell() -> Iterator[None]:
+    """For all bundles: each alone would load the readers anew."""
+    yield
+    CELL.close()
+
+
+def unpack(bundle: Path, data: Path) -> OpenedTest:
+    return unpack_in(bundle, data, cell=CELL)
 
 
 def everything(folder: Path) -> dict[str, bytes]:
@@ -204,6 +223,25 @@ def _another_id(held: dict[str, bytes]) -> None:
     listed(held, name, json.dumps({**json.loads(held[name]), "id": "t000007-abcdef"}).encode())
 
 
+def _no_steps(held: dict[str, bytes]) -> None:
+    listed(held, name_of(held, "/summary.json"), b"{}")
+
+
+def _other_digits(held: dict[str, bytes]) -> None:
+    """The test's id in digits that Unicode knows, and no id of ours has."""
+    manifest = json.loads(held.pop(MANIFEST))
+    old = manifest["test_id"]
+    new = old[0] + "".join(chr(0x0660 + int(digit)) for digit in old[1:7]) + old[7:]
+    for name in list(manifest["files"]):
+        moved = name.replace(old, new)
+        held[moved] = (
+            held.pop(name).replace(old.encode(), new.encode()) if name.endswith("test.json") else held.pop(name)
+        )
+        del manifest["files"][name]
+        manifest["files"][moved] = {"bytes": len(held[moved]), "sha256": hashlib.sha256(held[moved]).hexdigest()}
+    held[MANIFEST] = json.dumps({**manifest, "test_id": new}, ensure_ascii=False).encode()
+
+
 def _no_sums(held: dict[str, bytes]) -> None:
     held[MANIFEST] = json.dumps({**json.loads(held[MANIFEST]), "files": [1]}).encode()
 
@@ -228,6 +266,8 @@ ALTERED = {
     _deep: "bundle_altered",
     _another_id: "bundle_altered",
     _no_sums: "bundle_altered",
+    _no_steps: "bundle_altered",
+    _other_digits: "bundle_altered",
     _twice: "bundle_refused",
 }
 
@@ -374,3 +414,35 @@ def test_nothing_is_overwritten_and_links_stay_outside(
     (data / "tests" / measured[1] / "workspace.json").symlink_to(tmp_path / "secret.json")
     pack(data, measured[1], tmp_path / "linked.zip")
     assert not any(name.endswith("workspace.json") for name in members(tmp_path / "linked.zip"))
+
+
+@pytest.mark.fault(55)
+@pytest.mark.parametrize("kind", ["external storage", "virtual data set"])
+def test_a_result_whose_data_lie_elsewhere_is_refused(bundle: Path, tmp_path: Path, kind: str) -> None:
+    secret = tmp_path / "secret"
+    secret.write_bytes(bytes(range(200)))
+    held = members(bundle)
+    name = next(name for name in held if name.endswith("step_0001.nc"))
+    (tmp_path / "r.nc").write_bytes(held[name])
+    with h5py.File(tmp_path / "r.nc", "a") as file, h5py.File(tmp_path / "other.h5", "w") as other:
+        other["w"] = np.arange(10.0)
+        if kind == "external storage":
+            file.create_dataset("secret", (10,), np.uint8, external=[(str(secret), 0, 10)])
+        else:
+            layout = h5py.VirtualLayout((10,), np.float64)
+            layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "w", (10,))
+            file.create_virtual_dataset("secret", layout)
+    held[name] = (tmp_path / "r.nc").read_bytes()
+    held[f"{name}.sha256"] = f"{hashlib.sha256(held[name]).hexdigest()}  step_0001.nc\n".encode()
+    manifest = json.loads(held[MANIFEST])
+    for one in (name, f"{name}.sha256"):
+        manifest["files"][one] = {"bytes": len(held[one]), "sha256": hashlib.sha256(held[one]).hexdigest()}
+    held[MANIFEST] = json.dumps(manifest).encode()
+    hostile, there = tmp_path / "hostile.zip", tmp_path / "data"
+    with zipfile.ZipFile(hostile, "w") as archive:
+        for one, content in held.items():
+            archive.writestr(one, content)
+    with pytest.raises(StereorigError) as caught:
+        unpack(hostile, there)
+    assert caught.value.code == "file_refers_elsewhere"
+    assert not there.exists()

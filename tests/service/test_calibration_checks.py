@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import tifffile
 
-from core.calibration import CalibrationOptions, calibrate
-from core.target import GridTarget
-from server.formats.calibrations.native import calibration_content
-from server.store.verify import verify
-from server.workflows.service import Service
+from stereorig.core.calibration import CalibrationOptions, calibrate
+from stereorig.core.target import GridTarget
+from stereorig.server.formats.calibrations.native import calibration_content
+from stereorig.server.store.verify import verify
+from stereorig.server.workflows.service import Service
 from tests.support.calibration_truth import NOMINAL, PAPER, Grid, make_views, project
 from tests.support.grid_images import grid_image, paper_camera
 from tests.support.service_rig import new_test
@@ -43,7 +43,7 @@ def imported(client: httpx.Client, content: dict[str, Any]) -> str:
 
 @pytest.fixture(scope="module")
 def ids(client: httpx.Client) -> dict[str, str]:
-    options = CalibrationOptions(lens="paper", axis_tilt_sigma_rad=0.0)
+    options = CalibrationOptions(lens="paper", axis_tilt_sigma_rad=0.0, aspect_sigma=0.0)
     turned = [PAPER[0], {**PAPER[1], "beta": PAPER[1]["beta"] + np.radians(0.1)}]
     found = {}
     for name, seed, cameras in (("a", 1, PAPER), ("b", 2, PAPER), ("turned", 3, turned)):
@@ -193,10 +193,10 @@ def test_displacement_under_a_projected_pattern_is_refused_with_the_reason(
 
 
 def test_a_kept_check_is_in_the_report_s_calibration(client: httpx.Client, service: Service, tmp_path: Path) -> None:
-    from server.formats.calibrations.recognise import load_calibration
-    from server.report.calibration import CalibrationPart
-    from server.report.records import TestRecord
-    from server.report.source import _with_kept_checks
+    from stereorig.server.documents.tests import TestRecord
+    from stereorig.server.formats.calibrations.recognise import load_calibration
+    from stereorig.server.report.calibration import CalibrationPart
+    from stereorig.server.report.source import _with_kept_checks
 
     made = calibrate(make_views(), Grid(), NOMINAL, CalibrationOptions(lens="paper"))
     calibration_id = imported(client, calibration_content(made, GRID))

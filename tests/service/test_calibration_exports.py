@@ -15,19 +15,19 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Float
-from core.cameras.camera import Camera, RigidTransform
-from core.cameras.conversion import LensFit, fit_opencv, fit_seidel, image_positions
-from core.cameras.lens import OpenCVLens, SeidelLens
-from core.cameras.stereo import StereoPair
-from core.errors import StereorigError
-from core.field.points.result import Field
-from server.cli.main import main
-from server.formats.calibrations.export import FORMS, convert_calibration
-from server.formats.calibrations.programs.plausibility import check_calibration, shared_points
-from server.formats.calibrations.recognise import LoadedCalibration, load_calibration, parse_calibration
-from server.formats.results.writing import Provenance, write_field
-from server.results.epipolar_check import check_against
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.core.cameras.conversion import LensFit, fit_opencv, fit_seidel, image_positions
+from stereorig.core.cameras.lens import OpenCVLens, SeidelLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import StereorigError
+from stereorig.core.field.points.result import Field
+from stereorig.server.cli.main import main
+from stereorig.server.formats.calibrations.export import FORMS, convert_calibration
+from stereorig.server.formats.calibrations.programs.plausibility import check_calibration, shared_points
+from stereorig.server.formats.calibrations.recognise import LoadedCalibration, load_calibration, parse_calibration
+from stereorig.server.formats.results.writing import Provenance, write_field
+from stereorig.server.results.epipolar_check import check_against
 
 SIZE = (1280, 1024)
 PAPER = {

@@ -13,12 +13,12 @@ import httpx
 import numpy as np
 import pytest
 
-from server.cli import main
-from server.formats.results.reading import read_head
-from server.report.source import find_source
-from server.results.staleness import stale_results
-from server.store.verify import verify
-from server.workflows.service import Service
+from stereorig.server.cli import main
+from stereorig.server.formats.results.reading import read_head
+from stereorig.server.report.source import find_source
+from stereorig.server.results.staleness import stale_results
+from stereorig.server.store.verify import verify
+from stereorig.server.workflows.service import Service
 from tests.support.copied_tests import write_test_folder
 from tests.support.service_rig import TINY, new_test, true_cameras, wait_for_job
 
@@ -138,7 +138,7 @@ def test_a_damaged_copy_of_a_later_calibration_is_found_and_not_measured_with(
     kept.write_bytes(sound.replace(b'"phd_px": ', b'"phd_px": 1'))
     try:
         refused = client.post(f"{API}/tests/{test_id}/analyses", json=REGION)
-        assert (refused.status_code, refused.json()["code"]) == (422, "calibration_changed")
+        assert (refused.status_code, refused.json()["code"]) == (409, "checksum_mismatch")
         assert [f.path for f in verify(service.folder.root).findings] == [str(kept.relative_to(service.folder.root))]
     finally:
         kept.write_bytes(sound)

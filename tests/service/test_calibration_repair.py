@@ -13,11 +13,11 @@ import httpx
 import numpy as np
 import pytest
 
-from core.cameras.camera import TEN_PARAMETER_NAMES
-from server.cli import main
-from server.formats.calibrations.recognise import load_calibration
-from server.formats.images import encode_tiff, write_image
-from server.workflows.service import Service
+from stereorig.core.cameras.camera import TEN_PARAMETER_NAMES
+from stereorig.server.cli import main
+from stereorig.server.formats.calibrations.recognise import load_calibration
+from stereorig.server.formats.images import encode_tiff, write_image
+from stereorig.server.workflows.service import Service
 from tests.support.bumped_rig import SIZE, core_pair, picture, plain_camera, turned
 from tests.support.service_rig import served, tiny_config, wait_for_job
 
@@ -89,7 +89,7 @@ def test_the_command_line_repairs_beside_the_old_file(folder: Path, capsys: pyte
     image = folder / "cam2_1.tif"
     assert found["images"][1]["cam2"]["sha256"] == hashlib.sha256(image.read_bytes()).hexdigest()
     assert made["verdict"]["level"] == "warning"
-    assert "estimated anew" in made["verdict"]["reasons"][-1]
+    assert "estimated again" in made["verdict"]["reasons"][-1]
     old = calibration()
     assert made["cam1"] == old["cam1"]
     lens = ("phd_px", "cx_px", "cy_px", "kappa_per_px2", "aspect")

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from server.cli.main import main
-from server.config.rig_file import parse_config
-from server.workflows.service import Service
+from stereorig.server.cli.main import main
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.workflows.service import Service
 from tests.support.certified_bench import API, Fault, rig_text, take
 from tests.support.service_rig import served, wait_for_job
 

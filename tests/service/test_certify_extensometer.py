@@ -12,8 +12,8 @@ import httpx
 import numpy as np
 import pytest
 
-from server.formats.images import encode_tiff
-from server.workflows.service import Service
+from stereorig.server.formats.images import encode_tiff
+from stereorig.server.workflows.service import Service
 from tests.support.model_bench import write_result
 from tests.support.service_rig import served, tiny_config, true_cameras, wait_for_job
 from tests.support.strain_fields import make_field

@@ -9,6 +9,7 @@ import shutil
 import zipfile
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import h5py
 import httpx
@@ -19,15 +20,15 @@ import pytest
 import scipy.io
 import xarray
 
-from core.field.points.dense_record import METHOD
-from server.cli.main import main
-from server.exports.request import ExportRequest
-from server.exports.run import export
-from server.exports.source import find_source
-from server.formats.gauges.matlab import gauges_mat
-from server.formats.gauges.table import gauges_csv
-from server.results.gauges.readings import read_gauges
-from server.results.gauges.request import GaugeRequest
+from stereorig.core.field.points.dense_record import METHOD
+from stereorig.server.cli.main import main
+from stereorig.server.exports.request import ExportRequest
+from stereorig.server.exports.run import export
+from stereorig.server.exports.source import find_source
+from stereorig.server.formats.gauges.matlab import gauges_mat
+from stereorig.server.formats.gauges.table import gauges_csv
+from stereorig.server.results.gauges.readings import read_gauges
+from stereorig.server.results.gauges.request import GaugeRequest
 from tests.support.export_results import write_results
 from tests.support.problems import assert_problem
 from tests.support.service_rig import new_test
@@ -48,6 +49,7 @@ def test_folder(tmp_path: Path) -> Path:
         step = folder / "steps" / f"{n:04d}"
         step.mkdir(parents=True, exist_ok=True)
         record = {"n": n, "source": "import", "timestamp_utc": TIMES[n], "load_n": 100.0 * n, "channels": CHANNELS[n]}
+        record["channel_u"] = {"force_kn": 0.25}
         (step / "step.json").write_text(json.dumps(record), encoding="utf-8")
     return folder
 
@@ -62,6 +64,7 @@ def test_csv_says_channels_units_and_time_above_the_table(test_folder: Path, tmp
     about = dict(re.findall(r"^# (\w+): (.*)$", text, re.MULTILINE))
     assert json.loads(about["channels"]) == {"force_kn": 1.5}
     assert json.loads(about["channel_units"]) == {"force_kn": "kN"}
+    assert json.loads(about["channel_u"]) == {"force_kn": 0.25}
     assert float(about["time_s"]) == 10.0
     assert float(about["load_n"]) == 100.0
 
@@ -72,6 +75,7 @@ def test_netcdf_hdf5_and_mat_have_them_as_numbers(test_folder: Path, tmp_path: P
         assert (float(one["channel_force_kn"]), one["channel_force_kn"].attrs["units"]) == (3.0, "kN")
         assert (float(one["time_s"]), float(one["load_n"])) == (40.0, 200.0)
         assert float(one["channel_odd_name_C_"]) == 21.5
+        assert (float(one["channel_force_kn_u"]), one["channel_force_kn_u"].attrs["units"]) == (0.25, "kN")
     (stacked,) = exported(test_folder, "h5", tmp_path / "h5")
     with h5py.File(stacked) as data:
         np.testing.assert_array_equal(data["channel_force_kn"][...], [0.0, 1.5, 3.0])
@@ -81,6 +85,7 @@ def test_netcdf_hdf5_and_mat_have_them_as_numbers(test_folder: Path, tmp_path: P
     (mat,) = exported(test_folder, "mat", tmp_path / "mat")
     held = scipy.io.loadmat(mat, simplify_cells=True)["step_0001"]
     assert (held["channels"]["force_kn"], held["time_s"], held["load_n"]) == (1.5, 10.0, 100.0)
+    assert held["channel_u"]["force_kn"] == 0.25
 
 
 def test_the_time_series_for_paraview_goes_by_seconds(test_folder: Path, tmp_path: Path) -> None:
@@ -92,6 +97,7 @@ def test_the_time_series_for_paraview_goes_by_seconds(test_folder: Path, tmp_pat
     reader.set_active_time_value(10.0)
     grid = reader.read()[0]
     assert grid.field_data["force_kn"][0] == 1.5
+    assert grid.field_data["force_kn_u"][0] == 0.25
     assert grid.field_data["TimeValue"][0] == 10.0
 
 
@@ -114,6 +120,7 @@ def test_gauges_have_them_beside_each_reading(test_folder: Path) -> None:
     table = pd.read_csv(io.BytesIO(gauges_csv(readings)), comment="#")
     assert sorted(set(table["force_kn"])) == [0.0, 1.5, 3.0]
     assert set(table.loc[table["step"] == 2, 'odd "name" °C/$']) == {21.5}
+    assert set(table["force_kn_u"]) == {0.25}
     assert table.loc[table["step"] == 1, 'odd "name" °C/$'].isna().all()
     held = scipy.io.loadmat(io.BytesIO(gauges_mat(readings)), simplify_cells=True)["gauges"]
     assert set(held["force_kn"]) == {0.0, 1.5, 3.0}
@@ -232,8 +239,83 @@ def test_a_packed_export_holds_what_a_record_brought_later(test_folder: Path, tm
     document = json.loads(record_file.read_text(encoding="utf-8"))
     document["channels"]["stroke_mm"] = 0.25
     record_file.write_text(json.dumps(document), encoding="utf-8")
-    from server.exports.run import export_packed
+    from stereorig.server.exports.run import export_packed
 
     with zipfile.ZipFile(export_packed(find_source(test_folder), ExportRequest("csv"), tmp_path)) as packed:
         texts = [packed.read(name).decode() for name in sorted(packed.namelist())]
     assert ["stroke_mm" in text for text in texts] == [False, True, False]
+
+
+UNITS = "Time (s),Load (lbf),Gauge (nm),Clip (mN),Odd (furlong)\n"
+
+
+def test_a_record_keeps_its_units_in_the_step_and_its_forces_become_the_load(
+    client: httpx.Client, captured: tuple[str, list[float]]
+) -> None:
+    test_id, times = captured
+    # the force is 100 N a second of the record
+    rows = [
+        f"{t:.1f},{100 * t / 4.4482216152605:.6f},{t},{t},{t}" for t in np.arange(0.0, times[1] - times[0] + 9, 0.5)
+    ]
+    content = (UNITS + "\n".join(rows)).encode("utf-16")
+    answer = send(client, test_id, content, at_step=0, at_s=2.0, load="load_lbf")
+    assert answer.status_code == 200, answer.text
+    units = {"load_lbf": "lbf", "gauge_nm": "nm", "clip_mn": "mN", "odd_furlong": "furlong"}
+    assert answer.json()["channels"] == units
+    step = client.get(f"{API}/tests/{test_id}/steps/0").json()
+    assert step["channel_units"] == units
+    assert step["load_n"] == pytest.approx(200.0, abs=1e-3)
+    refused = send(client, test_id, content, at_step=0, at_s=2.0, load="gauge_nm")
+    assert "is in nm, not" in str(assert_problem(refused, 422, "load_unit")["detail"])
+    # the same title in another unit would make two units of one channel
+    other = content.decode("utf-16").replace("mN", "MN").encode()
+    assert_problem(send(client, test_id, other, at_step=0, at_s=2.0), 422, "channels_there")
+    assert send(client, test_id, other, at_step=0, at_s=2.0, replace=True).json()["channels"]["clip_mn"] == "MN"
+
+
+@pytest.mark.fault(64)
+def test_a_preview_shows_what_was_recognised_and_changes_nothing(
+    client: httpx.Client, captured: tuple[str, list[float]]
+) -> None:
+    test_id, times = captured
+    rows = [f"{t / 2:.1f};{1 + t / 1e3:.3f}".replace(".", ",") for t in range(2 * int(times[1] - times[0] + 9))]
+    content = "\n".join(["Prüfung;P-07", "Prüfzeit;Kraft", "s;kN", *rows, "0,0;OVER", *rows, "Maximum;1,2"]).encode(
+        "cp1252"
+    )
+    form = {"at_step": 0, "at_s": 2.0, "load": "kraft_kn"}
+
+    def preview(**more: object) -> dict[str, Any]:
+        data = {name: str(value) for name, value in {**form, **more}.items()}
+        url = f"{API}/tests/{test_id}/channels:preview"
+        answer = client.post(url, files={"file": ("frame.csv", content)}, data=data)
+        assert answer.status_code == 200, answer.text
+        return answer.json()  # type: ignore[no-any-return]
+
+    found = preview()
+    read = found["read"]
+    assert (read["encoding"], read["left_above"], read["left_below"]) == ("cp1252", 1, 1)
+    assert [(one["name"], one["unit"], one["decimal"]) for one in read["columns"]] == [
+        (None, "s", ","),
+        ("kraft_kn", "kN", ","),
+    ]
+    assert [one["option"] for one in read["questions"]] == ["segment"]
+    assert "segment" in found["refused"]
+    assert_problem(send(client, test_id, content, **form), 422, "channels_unsure")
+    found = preview(segment=2)
+    assert found["refused"] == ""
+    assert found["steps"][0]["channels"]["kraft_kn"] == pytest.approx(1.004)
+    assert client.get(f"{API}/tests/{test_id}/steps/0").json()["channels"] == {"own_v": 1.0}
+    assert send(client, test_id, content, **form, segment=2).json()["read"] == found["read"]
+
+
+@pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be", "cp1252", "cp932", "gb18030", "euc-kr", "cp1251"])
+def test_every_encoding_is_there_behind_the_walls(
+    client: httpx.Client, captured: tuple[str, list[float]], encoding: str
+) -> None:
+    time = {"cp932": "時間", "gb18030": "时间", "euc-kr": "시간", "cp1251": "время", "cp1252": "Prüfzeit"}.get(
+        encoding, "Zeit"
+    )
+    url = f"{API}/tests/{captured[0]}/channels:preview"
+    content = f"{time};F (N)\n0,5;1\n1,5;2\n".encode(encoding)
+    found = client.post(url, files={"file": ("frame.csv", content)}).json()
+    assert [(one["title"], one["kind"]) for one in found["read"]["columns"]] == [(time, "time"), ("F", "numbers")]

@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 
 import stereorig
-from core.errors import CalibrationInputError, Cancelled, InputError, StateError, StereorigError
-from server.api.models import AnalysisRequest, JobReply
-from server.config.rig_file import parse_config
-from server.workflows.service import Service
 from stereorig.client import AsyncAnalysis, AsyncClient, AsyncTest
 from stereorig.client.errors import error_of
 from stereorig.client.synchronous import Analysis, Client, Test
+from stereorig.core.errors import CalibrationInputError, Cancelled, InputError, StateError, StereorigError
+from stereorig.server.api.models import AnalysisRequest, JobReply
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.workflows.service import Service
 from tests.support.document_scripts import WRITTEN, one_block, run
 from tests.support.service_rig import SMALL, served, true_cameras, wait_for_rig
 
@@ -159,6 +159,39 @@ def test_a_job_is_watched_and_its_problem_is_raised(tiny: Client) -> None:
     assert {job.state for job in seen} >= {"succeeded", "cancelled"}
 
 
+# by name: titles and units, a row of time, force in newtons and stroke, the load's channel
+RECORDS = {
+    "decimal commas in quotes": ("Time,Load,Extension\n(s),(N),(mm)\n", '"{0:.3f}";"{1:.3f}";"{2:.3f}"', "load_n"),
+    "grouped thousands": ("Time (s),Force (N),Stroke (mm)\n", '"{0:.3f}","{1:,.3f}","{2:.3f}"', "force_n"),
+    "times in French": ("S/No;C_1_Temps[s];C_1_Force[kN]\n", "{3};{0};{4}", "c_1_force_kn"),
+    "units in a row": ("Axial Force\tStroke\tRunning Time\nkN\tmm\tSec\n", "{4}\t{2:.3f}\t{0}", "axial_force_kn"),
+}
+
+
+@pytest.mark.fault(64)
+@pytest.mark.parametrize("name", RECORDS)
+def test_a_record_is_looked_at_imported_and_kept(tiny: Client, tmp_path: Path, name: str) -> None:
+    head, row, load = RECORDS[name]
+    rows = [row.format(k / 2, 25.0 * k, 0.005 * k, k, 0.025 * k) for k in range(91)]
+    if name.startswith("decimal"):
+        rows = [one.replace(".", ",").replace(";", ",") for one in rows]
+    (tmp_path / "machine.csv").write_text(head + "\n".join(rows), encoding="utf-8")
+    test = tiny.new_test(name, calibration_id=None)
+    for k in range(5):
+        test.capture(timestamp_utc=f"2026-03-01T12:00:{10 * k:02d}Z")
+    how: dict[str, object] = {"at_step": 0, "at_s": 0.0, "load": load}
+    seen = test.preview_channels(tmp_path / "machine.csv", **how)
+    assert (seen.refused, seen.read.questions, seen.n_aligned) == ("", [], 5)
+    assert test.step(4).load_n is None
+    found = test.import_channels(tmp_path / "machine.csv", **how)
+    assert (found.readings, found.channels, found.steps) == (91, seen.channels, seen.steps)
+    for k in range(5):
+        step = test.step(k)
+        assert step.load_n == pytest.approx(500.0 * k)
+        assert step.channels[load] == pytest.approx(500.0 * k / (1000.0 if load.endswith("kn") else 1.0))
+        assert step.channel_units == found.channels
+
+
 def test_what_cannot_be_is_refused_in_the_users_words_before_anything_is_sent() -> None:
     def refuse(_: httpx.Request) -> httpx.Response:
         raise AssertionError("nothing may be sent")
@@ -167,7 +200,7 @@ def test_what_cannot_be_is_refused_in_the_users_words_before_anything_is_sent() 
         test = rig.test("t000001-abcdef")
         with pytest.raises(InputError, match="subset_px must be odd, got 32"):
             test.measure(region=REGION, subset_px=32)
-        with pytest.raises(InputError, match="What can be given: by_mm, dz_mm, positions_mm"):
+        with pytest.raises(InputError, match="Extra inputs are not permitted"):
             rig.move(targets_mm={"1": 2})
         with pytest.raises(InputError, match="given twice"):
             test.measure(AnalysisRequest.model_validate({"region": REGION}), subset_px=33)
@@ -189,7 +222,7 @@ def test_a_refusal_is_the_error_that_it_was_in_the_service(tiny: Client) -> None
     ("problem", "status", "kind"),
     [
         ({"code": "calibration_underdetermined", "detail": "a."}, 422, CalibrationInputError),
-        ({"code": "hardware_busy", "cause": "b."}, 409, StateError),
+        ({"code": "hardware_busy", "detail": "b."}, 409, StateError),
         ({"code": "of_a_later_version", "detail": "c."}, 422, InputError),
         ({"code": "of_a_later_version", "detail": "c."}, 409, StateError),
         ({}, 500, StateError),

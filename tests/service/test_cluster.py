@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -108,7 +109,7 @@ def test_an_analysis_on_the_cluster_is_cancelled_within_a_second_and_goes_on(els
     wait_for_steps(client, url, 2)
     limit = a_second(client)
     asked = time.monotonic()
-    assert client.post(f"{API}/jobs/{job['id']}/cancel").status_code == 202
+    assert client.post(f"{API}/jobs/{job['id']}:cancel").status_code == 202
     assert wait_for_job(client, job)["state"] == "cancelled"
     assert time.monotonic() - asked < limit
     rest = client.post(f"{url}:continue").json()["job"]
@@ -133,16 +134,69 @@ def test_images_may_travel_with_the_steps(
 
 
 def test_a_scheduler_that_is_not_there_is_named(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("server.worker.dask_cluster._CONNECT_S", 0.5)
+    monkeypatch.setattr("stereorig.server.worker.dask_cluster._CONNECT_S", 0.5)
     shutil.copytree(data / "tests", tmp_path / "tests", ignore=shutil.ignore_patterns("a0*"))
     host = Host(tmp_path, '[compute]\nscheduler = "tcp://127.0.0.1:9"')
     try:
         _, job = begin(host.client, URL, **INDEPENDENT)
         problem = wait_for_job(host.client, job)["problem"]
         assert problem["code"] == "cluster_unreachable"
-        assert "tcp://127.0.0.1:9" in problem["cause"]
+        assert "tcp://127.0.0.1:9" in problem["detail"]
     finally:
         host.close()
+
+
+def reasons(host: Host) -> list[str]:
+    return [one["code"] for one in host.client.get("/readyz").json().get("reasons", [])]
+
+
+def test_readiness_says_that_the_scheduler_is_away_and_that_it_is_back(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("stereorig.server.worker.dask_cluster._CONNECT_S", 0.5)
+    monkeypatch.setattr("stereorig.server.worker.dask_cluster._LOOK_S", 0.0)
+    shutil.copytree(data / "tests", tmp_path / "tests", ignore=shutil.ignore_patterns("a0*"))
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        address = listener.getsockname()
+        host = Host(tmp_path, f'[compute]\nscheduler = "tcp://127.0.0.1:{address[1]}"')
+        try:
+            assert "scheduler_away" not in reasons(host)
+            listener.close()
+            assert "scheduler_away" in reasons(host)
+            _, job = begin(host.client, URL, **INDEPENDENT)
+            assert "Dask scheduler" in wait_for_job(host.client, job)["progress"]["phase"]
+            with socket.create_server(address):
+                assert "scheduler_away" not in reasons(host)
+        finally:
+            host.close()
+
+
+def test_an_analysis_whose_scheduler_dies_says_that_it_waits_for_it(data: Path, tmp_path: Path) -> None:
+    shutil.copytree(data / "tests", tmp_path / "tests", ignore=shutil.ignore_patterns("a0*"))
+    with cluster_of(1, tmp_path) as cluster:
+        host = Host(tmp_path, f'[compute]\nscheduler = "{cluster.address}"')
+        try:
+            _, job = begin(host.client, URL)
+            while host.client.get(f"{API}/jobs/{job['id']}").json()["progress"]["phase"] == "waiting":
+                time.sleep(0.05)
+            assert "scheduler_away" not in reasons(host)
+            cluster.scheduler.kill()
+            cluster.scheduler.wait()
+            seen = ""
+            while "Dask scheduler" not in seen:
+                document = host.client.get(f"{API}/jobs/{job['id']}").json()
+                assert document["state"] == "running", document
+                seen = document["progress"]["phase"]
+                time.sleep(0.05)
+            assert "scheduler_away" in reasons(host)
+            assert client_cancels(host, job)["state"] == "cancelled"
+        finally:
+            host.close()
+
+
+def client_cancels(host: Host, job: dict[str, Any]) -> dict[str, Any]:
+    assert host.client.post(f"{API}/jobs/{job['id']}:cancel").status_code == 202
+    return wait_for_job(host.client, job)
 
 
 def test_steps_that_start_from_the_reference_need_total_correlation(elsewhere: Host) -> None:

@@ -10,15 +10,14 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import httpx
 import pytest
 
-from server.api.app import create_app
-from server.http.connections import ConnectionLimits
-from server.http.server import OrderlyServer
-from server.workflows.service import Service
+from stereorig.server.api.app import create_app
+from stereorig.server.front.limits import ConnectionLimits
+from stereorig.server.workflows.service import Service
+from tests.support.fronted import Fronted, fronted, web_process
 from tests.support.service_rig import tiny_config, wait_for_rig
 
 API = "/api/v1"
@@ -34,24 +33,20 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
 
 
 @pytest.fixture(scope="module")
-def port(own: Service) -> Iterator[int]:
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    # so that an unread answer waits with us, and not in the kernel
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 16 * 1024)
-    listener.bind(("127.0.0.1", 0))
-    listener.listen()  # who comes before the server is up waits in the queue
-    server = OrderlyServer(create_app(own, close_service=False), own, limits=LIMITS)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
-    thread.start()
-    with httpx.Client(
-        base_url=f"http://127.0.0.1:{listener.getsockname()[1]}", timeout=60.0, trust_env=False
-    ) as client:
-        wait_for_rig(client)
-    yield int(listener.getsockname()[1])
-    own.stop_streams()
-    server.should_exit = True
-    thread.join(20.0)
-    listener.close()
+def front(own: Service, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fronted]:
+    web = tmp_path_factory.mktemp("web") / "web.sock"
+    # a small buffer, so that an unread answer waits in the front, and not in the kernel
+    app = create_app(own, close_service=False)
+    with web_process(app, web), fronted(web, LIMITS, send_buffer=16 * 1024) as made:
+        with httpx.Client(base_url=f"http://127.0.0.1:{made.port}", timeout=60.0, trust_env=False) as client:
+            wait_for_rig(client)
+        yield made
+        own.stop_streams()
+
+
+@pytest.fixture
+def port(front: Fronted) -> int:
+    return front.port
 
 
 def dial(port: int) -> socket.socket:
@@ -76,13 +71,8 @@ def ended(connection: socket.socket) -> bool:
     return True
 
 
-def refused(own: Service, why: str) -> float:
-    found = re.search(rf'connections_refused_total{{why="{why}"}} (\S+)', own.metrics.text().decode())
-    return 0.0 if found is None else float(found[1])
-
-
-def test_headers_that_never_end_end_the_connection(own: Service, port: int) -> None:
-    before = refused(own, "slow_headers")
+def test_headers_that_never_end_end_the_connection(front: Fronted, port: int) -> None:
+    before = front.refused.count("slow_headers")
     silent, dripping = dial(port), dial(port)
     stop = threading.Event()
 
@@ -102,7 +92,7 @@ def test_headers_that_never_end_end_the_connection(own: Service, port: int) -> N
         thread.join()
         silent.close()
         dripping.close()
-    assert refused(own, "slow_headers") >= before + 2
+    assert front.refused.count("slow_headers") >= before + 2
 
 
 def test_a_connection_waits_longer_than_its_client(port: int) -> None:
@@ -117,7 +107,7 @@ def test_a_connection_waits_longer_than_its_client(port: int) -> None:
         assert connection.sock is held
 
 
-def test_a_second_request_on_a_connection_has_its_time_too(own: Service, port: int) -> None:
+def test_a_second_request_on_a_connection_has_its_time_too(port: int) -> None:
     with dial(port) as connection:
         connection.sendall(request("GET", "/healthz"))
         assert connection.recv(65536).startswith(b"HTTP/1.1 200")
@@ -125,8 +115,8 @@ def test_a_second_request_on_a_connection_has_its_time_too(own: Service, port: i
         assert ended(connection)
 
 
-def test_a_body_that_comes_by_the_drop_ends_the_connection(own: Service, port: int) -> None:
-    before = refused(own, "slow_body")
+def test_a_body_that_comes_by_the_drop_ends_the_connection(front: Fronted, port: int) -> None:
+    before = front.refused.count("slow_body")
     with dial(port) as connection:
         connection.sendall(request("POST", f"{API}/tests", "Content-Type: application/json", "Content-Length: 1000000"))
         stop = threading.Event()
@@ -143,7 +133,7 @@ def test_a_body_that_comes_by_the_drop_ends_the_connection(own: Service, port: i
         finally:
             stop.set()
             thread.join()
-    assert refused(own, "slow_body") == before + 1
+    assert front.refused.count("slow_body") == before + 1
 
 
 def test_a_body_at_a_fair_pace_may_take_longer_than_that(port: int) -> None:
@@ -158,12 +148,12 @@ def test_a_body_at_a_fair_pace_may_take_longer_than_that(port: int) -> None:
     assert answer.startswith(b"HTTP/1.1 201"), answer[:200]
 
 
-def test_an_answer_that_nobody_reads_ends_the_connection_and_holds_little(own: Service, port: int) -> None:
-    before = refused(own, "unread")
+def test_an_unread_answer_ends_the_connection_and_holds_little_memory(own: Service, front: Fronted, port: int) -> None:
+    before = front.refused.count("unread")
     with dial(port) as connection:
         connection.sendall(request("GET", f"{API}/cameras/cam1/stream.mjpg?rate_hz=30"))
         deadline = time.monotonic() + END_S
-        while refused(own, "unread") == before:
+        while front.refused.count("unread") == before:
             assert time.monotonic() < deadline
             time.sleep(0.1)
     deadline = time.monotonic() + END_S
@@ -172,7 +162,7 @@ def test_an_answer_that_nobody_reads_ends_the_connection_and_holds_little(own: S
         time.sleep(0.05)
 
 
-def test_idle_connections_give_way_to_new_ones(own: Service, port: int) -> None:
+def test_idle_connections_give_way_to_new_ones(front: Fronted, port: int) -> None:
     idle = []
     for _ in range(LIMITS.max_open):
         idle.append(dial(port))
@@ -182,14 +172,14 @@ def test_idle_connections_give_way_to_new_ones(own: Service, port: int) -> None:
         with dial(port) as newcomer:
             newcomer.sendall(request("GET", "/healthz"))
             assert newcomer.recv(65536).startswith(b"HTTP/1.1 200")
-        assert refused(own, "too_many") >= 1
+        assert front.refused.count("too_many") >= 1
     finally:
         for connection in idle:
             connection.close()
 
 
 @pytest.mark.fault(50)
-def test_where_all_are_busy_live_views_give_way_and_a_stop_is_served(own: Service, port: int) -> None:
+def test_where_all_are_busy_live_views_give_way_and_a_stop_is_served(front: Fronted, port: int) -> None:
     def opened(path: str) -> socket.socket:
         connection = dial(port)
         connection.sendall(request("GET", path))
@@ -205,14 +195,15 @@ def test_where_all_are_busy_live_views_give_way_and_a_stop_is_served(own: Servic
             assert ended(view)  # a mere reader went first
         busy.append(opened(f"{API}/events"))  # now all work
         with dial(port) as crowded:
-            crowded.sendall(request("POST", f"{API}/stage/stop", "Content-Length: 0"))
+            crowded.sendall(request("POST", f"{API}/stage:stop", "Content-Length: 0"))
             assert crowded.recv(64).startswith(b"HTTP/1.1 200")
+        assert front.halts == ["stop"]
     finally:
         for connection in [view, *busy]:
             connection.close()
 
 
-def test_where_all_work_a_newcomer_is_refused_in_words(own: Service, port: int) -> None:
+def test_where_all_work_a_newcomer_is_refused_in_words(port: int) -> None:
     busy = []
     try:
         for _ in range(LIMITS.max_open + 1):
@@ -254,12 +245,3 @@ def test_what_is_no_proper_http_is_refused_and_the_connection_ends(port: int, da
         assert b"application/problem+json" in answer
     with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=60.0, trust_env=False) as client:
         assert client.get("/healthz").status_code == 200
-
-
-def test_settings_are_kept_to(tmp_path: Path) -> None:
-    made = Service(tiny_config(compute_queue="compute_queue = 2\nconnections = 40"), tmp_path / "data").start()
-    try:
-        server = OrderlyServer(create_app(made, close_service=False), made)
-        assert server._keeper.limits.max_open == 40
-    finally:
-        made.close()

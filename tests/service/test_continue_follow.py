@@ -14,9 +14,10 @@ import httpx
 import numpy as np
 import pytest
 
-from server.formats.images import encode_tiff, read_image
-from server.workflows.analysis import run
+from stereorig.server.formats.images import encode_tiff, read_image
+from stereorig.server.workflows.analysis import run
 from tests.support.copied_tests import write_test_folder
+from tests.support.patience import Deadline
 from tests.support.running_analyses import API, BODY, Host, begin, contents, folder_of, wait_for_steps
 from tests.support.service_rig import a_second, wait_for_job
 
@@ -126,7 +127,7 @@ def test_a_cancelled_analysis_goes_on_as_if_nothing_had_been(
     for path in half:
         path.write_bytes(b"")
     asked = time.monotonic()
-    assert client.post(f"{API}/jobs/{job['id']}/cancel").status_code == 202
+    assert client.post(f"{API}/jobs/{job['id']}:cancel").status_code == 202
     ended = wait_for_job(client, job)
     assert time.monotonic() - asked < limit
     assert ended["state"] == "cancelled"
@@ -156,7 +157,7 @@ def test_a_worker_that_was_killed_is_told_and_its_analysis_goes_on(host: Host, t
     os.kill(worker.pid, signal.SIGCONT)
     done = wait_for_job(client, job)
     assert (done["state"], done["problem"]["code"]) == ("failed", "worker_died")
-    assert "SIGSEGV" in done["problem"]["cause"]
+    assert "SIGSEGV" in done["problem"]["detail"]
     assert done["problem"]["context"]["signal"] == 11
     assert done["problem"]["context"]["memory_mib"] > 20.0
     assert worker.starts == starts + 1
@@ -168,7 +169,7 @@ def test_a_damaged_result_is_measured_again(host: Host, test_url: str, plain: st
     client = host.client
     url, job = begin(client, test_url, steps=[1, 2, 3, 4])
     wait_for_steps(client, url, 3)
-    client.post(f"{API}/jobs/{job['id']}/cancel")
+    client.post(f"{API}/jobs/{job['id']}:cancel")
     wait_for_job(client, job)
     path = folder_of(host, url) / "step_0001.nc"
     content = bytearray(path.read_bytes())
@@ -194,18 +195,20 @@ def test_what_cannot_go_on_says_why(host: Host, test_url: str, plain: str) -> No
     url, job = begin(client, test_url)
     refused(client.post(f"{url}:continue"), 409, "analysis_running")
     refused(client.post(f"{url}:finish"), 409, "not_following")
-    client.post(f"{API}/jobs/{job['id']}/cancel")
+    client.post(f"{API}/jobs/{job['id']}:cancel")
     wait_for_job(client, job)
     file = folder_of(host, url) / "analysis.json"
     text = file.read_text()
     version = client.get(url).json()["software"]
     file.write_text(text.replace(f'"{version}"', '"0.0.1"'))
+    host.service.folder.manifests.take_over(file.parent.parent.parent, [file])
     refused(client.post(f"{url}:continue"), 409, "software_changed")
     accepted = client.post(f"{url}:continue", json={"other_version": True})
     assert accepted.status_code == 202
-    client.post(f"{API}/jobs/{accepted.json()['job']['id']}/cancel")
+    client.post(f"{API}/jobs/{accepted.json()['job']['id']}:cancel")
     wait_for_job(client, accepted.json()["job"])
     file.write_text(text.replace('"calibration_sha256": "', '"calibration_sha256": "0'))
+    host.service.folder.manifests.take_over(file.parent.parent.parent, [file])
     refused(client.post(f"{url}:continue"), 409, "analysis_stale")
 
 
@@ -237,8 +240,8 @@ def state_of(client: httpx.Client, job: dict[str, Any]) -> tuple[str, str]:
 
 
 def wait_until_it_waits(client: httpx.Client, job: dict[str, Any]) -> None:
-    deadline = time.monotonic() + 240
-    while state_of(client, job) != ("running", "waiting for the next step") and time.monotonic() < deadline:
+    deadline = Deadline(240.0)
+    while state_of(client, job) != ("running", "waiting for the next step") and deadline.left:
         time.sleep(0.01)
     assert state_of(client, job) == ("running", "waiting for the next step")
 
@@ -281,8 +284,8 @@ def test_a_step_that_fails_while_an_analysis_follows_is_named_and_the_rest_is_me
         blank[0, 0] = 91 + k  # outside the region; without it the import itself is refused
         images[cam] = (cam, encode_tiff(blank))
     assert client.post(f"{growing}/steps:import", files=images).status_code == 201
-    deadline = time.monotonic() + 240
-    while not client.get(url).json()["steps_failed"] and time.monotonic() < deadline:
+    deadline = Deadline(240.0)
+    while not client.get(url).json()["steps_failed"] and deadline.left:
         assert state_of(client, job)[0] == "running"
         time.sleep(0.01)
     wait_until_it_waits(client, job)  # for more, as if nothing had been
@@ -319,7 +322,7 @@ def test_a_follower_that_waits_is_cancelled_at_once_and_goes_on_when_asked(
     wait_until_it_waits(client, job)
     limit = a_second(client)
     asked = time.monotonic()
-    assert client.post(f"{API}/jobs/{job['id']}/cancel").json()["state"] == "cancelled"
+    assert client.post(f"{API}/jobs/{job['id']}:cancel").json()["state"] == "cancelled"
     assert time.monotonic() - asked < limit
     send(client, growing, taken, 1)
     assert client.get(url).json()["steps_finished"] == [0]

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from server.api.docs.problem_pages import known_problems
-from server.results.field_forms import Part, encode, nested, take
-from server.results.reader import Variable
-from server.workflows.service import Service
+from stereorig.server.api.docs.problem_pages import known_problems
+from stereorig.server.results.field_forms import Part, encode, nested, take
+from stereorig.server.results.reader import FileVariable
+from stereorig.server.workflows.service import Service
 from tests.support.service_rig import new_test
 
 API = "/api/v1"
@@ -203,7 +203,7 @@ def test_pages_hold_everything_once_whatever_is_made_and_deleted_meanwhile(clien
 
 def test_jobs_come_newest_first_page_by_page(client: httpx.Client) -> None:
     for _ in range(5):
-        job = client.post(f"{API}/stage/home").json()["job"]
+        job = client.post(f"{API}/stage:home").json()["job"]
         while client.get(f"{API}/jobs/{job['id']}").json()["state"] not in ("succeeded", "failed"):
             pass
     whole = [job["id"] for job in client.get(f"{API}/jobs", params={"limit": 1000}).json()["jobs"]]
@@ -221,7 +221,7 @@ def test_steps_come_page_by_page(client: httpx.Client) -> None:
 
 @pytest.mark.fault(48)
 @pytest.mark.parametrize("cursor", ["%%%", "a", "é", "_-_-", "A" * 200, "-1"])
-def test_a_cursor_of_nobody_is_refused_or_leads_to_a_page(client: httpx.Client, cursor: str) -> None:
+def test_an_invented_cursor_is_refused_or_leads_to_a_page(client: httpx.Client, cursor: str) -> None:
     answer = client.get(f"{API}/tests", params={"cursor": cursor})
     if answer.status_code != 200:
         refused(answer, 422, "cursor_invalid")
@@ -235,7 +235,7 @@ def test_a_cursor_of_nobody_is_refused_or_leads_to_a_page(client: httpx.Client, 
 GRID = (7, 9)
 
 
-def field(shape: tuple[int, ...] = GRID, kind: str = "f8", name: str = "w_mm") -> dict[str, Variable]:
+def field(shape: tuple[int, ...] = GRID, kind: str = "f8", name: str = "w_mm") -> dict[str, FileVariable]:
     rng = np.random.default_rng(4)
     values = rng.normal(0.01, 0.002, shape).astype(kind) if kind.startswith("f") else rng.integers(0, 9, shape, kind)
     if kind.startswith("f"):
@@ -243,9 +243,9 @@ def field(shape: tuple[int, ...] = GRID, kind: str = "f8", name: str = "w_mm") -
     y, x = np.mgrid[100:170:10, 50:140:10].astype(float)
     grid = ("row", "col", "component", "component_of")
     return {
-        name: Variable(values, "mm", "displacement", grid[: values.ndim]),
-        "x_px": Variable(x, "pixel", "", grid[:2]),
-        "y_px": Variable(y, "pixel", "", grid[:2]),
+        name: FileVariable(values, "mm", "displacement", grid[: values.ndim]),
+        "x_px": FileVariable(x, "pixel", "", grid[:2]),
+        "y_px": FileVariable(y, "pixel", "", grid[:2]),
     }
 
 
@@ -264,7 +264,7 @@ def test_ranges_and_strides_take_what_numpy_takes() -> None:
 
 @pytest.mark.parametrize("rows", ["5:5", "6:2", "7:9", "100:", "0:0"])
 def test_a_range_that_holds_nothing_is_refused(rows: str) -> None:
-    from core.errors import InputError
+    from stereorig.core.errors import InputError
 
     with pytest.raises(InputError, match="range_empty"):
         take("w_mm", field().__getitem__, Part(rows, None, 1))
@@ -329,10 +329,10 @@ def test_the_picture_has_map_and_colour_bar(kind: str) -> None:
 
 
 def test_what_is_not_over_the_grid_is_refused() -> None:
-    from core.errors import InputError
+    from stereorig.core.errors import InputError
 
     with pytest.raises(InputError, match="field_not_scalar"):
-        take("volume", lambda _: Variable(np.zeros((3, 2)), "mm", "", ("step", "gauge")), Part())
+        take("volume", lambda _: FileVariable(np.zeros((3, 2)), "mm", "", ("step", "gauge")), Part())
 
 
 def test_json_is_strict(tmp_path: Path) -> None:

@@ -18,16 +18,16 @@ from types import SimpleNamespace
 import httpx
 import pytest
 
-from core.errors import CameraError
-from drivers.cameras.protocol import FoundDevice
-from drivers.registry import open_stage
-from drivers.stages import serial_ports
-from drivers.stages.protocol import AxisOptions
-from drivers.stages.serial_ports import discover_ports, port_problem
-from server.cli import main
-from server.cli.operation.devices import report
-from server.rig.devices import DeviceFinder, DeviceListing, HeldDevice
-from server.workflows.service import Service
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.protocol import FoundDevice
+from stereorig.drivers.registry import open_stage
+from stereorig.drivers.stages import serial_ports
+from stereorig.drivers.stages.protocol import AxisOptions
+from stereorig.drivers.stages.serial_ports import discover_ports, port_problem
+from stereorig.server.cli import main
+from stereorig.server.cli.operation.devices import report
+from stereorig.server.rig.devices import DeviceFinder, DeviceListing, HeldDevice
+from stereorig.server.workflows.service import Service
 from tests.support.requirements import ROOT
 from tests.support.service_rig import served, wait_for_rig
 
@@ -164,6 +164,17 @@ def test_a_free_port_is_listed_with_its_identity(port: str, tmp_path: Path) -> N
     assert "CONEX-CC" in found.extra["hint"]
 
 
+def test_a_controller_whose_usb_port_has_no_driver_is_listed_with_the_way_that_works(tmp_path: Path) -> None:
+    for name, product in (("1-1", "3001"), ("1-2", "3002"), ("1-0:1.0", None)):
+        (tmp_path / name).mkdir()
+        if product is not None:
+            (tmp_path / name / "idVendor").write_text("104d\n")
+            (tmp_path / name / "idProduct").write_text(f"{product}\n")
+    found = [one for one in discover_ports(usb=tmp_path) if one.model == "Newport ESP301"]
+    assert [(one.device, one.address) for one in found] == [("usb 1-1", "104d:3001")]
+    assert "RS-232" in str(found[0].problem)
+
+
 @pytest.mark.parametrize("how", ["open", "locked"])
 def test_a_port_that_another_program_holds_names_it(port: str, how: str, tmp_path: Path) -> None:
     script = (
@@ -277,7 +288,7 @@ def client(service: Service) -> Iterator[httpx.Client]:
 
 @pytest.mark.parametrize(("driver", "pty_too"), [("esp301", ()), ("smc100", ("--pty",))])
 def test_a_simulated_controller_can_be_run_apart(driver: str, pty_too: tuple[str, ...]) -> None:
-    code = "import sys; from server.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from stereorig.server.cli import main; sys.exit(main(sys.argv[1:]))"
     with subprocess.Popen(
         [sys.executable, "-c", code, "simstage", "--driver", driver, "--port", "0", *pty_too],
         stdout=subprocess.PIPE,

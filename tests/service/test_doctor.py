@@ -16,19 +16,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-import server.rig.build
-from drivers.cameras.protocol import CameraSettings
-from drivers.stages.protocol import AxisOptions
-from server.cli import main
-from server.doctor import Check, Report, examine
-from server.doctor.disk import check_disk
-from server.doctor.machine import check_machine
-from server.doctor.report import Notebook, line_of, percentile
-from server.doctor.stage import check_stage
-from server.store.folder import DataFolder
-from sim.controllers.registry import make_controller
-from sim.controllers.server import ControllerServer
-from sim.grabber import SimFrameGrabber
+import stereorig.sim.grabber
+from stereorig.drivers.cameras.protocol import CameraSettings
+from stereorig.drivers.stages.protocol import AxisOptions
+from stereorig.server.cli import main
+from stereorig.server.doctor import AllChecks, Check, examine
+from stereorig.server.doctor.disk import check_disk
+from stereorig.server.doctor.machine import check_machine
+from stereorig.server.doctor.report import Notebook, line_of, percentile
+from stereorig.server.doctor.stage import check_stage
+from stereorig.server.store.folder import DataFolder
+from stereorig.sim.controllers.registry import make_controller
+from stereorig.sim.controllers.server import ControllerServer
+from stereorig.sim.grabber import SimFrameGrabber
+from tests.support.patience import busy
 from tests.support.service_rig import TINY, tiny_config
 from tests.support.stage_bench import CONTROLLERS, Bench, bench
 
@@ -49,12 +50,14 @@ def rig(tmp_path: Path) -> Path:
     return path
 
 
-def diagnose(rig: Path, **options: Any) -> Report:
+def diagnose(rig: Path, **options: Any) -> AllChecks:
     return examine(rig, seconds=0.3, data=rig.parent / "data", **options)
 
 
-def check_of(checks: Report | list[Check], part: str, name: str) -> Check:
-    found = [c for c in (checks.checks if isinstance(checks, Report) else checks) if (c.part, c.name) == (part, name)]
+def check_of(checks: AllChecks | list[Check], part: str, name: str) -> Check:
+    found = [
+        c for c in (checks.checks if isinstance(checks, AllChecks) else checks) if (c.part, c.name) == (part, name)
+    ]
     assert len(found) == 1, (part, name, found)
     return found[0]
 
@@ -68,7 +71,7 @@ def spoil(monkeypatch: pytest.MonkeyPatch, cam: str, harm: Callable[[SimFrameGra
             if name == cam:
                 harm(self)
 
-    monkeypatch.setattr(server.rig.build, "SimFrameGrabber", Spoilt)
+    monkeypatch.setattr(stereorig.sim.grabber, "SimFrameGrabber", Spoilt)
 
 
 # the whole -------------------------------------------------------------------------------------------------------
@@ -76,7 +79,7 @@ def spoil(monkeypatch: pytest.MonkeyPatch, cam: str, harm: Callable[[SimFrameGra
 
 def test_a_good_bench_is_called_good(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--config", str(rig), "--seconds", "0.3", "--data", str(rig.parent), "--json"]) == 0
-    report = Report.model_validate_json(capsys.readouterr().out)
+    report = AllChecks.model_validate_json(capsys.readouterr().out)
     assert report.good
     assert report.rig == "tiny rig"
     for check in report.checks:
@@ -197,7 +200,7 @@ def test_skew_above_the_limit_is_measured_and_judged(
                 self.faults.skew_ms = next(delays, 0.5)
             return super().trigger()
 
-    monkeypatch.setattr(server.rig.build, "SimFrameGrabber", Uneven)
+    monkeypatch.setattr(stereorig.sim.grabber, "SimFrameGrabber", Uneven)
     report = examine(rig, seconds=1.5, data=rig.parent)  # the first picture takes its time
     skew = check_of(report, "pairs", "skew")
     assert skew.state == state
@@ -242,7 +245,7 @@ def test_one_damaged_frame_in_many_is_a_warning(rig: Path, monkeypatch: pytest.M
                 self.faults.incomplete = 1
             return super().trigger()
 
-    monkeypatch.setattr(server.rig.build, "SimFrameGrabber", Once)
+    monkeypatch.setattr(stereorig.sim.grabber, "SimFrameGrabber", Once)
     report = examine(rig, seconds=2.0, data=rig.parent)
     losses = check_of(report, "cam1", "losses")
     assert losses.figures["incomplete"] == 1
@@ -255,7 +258,7 @@ def test_a_setting_that_the_device_bends_fails(rig: Path, monkeypatch: pytest.Mo
         def configure(self, settings: CameraSettings) -> CameraSettings:
             return replace(super().configure(settings), exposure_ms=8.0, gain_db=0.0)
 
-    monkeypatch.setattr(server.rig.build, "SimFrameGrabber", Bends)
+    monkeypatch.setattr(stereorig.sim.grabber, "SimFrameGrabber", Bends)
     report = diagnose(rig)
     settings = check_of(report, "cam1", "settings")
     assert settings.state == "failed"
@@ -347,12 +350,13 @@ def test_a_silent_controller_fails_and_nothing_hangs(stage: Bench) -> None:
 
 @pytest.mark.parametrize("stage", ["esp301"], indirect=True)
 def test_slow_answers_are_warned_of(stage: Bench) -> None:
+    patient = stage.another(OPTIONS)
     stage.controller.line_faults.delay_s = 0.12
     book = Notebook()
-    check_stage(book, stage.stage, tiny_config(), move=False, home=False)
+    check_stage(book, patient, tiny_config(), move=False, home=False)
     answers = check_of(book.checks, "stage", "answers")
     assert answers.state == "warning"
-    assert answers.figures["median_ms"] == pytest.approx(120.0, abs=40.0)
+    assert 80.0 < float(answers.figures["median_ms"]) < 160.0 * busy()  # type: ignore[arg-type]
     assert check_of(book.checks, "stage", "stop").state == "warning"
 
 

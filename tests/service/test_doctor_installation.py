@@ -9,18 +9,19 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numba
 import pytest
 
-from core.errors import CameraError
-from drivers.cameras.aravis.library import aravis
-from server.doctor import Check
-from server.doctor.access import check_service_port, check_usb_cameras
-from server.doctor.disk import check_disk
-from server.doctor.machine import check_kernels
-from server.doctor.report import Notebook
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.aravis.library import aravis, repository
+from stereorig.server.doctor import Check
+from stereorig.server.doctor.access import check_service_port, check_usb_cameras
+from stereorig.server.doctor.disk import check_disk
+from stereorig.server.doctor.machine import check_kernels
+from stereorig.server.doctor.report import Notebook
 
 
 def check_of(checks: list[Check], part: str, name: str) -> Check:
@@ -63,9 +64,9 @@ def test_where_kernels_can_be_kept_nowhere_the_command_keeps_them_for_as_long_as
     (tmp_path / "home").touch()
     code = (
         "import os, pathlib, sys\n"
-        "import server.base.kernel_folder as folder\n"
+        "import stereorig.server.base.kernel_folder as folder\n"
         "folder.kernel_folders.__defaults__ = (pathlib.Path(sys.argv[1]),)\n"
-        "import server.cli\n"
+        "import stereorig.server.cli\n"
         "print(os.environ['NUMBA_CACHE_DIR'], os.path.isdir(os.environ['NUMBA_CACHE_DIR']))\n"
     )
     environment = {**os.environ, "HOME": str(tmp_path / "home"), "XDG_CACHE_HOME": str(tmp_path / "home" / "cache")}
@@ -154,14 +155,14 @@ def test_a_data_folder_of_another_user_fails_and_says_what_to_do(mode: int) -> N
 
 
 def test_a_missing_aravis_library_is_named_with_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    def absent(name: str) -> Any:
+    def absent(name: str, _version: str) -> Any:
         raise ValueError(f"Namespace {name} not available")
 
-    monkeypatch.setattr("drivers.cameras.aravis.library.importlib.import_module", absent)
-    aravis.cache_clear()
+    monkeypatch.setitem(sys.modules, "gi", SimpleNamespace(require_version=absent))
+    repository.cache_clear()
     try:
         with pytest.raises(CameraError, match="Aravis library cannot be used") as caught:
             aravis()
     finally:
-        aravis.cache_clear()
+        repository.cache_clear()
     assert "gir1.2-aravis-0.8" in str(caught.value.remedy)

@@ -10,10 +10,10 @@ from typing import Any
 import httpx
 import pytest
 
-from server.jobs.events import Event, EventHub
-from server.jobs.job import Job, Phase
-from server.store.catalog import Catalog
-from server.workflows.service import Service
+from stereorig.server.jobs.events import Event, EventHub
+from stereorig.server.jobs.job import Job, Phase
+from stereorig.server.store.catalog import Catalog
+from stereorig.server.workflows.service import Service
 from tests.support.service_rig import new_test, served, tiny_config, wait_for_job, wait_for_rig
 
 API = "/api/v1"

@@ -9,7 +9,7 @@ import httpx
 import numpy as np
 import pytest
 
-from server.cli.main import main
+from stereorig.server.cli.main import main
 from tests.support.requirements import ROOT
 
 RIG = str(ROOT / "config" / "sim_paper.toml")

@@ -9,8 +9,9 @@ from typing import Any
 import httpx
 import pytest
 
-from server.workflows.service import Service
+from stereorig.server.workflows.service import Service
 from tests.support.copied_tests import write_test_folder
+from tests.support.patience import Deadline
 from tests.support.service_rig import served, tiny_config, wait_for_job, wait_for_rig
 
 API = "/api/v1"
@@ -40,13 +41,13 @@ def jobs(client: httpx.Client) -> Iterator[list[dict[str, Any]]]:
         answer = client.post(f"{API}/tests/{TEST}/analyses", json=BODY)
         assert answer.status_code == 202, answer.text
         made.append(answer.json()["job"])
-        deadline = time.monotonic() + 60.0
+        deadline = Deadline(60.0)
         while client.get(f"{API}/jobs/{made[0]['id']}").json()["state"] == "queued":  # the first one leaves the queue
-            assert time.monotonic() < deadline
+            assert deadline.left
             time.sleep(0.01)
     yield made
     for job in made:
-        client.post(f"{API}/jobs/{job['id']}/cancel")
+        client.post(f"{API}/jobs/{job['id']}:cancel")
     for job in made:
         wait_for_job(client, job)
 
@@ -78,14 +79,14 @@ def test_one_too_many_is_told_when_to_come_again(
     # what is no computation goes on: the stage moves, and stops
     moved = client.post(f"{API}/stage/moves", json={"by_mm": {"1": 0.1}})
     assert moved.status_code == 202, moved.text
-    assert client.post(f"{API}/stage/stop").status_code == 200
+    assert client.post(f"{API}/stage:stop").status_code == 200
     wait_for_job(client, moved.json()["job"])
     # the same request again, with its key, once there is room
-    client.post(f"{API}/jobs/{jobs[-1]['id']}/cancel").raise_for_status()
+    client.post(f"{API}/jobs/{jobs[-1]['id']}:cancel").raise_for_status()
     wait_for_job(client, jobs[-1])
     taken = client.post(API + path, json=body, headers={"Idempotency-Key": f"again {operation}"})
     assert taken.status_code == 202, taken.text
-    client.post(f"{API}/jobs/{taken.json()['job']['id']}/cancel")
+    client.post(f"{API}/jobs/{taken.json()['job']['id']}:cancel")
     wait_for_job(client, taken.json()["job"])
 
 

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from core.common.factor import Causes
-from core.field.points.result import Field
-from server.cli.main import main
-from server.formats.results.writing import Provenance, write_field
+from stereorig.core.common.factor import Causes
+from stereorig.core.field.points.result import Field
+from stereorig.server.cli.main import main
+from stereorig.server.formats.results.writing import Provenance, write_field
 from tests.support.gauge_field import SUBSET, make_field
 
 INPUTS = {"calibration": "aa", "reference_cam1": "bb", "reference_cam2": "cc"}

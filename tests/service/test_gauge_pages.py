@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import stereorig
-from server.api.models import GaugesReply
-from server.workflows.service import Service
+from stereorig.server.api.models import GaugesReply
+from stereorig.server.workflows.service import Service
 from tests.support.model_bench import write_result
 from tests.support.service_rig import served, tiny_config
 from tests.support.strain_fields import make_field
@@ -159,7 +159,7 @@ def test_a_record_for_many_steps_is_summed_up(client: httpx.Client) -> None:
     assert answer.is_success, answer.text
     found = answer.json()
     assert (found["n_steps"], found["n_aligned"]) == (STEPS + 1, 110)
-    assert found["reasons"] == {"it lies outside the record": STEPS + 1 - 110}
+    assert found["reasons"] == {"it is outside the record": STEPS + 1 - 110}
     assert [one["n"] for one in found["steps"]] == list(range(100))
     further = {"cursor": found["steps_next_cursor"], "channels": True}
     others = client.get(f"{API}/tests/{TEST}/steps", params=further).json()["steps"]

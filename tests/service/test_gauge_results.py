@@ -16,15 +16,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Float
-from core.field.points.result import Field
-from core.field.region.cuts import Cuts
-from core.strain import StrainOptions, surface_strain
-from server.cli.main import main
-from server.formats.results.reading import read_field, read_head
-from server.formats.results.strain import read_strain
-from server.formats.results.writing import Provenance, write_field
-from server.workflows.service import Service
+from stereorig.core.arrays import Float
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.core.strain import StrainOptions, surface_strain
+from stereorig.server.cli.main import main
+from stereorig.server.formats.results.reading import read_field, read_head
+from stereorig.server.formats.results.strain import read_strain
+from stereorig.server.formats.results.writing import Provenance, write_field
+from stereorig.server.workflows.service import Service
 from tests.support.gauge_field import SUBSET, make_field, pixel_noise, surface
 from tests.support.service_rig import new_test
 
@@ -470,6 +470,30 @@ def test_api_and_command_line_give_the_same_document(
             step.setdefault("rigid_motion", None)
             step.setdefault("problem", None)
     assert of_api == of_file
+
+
+def test_an_evaluation_answers_over_the_api_as_the_command_does(
+    client: httpx.Client, url: str, results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = {"variable": "w_mm", "lower": -1.0, "upper": 0.5, "step": 2}
+    at = url.removesuffix("gauges") + "evaluations"
+    answer = client.post(f"{at}/conformity", json={"settings": settings}, timeout=60.0)
+    assert answer.status_code == 200, answer.text
+    given = [part for name, value in settings.items() for part in ("--set", f"{name}={value}")]
+    capsys.readouterr()
+    main(["evaluate", "conformity", str(results), *given, "--json"])
+    assert answer.json() == {"name": "conformity", "document": json.loads(capsys.readouterr().out)}
+    listed = client.get(f"{API}/evaluations", timeout=60.0).json()["evaluations"]
+    shown = next(one for one in listed if one["name"] == "conformity")
+    assert set(settings) <= set(shown["settings"]["properties"])
+    assert set(answer.json()["document"]) == set(shown["document"]["properties"])
+    for name, settings, status, code in (
+        ("conformity", {"variable": "w_mm"}, 422, "evaluation_settings"),
+        ("conformity", {"variable": "none", "upper": 1.0}, 422, "evaluation_needs"),
+        ("nothing", {}, 404, "evaluation_missing"),
+    ):
+        refused = client.post(f"{at}/{name}", json={"settings": settings}, timeout=60.0)
+        assert (refused.status_code, refused.json()["code"]) == (status, code)
 
 
 def test_a_field_over_the_api_is_the_command_lines(

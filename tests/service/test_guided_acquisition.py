@@ -10,8 +10,9 @@ from typing import Any
 import httpx
 import pytest
 
-from server.config.rig_file import parse_config
-from server.workflows.service import Service
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.workflows.service import Service
+from tests.support.patience import Deadline
 from tests.support.problems import assert_problem
 from tests.support.service_rig import data_of, served, wait_for_job, wait_for_rig
 from tests.support.small_board_rig import SMALL_BOARD
@@ -34,8 +35,8 @@ def hold(client: httpx.Client, pose: list[float]) -> None:
 
 def guided(client: httpx.Client, calibration_id: str, ready: Any, seconds: float = 90.0) -> dict[str, Any]:
     """Ask until something holds."""
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
+    deadline = Deadline(seconds)
+    while deadline.left:
         state: dict[str, Any] = client.get(f"{API}/calibrations/{calibration_id}/guide").json()
         if ready(state):
             return state
@@ -105,7 +106,7 @@ def test_views_survive_a_cancel_and_can_be_fitted(client: httpx.Client) -> None:
     assert live["like_view"] == len(poses) - 1
     assert not live["new"]
     assert len(live["cameras"]["cam1"]["points_px"]) == 54
-    client.post(f"{API}/jobs/{answer['job']['id']}/cancel")
+    client.post(f"{API}/jobs/{answer['job']['id']}:cancel")
     assert wait_for_job(client, answer["job"])["state"] == "cancelled"
     assert len(client.get(f"{API}/calibrations/{calibration_id}/views").json()["views"]) == 2 * len(poses)
     assert_problem(client.post(f"{API}/calibrations/{calibration_id}/guide/views"), 409, "guide_ended")
@@ -123,7 +124,7 @@ def test_a_target_that_cannot_be_found_ends_a_calibration_before_anything_moves(
     ended = wait_for_job(client, answer["job"])
     assert ended["state"] == "failed"
     assert ended["problem"]["code"] == "target_not_found"
-    assert "before anything moved" in ended["problem"]["cause"]
+    assert "before anything moved" in ended["problem"]["detail"]
     assert client.get(f"{API}/stage").json()["axes"][0]["position_mm"] == before
     views = client.get(f"{API}/calibrations/{answer['calibration_id']}/views").json()["views"]
     assert [v["role"] for v in views] == ["first_look"] * 2
@@ -144,10 +145,10 @@ def test_one_stage_under_the_target_calibrates_a_board(client: httpx.Client) -> 
 def test_a_cancelled_calibration_offers_the_way_back(client: httpx.Client) -> None:
     hold(client, [0.0] * 6)
     answer = client.post(f"{API}/calibrations", json={"positions_mm": [-8.0, 8.0]}).json()
-    deadline = time.monotonic() + 60.0
-    while client.get(f"{API}/stage").json()["axes"][0]["position_mm"] > -1.0 and time.monotonic() < deadline:
+    deadline = Deadline(60.0)
+    while client.get(f"{API}/stage").json()["axes"][0]["position_mm"] > -1.0 and deadline.left:
         time.sleep(0.02)
-    client.post(f"{API}/jobs/{answer['job']['id']}/cancel")
+    client.post(f"{API}/jobs/{answer['job']['id']}:cancel")
     ended = wait_for_job(client, answer["job"])
     assert ended["state"] == "cancelled"
     back = ended["problem"]["context"]["way_back"]

@@ -10,9 +10,9 @@ import httpx
 import numpy as np
 import pytest
 
-from server.config.rig_file import parse_config
-from server.formats.images import decode
-from server.workflows.service import Service
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.formats.images import decode
+from stereorig.server.workflows.service import Service
 from tests.support.service_rig import SMALL, data_of, true_cameras, wait_for_job
 
 pytestmark = [pytest.mark.timeout(300), pytest.mark.warm_worker]
@@ -49,7 +49,7 @@ def test_the_exposure_is_searched_from_dark_and_from_bright(client: httpx.Client
     assert client.get(f"{API}/cameras/cam2").json()["settings"]["exposure_ms"] == 10.0
 
 
-def test_light_that_does_not_suffice_leaves_the_exposure_as_it_was(client: httpx.Client) -> None:
+def test_too_little_light_keeps_the_old_exposure(client: httpx.Client) -> None:
     client.patch(f"{API}/cameras/cam2", json={"exposure_ms": 10.0}).raise_for_status()
     refused = client.post(f"{API}/cameras/cam2:expose", json={"longest_ms": 0.5})
     assert refused.status_code == 409

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 import xarray
 
-from core.compiling import NotCompiledError, compile_elsewhere, refuse_compiling, report_compiling
-from server.worker import kernel_compiler
-from server.worker.kernel_compiler import KernelCompiler, compiled_aside
+from stereorig.core.compiling import NotCompiledError, compile_elsewhere, refuse_compiling, report_compiling
+from stereorig.server.worker import kernel_compiler
+from stereorig.server.worker.kernel_compiler import KernelCompiler, compiled_aside
 from tests.support.copied_tests import write_test_folder
 from tests.support.measure_command import command
 from tests.support.requirements import ROOT
 
 KERNEL = """
-from core.matching.kernels.naming import entry
+from stereorig.core.matching.kernels.naming import entry
 
 def twice(x):
     return 2.0 * x
@@ -53,7 +53,7 @@ def test_it_is_compiled_by_another_process_and_loaded_here(kernel):
     told = []
     with compiled_aside(), report_compiling(lambda: told.append(True)):
         assert kernel(1.5) == 3.0
-    assert sum(kernel.stats.cache_hits.values()) == 1
+    assert sum(kernel.compiled.stats.cache_hits.values()) == 1
     assert told == [True]
 
 
@@ -62,7 +62,7 @@ def test_one_process_compiles_all_that_is_asked_for(kernel, started):
         assert kernel(1.5) == 3.0
         assert kernel(np.float32(1.5)) == 3.0
     assert len(started) == 1
-    assert sum(kernel.stats.cache_hits.values()) == 2
+    assert sum(kernel.compiled.stats.cache_hits.values()) == 2
     assert started[0].returncode is not None
 
 
@@ -75,20 +75,20 @@ def test_where_the_process_dies_it_is_compiled_here(kernel, monkeypatch, instead
     )
     with compiled_aside():
         assert kernel(1.5) == 3.0
-    assert sum(kernel.stats.cache_hits.values()) == 0
+    assert sum(kernel.compiled.stats.cache_hits.values()) == 0
 
 
-def test_one_that_ended_between_two_questions_is_started_anew(kernel, started):
+def test_a_compiler_that_ended_is_started_again(kernel, started):
     with compiled_aside():
         assert kernel(1.5) == 3.0
         started[0].kill()
         started[0].wait()
         assert kernel(np.float32(1.5)) == 3.0
     assert len(started) == 2
-    assert sum(kernel.stats.cache_hits.values()) == 2
+    assert sum(kernel.compiled.stats.cache_hits.values()) == 2
 
 
-def test_nobody_is_asked_where_compiling_is_refused(kernel):
+def test_a_refused_compilation_starts_no_compiler(kernel):
     asked = []
     with compile_elsewhere(lambda *what: asked.append(what)), refuse_compiling(), pytest.raises(NotCompiledError):
         kernel(1.5)
@@ -98,7 +98,7 @@ def test_nobody_is_asked_where_compiling_is_refused(kernel):
 def test_what_is_on_disk_starts_no_process(kernel, monkeypatch):
     kernel(1.5)
     monkeypatch.setattr(kernel_compiler, "_start", lambda: pytest.fail("started"))
-    kernel._reset_overloads()
+    kernel.compiled._reset_overloads()
     with compiled_aside():
         assert kernel(1.5) == 3.0
 
@@ -114,7 +114,7 @@ def test_the_first_measurement_on_a_machine_equals_the_next_to_the_last_bit(tmp_
 
     def measured(name: str) -> list[xarray.Dataset]:
         arguments = command(tmp_path, tmp_path / name, cam1=None, cam2=None, calibration=None, roi="25,25,130,115")
-        line = [sys.executable, "-m", "server.cli", *arguments, str(tmp_path / "test")]
+        line = [sys.executable, "-m", "stereorig.server.cli", *arguments, str(tmp_path / "test")]
         done = subprocess.run(line, capture_output=True, text=True, env=environment)
         assert done.returncode == 0, done.stderr
         assert ("compiling" in done.stderr) == (name == "first")

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import httpx
 import pytest
 
-from server.workflows.service import Service
+from stereorig.server.workflows.service import Service
 
 pytestmark = pytest.mark.timeout(120)
 SECONDS, RATE_HZ = 4.0, 10.0

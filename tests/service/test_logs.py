@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextvars
+import io
 import json
 import logging
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -16,10 +18,12 @@ from pathlib import Path
 import httpx
 import pytest
 
-from server.base.logs import AboutFilter, JsonFormatter, TextFormatter, about, current_ids
-from server.jobs.hardware import HardwareHold
-from server.worker.embedded import ComputeWorker
-from server.workflows.service import Service
+from stereorig.server.base import logs
+from stereorig.server.base.logs import AboutFilter, JsonFormatter, LimitedHandler, TextFormatter, about, current_ids
+from stereorig.server.jobs.hardware import HardwareHold
+from stereorig.server.worker.embedded import ComputeWorker
+from stereorig.server.workflows.service import Service
+from tests.support.patience import Deadline
 from tests.support.requirements import ROOT
 from tests.support.service_rig import TINY, new_test, wait_for_job, wait_for_rig
 
@@ -114,8 +118,8 @@ def test_a_requests_lines_and_its_jobs_lines_can_be_told_apart(
     job = made.json()["job"]
     wait_for_job(client, job)
     client.get(f"{API}/jobs/%0d%0ax", headers={"X-Request-Id": "mine-2"})
-    deadline = time.monotonic() + 10.0
-    while not [x for x in as_json.documents() if x.get("request_id") == "mine-2"] and time.monotonic() < deadline:
+    deadline = Deadline(10.0)
+    while not [x for x in as_json.documents() if x.get("request_id") == "mine-2"] and deadline.left:
         time.sleep(0.01)
     lines = as_json.documents()
     states = [line["state"] for line in lines if line.get("job_id") == job["id"] and "state" in line]
@@ -145,7 +149,7 @@ def test_serve_writes_json_lines_where_it_is_told(tmp_path: Path) -> None:
         [
             sys.executable,
             "-m",
-            "server.cli",
+            "stereorig.server.cli",
             "serve",
             "--config",
             str(tmp_path / "rig.toml"),
@@ -175,3 +179,107 @@ def test_serve_writes_json_lines_where_it_is_told(tmp_path: Path) -> None:
     lines = [json.loads(line) for line in errors.splitlines()]
     assert all({"utc", "level", "logger", "message"} <= set(line) for line in lines)
     assert any(line.get("path") == f"{API}/tests" and line["status"] == 201 for line in lines)
+
+
+@pytest.fixture
+def limited(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[LimitedHandler, list[float]]]:
+    """A handler that writes into a text, and the seconds on its clock."""
+    now = [0.0]
+    monkeypatch.setattr(logs.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(threading.Timer, "start", lambda _: None)  # the test reports when its own clock has moved
+    handler = LimitedHandler()
+    handler.setFormatter(TextFormatter())
+    handler.setStream(io.StringIO())
+    yield handler, now
+    handler.close()
+
+
+def failed(depth: int = 3) -> logging.LogRecord:
+    def fall(left: int) -> None:
+        if left:
+            fall(left - 1)
+        raise OSError(24, "Too many open files")
+
+    try:
+        fall(depth)
+    except OSError:
+        return logging.makeLogRecord(
+            {"name": "asyncio", "levelno": logging.ERROR, "levelname": "ERROR", "msg": "x", "exc_info": sys.exc_info()}
+        )
+    raise AssertionError
+
+
+@pytest.mark.fault(60)
+def test_no_second_has_more_than_100_lines_and_what_was_left_out_is_counted(
+    limited: tuple[LimitedHandler, list[float]],
+) -> None:
+    handler, now = limited
+    at: list[float] = []
+    for k in range(5000):
+        now[0] = k / 1000
+        handler.handle(failed())
+        if k % 1000 == 999:
+            handler.report()
+        at += [now[0]] * (len(handler.stream.getvalue().splitlines()) - len(at))
+    text = handler.stream.getvalue()
+    assert max(sum(t - 1.0 < other <= t for other in at) for t in at) <= 100
+    assert text.count("Traceback") > 10
+    counts = re.findall("([0-9]+) messages were left out", text)
+    assert sum(map(int, counts)) + text.count("OSError: [Errno 24]") == 5000
+
+
+def test_many_requests_do_not_crowd_out_an_error(limited: tuple[LimitedHandler, list[float]]) -> None:
+    handler, _ = limited
+    for _ in range(500):
+        handler.handle(logging.makeLogRecord({"levelno": logging.INFO, "msg": "GET /"}))
+    handler.handle(failed())
+    assert "Too many open files" in handler.stream.getvalue()
+
+
+def test_a_long_traceback_is_cut_and_a_wrong_call_or_a_closed_stream_prints_none(
+    limited: tuple[LimitedHandler, list[float]], capfd: pytest.CaptureFixture[str]
+) -> None:
+    handler, now = limited
+    long = logging.makeLogRecord({"levelno": logging.ERROR, "msg": "\n".join("abc"), "exc_text": "line\n" * 5000})
+    handler.handle(long)
+    assert len(handler.stream.getvalue().splitlines()) == 99
+    handler.setStream(io.StringIO())
+    now[0] = 2.0
+    handler.handle(logging.makeLogRecord({"levelno": logging.ERROR, "msg": "%d", "args": ("x",)}))
+    assert "cannot be formatted" in handler.stream.getvalue()
+    handler.stream.close()
+    handler.handle(failed())
+    handler.setStream(io.StringIO())
+    handler.report()
+    assert "1 messages were left out" in handler.stream.getvalue()
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.fault(60)
+@pytest.mark.parametrize("form", logs.FORMATS)
+def test_a_storm_of_errors_in_the_event_loop_and_in_threads_fills_no_disk(form: str) -> None:
+    script = f"""
+import asyncio, logging, threading, time
+from stereorig.server.base import logs
+logs.configure("info", {form!r})
+began, sent = time.monotonic(), 0
+while time.monotonic() - began < 2.5:
+    loop = asyncio.new_event_loop()
+    for _ in range(100):
+        loop.call_exception_handler({{"message": "socket.accept() failed", "exception": OSError(24, "x")}})
+    thread = threading.Thread(target=lambda: 1 / 0)
+    thread.start()
+    thread.join()
+    loop.close()
+    sent += 101
+print(sent, time.monotonic() - began)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True, timeout=120
+    )
+    sent, took_s = done.stdout.split()
+    lines = done.stderr.splitlines()
+    assert int(sent) > 1000
+    assert 50 < len(lines) <= 100 * (float(took_s) + 2.0)
+    assert any("were left out" in line for line in lines)
+    assert any("socket.accept() failed" in line for line in lines)

@@ -15,17 +15,18 @@ import numpy as np
 import pytest
 
 import stereorig
-from server.api.models import AnalysisRequest
-from server.formats.images import encode_tiff
-from server.results.warnings import checks as results_checks
-from server.results.warnings.checks import checks_of, state_of
-from server.store.documents import JobRecord
-from server.store.indexing.entries import analysis_entry
-from server.worker.executor import WorkerDiedError
-from server.workflows.analysis import checks as service_checks
-from server.workflows.analysis.checks import AnalysisChecks
-from server.workflows.service import Service
+from stereorig.server.api.models import AnalysisRequest
+from stereorig.server.documents.jobs import JobRecord
+from stereorig.server.formats.images import encode_tiff
+from stereorig.server.results.warnings import checks as results_checks
+from stereorig.server.results.warnings.checks import checks_of, state_of
+from stereorig.server.store.indexing.entries import analysis_entry
+from stereorig.server.worker.executor import WorkerDiedError
+from stereorig.server.workflows.analysis import checks as service_checks
+from stereorig.server.workflows.analysis.checks import AnalysisChecks
+from stereorig.server.workflows.service import Service
 from tests.bench.years.folder import TrueTest
+from tests.support.patience import Deadline
 from tests.support.service_rig import new_test, served, tiny_config
 
 API = "/api/v1"
@@ -116,7 +117,7 @@ def _analysis(service: Service, test_id: str, steps: int) -> str:
         valid = 30 if n == steps - 2 else 100
         figures = {"n": n, "points": 100, "valid": valid, "valid_fraction": valid / 100}
         (folder / f"step_{n:04d}.json").write_text(json.dumps(figures))
-    problem = {"code": "image_blank", "cause": "It is blank.", "remedy": "Capture it again.", "detail": "It is blank."}
+    problem = {"code": "image_blank", "detail": "It is blank.", "remedy": "Capture it again."}
     summary = {"state": "succeeded", "steps": [{"n": n} for n in range(steps - 1)], "steps_failed": {}}
     service.tests.analyses.put_summary(test_id, made.id, summary | {"steps_failed": {str(steps - 1): problem}})
     service.catalog.put_entry("analysis", test_id, made.id, analysis_entry(made))
@@ -159,18 +160,18 @@ def test_the_checks_of_an_analysis_of_many_steps_are_made_and_renewed(
     def codes() -> set[str]:
         return {one["code"] for one in client.get(url).json()["warnings"]}
 
-    deadline = time.monotonic() + 60.0
-    while codes() == {"not_checked_yet"} and time.monotonic() < deadline:
+    deadline = Deadline(60.0)
+    while codes() == {"not_checked_yet"} and deadline.left:
         time.sleep(0.1)
     assert {"low_coverage", "steps_failed"} <= codes() <= {"low_coverage", "steps_failed", "image_quality"}
     trash = client.delete(f"{API}/tests/{many}/steps/{MANY - 3}").raise_for_status().json()["id"]
-    while "out_of_date" not in codes() and time.monotonic() < deadline:
+    while "out_of_date" not in codes() and deadline.left:
         time.sleep(0.1)
     assert client.get(url).json()["stale_reasons"] == [f"step {MANY - 3} is gone"]
     client.post(f"{API}/trash/{trash}:restore").raise_for_status()
 
 
-def test_only_the_first_who_asks_waits_for_the_checks(
+def test_only_the_first_request_waits_for_the_checks(
     service: Service, many: str, analyses: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waited: list[float | None] = []
@@ -203,16 +204,16 @@ def test_the_checks_of_many_steps_are_found_by_a_process_of_their_own(
         return asked[0]
 
     monkeypatch.setattr(checks._process, "submit", submitted)
-    deadline = time.monotonic() + 60.0
+    deadline = Deadline(60.0)
     while (found := checks.of(many, analyses[many])).warnings[0].code == "not_checked_yet":
-        assert time.monotonic() < deadline
+        assert deadline.left
         time.sleep(0.05)
     assert len(asked) == 1
     assert found == checks_of(service.tests.analyses.path(many, analyses[many]))
     checks.close()
 
 
-def test_who_asks_while_the_service_closes_hears_what_is_known(
+def test_a_request_while_the_service_closes_gets_the_last_known_checks(
     service: Service, many: str, analyses: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     closed = AnalysisChecks(service.tests)
@@ -231,9 +232,9 @@ def test_checks_of_some_age_are_confirmed_without_reading_the_steps(
     service: Service, few: str, analyses: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     checks = AnalysisChecks(service.tests)
-    deadline = time.monotonic() + 60.0
+    deadline = Deadline(60.0)
     while (found := checks.of(few, analyses[few])).warnings[0].code == "not_checked_yet":
-        assert time.monotonic() < deadline
+        assert deadline.left
         time.sleep(0.05)
     looked: list[Path] = []
 
@@ -247,7 +248,7 @@ def test_checks_of_some_age_are_confirmed_without_reading_the_steps(
     monkeypatch.setattr(service_checks, "_SHARE", 1e9)
     while len(looked) < 2:
         assert checks.of(few, analyses[few]) == found
-        assert time.monotonic() < deadline
+        assert deadline.left
         time.sleep(0.01)
     checks.close()
 

@@ -9,10 +9,11 @@ import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from core.errors import StageError, StorageError
-from server.base.metrics import Metrics
-from server.base.streams import Streams
-from server.workflows.service import Service
+from stereorig.core.errors import StageError, StorageError
+from stereorig.server.base.metrics import Metrics
+from stereorig.server.base.streams import Streams
+from stereorig.server.workflows.service import Service
+from tests.support.patience import Deadline
 from tests.support.service_rig import new_test, wait_for_job, wait_for_rig
 
 API = "/api/v1"
@@ -37,9 +38,9 @@ def value(samples: Samples, name: str, **labels: str) -> float:
 
 
 def await_value(client: httpx.Client, name: str, wanted: Callable[[float], bool], **labels: str) -> None:
-    deadline = time.monotonic() + 20.0
+    deadline = Deadline(20.0)
     while not wanted(value(scrape(client), name, **labels)):
-        assert time.monotonic() < deadline, value(scrape(client), name, **labels)
+        assert deadline.left, value(scrape(client), name, **labels)
         time.sleep(0.05)
 
 
@@ -51,7 +52,7 @@ def test_captures_frames_jobs_and_stops_are_counted_and_timed(client: httpx.Clie
         assert client.post(f"{API}/tests/{test_id}/steps", json={}).status_code == 201
     job = client.post(f"{API}/stage/moves", json={"positions_mm": {"1": 0.4}}).json()["job"]
     assert wait_for_job(client, job)["state"] == "succeeded"
-    assert client.post(f"{API}/stage/stop").status_code == 200
+    assert client.post(f"{API}/stage:stop").status_code == 200
     after = scrape(client)
 
     def more(name: str, **labels: str) -> float:

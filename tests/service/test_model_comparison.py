@@ -12,11 +12,11 @@ import meshio
 import numpy as np
 import pytest
 
-from server.cli.main import main
-from server.report.build import make_report
-from server.report.source import find_source
-from server.store.verify import verify
-from server.workflows.service import Service
+from stereorig.server.cli.main import main
+from stereorig.server.report.build import make_report
+from stereorig.server.report.source import find_source
+from stereorig.server.store.verify import verify
+from stereorig.server.workflows.service import Service
 from tests.support.model_bench import MM_PER_PX, bench, kirsch, mesh, write_model, write_result
 from tests.support.service_rig import new_test, served, tiny_config
 
@@ -209,3 +209,37 @@ def test_the_report_shows_the_newest_models(service: Service, client: httpx.Clie
     assert "wrong.xdmf" in part
     assert "The model is refuted" in part
     assert "data:image/png;base64," in part
+
+
+def test_a_plane_model_is_compared_in_its_plane_by_every_door(
+    service: Service, client: httpx.Client, url: str, folder: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    surface = mesh(kirsch(radius_mm=HOLE_MM), half_mm=6.0, hole_mm=HOLE_MM)
+    flat = {"displacement": surface.displacement_mm[:, :2]}
+    meshio.write(tmp_path / "plane.vtu", meshio.Mesh(surface.nodes_mm, [("triangle", surface.triangles)], flat))
+    rows = np.column_stack([surface.displacement_mm[:, :2], surface.nodes_mm, 7.0 + surface.nodes_mm[:, :2]])
+    titles = '"U:0","U:1","Points:0","Points:1","Points:2","disp:0","disp:1"'
+    np.savetxt(tmp_path / "viewer.csv", rows, delimiter=",", header=titles, comments="")
+    for name, form in (("plane.vtu", {}), ("viewer.csv", {"displacement": "U"})):
+        model = kept(client, url, tmp_path / name, unit="mm", **form)
+        found = compared(client, url, model)
+        assert (found["left_out"], found["accepted"]) == ("w_mm", True)
+        assert found["displacement"]["rms"]["w_mm"] is found["displacement"]["rms_z"]["w_mm"] is None
+        assert found["regions"][0]["displacement"]["degrees"] == 2
+        assert found["regions"][0]["difference"]["w_mm"] == {"value": None, "sigma": None, "units": "mm"}
+        assert found["strain"]["rms"]["exx"] > 0.0
+        answer = client.post(f"{url}/comparison", params={"format": "vtu"}, json={"model_id": model["id"]})
+        (tmp_path / "c.vtu").write_bytes(answer.content)
+        data = meshio.read(tmp_path / "c.vtu").point_data
+        assert np.isnan(data["difference_w_mm"]).all()
+        assert np.isfinite(data["difference_v_mm"][data["model_status"] == 0]).all()
+        args = ["compare-model", str(folder), "--model", str(tmp_path / name), "--unit", "mm", "--align", "best-fit"]
+        assert main([*args, *(["--displacement", form["displacement"]] if form else [])]) == 0
+        assert "plane model: w is left out of difference, chi-square and verdict" in capsys.readouterr().out
+    test_id, analysis_id = model["test_id"], url.split("/")[-1]
+    page = make_report(find_source(service.tests.analyses.path(test_id, analysis_id))).page.decode()
+    assert "A plane model: W is left out." in page
+    models = f"{url.split('/analyses')[0]}/models"
+    with (tmp_path / "viewer.csv").open("rb") as file:
+        answer = client.post(models, files={"file": ("viewer.csv", file)}, data={"unit": "mm"})
+    assert answer.json()["code"] == "model_displacement_unclear"

@@ -13,12 +13,12 @@ import httpx
 import numpy as np
 import pytest
 
-import server.store.folder
-from core.errors import FileFormatError
-from server.formats.images import encode_tiff
-from server.store.folder import DataFolder
-from server.store.verify import verify
-from server.workflows.service import Service
+import stereorig.server.store.folder
+from stereorig.core.errors import FileFormatError
+from stereorig.server.formats.images import encode_tiff
+from stereorig.server.store.folder import DataFolder
+from stereorig.server.store.verify import verify
+from stereorig.server.workflows.service import Service
 from tests.support.problems import assert_problem
 from tests.support.service_rig import served, tiny_config, wait_for_job, wait_for_rig
 
@@ -78,7 +78,7 @@ def test_every_label_is_kept_to_the_letter_and_names_no_file(service: Service, c
         assert document["name"] == name
         steps = {"0000", "0001"} & {p.name for p in (root / "tests" / test_id / "steps").iterdir()}
         assert {p.name for p in (root / "tests" / test_id).rglob("*")} == {
-            *("test.json", "steps", "analyses", "step.json", "cam1.tif", "cam2.tif"),
+            *("test.json", "manifest.json", "steps", "analyses", "step.json", "cam1.tif", "cam2.tif"),
             *steps,
         }
     labelled = client.post(f"{API}/noise", json={"label": NAMES[0], "frames": 2})
@@ -121,7 +121,7 @@ class Jumping(datetime):
 
 @pytest.mark.fault(7)
 def test_order_stands_when_the_clock_steps_back_and_forward(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server.store.folder, "datetime", Jumping)
+    monkeypatch.setattr(stereorig.server.store.folder, "datetime", Jumping)
     service = Service(tiny_config(), tmp_path / "data").start()
     jumps = [0, -3600, 86400 * 365 * 10, -86400 * 365 * 40, 1, 0]
     tests: list[str] = []
@@ -181,7 +181,7 @@ def test_a_folder_of_an_older_format_opens(tmp_path: Path, content: str | None) 
 
 
 @pytest.mark.fault(10)
-@pytest.mark.parametrize("content", ['{"format": 2}', '{"format": "new"}', "{}", '{"format": 1e9}', '{"format": true}'])
+@pytest.mark.parametrize("content", ['{"format": 3}', '{"format": "new"}', "{}", '{"format": 1e9}', '{"format": true}'])
 def test_a_folder_of_a_newer_format_is_refused_by_every_command(tmp_path: Path, content: str) -> None:
     DataFolder(tmp_path / "data").open().close()
     (tmp_path / "data" / "format.json").write_text(content)
@@ -190,9 +190,9 @@ def test_a_folder_of_a_newer_format_is_refused_by_every_command(tmp_path: Path, 
     assert caught.value.code == "data_format_newer"
     with pytest.raises(FileFormatError):
         verify(tmp_path / "data")
-    if "2" not in content:
+    if "3" not in content:
         return
-    command = [sys.executable, "-m", "server.cli", "serve", "--port", "0", "--data", str(tmp_path / "data")]
+    command = [sys.executable, "-m", "stereorig.server.cli", "serve", "--port", "0", "--data", str(tmp_path / "data")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1
     assert "data_format_newer" in done.stderr

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import tomllib
 
@@ -10,9 +9,10 @@ import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from server.api.docs.problem_pages import known_problems
-from server.cli.main import main
-from server.config.rig_file import ServiceSection
+from stereorig.server.api.docs.problem_pages import known_problems
+from stereorig.server.cli.main import main
+from stereorig.server.config.rig_file import ServiceSection
+from tests.support.api_description import current
 from tests.support.requirements import ROOT
 from tests.support.service_rig import wait_for_rig
 
@@ -75,8 +75,7 @@ def test_every_code_of_the_table_is_one_that_the_service_gives() -> None:
 
 
 def test_the_paths_it_names_are_operations() -> None:
-    described = json.loads((ROOT / "docs" / "openapi.json").read_text(encoding="utf-8"))["paths"]
-    plain = {re.sub(r"\{[a-z_]+\}", "{}", path.removeprefix("/api/v1")) for path in described}
+    plain = {re.sub(r"\{[a-z_]+\}", "{}", path.removeprefix("/api/v1")) for path in current()["paths"]}
     for method, path in re.findall(r"`(GET|POST|PUT|PATCH|DELETE) ([^`]+)`", TEXT):
         named = re.sub(r"\{[a-z_]+\}", "{}", path).removeprefix("...")
         end = "{}:" + named.rpartition(":")[2] if path.startswith("...") else named

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from server.results.images.previews import (
+from stereorig.server.results.images.previews import (
     GOOD_PX,
     NOISE_SHARE,
     eight_bit,

@@ -10,11 +10,11 @@ from pathlib import Path
 import httpx
 import pytest
 
-from server.api.docs.problem_pages import known_problems
+from stereorig.server.api.docs.problem_pages import known_problems
 from tests.bench.documents.problem_list import LIST, PACKAGES, ROOT, scan, text_of, tree
 
 STATIC = ROOT / "server" / "static"
-COMMAND = "run `make openapi` (python -m tests.bench.documents.problem_list) and commit what it writes"
+COMMAND = "run `make problems` and commit what it writes"
 # keywords named code that are no code of a problem
 OTHER = {"ok"}
 

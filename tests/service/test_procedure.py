@@ -11,12 +11,12 @@ import httpx
 import numpy as np
 import pytest
 
-from core.errors import InputError
-from server.cli.main import main
-from server.config.rig_file import parse_config
-from server.results.certificate.plan import CertificatePlan
-from server.results.certificate.procedure import procedure_of
-from server.workflows.service import Service
+from stereorig.core.errors import InputError
+from stereorig.server.cli.main import main
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.results.certificate.plan import CertificatePlan
+from stereorig.server.results.certificate.procedure import procedure_of
+from stereorig.server.workflows.service import Service
 from tests.support.service_rig import SMALL, new_test, served, true_cameras, wait_for_job, wait_for_rig
 
 API = "/api/v1"

@@ -8,9 +8,10 @@ from collections import namedtuple
 import httpx
 import pytest
 
-import server.store.folder
-from server.base.problem import JobProblem
-from server.workflows.service import Service
+import stereorig.server.store.folder
+from stereorig.server.base.problem import JobProblem
+from stereorig.server.workflows.service import Service
+from tests.support.patience import Deadline
 from tests.support.problems import assert_problem
 from tests.support.service_rig import new_test, wait_for_job, wait_for_rig
 
@@ -22,15 +23,17 @@ pytestmark = pytest.mark.warm_worker
 
 @pytest.fixture
 def nearly_full(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server.store.folder.shutil, "disk_usage", lambda _: Usage(10**12, 10**12 - 10**6, 10**6))
+    monkeypatch.setattr(
+        stereorig.server.store.folder.shutil, "disk_usage", lambda _: Usage(10**12, 10**12 - 10**6, 10**6)
+    )
 
 
 def test_it_is_ready_once_rig_worker_and_disk_are(service: Service, client: httpx.Client) -> None:
-    deadline = time.monotonic() + 120.0
+    deadline = Deadline(120.0)
     while not (answer := client.get(f"{API}/readyz")).json()["ready"]:
         assert answer.status_code == 503
         assert {reason["code"] for reason in answer.json()["reasons"]} <= {"worker_starting", "not_connected"}
-        assert time.monotonic() < deadline
+        assert deadline.left
         time.sleep(0.1)
     assert answer.status_code == 200
     assert answer.json() == {"ready": True}
@@ -41,7 +44,7 @@ def test_it_is_ready_once_rig_worker_and_disk_are(service: Service, client: http
 def test_a_lost_rig_is_a_reason(service: Service, client: httpx.Client) -> None:
     wait_for_rig(client)
     fault = service.rig._fault
-    service.rig._fault = JobProblem(code="stage_lost", cause="The controller is silent.", remedy="Look.")
+    service.rig._fault = JobProblem(code="stage_lost", detail="The controller is silent.", remedy="Look.")
     try:
         answer = client.get("/readyz")
         assert answer.status_code == 503

@@ -10,12 +10,12 @@ from typing import Any
 import httpx
 import pytest
 
-from server.api.models.recipes import RECIPE_VERSION
-from server.cli import main
-from server.report.source import find_source
-from server.results.gauges.request import GaugeRequest
-from server.store.verify import verify
-from server.workflows.service import Service
+from stereorig.server.api.models.recipes import RECIPE_VERSION
+from stereorig.server.cli import main
+from stereorig.server.report.source import find_source
+from stereorig.server.results.gauges.request import GaugeRequest
+from stereorig.server.store.verify import verify
+from stereorig.server.workflows.service import Service
 from tests.support.copied_tests import write_test_folder
 from tests.support.problems import assert_problem
 from tests.support.service_rig import TINY, new_test, served, tiny_config, true_cameras, wait_for_job

@@ -8,9 +8,9 @@ import httpx
 import numpy as np
 import pytest
 
-from core.cameras.camera import Camera
-from server.config.rig_file import parse_config
-from server.workflows.service import Service
+from stereorig.core.cameras.camera import Camera
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.workflows.service import Service
 from tests.support.service_rig import SMALL, new_test, plate_test, true_cameras, wait_for_job
 
 API = "/api/v1"

@@ -23,12 +23,12 @@ import xarray
 from PIL import Image
 from scipy.optimize import fsolve
 
-from server.cli import main
-from server.config.rig_file import parse_config
-from server.report.source import find_source
-from server.report.steps import read_steps
-from server.workflows.service import Service
-from sim.texture import speckle
+from stereorig.server.cli import main
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.report.source import find_source
+from stereorig.server.report.steps import read_steps
+from stereorig.server.workflows.service import Service
+from stereorig.sim.texture import speckle
 from tests.support.independent_rig import PlainCamera
 from tests.support.report_page import Page
 from tests.support.service_rig import SMALL, served, wait_for_job, wait_for_rig
@@ -438,7 +438,7 @@ def test_pictures_are_pictures_with_a_bar_and_a_unit(page: Page) -> None:
             assert b"<svg" in base64.b64decode(data)
 
 
-def test_nothing_is_asked_of_anyone_else(answered: Answered) -> None:
+def test_the_page_loads_nothing_from_elsewhere(answered: Answered) -> None:
     answer, page = answered.response, Page(answered.response.text)
     for tag, attributes in page.tags:
         assert tag not in {"script", "link", "iframe", "object", "embed", "base", "form"}, tag

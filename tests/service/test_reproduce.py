@@ -12,9 +12,9 @@ from typing import Any
 import netCDF4
 import pytest
 
-from server.cli.main import main
-from server.config.rig_file import parse_config
-from server.workflows.service import Service
+from stereorig.server.cli.main import main
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.workflows.service import Service
 from tests.support.measured_test import API, measured_test
 from tests.support.service_rig import SMALL, served, wait_for_job
 
@@ -39,8 +39,9 @@ def reproduced(data: Path, name: str, capsys: pytest.CaptureFixture[str]) -> tup
 
 
 def changed(data: Path, name: str, n: int, change: Callable[[Any], None]) -> None:
-    """Change a result of an analysis, and its checksum with it."""
+    """Change a result of an analysis, and its checksum with it, in a folder that never had a manifest."""
     test_id, analysis_id = name.split("/")
+    (data / "tests" / test_id / "manifest.json").unlink(missing_ok=True)
     path = data / "tests" / test_id / "analyses" / analysis_id / f"step_{n:04d}.nc"
     with netCDF4.Dataset(path, "a") as dataset:
         dataset.set_auto_mask(False)
@@ -131,7 +132,7 @@ def test_a_result_from_before_environments_were_kept_says_so(
     ("spoil", "code"),
     [
         ("steps/0001/cam2.tif", "checksum_mismatch"),
-        ("calibration.json", "calibration_changed"),
+        ("calibration.json", "checksum_mismatch"),
         ("analyses/*/step_0001.nc", "checksum_mismatch"),
     ],
 )

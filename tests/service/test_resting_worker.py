@@ -8,9 +8,10 @@ import time
 import psutil
 import pytest
 
-from core.errors import Cancelled
-from server.worker import resting
-from server.worker.resting import RestingWorker
+from stereorig.core.errors import Cancelled
+from stereorig.server.worker import resting
+from stereorig.server.worker.resting import RestingWorker
+from tests.support.patience import Deadline
 
 
 def test_it_works_in_one_process_and_ends_it_after_a_rest(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -19,9 +20,9 @@ def test_it_works_in_one_process_and_ends_it_after_a_rest(monkeypatch: pytest.Mo
     first = worker.submit(os.getpid).result(timeout=60.0)
     assert worker.submit(os.getpid).result(timeout=60.0) == first != os.getpid()
     assert worker.unfinished == 0
-    deadline = time.monotonic() + 30.0
+    deadline = Deadline(30.0)
     while psutil.pid_exists(first):
-        assert time.monotonic() < deadline
+        assert deadline.left
         time.sleep(0.05)
     assert worker.submit(os.getpid).result(timeout=60.0) != first
     worker.close()

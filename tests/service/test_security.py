@@ -7,7 +7,6 @@ import io
 import json
 import re
 import resource
-import socket
 import struct
 import threading
 import time
@@ -21,12 +20,15 @@ import numpy as np
 import pytest
 import tifffile
 
-from server.api.app import create_app
-from server.http.access import KeyFile
-from server.http.server import OrderlyServer
-from server.workflows.service import Service
+from stereorig.server.api.app import create_app
+from stereorig.server.front.front import ConnectionLimits
+from stereorig.server.http import shutout
+from stereorig.server.http.access import KeyFile
+from stereorig.server.workflows.service import Service
+from tests.support.fronted import fronted, web_process
 from tests.support.raw_http import ask, send
 from tests.support.service_rig import new_test, tiny_config, wait_for_rig
+from tests.support.stage_service import wait_until
 
 API = "/api/v1"
 #: texts that must stay inside
@@ -45,19 +47,11 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def guarded(base: Path) -> Iterator[tuple[Service, int]]:
     service = Service(tiny_config(), base / "data").start()
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    listener.bind(("127.0.0.1", 0))
-    listener.listen()  # who comes before the server is up waits in the queue
-    server = OrderlyServer(create_app(service, close_service=False), service)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
-    thread.start()
-    while not server.started:
-        time.sleep(0.01)
-    yield service, int(listener.getsockname()[1])
-    service.stop_streams()
-    server.should_exit = True
-    thread.join(20.0)
-    listener.close()
+    app = create_app(service, close_service=False)
+    with web_process(app, base / "web"), fronted(base / "web", ConnectionLimits()) as front:
+        front.permits = False  # this process' own decides
+        yield service, front.port
+        service.stop_streams()
     service.close()
 
 
@@ -137,9 +131,9 @@ def test_its_own_names_are_served_with_any_port(port: int, host: str) -> None:
         "http://localhost.evil.example",
     ],
 )
-def test_pages_of_others_move_nothing_and_read_nothing(client: httpx.Client, port: int, origin: str) -> None:
+def test_pages_of_other_sites_can_neither_move_nor_read(client: httpx.Client, port: int, origin: str) -> None:
     for method, path in (
-        ("POST", "/stage/stop"),
+        ("POST", "/stage:stop"),
         ("GET", "/rig"),
         ("DELETE", "/tests/t000001-abcdef"),
         ("OPTIONS", "/rig"),
@@ -212,8 +206,9 @@ def test_the_name_in_the_target_counts_as_little_as_a_second_host(port: int) -> 
 
 @pytest.mark.fault(45)
 def test_a_wrong_key_learns_nothing_from_any_operation(
-    guarded: tuple[Service, int], client: httpx.Client, port: int
+    guarded: tuple[Service, int], client: httpx.Client, port: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(shutout, "MOST_WRONG", 10_000)  # ten would shut this address out for a minute
     service, _ = guarded
     KeyFile(service.folder.root).add("somebody", "operator")
     paths = client.get(f"{API}/openapi.json").json()["paths"]
@@ -311,7 +306,7 @@ def test_names_in_uploads_and_labels_are_kept_as_text_or_refused(client: httpx.C
     for body in ({"name": name}, {"name": "x", "specimen": name, "notes": name}):
         assert client.post(f"{API}/tests", json=body).status_code in (201, 422)
     folders = {path.name for path in (base / "data" / "tests" / test_id).rglob("*")}
-    allowed = r"steps|analyses|test\.json|\d{4}|cam[12]\.tif|step\.json|incomplete-.*|channels.*"
+    allowed = r"steps|analyses|test\.json|manifest\.json|\d{4}|cam[12]\.tif|step\.json|incomplete-.*|channels.*"
     assert all(re.fullmatch(allowed, folder) for folder in folders), folders
     assert outside(base) == before
 
@@ -338,7 +333,7 @@ def test_a_link_in_the_data_folder_gives_away_nothing(client: httpx.Client, base
 )
 @pytest.mark.parametrize("value", ["a%0d%0aX-Evil: 1", "a\x00b", "é" * 10, "a" * 5000, "\t", '"', "a\x7fb"])
 def test_no_header_of_a_client_becomes_a_header_of_ours(port: int, header: str, value: str) -> None:
-    for method, path in (("GET", "/healthz"), ("POST", "/stage/stop")):
+    for method, path in (("GET", "/healthz"), ("POST", "/stage:stop")):
         answer = ask(port, method, API + path, f"{header}: {value}")
         assert answer.status in (200, 400, 401, 403, 422), answer
         assert "x-evil" not in answer.headers
@@ -359,6 +354,8 @@ def test_what_is_logged_stays_one_line(guarded: tuple[Service, int], port: int) 
     before = len(log.read_text(encoding="utf-8").split("\n")) if log.exists() else 1
     forged = "%0a%7b%22who%22:%22admin%22%7d%0d%e2%80%a8"
     ask(port, "POST", f"{API}/tests/{forged}", "Content-Type: application/json", body=b"{}")
+    # the line is written once the answer is on its way
+    wait_until(lambda: len(log.read_text(encoding="utf-8").split("\n")) > before)
     after = log.read_text(encoding="utf-8").split("\n")
     assert len(after) == before + 1
     assert json.loads(after[-2])["path"].startswith(f"{API}/tests/\n")

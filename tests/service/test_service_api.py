@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from server.formats.images import decode_image
-from server.workflows.service import Service
+from stereorig.server.formats.images import decode_image
+from stereorig.server.workflows.service import Service
+from tests.support.patience import busy
 from tests.support.problems import assert_problem
 from tests.support.service_rig import new_test, served, tiny_config, wait_for_job, wait_for_rig
 
@@ -65,9 +66,12 @@ def test_every_operation_documents_its_errors_as_problems(client: httpx.Client) 
 @pytest.mark.fault(45)
 def test_foreign_host_and_origin_are_refused(client: httpx.Client) -> None:
     assert_problem(client.get(f"{API}/rig", headers={"Host": "evil.example"}), 403, "foreign_host")
-    answer = client.post(f"{API}/stage/stop", headers={"Origin": "http://evil.example"})
+    answer = client.post(f"{API}/stage:stop", headers={"Origin": "http://evil.example"})
     assert_problem(answer, 403, "foreign_origin")
-    assert client.get(f"{API}/rig", headers={"Origin": "http://localhost:8000"}).status_code == 200
+    own = str(client.base_url).rstrip("/")
+    assert client.get(f"{API}/rig", headers={"Origin": own}).status_code == 200
+    for other in ("http://127.0.0.1:1", "http://127.0.0.1", own.replace("127.0.0.1", "localhost"), f"ws{own[4:]}"):
+        assert_problem(client.post(f"{API}/stage:stop", headers={"Origin": other}), 403, "foreign_origin")
 
 
 def test_unknown_path_and_method_are_problems(client: httpx.Client) -> None:
@@ -158,34 +162,34 @@ def test_second_client_gets_the_holder_and_stop_works_during_a_move(client: http
     job = client.post(f"{API}/stage/moves", json={"positions_mm": {"1": 6.0}}).json()["job"]
     problem = assert_problem(client.post(f"{API}/stage/moves", json={"positions_mm": {"2": 1.0}}), 409, "hardware_busy")
     assert problem["holder"]["job_id"] == job["id"]  # type: ignore[index]
-    stopped = client.post(f"{API}/stage/stop").json()
+    stopped = client.post(f"{API}/stage:stop").json()
     assert stopped["cancelled_job"] == job["id"]
     done = wait_for_job(client, job)
     assert done["state"] == "cancelled"
     axis = client.get(f"{API}/stage").json()["axes"][0]
     assert axis["moving"] is False
     assert axis["position_mm"] < 5.9
-    home = client.post(f"{API}/stage/home").json()["job"]
+    home = client.post(f"{API}/stage:home").json()["job"]
     assert wait_for_job(client, home)["state"] == "succeeded"
     assert client.get(f"{API}/stage").json()["axes"][0]["position_mm"] == pytest.approx(0.0, abs=0.002)
 
 
 def test_cancelling_a_move_stops_the_axis(client: httpx.Client) -> None:
     job = client.post(f"{API}/stage/moves", json={"positions_mm": {"2": -5.5}}).json()["job"]
-    assert client.post(f"{API}/jobs/{job['id']}/cancel").status_code == 202
+    assert client.post(f"{API}/jobs/{job['id']}:cancel").status_code == 202
     assert wait_for_job(client, job)["state"] == "cancelled"
     axis = client.get(f"{API}/stage").json()["axes"][1]
     assert axis["moving"] is False
     assert axis["position_mm"] > -5.4
-    assert wait_for_job(client, client.post(f"{API}/stage/home").json()["job"])["state"] == "succeeded"
+    assert wait_for_job(client, client.post(f"{API}/stage:home").json()["job"])["state"] == "succeeded"
 
 
 def test_stop_without_a_job_is_fine(client: httpx.Client) -> None:
-    assert client.post(f"{API}/stage/stop").json()["cancelled_job"] is None
+    assert client.post(f"{API}/stage:stop").json()["cancelled_job"] is None
 
 
 def test_reconnect_brings_the_rig_back(client: httpx.Client) -> None:
-    job = client.post(f"{API}/rig/reconnect").json()["job"]
+    job = client.post(f"{API}/rig:reconnect").json()["job"]
     assert wait_for_job(client, job)["state"] == "succeeded"
     wait_for_rig(client)
 
@@ -220,7 +224,7 @@ def test_a_board_in_a_hand_is_put_before_the_cameras_and_a_bumped_camera_stays_s
         time.sleep(0.15)
         after = decode_image(client.get(f"{API}/cameras/cam1/frame", params={"format": "tiff"}).content).astype(float)
         assert np.abs(after - before).mean() > 5.0
-        job = client.post(f"{API}/rig/reconnect").json()["job"]
+        job = client.post(f"{API}/rig:reconnect").json()["job"]
         assert wait_for_job(client, job)["state"] == "succeeded"
         wait_for_rig(client)
     for wrong in ({"hand": -1}, {"pose": [1.0]}, {"size": [1e9, 1e9]}, {"dictionary": "DICT_1"}, {"bump_cam1": [1.0]}):
@@ -242,6 +246,7 @@ def test_step_is_on_disk_with_its_checksums_when_it_is_acknowledged(client: http
     assert body["load_n"] == 12.5
     assert body["quality"]["code"] == "ok"
     assert body["skew_ms"] < 1.0
+    assert (body["skew_source"], body["skew_uncertainty_ms"]) == ("clock", 0.0)
     folder = service.folder.tests / test_id / "steps" / "0000"
     assert sorted(p.name for p in folder.iterdir()) == ["cam1.tif", "cam2.tif", "step.json"]
     for cam in ("cam1", "cam2"):
@@ -478,7 +483,7 @@ def test_job_events_end_with_the_job(client: httpx.Client) -> None:
 def test_cancelling_a_finished_job_says_its_state(client: httpx.Client) -> None:
     job = client.post(f"{API}/stage/moves", json={"positions_mm": {"1": 0.0}}).json()["job"]
     wait_for_job(client, job)
-    problem = assert_problem(client.post(f"{API}/jobs/{job['id']}/cancel"), 409, "job_finished")
+    problem = assert_problem(client.post(f"{API}/jobs/{job['id']}:cancel"), 409, "job_finished")
     assert problem["state"] == "succeeded"
 
 
@@ -526,11 +531,11 @@ def test_a_lost_camera_is_shown_and_comes_back_by_reconnecting(service: Service,
     faults_of(service, "cam2").gone = True  # type: ignore[attr-defined]
     began = time.monotonic()
     assert_problem(client.post(f"{API}/tests/{test_id}/steps", json={}), 503, "camera_lost")
-    assert time.monotonic() - began < 1.0
+    assert time.monotonic() - began < 1.0 * busy()
     while (fault := client.get(f"{API}/rig").json()["cameras"]["cam2"]["fault"]) is None:
-        assert time.monotonic() - began < 1.0
+        assert time.monotonic() - began < 1.0 * busy()
     assert fault["code"] == "camera_lost"
-    assert wait_for_job(client, client.post(f"{API}/rig/reconnect").json()["job"])["state"] == "succeeded"
+    assert wait_for_job(client, client.post(f"{API}/rig:reconnect").json()["job"])["state"] == "succeeded"
     wait_for_rig(client)
     assert client.get(f"{API}/rig").json()["cameras"]["cam2"]["fault"] is None
     assert client.get(f"{API}/cameras/cam2").json()["settings"]["exposure_ms"] == 8.0
@@ -551,10 +556,10 @@ def test_a_jammed_axis_ends_move_and_calibration_with_a_fault(
         job = client.post(f"{API}/stage/moves", json={"positions_mm": {"2": 1.0}}).json()["job"]
         assert wait_for_job(client, job)["problem"]["code"] == "motion_fault"
         axis.faults.jam_mm = None
-        assert wait_for_job(client, client.post(f"{API}/stage/home").json()["job"])["state"] == "succeeded"
+        assert wait_for_job(client, client.post(f"{API}/stage:home").json()["job"])["state"] == "succeeded"
         axis.faults.jam_mm = (-0.5, 2.5)  # on the way to 5 mm
         # this rig's lines are too thin to be found, and the jam comes after the first look
-        monkeypatch.setattr("server.workflows.calibration.sequence.look_first", lambda *_: None)
+        monkeypatch.setattr("stereorig.server.workflows.calibration.sequence.look_first", lambda *_: None)
         plan = {"positions_mm": [0, 5], "held_out_mm": [], "frames": 2}
         answer = client.post(f"{API}/calibrations", json=plan)
         assert answer.status_code == 202, answer.text
@@ -565,7 +570,7 @@ def test_a_jammed_axis_ends_move_and_calibration_with_a_fault(
         assert calibration["problem"]["code"] == "motion_fault"
     finally:
         axis.faults.jam_mm = None
-    assert wait_for_job(client, client.post(f"{API}/stage/home").json()["job"])["state"] == "succeeded"
+    assert wait_for_job(client, client.post(f"{API}/stage:home").json()["job"])["state"] == "succeeded"
 
 
 @pytest.mark.fault(23)
@@ -576,7 +581,7 @@ def test_moves_before_homing_are_refused(tmp_path: Path) -> None:
             # the simulated controller powers up with its motors off and without a position
             assert_problem(own.post(f"{API}/stage/moves", json={"positions_mm": {"1": 1.0}}), 409, "motor_off")
             assert_problem(own.post(f"{API}/calibrations"), 409, "motor_off")
-            assert wait_for_job(own, own.post(f"{API}/stage/home").json()["job"])["state"] == "succeeded"
+            assert wait_for_job(own, own.post(f"{API}/stage:home").json()["job"])["state"] == "succeeded"
             job = own.post(f"{API}/stage/moves", json={"positions_mm": {"1": 1.0}}).json()["job"]
             assert wait_for_job(own, job)["state"] == "succeeded"
     finally:

@@ -7,15 +7,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import httpx
 import numpy as np
 import pytest
 
-from server.formats.calibrations.recognise import load_calibration
-from server.formats.images import encode_tiff
-from server.formats.results.reading import read_head
-from server.workflows.service import Service
+from stereorig.server.formats.calibrations.recognise import load_calibration, parse_calibration
+from stereorig.server.formats.images import decode_image, encode_tiff
+from stereorig.server.formats.results.reading import read_head
+from stereorig.server.workflows.service import Service
 from tests.support.service_rig import new_test, served, tiny_config, wait_for_job
+from tests.support.written_tiffs import HEIGHT, WIDTH, tiff
 
 API = "/api/v1"
 OURS = {
@@ -159,9 +161,47 @@ def test_images_of_another_size_than_the_calibrations_are_refused_when_they_come
     assert client.get(f"{API}/tests/{test_id}").json()["steps"] == []
 
 
-def test_an_address_in_place_of_a_file_is_refused_in_words_of_who_sent_it(client: httpx.Client) -> None:
+def test_an_address_in_place_of_a_file_is_refused_in_plain_words(client: httpx.Client) -> None:
     form = {"cam1": "s3://bucket/left_0000.tif", "cam2": "s3://bucket/right_0000.tif"}
     answer = client.post(f"{API}/tests/{new_test(client)}/steps:import", data=form)
     assert answer.status_code == 422
-    assert "cam1: must be a file that is sent, got 's3://bucket/left_0000.tif'." in answer.json()["detail"]
+    assert "cam1: Input should be a file, got 's3://bucket/left_0000.tif'." in answer.json()["detail"]
     assert "class" not in answer.json()["detail"]
+
+
+def test_a_calibration_in_metres_is_asked_about_and_its_unit_is_taken(client: httpx.Client) -> None:
+    matrix, lens = "[[1400, 0, 64], [0, 1400, 64], [0, 0, 1]]", "[0, 0, 0, 0, 0]"
+    text = (
+        f"M1: {matrix}\nD1: {lens}\nM2: {matrix}\nD2: {lens}\nR: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\nT: [-0.08, 0, 0]\n"
+    )
+    asked = imported(client, text.encode()).json()["plan"]["check"]
+    assert any("a baseline of 0.08 mm? It seems to be in metres." in warning for warning in asked["warnings"])
+    made = imported(client, text.encode(), data={"unit": "m"}).json()
+    assert made["plan"]["check"]["baseline_mm"] == pytest.approx(80.0)
+    assert not any("unit of T" in warning for warning in made["plan"]["check"]["warnings"])
+    file = client.get(f"{API}/calibrations/{made['id']}/file").content
+    assert parse_calibration(file, name="a").pair.baseline_mm == pytest.approx(80.0)
+    refused(imported(client, file, data={"unit": "mm"}), 422, "calibration_unit_conflict")
+    refused(imported(client, text.encode(), data={"unit": "ell"}), 422, "calibration_unit_unknown")
+    half = text[text.index("R:") :]
+    answer = imported(client, f"# opencv\n{half}".encode())
+    refused(answer, 422, "calibration_unreadable")
+    assert "M1 D1 M2 D2 are in the other" in answer.text
+
+
+def test_twelve_packed_bits_are_imported_with_their_own_full_scale(client: httpx.Client) -> None:
+    rng = np.random.default_rng(4)
+    scenes = [cv2.GaussianBlur(rng.normal(size=(HEIGHT, WIDTH)), (0, 0), 1.5) for _ in range(2)]
+    images = [
+        cv2.normalize(scene, None, 400, 5000, cv2.NORM_MINMAX).clip(0, 4095).astype(np.uint16) for scene in scenes
+    ]
+    files = {
+        cam: (cam, tiff(image[..., None], 12, "strips", "none", "<", planar=False, big=False, differences=False))
+        for cam, image in zip(("cam1", "cam2"), images, strict=True)
+    }
+    test_id = new_test(client)
+    step = client.post(f"{API}/tests/{test_id}/steps:import", files=files).json()
+    assert step["quality"]["code"] == "saturated"
+    assert step["quality"]["cam1"]["saturated_share"] == pytest.approx(np.mean(images[0] == 4095), abs=1e-5)
+    kept = client.get(f"{API}/tests/{test_id}/steps/0/cam1").content
+    np.testing.assert_array_equal(decode_image(kept), images[0])

@@ -17,16 +17,17 @@ from typing import Any
 
 import pytest
 
-from core.errors import Cancelled, FileFormatError, StateError, StorageError
-from server.base.errors import BusyError, QueueFullError
-from server.jobs.hardware import HardwareHold
-from server.jobs.job import Job, Phase
-from server.store.catalog import Catalog
-from server.store.folder import DataFolder
-from server.workflows.service import Service
-from server.workflows.waiting import run_task
+from stereorig.core.errors import Cancelled, FileFormatError, StateError, StorageError
+from stereorig.server.base.errors import BusyError, QueueFullError
+from stereorig.server.jobs.hardware import HardwareHold
+from stereorig.server.jobs.job import Job, Phase
+from stereorig.server.store.catalog import Catalog
+from stereorig.server.store.folder import DataFolder
+from stereorig.server.workflows.service import Service
+from stereorig.server.workflows.waiting import run_task
 from tests.support import worker_functions as work
 from tests.support.job_bench import Bench
+from tests.support.patience import busy
 from tests.support.requirements import ROOT
 from tests.support.service_rig import TINY, new_test, served, tiny_config, wait_for_job, wait_for_rig
 
@@ -147,7 +148,7 @@ def test_a_failure_keeps_code_cause_and_remedy(bench: Bench) -> None:
 
     problem = bench.end_of(bench.jobs.submit("analysis", "an analysis", {}, compute(run)))["problem"]
     assert problem["code"] == "storage_failed"
-    assert problem["cause"] == "The disk is gone."
+    assert problem["detail"] == "The disk is gone."
     assert problem["remedy"]
 
 
@@ -210,8 +211,8 @@ def test_second_service_on_a_data_folder_is_told_who_has_it(tmp_path: Path) -> N
 @pytest.mark.fault(10)
 def test_a_newer_format_is_refused(tmp_path: Path) -> None:
     DataFolder(tmp_path).open().close()
-    (tmp_path / "format.json").write_text('{"format": 2}')
-    with pytest.raises(FileFormatError, match="format 2"):
+    (tmp_path / "format.json").write_text('{"format": 3}')
+    with pytest.raises(FileFormatError, match="format 3"):
         DataFolder(tmp_path).open()
 
 
@@ -304,9 +305,9 @@ def test_killed_worker_fails_its_job_and_is_started_again(tmp_path: Path) -> Non
             while job.document().progress.done < 1:
                 time.sleep(0.01)
             asked = time.monotonic()
-            assert client.post(f"/api/v1/jobs/{job.id}/cancel").json()["state"] in ("cancelling", "cancelled")
+            assert client.post(f"/api/v1/jobs/{job.id}:cancel").json()["state"] in ("cancelling", "cancelled")
             assert wait_for_job(client, {"id": job.id})["state"] == "cancelled"
-            assert time.monotonic() - asked < 1.0
+            assert time.monotonic() - asked < 1.0 * busy()
     finally:
         service.close()
 
@@ -315,7 +316,7 @@ def test_killed_worker_fails_its_job_and_is_started_again(tmp_path: Path) -> Non
 
 
 def serve(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "server.cli", "serve", *arguments]
+    command = [sys.executable, "-m", "stereorig.server.cli", "serve", *arguments]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
 
 
@@ -348,7 +349,7 @@ def test_serve_refuses_in_one_line(tmp_path: Path, arguments: list[str], code: s
     ],
 )
 def test_wrong_rig_files_name_the_field_in_one_line(tmp_path: Path, old: str, new: str, field: str) -> None:
-    from server.config.rig_file import load_config
+    from stereorig.server.config.rig_file import load_config
 
     path = tmp_path / "rig.toml"
     path.write_text(TINY.replace(old, new, 1))
@@ -362,7 +363,7 @@ def test_wrong_rig_files_name_the_field_in_one_line(tmp_path: Path, old: str, ne
 def test_serve_announces_itself_and_ends_in_order(tmp_path: Path) -> None:
     path = tmp_path / "rig.toml"
     path.write_text(TINY)
-    command = [sys.executable, "-m", "server.cli", "serve", "--config", str(path), "--port", "0", "--data"]
+    command = [sys.executable, "-m", "stereorig.server.cli", "serve", "--config", str(path), "--port", "0", "--data"]
     process = subprocess.Popen(
         [*command, str(tmp_path / "data")], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -426,7 +427,7 @@ def test_a_start_that_fails_closes_what_was_opened_before(tmp_path: Path, monkey
     def broken(*_: object) -> list[str]:
         raise StorageError("The index cannot be made.")
 
-    monkeypatch.setattr("server.workflows.service.Index.begin", broken)
+    monkeypatch.setattr("stereorig.server.workflows.service.Index.begin", broken)
     threads = threading.active_count()
     with pytest.raises(StorageError), Service(tiny_config(), tmp_path / "data"):
         pass

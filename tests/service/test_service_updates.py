@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from core.errors import FileFormatError, StereorigError, StorageError
-from core.field.points.result import Field
-from server.api.models import AnalysisRequest
-from server.compute import measurement, sequence
-from server.compute.sequence import SequenceMeasurement
-from server.formats.images import write_image
-from server.worker.process import TaskChannel
-from server.worker.tasks import StepImages, StepTask
+from stereorig.core.errors import FileFormatError, StereorigError, StorageError
+from stereorig.core.field.points.result import Field
+from stereorig.server.api.models import AnalysisRequest
+from stereorig.server.compute import measurement, sequence
+from stereorig.server.compute.sequence import SequenceMeasurement
+from stereorig.server.compute.tasks import StepImages, StepTask
+from stereorig.server.formats.images import write_image
+from stereorig.server.worker.process import TaskChannel
 from tests.support import sequence_bench as bench
 
 STEPS = (3, 4, 6, 7)  # as a test numbers them, one is missing
@@ -148,7 +148,7 @@ def test_a_step_that_was_begun_before_it_was_asked_for_is_the_same(
     measurement._kept.clear()
 
 
-def test_a_step_begun_ahead_hands_its_error_to_whoever_asks_for_it(
+def test_a_step_begun_ahead_gives_its_error_to_the_task_that_asks_for_it(
     inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = tasks(inputs, tmp_path / "broken", reference_update="never")

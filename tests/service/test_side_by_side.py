@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from core.field.sequence.joint import AGREE_SIGMAS
-from server.workflows.analysis.blocks import Blocks
+from stereorig.core.field.sequence.joint import AGREE_SIGMAS
+from stereorig.server.workflows.analysis.blocks import Blocks
 from tests.support import sequence_bench as bench
 from tests.support.copied_tests import write_test_of
 from tests.support.dask_bench import Host, cluster_of
@@ -134,7 +134,7 @@ def test_what_was_cancelled_goes_on_where_it_was_and_comes_to_the_same(
 ) -> None:
     url, job = begin(host.client, URL, **BODY)
     wait_for_steps(host.client, url, 4)
-    assert host.client.post(f"{API}/jobs/{job['id']}/cancel").status_code == 202
+    assert host.client.post(f"{API}/jobs/{job['id']}:cancel").status_code == 202
     assert wait_for_job(host.client, job)["state"] == "cancelled"
     there = {path.name for path in folder_of(host, url).glob("step_*.nc")}
     before = len(asked)

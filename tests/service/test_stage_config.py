@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import pytest
 
-from core.errors import FileFormatError
-from drivers.stages.protocol import AxisOptions
-from drivers.stages.smc100 import ConexCCStage
-from server.config.rig_file import RigConfig
-from server.rig.build import _axis_options, first_settings, open_devices
-from sim.controllers.registry import make_controller
-from sim.controllers.server import ControllerServer
-from tests.support.stage_service import rig
+from stereorig.core.errors import FileFormatError
+from stereorig.drivers.stages.protocol import AxisOptions
+from stereorig.server.config.rig_file import RigConfig, load_config, parse_config
+from stereorig.server.rig.build import _axis_options, first_settings, open_configured_stage, open_devices
+from stereorig.sim.controllers.registry import make_controller
+from stereorig.sim.controllers.server import ControllerServer
+from tests.support.fake_xps import FakeXPS
+from tests.support.fake_zaber import FakeZaber
+from tests.support.requirements import ROOT
+from tests.support.stage_service import rig, rig_text
 
 
 def refusal(more: str = "", **stage: str) -> str:
@@ -56,6 +58,7 @@ home_mode = 4
         ("[stage.axes.1]\nsoft_limits_mm = [4.0, -4.0]", "low < high"),
         ("[stage.axes.1]\nvelocity_mm_s = 0.0", "stage.axes.1.velocity_mm_s"),
         ("[stage.axes.1]\nhome_mode = 7", "stage.axes.1.home_mode"),
+        ('[stage.axes.1]\npositioner = "A.Pos)GroupKill(B"', "stage.axes.1.positioner"),
     ],
 )
 def test_a_wrong_axis_table_is_named(more: str, words: str) -> None:
@@ -69,7 +72,6 @@ def test_simulated_cameras_can_look_at_a_real_stage_which_is_not_homed_unasked()
         assert config.home_at_start is False
         devices = open_devices(config, {cam: first_settings(config, cam) for cam in ("cam1", "cam2")})  # type: ignore[misc]
         try:
-            assert isinstance(devices.stage, ConexCCStage)
             assert devices.stage.identify().driver == "conex-cc"
             assert devices.stage.identify().model == "CONEX-CC"
             assert devices.controller is None
@@ -81,6 +83,56 @@ def test_simulated_cameras_can_look_at_a_real_stage_which_is_not_homed_unasked()
             assert devices.world._position_mm(1) == pytest.approx(2.0, abs=1e-4)
         finally:
             devices.close()
+
+
+def test_a_standa_controller_has_one_axis_with_steps_of_known_length() -> None:
+    controllers = "\n".join(f'[[stage.controllers]]\nurl = "xi-com:///dev/ttyACM{n}"\naxes = [{n}]' for n in (1, 2))
+    text = rig_text(controllers, driver='"standa"')
+    text = "\n".join(line for line in text.splitlines() if not line.startswith('url = "sim"'))
+    with pytest.raises(FileFormatError, match="mm_per_step must be given"):
+        parse_config(text)
+    config = parse_config(text.replace('driver = "standa"', 'driver = "standa"\nmm_per_step = 0.00125'))
+    assert options(config, 2).mm_per_step == 0.00125
+    for driver in ("standa", "kinesis"):
+        assert "one axis" in refusal(driver=f'"{driver}"', url='"xi-com:///dev/ttyACM0"', mm_per_step="0.00125")
+
+
+def test_a_zaber_axis_is_named_by_device_and_axis_with_the_length_of_a_microstep() -> None:
+    there = {"driver": '"zaber"', "url": '"socket://127.0.0.1:55550"'}
+    assert "mm_per_step must be given for the axes [1, 2]" in refusal(**there)
+    there["mm_per_step"] = "4.096e-5"
+    for wrong in ("Left.Pos", "1.1", "100.1", "0.1"):
+        assert "a Zaber axis is device.axis" in refusal(f'[stage.axes.2]\npositioner = "{wrong}"\n', **there)
+    controller = FakeZaber(one_device=True, time_scale=50.0, start_mm=3.0)
+    with ControllerServer(controller) as server:
+        config = rig('[stage.axes.2]\npositioner = "1.2"\n', **(there | {"url": f'"{server.url}"'}))
+        stage = open_configured_stage(config)
+        try:
+            stage.home(2)
+            assert stage.move_to(2, 1.0).position_mm == pytest.approx(1.0, abs=1e-4)
+            assert controller.true_position_mm(1) == 3.0
+        finally:
+            stage.close()
+
+
+def test_an_xps_has_its_axes_by_the_names_of_the_rig_file() -> None:
+    assert "no simulated xps" in refusal(driver='"xps"')
+    there = {"driver": '"xps"', "url": '"socket://127.0.0.1:1"'}
+    assert "a group of its own" in refusal('[stage.axes.2]\npositioner = "Group1.X"\n', **there)
+    fake = FakeXPS()
+    fake.axes["Right"] = fake.axes.pop("Group2")
+    fake.states["Right"] = fake.states.pop("Group2")
+    try:
+        config = rig('[stage.axes.2]\npositioner = "Right.Pos"\n', **(there | {"url": f'"{fake.url}"'}))
+        stage = open_configured_stage(config)
+        try:
+            stage.enable(2)
+            assert stage.home(2) == pytest.approx(0.0, abs=1e-4)
+            assert [axis.serial for axis in stage.identify().axes] == ["Group1.Pos", "Right.Pos"]
+        finally:
+            stage.close()
+    finally:
+        fake.close()
 
 
 @pytest.mark.parametrize(
@@ -107,3 +159,25 @@ def test_each_controller_has_its_usual_line_and_the_rig_file_another(
         found = "hardware" if last["rtscts"] else "software" if last["xonxoff"] else "none"
         assert (last["baudrate"], found) == expected
         assert (last["url"], last["exclusive"]) == ("/dev/ttyS7", True)
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in (ROOT / "config").glob("lab_*.toml")))
+def test_the_stage_of_a_laboratorys_rig_file_opens_on_the_controller_that_it_names(name: str) -> None:
+    config = load_config(ROOT / "config" / name)
+    assert config.stage is not None
+    (line,) = config.stage.lines(config.axes)
+    controller = make_controller(line.driver, sorted(line.numbers.values()), travel_mm=(-25.0, 25.0), time_scale=100.0)
+    with ControllerServer(controller) as server:
+        own = config.model_copy(update={"stage": config.stage.model_copy(update={"url": server.url})})
+        stage = open_configured_stage(own)
+        try:
+            who = stage.identify()
+            assert (who.driver, [one.axis for one in who.axes]) == (line.driver, list(config.axes))
+            for axis in config.axes:
+                section, limits = config.axis(axis), stage.limits(axis)
+                assert (limits.low_mm, limits.high_mm) == section.soft_limits_mm
+                stage.enable(axis)
+                stage.home(axis)  # before it an SMC100 takes no speed
+                assert stage.dynamics(axis).velocity_mm_s == pytest.approx(section.velocity_mm_s)
+        finally:
+            stage.close()

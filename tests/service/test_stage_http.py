@@ -43,15 +43,15 @@ def test_nothing_moves_before_homing_nor_without_power(tmp_path_factory: pytest.
             off = driver == "esp301"  # its motors are off at power-on; the SMC100 has states of its own
             for path, body in (("/stage/moves", {"positions_mm": {"1": 1.0}}), ("/calibrations", {})):
                 problem(stand.post(path, **body), 409, "motor_off" if off else "not_homed")
-            assert stand.client.post(f"{API}/stage/enable").status_code == 200
+            assert stand.client.post(f"{API}/stage:enable").status_code == 200
             problem(stand.post("/stage/moves", positions_mm={"1": 1.0}), 409, "not_homed")
             assert not stand.controller.commands("PA")
             stand.home()
-            answer = stand.client.post(f"{API}/stage/disable", json={"axes": [1]})
+            answer = stand.client.post(f"{API}/stage:disable", json={"axes": [1]})
             assert [axis["motor_on"] for axis in answer.json()["axes"]] == [False, True]
             problem(stand.post("/stage/moves", positions_mm={"1": 1.0}), 409, "motor_off")
             assert not [text for text in stand.actions() if "PA" in text]
-            stand.post("/stage/enable", axes=[1])
+            stand.post("/stage:enable", axes=[1])
             assert stand.done(stand.job("/stage/moves", positions_mm={"1": 1.0}))["state"] == "succeeded"
 
 
@@ -79,7 +79,7 @@ def test_nothing_moves_before_homing_nor_without_power(tmp_path_factory: pytest.
         ('{"positions_mm": ', "invalid_request"),
     ],
 )
-def test_a_target_that_is_none_leaves_the_wire_as_it_was(homed: StageService, body: str, code: str) -> None:
+def test_an_invalid_target_sends_nothing(homed: StageService, body: str, code: str) -> None:
     wire = list(homed.controller.received)
     answer = homed.client.post(f"{API}/stage/moves", content=body, headers={"Content-Type": "application/json"})
     problem(answer, 422, code)
@@ -102,7 +102,7 @@ def test_a_motion_that_goes_wrong_is_stopped_and_no_calibration_comes_of_it(
     homed: StageService, trouble: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # the tiny rig's pixels do not show its grid's lines, and the target is looked for before anything moves
-    monkeypatch.setattr("server.workflows.calibration.sequence.look_first", lambda *_: None)
+    monkeypatch.setattr("stereorig.server.workflows.calibration.sequence.look_first", lambda *_: None)
 
     def break_it() -> None:
         faults = homed.axis(1).faults
@@ -158,10 +158,10 @@ def test_a_controller_that_falls_silent_is_lost_and_found_again(homed: StageServ
         homed.controller.line_faults.deaf = False
     assert len(homed.controller.commands("1PA")) == before
     problem(homed.post("/stage/moves", positions_mm={"3": 1.0}), 422, "invalid_axis")
-    homed.post("/stage/stop")
+    homed.post("/stage:stop")
     wait_until(lambda: not homed.axis(1).moving)
     homed.axis(1).velocity_mm_s = 10.0
-    assert homed.done(homed.job("/rig/reconnect"))["state"] == "succeeded"
+    assert homed.done(homed.job("/rig:reconnect"))["state"] == "succeeded"
     homed.home()
 
 
@@ -171,7 +171,7 @@ def test_a_move_whose_job_is_cancelled_is_stopped(homed: StageService) -> None:
     try:
         job = homed.job("/stage/moves", positions_mm={"1": 5.0})
         wait_until(lambda: homed.axis(1).moving)
-        assert homed.post(f"/jobs/{job['id']}/cancel").status_code == 202
+        assert homed.post(f"/jobs/{job['id']}:cancel").status_code == 202
         wait_until(lambda: not homed.axis(1).moving)
         assert homed.done(job)["state"] == "cancelled"
         assert homed.controller.true_position_mm(1) < 4.0
@@ -194,7 +194,7 @@ def test_who_sees_that_a_job_has_ended_may_move_at_once(homed: StageService) -> 
     try:
         stopped = homed.job("/stage/moves", positions_mm={"1": 5.0})
         wait_until(lambda: homed.axis(1).moving)
-        homed.post("/stage/stop")
+        homed.post("/stage:stop")
         assert homed.done(stopped)["state"] == "cancelled"
         homed.axis(1).velocity_mm_s = 10.0
         back = homed.job("/stage/moves", positions_mm={"1": 0.0})  # refused, if the hardware were still held
@@ -206,7 +206,7 @@ def test_who_sees_that_a_job_has_ended_may_move_at_once(homed: StageService) -> 
 
 
 @pytest.mark.fault(27)
-@pytest.mark.parametrize("path", ["/stage/moves", "/stage/home"])
+@pytest.mark.parametrize("path", ["/stage/moves", "/stage:home"])
 def test_a_client_that_goes_away_lets_go_of_the_handle_that_it_held(homed: StageService, path: str) -> None:
     homed.done(homed.job("/stage/moves", positions_mm={"1": 5.0}))
     if homed.service.config.stage.driver == "smc100" and path.endswith("home"):
@@ -235,7 +235,7 @@ def test_an_attached_move_answers_when_it_has_ended(homed: StageService) -> None
 
 
 @pytest.mark.fault(28)
-def test_who_comes_second_is_told_who_has_the_stage_and_may_stop_it(homed: StageService) -> None:
+def test_a_second_client_learns_who_has_the_stage_and_may_stop_it(homed: StageService) -> None:
     homed.axis(1).velocity_mm_s = 0.2
     try:
         job = homed.job("/stage/moves", positions_mm={"1": 5.0})
@@ -243,19 +243,19 @@ def test_who_comes_second_is_told_who_has_the_stage_and_may_stop_it(homed: Stage
         before = [text for text in homed.actions() if not text.endswith("ST")]
         for method, path, body in (
             ("POST", "/stage/moves", {"positions_mm": {"2": 1.0}}),
-            ("POST", "/stage/home", {"axes": [2]}),
-            ("POST", "/stage/enable", {"axes": [2]}),
-            ("POST", "/stage/disable", {"axes": [1]}),
+            ("POST", "/stage:home", {"axes": [2]}),
+            ("POST", "/stage:enable", {"axes": [2]}),
+            ("POST", "/stage:disable", {"axes": [1]}),
             ("PATCH", "/stage/axes/1", {"velocity_mm_s": 1.0}),
-            ("POST", "/stage/axes/1/leave-configuration", {"write_flash": True}),
+            ("POST", "/stage/axes/1:leave-configuration", {"write_flash": True}),
             ("POST", "/calibrations", {}),
-            ("POST", "/rig/reconnect", None),
+            ("POST", "/rig:reconnect", None),
         ):
             busy = problem(homed.client.request(method, f"{API}{path}", json=body), 409, "hardware_busy")
             assert busy["holder"]["job_id"] == job["id"]  # type: ignore[index]
         assert [text for text in homed.actions() if not text.endswith("ST")] == before
         assert homed.axis(1).moving
-        stopped = homed.post("/stage/stop").json()
+        stopped = homed.post("/stage:stop").json()
         assert stopped["cancelled_job"] == job["id"]
         wait_until(lambda: not homed.axis(1).moving)
         assert homed.done(job)["state"] == "cancelled"
@@ -279,7 +279,7 @@ def test_many_clients_at_once_start_one_move(homed: StageService) -> None:
             thread.join()
         assert sorted(statuses) == [202, *[409] * 11]
         wait_until(lambda: len(homed.controller.commands("1PA")) > before)
-        homed.post("/stage/stop")
+        homed.post("/stage:stop")
         wait_until(lambda: homed.service.hardware.holder is None)
         assert len(homed.controller.commands("1PA")) == before + 1
     finally:
@@ -294,7 +294,7 @@ def test_velocities_are_set_and_read_back_and_outlast_a_reconnection(homed: Stag
     assert patch(acceleration_mm_s2=20.0).json()["acceleration_mm_s2"] == pytest.approx(20.0)
     assert homed.axis(1).velocity_mm_s == pytest.approx(2.5)
     assert homed.stage()["axes"][0]["dynamics"]["velocity_mm_s"] == pytest.approx(2.5)
-    assert homed.done(homed.job("/rig/reconnect"))["state"] == "succeeded"
+    assert homed.done(homed.job("/rig:reconnect"))["state"] == "succeeded"
     assert homed.stage()["axes"][0]["dynamics"]["velocity_mm_s"] == pytest.approx(2.5)
     homed.home()
     assert homed.axis(1).acceleration_mm_s2 == pytest.approx(20.0)
@@ -314,7 +314,7 @@ def test_abort_switches_the_motors_off_in_mid_move(homed: StageService) -> None:
     try:
         job = homed.job("/stage/moves", positions_mm={"1": 5.0})
         wait_until(lambda: homed.axis(1).moving)
-        answer = homed.post("/stage/abort")
+        answer = homed.post("/stage:abort")
         assert answer.status_code == 200, answer.text
         assert answer.json()["cancelled_job"] == job["id"]
         assert homed.done(job)["state"] == "cancelled"
@@ -331,10 +331,10 @@ def test_an_axis_in_configuration_state_is_left_with_consent_only(tmp_path_facto
         axis = stand.stage()["axes"][0]
         assert axis["state"] == "configuration"
         assert "PW0" in axis["detail"]
-        for path, body in (("/stage/moves", {"positions_mm": {"1": 1.0}}), ("/stage/home", {}), ("/calibrations", {})):
+        for path, body in (("/stage/moves", {"positions_mm": {"1": 1.0}}), ("/stage:home", {}), ("/calibrations", {})):
             shown = problem(stand.post(path, **body), 409, "configuration_state")
             assert "flash" in str(shown["remedy"])
-        leave = "/stage/axes/1/leave-configuration"
+        leave = "/stage/axes/1:leave-configuration"
         for body in ({}, {"write_flash": False}, {"write_flash": "true"}, {"write_flash": 1}):
             problem(stand.post(leave, **body), 422, "invalid_request")
         assert stand.controller.flash_writes(1) == 0
@@ -348,10 +348,10 @@ def test_an_axis_in_configuration_state_is_left_with_consent_only(tmp_path_facto
 
 
 def test_a_rig_with_a_stuck_axis_opens_and_homes_the_other(tmp_path_factory: pytest.TempPathFactory) -> None:
-    from server.jobs.hardware import HardwareHold
-    from server.rig import Rig
-    from sim.controllers.registry import make_controller
-    from sim.controllers.server import ControllerServer
+    from stereorig.server.jobs.hardware import HardwareHold
+    from stereorig.server.rig.rig import Rig
+    from stereorig.sim.controllers.registry import make_controller
+    from stereorig.sim.controllers.server import ControllerServer
     from tests.support.stage_service import rig
 
     controller = make_controller("smc100", (1, 2), time_scale=50.0)
@@ -375,10 +375,10 @@ def test_a_stop_while_the_rig_homes_at_its_start_leaves_it_open(tmp_path_factory
         wait_until(lambda: all(axis["state"] == "ready" for axis in stand.stage()["axes"]))
         moved = stand.done(stand.job("/stage/moves", positions_mm={"1": 5.0, "2": 5.0}))
         assert moved["state"] == "succeeded"
-        job = stand.job("/rig/reconnect")
+        job = stand.job("/rig:reconnect")
         # between the old line's end and the new one's beginning there is no stage to ask
         wait_until(lambda: any(axis["moving"] for axis in stand.client.get(f"{API}/stage").json().get("axes", ())))
-        assert stand.client.post(f"{API}/stage/stop").status_code == 200
+        assert stand.client.post(f"{API}/stage:stop").status_code == 200
         assert stand.done(job)["state"] == "cancelled"
         shown = stand.client.get(f"{API}/rig").json()
         assert shown["connected"] is True
@@ -390,25 +390,26 @@ def test_a_stop_while_the_rig_homes_at_its_start_leaves_it_open(tmp_path_factory
 
 
 def test_a_stage_that_is_not_there_says_so_everywhere(tmp_path_factory: pytest.TempPathFactory) -> None:
-    from server.workflows.service import Service
+    from stereorig.server.workflows.service import Service
     from tests.support.service_rig import served
     from tests.support.stage_service import rig
 
     service = Service(rig(url='"/dev/no-such-port"'), tmp_path_factory.mktemp("none") / "data").start()
     try:
         with served(service) as client:
-            wait_until(lambda: (client.get(f"{API}/rig").json()["fault"] or {}).get("code") == "stage_lost")
+            wait_until(lambda: (client.get(f"{API}/rig").json()["stage"]["fault"] or {}).get("code") == "stage_lost")
+            assert client.get(f"{API}/rig").json()["fault"] is None  # the cameras can be used
             assert client.get(f"{API}/stage").json()["fault"]["code"] == "stage_lost"
             assert client.get(f"{API}/stage/messages").json() == {"messages": []}
             for method, path, body in (
-                ("POST", "/stage/stop", None),
-                ("POST", "/stage/abort", None),
-                ("POST", "/stage/enable", None),
-                ("POST", "/stage/home?attached=true", None),
+                ("POST", "/stage:stop", None),
+                ("POST", "/stage:abort", None),
+                ("POST", "/stage:enable", None),
+                ("POST", "/stage:home?attached=true", None),
                 ("POST", "/stage/moves?attached=true", {"positions_mm": {"1": 1.0}}),
                 ("PATCH", "/stage/axes/1", {"velocity_mm_s": 1.0}),
-                ("POST", "/stage/axes/1/leave-configuration", {"write_flash": True}),
+                ("POST", "/stage/axes/1:leave-configuration", {"write_flash": True}),
             ):
-                problem(client.request(method, f"{API}{path}", json=body), 503, "not_connected")
+                problem(client.request(method, f"{API}{path}", json=body), 503, "stage_lost")
     finally:
         service.close()

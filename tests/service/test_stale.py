@@ -16,17 +16,17 @@ import httpx
 import numpy as np
 import pytest
 
-from core.errors import FileFormatError
-from core.names import CAMERAS
-from server.cli import main
-from server.cli.measurement.measure import SOME_FAILED
-from server.formats.images import write_image
-from server.workflows.analysis import start as analysis_start
-from server.workflows.analysis.tasks import task_of
-from server.workflows.service import Service
-from sim.catalog import make_scene
-from sim.render import RenderOptions, render
-from sim.rig import SimRig
+from stereorig.core.errors import FileFormatError
+from stereorig.core.names import CAMERAS
+from stereorig.server.cli import main
+from stereorig.server.cli.measurement.measure import SOME_FAILED
+from stereorig.server.formats.images import write_image
+from stereorig.server.workflows.analysis import start as analysis_start
+from stereorig.server.workflows.analysis.tasks import task_of
+from stereorig.server.workflows.service import Service
+from stereorig.sim.catalog import make_scene
+from stereorig.sim.render import RenderOptions, render
+from stereorig.sim.rig import SimRig
 from tests.support.measure_command import rig as rig
 from tests.support.service_rig import wait_for_job
 
@@ -143,7 +143,7 @@ def test_a_step_whose_image_was_replaced_fails_alone(taken: Path, tmp_path: Path
     assert "step 2 of 3: failed: checksum_mismatch: " in capfd.readouterr().err
     summary = json.loads((test / "exports" / "measure" / "summary.json").read_text())
     assert [step["n"] for step in summary["steps"]] == [0, 1, 3]
-    assert "cam2.tif" in summary["steps_failed"]["2"]["cause"]
+    assert "cam2.tif" in summary["steps_failed"]["2"]["detail"]
 
 
 def gauges(where: Path, out: Path) -> dict[str, Any]:
@@ -209,7 +209,7 @@ def copied_in(test: Path, service: Service) -> tuple[str, Path]:
     """A folder copied by hand from elsewhere is a valid test."""
     name = service.folder.ids.new("t")
     test_folder = service.folder.tests / name
-    shutil.copytree(test, test_folder)
+    shutil.copytree(test, test_folder, ignore=shutil.ignore_patterns("manifest.json", "manifest"))
     (test_folder / "analyses").mkdir(exist_ok=True)
     record = json.loads((test_folder / "test.json").read_text())
     (test_folder / "test.json").write_text(json.dumps({**record, "id": name, "name": "a plate"}))
@@ -273,13 +273,13 @@ def test_what_changes_between_asking_and_measuring_is_refused(
     spoil(test_folder, "the reference was taken again")
     with pytest.raises(FileFormatError) as caught:
         task_of(service.tests, made, 1, {}, None)
-    assert caught.value.code == "step_changed"
+    assert caught.value.code == "checksum_mismatch"
     _, test_folder = copied_in(taken, service)
     made = service.tests.analyses.create(test_folder.name, document)
     spoil(test_folder, "the calibration was replaced")
     with pytest.raises(FileFormatError) as caught:
         task_of(service.tests, made.model_copy(update={"test_id": test_folder.name}), 1, {}, None)
-    assert caught.value.code == "calibration_changed"
+    assert caught.value.code == "checksum_mismatch"
 
 
 def test_an_untouched_analysis_is_not_stale(analysed: tuple[Path, str], client: httpx.Client) -> None:

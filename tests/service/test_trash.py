@@ -12,19 +12,19 @@ import httpx
 import numpy as np
 import pytest
 
-from core.errors import FileFormatError, StateError, StorageError
-from server.cli.main import main
-from server.formats import disk as disk_module
-from server.formats.images import encode_tiff
-from server.jobs.job import Phase
-from server.store.calibrations import CalibrationStore
-from server.store.catalog import Catalog
-from server.store.folder import DataFolder
-from server.store.indexing.build import rebuild
-from server.store.tests.tests import TestStore
-from server.store.trash import Trash
-from server.store.verify import verify
-from server.workflows.service import Service
+from stereorig.core.errors import FileFormatError, StateError, StorageError
+from stereorig.server.cli.main import main
+from stereorig.server.formats import disk as disk_module
+from stereorig.server.formats.images import encode_tiff
+from stereorig.server.jobs.job import Phase
+from stereorig.server.store.calibrations import CalibrationStore
+from stereorig.server.store.catalog import Catalog
+from stereorig.server.store.folder import DataFolder
+from stereorig.server.store.indexing.build import rebuild
+from stereorig.server.store.tests.tests import TestStore
+from stereorig.server.store.trash import Trash
+from stereorig.server.store.verify import verify
+from stereorig.server.workflows.service import Service
 from tests.support.faulty_disk import WAYS, FaultyDisk, Way
 from tests.support.problems import assert_problem
 from tests.support.service_rig import new_test, served, tiny_config
@@ -76,11 +76,11 @@ def test_a_test_goes_to_the_trash_whole_and_comes_back(service: Service, client:
     assert listed is not None
     assert listed["size_bytes"] >= sum(map(len, before.values()))
     assert verify(service.folder.root).findings == ()
-    assert client.post(f"{API}/trash/{gone['id']}/restore").json()["test_id"] == test_id
+    assert client.post(f"{API}/trash/{gone['id']}:restore").json()["test_id"] == test_id
     assert hashes(service.tests.path(test_id)) == before
     assert client.get(f"{API}/tests/{test_id}").json() == shown
     assert entry_of(client, gone["id"]) is None
-    assert_problem(client.post(f"{API}/trash/{gone['id']}/restore"), 404, "not_found")
+    assert_problem(client.post(f"{API}/trash/{gone['id']}:restore"), 404, "not_found")
     assert verify(service.folder.root).findings == ()
 
 
@@ -93,11 +93,11 @@ def test_a_deleted_steps_number_is_not_given_again(service: Service, client: htt
     assert [s["n"] for s in client.get(f"{API}/tests/{test_id}").json()["steps"]] == [1]
     assert add_step(client, test_id, 5) == 3
     assert verify(service.folder.root).findings == ()
-    assert client.post(f"{API}/trash/{last['id']}/restore").status_code == 200
+    assert client.post(f"{API}/trash/{last['id']}:restore").status_code == 200
     assert [s["n"] for s in client.get(f"{API}/tests/{test_id}/steps").json()["steps"]] == [1, 2, 3]
     # once its test is gone a step has nowhere to go
     delete(client, f"/tests/{test_id}")
-    assert_problem(client.post(f"{API}/trash/{first['id']}/restore"), 409, "parent_deleted")
+    assert_problem(client.post(f"{API}/trash/{first['id']}:restore"), 409, "parent_deleted")
     everything = new_test(client)
     add_step(client, everything, 1)
     delete(client, f"/tests/{everything}/steps/0")
@@ -145,7 +145,7 @@ def test_a_test_keeps_its_own_copy_of_a_calibration_that_is_deleted(service: Ser
     assert_problem(client.post(f"{API}/tests", json={"name": "x", "calibration_id": calibration_id}), 404, "not_found")
     assert service.tests.calibration_file(test_id).read_bytes() == copy
     assert add_step(client, test_id, 3) == 0  # checked against the copy's image size
-    assert client.post(f"{API}/trash/{gone['id']}/restore").status_code == 200
+    assert client.post(f"{API}/trash/{gone['id']}:restore").status_code == 200
     assert client.get(f"{API}/calibrations/{calibration_id}").json()["state"] == "complete"
     noise_id = service.noise.create({"frames": 2, "label": ""})
     delete(client, f"/noise/{noise_id}")
@@ -209,7 +209,10 @@ def test_a_disk_that_fails_while_something_is_deleted_keeps_all_of_it_somewhere(
         # whatever happened, everything can be brought back
         for trash_id in reversed(trash.ids()):
             trash.restore(trash_id)
-        assert {k: v for k, v in hashes(folder.tests / test_id).items() if "deleted" not in k} == before
+        # the manifest says what was changed and taken back: `verify` compares it with the files
+        there = {k: v for k, v in hashes(folder.tests / test_id).items() if "deleted" not in k}
+        assert there | {"manifest.json": before["manifest.json"]} == before
+        assert verify(folder.root).sound
         folder.close()
         if not faulty.failed:
             assert not refused
@@ -304,10 +307,10 @@ def test_a_copy_is_acknowledged_only_where_it_holds_what_the_test_has(tmp_path: 
         with served(service) as client:
             test_id = new_test(client)
             add_step(client, test_id, 1)
-            too_little = client.post(f"{API}/tests/{test_id}/exported", json={"steps": 0, "results": 0})
+            too_little = client.post(f"{API}/tests/{test_id}:acknowledge-export", json={"steps": 0, "results": 0})
             problem = assert_problem(too_little, 409, "export_differs")
             assert problem["steps"] == 1
-            answer = client.post(f"{API}/tests/{test_id}/exported", json={"steps": 1, "results": 0})
+            answer = client.post(f"{API}/tests/{test_id}:acknowledge-export", json={"steps": 1, "results": 0})
             assert answer.status_code == 200
             assert client.get(f"{API}/tests/{test_id}").json()["exported"]["steps"] == 1
             assert client.get(f"{API}/trash").json()["trash"] == []

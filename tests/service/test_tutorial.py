@@ -14,7 +14,7 @@ import httpx
 import numpy as np
 import pytest
 
-from server.demo.process import running_service
+from stereorig.server.demo.process import running_service
 from tests.support.document_scripts import WRITTEN, blocks, one_block, run
 from tests.support.plate_truth import check_plate_field
 from tests.support.requirements import ROOT

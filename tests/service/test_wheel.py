@@ -33,7 +33,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
     for name in _SOURCES:
         if (ROOT / name).is_dir():
-            shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copytree(ROOT / name, folder / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
         else:
             shutil.copy(ROOT / name, folder / name)
     pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--disable-pip-version-check", "--no-deps"]
@@ -61,18 +61,25 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_wheel_holds_everything_that_is_no_python(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
-        names = set(archive.namelist())
-    assert {f"{package}/py.typed" for package in ("core", "drivers", "server", "sim", "stereorig")} <= names
-    static = {str(path.relative_to(ROOT)) for path in (ROOT / "server" / "static").rglob("*") if path.is_file()}
-    assert static <= names
+        listed = archive.namelist()
+    names = set(listed)
+    assert len(listed) == len(names)
+    assert "stereorig/py.typed" in names
+    static = {path.relative_to(ROOT) for path in (ROOT / "server" / "static").rglob("*") if path.is_file()}
+    assert {f"stereorig/{path}" for path in static} <= names
     assert {name.rpartition("/")[2] for name in names if name.endswith(".toml")} == {
         path.name for path in (ROOT / "config").glob("sim_*.toml")
     }
-    assert not [name for name in names if name.startswith("tests")]
+
+
+def test_the_wheel_installs_one_import_name(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        folders = {name.partition("/")[0] for name in archive.namelist()}
+    assert {name for name in folders if not name.endswith((".dist-info", ".data"))} == {"stereorig"}
 
 
 def test_the_program_comes_from_the_wheel_and_not_from_the_checkout(installed: Path, tmp_path: Path) -> None:
-    code = "import core, server, sim, drivers, stereorig; print(stereorig.Client.__name__, server.__file__)"
+    code = "import stereorig.server; print(stereorig.Client.__name__, stereorig.server.__file__)"
     done = ran([str(installed / "python"), "-c", code], tmp_path)
     assert done.returncode == 0, done.stderr
     name, path = done.stdout.split()

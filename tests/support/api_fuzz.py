@@ -24,12 +24,12 @@ import schemathesis
 from schemathesis.config import SchemathesisConfig
 from schemathesis.engine import events, from_schema
 
-from core.errors import StateError
-from server.api.app import create_app
-from server.api.docs.problem_pages import known_problems
-from server.config.rig_file import parse_config
-from server.workflows.deletion import restore
-from server.workflows.service import Service
+from stereorig.core.errors import StateError
+from stereorig.server.api.app import create_app
+from stereorig.server.api.docs.problem_pages import known_problems
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.workflows.deletion import restore
+from stereorig.server.workflows.service import Service
 from tests.support.impatient_client import Impatient
 from tests.support.service_rig import TINY, served, true_cameras, wait_for_job, wait_for_rig
 from tests.support.tiny_rig import tiny_rig
@@ -263,6 +263,7 @@ def fuzz(
     @schemathesis.check
     def what_is_made_is_there(ctx: Any, response: Any, case: Any) -> None:
         known.check_there(ctx, response, case)
+        assert str(service.folder.root).encode() not in response.content, "an answer names the data folder's place"
 
     if only:
         schema = schema.include(operation_id=only)

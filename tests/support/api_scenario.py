@@ -1,12 +1,8 @@
-"""Every operation of the API in one session on a small simulated rig: the examples of the description.
-
-Used by test_openapi_examples.py and by tests/bench/documents/api_examples.py.
-"""
+"""Every operation of the API in one session on a small simulated rig, with the requests that the description shows."""
 
 from __future__ import annotations
 
 import json
-import math
 import re
 import time
 from collections.abc import Callable
@@ -17,17 +13,16 @@ import cv2
 import httpx
 import numpy as np
 
-from core.cameras.camera import Camera
-from core.target import GridTarget
-from server.config.rig_file import parse_config
-from server.formats.calibrations.target_toml import target_of
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.target import GridTarget
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.formats.calibrations.target_toml import target_of
 from tests.support.grid_images import grid_image, paper_camera
+from tests.support.patience import Deadline
 from tests.support.service_rig import SMALL, true_cameras, wait_for_job, wait_for_rig
 
 API = "/api/v1"
 REGION = {"rectangle": [95, 95, 165, 150]}
-MAX_ITEMS = 4
-TEXT_CHARACTERS = 400
 #: placeholder in an example for a file that text cannot hold
 FILE = "(the bytes of a file)"
 
@@ -118,19 +113,6 @@ class Session:
         return answer
 
 
-def short(value: Any) -> Any:
-    """Cut long lists and texts, round numbers to what they are good for; keys stay."""
-    if isinstance(value, dict):
-        return {name: short(v) for name, v in value.items()}
-    if isinstance(value, list):
-        return [short(v) for v in (value if len(value) <= MAX_ITEMS else value[: MAX_ITEMS - 1])]
-    if isinstance(value, str):
-        return value if len(value) <= TEXT_CHARACTERS else value[:TEXT_CHARACTERS].rsplit("\n", 1)[0] + "\n"
-    if isinstance(value, float) and math.isfinite(value) and value != 0.0:
-        return float(f"{value:.6g}")
-    return value
-
-
 def operations_of(description: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Return the description's operations by id, with method and path."""
     return {
@@ -148,10 +130,11 @@ def image(seed: int) -> bytes:
     return data.tobytes()
 
 
-def run(client: httpx.Client, description: dict[str, Any]) -> Session:
-    """Go through the whole job; every operation is called at least once."""
+def run(client: httpx.Client, description: dict[str, Any], key: str) -> Session:
+    """Go through the whole job; every operation is called at least once. ``key`` is an admin's, `lab-page`."""
     session = Session(client, operations_of(description))
     wait_for_rig(client)
+    _sessions(session.call, {"Authorization": f"Bearer {key}"})
     _read_everything(session.call)
     _stage(session)
     calibration = _calibration(session)
@@ -176,8 +159,8 @@ def _guided(session: Session) -> None:
     begun = call("begin_guide", summary="Until Z is known to 1 um, each view on request", body=goal).json()
     identity = begun["calibration_id"]
     call("take_view", identity)
-    deadline = time.monotonic() + 60.0
-    while time.monotonic() < deadline and _taken(client, identity) == 0:
+    deadline = Deadline(60.0)
+    while deadline.left and _taken(client, identity) == 0:
         time.sleep(0.1)
     call("get_guide", identity)
     wait_for_job(client, call("finish_guide", identity).json()["job"])
@@ -189,7 +172,7 @@ def _taken(client: httpx.Client, calibration_id: str) -> int:
 
 
 def _read_everything(call: Callable[..., httpx.Response]) -> None:
-    for operation in ("healthz", "metrics", "get_rig", "get_cameras", "get_devices", "get_session"):
+    for operation in ("healthz", "metrics", "get_rig", "get_cameras", "get_devices", "get_channels", "get_session"):
         call(operation)
     etag = call("get_camera", "cam1").headers["ETag"]
     call("patch_camera", "cam1", summary="Expose for 12 ms", body={"exposure_ms": 12.0}, headers={"If-Match": etag})
@@ -200,7 +183,14 @@ def _read_everything(call: Callable[..., httpx.Response]) -> None:
     call("get_stats", "cam1")
     call("get_live_map", "cam1", "saturation")
     call("get_stream", "cam1")
-    call("log_in")
+
+
+def _sessions(call: Callable[..., httpx.Response], key: dict[str, str]) -> None:
+    call("log_in", headers=key)
+    call("end_session", call("list_sessions").json()["sessions"][0]["id"])
+    call("log_in", headers=key)
+    call("end_sessions", query={"name": "lab-page"})
+    call("log_in", headers=key)
     call("log_out")
 
 
@@ -298,11 +288,21 @@ def _test(session: Session, calibration: str) -> str:
     burst = {"label": "cycle 3", "count": 2, "interval_ms": 500.0}
     taken = wait_for_job(client, call("create_step", test, summary="Two steps, two a second", body=burst).json()["job"])
     call("job_steps", taken["id"])
+    around = {"label": "knock", "before_s": 0.5, "after_s": 0.2, "rate_hz": 10.0, "trigger": {"kind": "call"}}
+    other = client.post(f"{API}/tests", json={"name": "a knock"}).json()["id"]
+    kept = call("record", other, summary="Half a second before a call, a fifth behind it", body=around).json()["job"]
+    while client.get(f"{API}/jobs/{kept['id']}").json()["progress"]["phase"] != "trigger":
+        time.sleep(0.02)
+    call("trigger_record", other)
+    wait_for_job(client, kept)
+    call("get_readings", other)
     form = {"label": "from another program", "load_n": 1300.0, "channels": '{"stroke_mm": 0.42}'}
     files = {cam: image(k) for k, cam in enumerate(("cam1", "cam2"))}
     imported = call("import_images", test, summary="A pair of image files", form=form, files=files).json()["n"]
     record = b"Time (s),Force (kN),Stroke (um)\n0.0,0.00,420\n0.5,0.01,421\n1.0,0.02,422\n"
     aligned = {"at_step": 0, "at_s": 0.75, "max_gap_s": 1.0}
+    looked = {"form": aligned, "files": {"file": record}, "text_files": True}
+    call("preview_record", test, summary="What an import of that record would do", **looked)
     call(
         "import_channels",
         test,
@@ -452,9 +452,9 @@ def _live(session: Session, test: str) -> None:
 
 
 def _until(true: Callable[[], bool], seconds: float = 240.0) -> None:
-    deadline = time.monotonic() + seconds
+    deadline = Deadline(seconds)
     while not true():
-        assert time.monotonic() < deadline
+        assert deadline.left
         time.sleep(0.05)
 
 
@@ -504,6 +504,9 @@ def _results(session: Session, test: str, analysis: str) -> None:
     call("compare_with_model", test, analysis, summary="The load known to half a per cent", body=asked)
     call("compare_with_model", test, analysis, body=asked, query={"format": "vtu"})
     call("delete_model", test, model)
+    call("list_evaluations")
+    limits = {"settings": {"variable": "w_mm", "lower": -0.5, "upper": 0.5, "share": 0.99}}
+    call("evaluate", test, analysis, "conformity", summary="Points whose w is within limits", body=limits)
     for form in ("csv", "nc"):
         call("export", test, analysis, query={"format": form, "step": 1})
     begun = call("begin_export", test, analysis, query={"format": "csv", "step": 1}).json()["job"]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from core.names import CameraName
-from drivers.cameras.protocol import CameraOptions, FrameGrabber
-from drivers.registry import make_camera
+from stereorig.core.names import CameraName
+from stereorig.drivers.cameras.protocol import CameraOptions, FrameGrabber
+from stereorig.drivers.registry import make_camera
 from tests.support.camera_bench import CameraBench
 from tests.support.fake_gige import FakeCamera, small_sensor_xml
 

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from core.cameras.stereo import StereoPair
-from core.field.region.region import PointGrid
-from core.measure import MeasureOptions, ReferencePair
-from core.settings import PatchSetting
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureOptions, ReferencePair
+from stereorig.core.settings import PatchSetting
 from tests.support.relief_parts import calibrated
 from tests.support.relief_rig import Body, Optics, Texture, exposed, picture, truth, two_cameras
 

@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.boards import BoardTarget
+from stereorig.core.arrays import Float
+from stereorig.core.boards import BoardTarget
 
 _MARKER_SQUARE_PX = 240
 HOLLOW = 0.5  # inner over outer radius of a hollow dot

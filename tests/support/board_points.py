@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from core.boards import BoardTarget
-from core.calibration import CalibrationView, NominalCamera
-from core.cameras.stereo import StereoPair
-from core.names import CAMERAS
+from stereorig.core.boards import BoardTarget
+from stereorig.core.calibration import CalibrationView, NominalValues
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.names import CAMERAS
 
 Array = NDArray[np.float64]
 
@@ -61,11 +61,11 @@ def true_pair(
     return one, two
 
 
-def nominal_pair(angle_deg: float | None = 12.5) -> tuple[NominalCamera, NominalCamera]:
+def nominal_pair(angle_deg: float | None = 12.5) -> tuple[NominalValues, NominalValues]:
     """Nominal cameras, some per cent off."""
     if angle_deg is None:
-        return NominalCamera(SIZE_PX, 1.1 * FOCAL_PX), NominalCamera(SIZE_PX, 0.95 * FOCAL_PX)
-    one, two = (NominalCamera(SIZE_PX, 1.01 * FOCAL_PX, 1.02 * DISTANCE_MM, s * angle_deg) for s in (-1.0, 1.0))
+        return NominalValues(SIZE_PX, 1.1 * FOCAL_PX), NominalValues(SIZE_PX, 0.95 * FOCAL_PX)
+    one, two = (NominalValues(SIZE_PX, 1.01 * FOCAL_PX, 1.02 * DISTANCE_MM, s * angle_deg) for s in (-1.0, 1.0))
     return one, two
 
 

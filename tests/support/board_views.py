@@ -18,21 +18,21 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.boards import BoardTarget
-from core.cameras.camera import Camera, RigidTransform, angles_from_rotation, rotation_from_angles
-from core.cameras.lens import LensModel
-from core.names import CAMERAS, CameraName
-from core.target import GridTarget
-from sim.boards.pattern import BEHIND
-from sim.boards.poses import hand_pose, pose_of, transform_of
-from sim.boards.target import SimTarget
-from sim.optics.lens import SimLens, core_lens, flat_lens, image_of
-from sim.render import RenderOptions, render
-from sim.rig import SimRig
-from sim.scene import Scene
-from sim.sensor import Sensor
-from sim.world import SimWorld
+from stereorig.core.arrays import Float
+from stereorig.core.boards import BoardTarget
+from stereorig.core.cameras.camera import Camera, RigidTransform, angles_from_rotation, rotation_from_angles
+from stereorig.core.cameras.lens import LensModel
+from stereorig.core.names import CAMERAS, CameraName
+from stereorig.core.target import GridTarget
+from stereorig.sim.boards.pattern import BEHIND
+from stereorig.sim.boards.poses import hand_pose, pose_of, transform_of
+from stereorig.sim.boards.target import SimTarget
+from stereorig.sim.optics.lens import SimLens, core_lens, flat_lens, image_of
+from stereorig.sim.render import RenderOptions, render
+from stereorig.sim.rig import SimRig
+from stereorig.sim.scene import Scene
+from stereorig.sim.sensor import Sensor
+from stereorig.sim.world import SimWorld
 
 SIZE_PX = (1224, 1024)
 ORDINARY = {"k1": -0.05, "k2": 0.02, "p1": 2e-4, "p2": -3e-4}
@@ -122,7 +122,7 @@ def hand_poses(
     size_px: tuple[int, int] = SIZE_PX,
     seed: int = 0,
 ) -> list[tuple[float, ...]]:
-    """Return a hand's poses, see :func:`sim.boards.poses.hand_pose`."""
+    """Return a hand's poses, see :func:`stereorig.sim.boards.poses.hand_pose`."""
     held = target if isinstance(target, SimTarget) else sim_target(target)
     return [hand_pose(held, cameras, [size_px] * len(cameras), n, seed=seed) for n in numbers]
 
@@ -140,7 +140,7 @@ def render_views(
     blur_px: float = 0.7,
     threads: int = 1,
 ) -> list[ViewPair]:
-    """Render views of a target in poses ``[rx_deg, ry_deg, rz_deg, x_mm, y_mm, z_mm]``, see `sim.boards.poses`.
+    """Render views of a target in poses ``[rx_deg, ry_deg, rz_deg, x_mm, y_mm, z_mm]``, see `.boards.poses`.
 
     Parameters
     ----------

@@ -8,11 +8,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.camera import Camera
-from core.cameras.stereo import StereoPair
-from core.field.region.region import PointGrid
-from core.measure import MeasureOptions
-from core.orientation import Repair, repair_orientation
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureOptions
+from stereorig.core.orientation import RepairedPair, repair_orientation
 from tests.support.independent_rig import Array, PlainCamera, Waves, render
 
 #: a wide view, as of an 8 mm lens on a 2/3 inch sensor: over a narrow one, offsets do not determine the vergence
@@ -111,7 +111,7 @@ def seen(camera: PlainCamera, pose: int, n: int = 3) -> NDArray[np.uint8]:
     return picture(camera, pose, seed=10 * pose + (camera.phd > 1300.0), n=n)
 
 
-def repaired(one: PlainCamera, two: PlainCamera, poses: tuple[int, ...] = (0, 1), n: int = 3) -> Repair:
+def repaired(one: PlainCamera, two: PlainCamera, poses: tuple[int, ...] = (0, 1), n: int = 3) -> RepairedPair:
     """The repair of the calibrated pair from pictures of the cameras as they are now."""
     images = [(seen(one, k, n), seen(two, k, n)) for k in poses]
     return repair_orientation(core_pair(CAM1, CAM2), images, grid(), MeasureOptions(subset_px=SUBSET_PX))

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from core.calibration import COVARIANCE_NAMES
-from core.target import GridTarget
+from stereorig.core.calibration import COVARIANCE_NAMES
+from stereorig.core.target import GridTarget
 from tests.support.field_bench import SIZE, pair
 
 TARGET = GridTarget(pitch_mm=0.5, lines=(7, 7), line_width_mm=0.02)

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from core.boards import BoardTarget
-from core.calibration import CalibrationView
-from core.cameras.camera import Camera, RigidTransform
-from core.cameras.lens import OpenCVLens
-from core.cameras.stereo import StereoPair
-from core.names import CAMERAS
+from stereorig.core.boards import BoardTarget
+from stereorig.core.calibration import CalibrationView
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.core.cameras.lens import OpenCVLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.names import CAMERAS
 
 Array = NDArray[np.float64]
 LENSES: dict[str, tuple[float, ...]] = {

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration import CalibrationOptions, CalibrationView, NominalCamera
+from stereorig.core.calibration import CalibrationOptions, CalibrationView, NominalValues
 
 Array = NDArray[np.float64]
 
@@ -20,6 +20,7 @@ class Grid:
     pitch_mm: float = 1.0
     lines: tuple[int, int] = (11, 11)
     node_tolerance_mm: float = 0.0
+    pitch_scale_sigma: float | None = None
 
 
 PAPER: tuple[dict[str, float], dict[str, float]] = (
@@ -76,8 +77,8 @@ NOISE_PX = 0.0022
 
 
 NOMINAL = (
-    NominalCamera((512, 480), 12000.0, 400.0, -30.0, 0.9617),
-    NominalCamera((512, 480), 12000.0, 400.0, 30.0, 0.9617),
+    NominalValues((512, 480), 12000.0, 400.0, -30.0, 0.9617),
+    NominalValues((512, 480), 12000.0, 400.0, 30.0, 0.9617),
 )
 
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Float
-from core.certify.evidence import CameraOffset, Evidence, KnownLength, MovedStep, Scatter, StaticStep
-from core.certify.measured import Measured
+from stereorig.core.arrays import Float
+from stereorig.core.certify.evidence import CameraOffset, CheckedLength, Evidence, MovedStep, Scatter, StaticStep
+from stereorig.core.certify.measured import Measured
 
 SIGMA_MM = 2e-4
 """Noise of a mean displacement, new at each step and of the reference."""
@@ -82,6 +82,6 @@ def evidence(seed: int, fault: Fault | None = None, *, static: int = 4, distance
         measured = scale * length * (1.0 + fault.artefact) + SIGMA_MM * rng.standard_normal()
         common = np.array([[PITCH_U * length]])
         one = Measured(np.array([measured]), own, np.zeros((1, 1)), common)
-        lengths.append(KnownLength(f"length {k}", one, length, 1e-4, "bar"))
+        lengths.append(CheckedLength(f"length {k}", one, length, 1e-4, "bar"))
     cameras = (CameraOffset(1, "calibration", fault.camera, 0.4 if fault.camera else 0.004, 0.01, 30.0),)
     return Evidence(at_rest, tuple(moved), tuple(lengths), None, cameras)

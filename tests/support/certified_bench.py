@@ -8,8 +8,8 @@ from typing import Any
 import httpx
 import numpy as np
 
-from sim.rig import SimRig
-from sim.world import SimWorld
+from stereorig.sim.rig import SimRig
+from stereorig.sim.world import SimWorld
 from tests.support.service_rig import SMALL, wait_for_job, wait_for_rig
 
 API = "/api/v1"

@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 from tests.support.requirements import ROOT, missing
 
@@ -131,3 +134,13 @@ class Image:
         subprocess.run([*map(str, self._buildah), "umount", "--all"], capture_output=True, timeout=60)
         subprocess.run([*map(str, self._buildah), "rm", "--all"], capture_output=True, timeout=60)
         shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def unmount_leftovers() -> None:
+    """Unmount the images of killed test runs: pytest could not delete their temporary folders."""
+    for line in Path("/proc/self/mounts").read_text(encoding="utf-8").splitlines():
+        mounted = re.match(r"\S+ ((\S+/pytest-of-[^/ ]+/pytest-\d+)/\S+) ", line)
+        if mounted is not None:
+            lock = Path(mounted[2]) / ".lock"  # holds the process number of the run that made the folder
+            if not (lock.is_file() and psutil.pid_exists(int(lock.read_text() or 0))):
+                subprocess.run(["umount", "--lazy", mounted[1]], capture_output=True, timeout=60)

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from core.cameras.stereo import StereoPair
-from core.names import CAMERAS
-from server.config.rig_file import parse_config
-from server.formats.images import encode_tiff
-from sim.rig import SimRig
-from sim.world import SimWorld
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.names import CAMERAS
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.formats.images import encode_tiff
+from stereorig.sim.rig import SimRig
+from stereorig.sim.world import SimWorld
 from tests.support.service_rig import TINY
 
 TIME = "2026-01-01T00:00:00Z"

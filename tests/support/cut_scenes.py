@@ -11,8 +11,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.camera import Camera
-from sim.render import material_points
+from stereorig.core.cameras.camera import Camera
+from stereorig.sim.render import material_points
 from tests.support import field_bench as bench
 
 Motion = tuple[float, float, float, float, float, float]

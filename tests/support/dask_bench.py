@@ -14,8 +14,8 @@ from pathlib import Path
 
 import httpx
 
-from server.config.rig_file import parse_config
-from server.workflows.service import Service
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.workflows.service import Service
 from tests.support.copied_tests import CONFIG
 from tests.support.requirements import ROOT, missing
 from tests.support.service_rig import served
@@ -29,7 +29,7 @@ class Cluster:
         self._file = folder / "scheduler.json"
         self._log = (folder / "cluster.log").open("wb")
         self.workers: list[subprocess.Popen[bytes]] = []
-        self._scheduler = self._start(
+        self.scheduler = self._start(
             "dask_scheduler", "--port", "0", "--host", "127.0.0.1", "--scheduler-file", str(self._file)
         )
         try:
@@ -75,7 +75,7 @@ class Cluster:
             client.wait_for_workers(count, timeout=seconds)
 
     def close(self) -> None:
-        for process in [*self.workers, self._scheduler]:
+        for process in [*self.workers, self.scheduler]:
             process.kill()
             process.wait()
         self._log.close()

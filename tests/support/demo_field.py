@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from core.field.points.result import Field
+from stereorig.core.field.points.result import Field
 
 
 def field_of(w_of: Callable[[np.ndarray, np.ndarray], np.ndarray], *, noise_mm: float = 0.0, seed: int = 0) -> Field:

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, spline_filter
 
-from core.cameras.stereo import StereoPair
-from core.matching import prepare
-from core.matching.geometry import covariance_xyz, covariance_xyzuvw, motion_geometry, shape_geometry
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.matching import prepare
+from stereorig.core.matching.geometry import covariance_xyz, covariance_xyzuvw, motion_geometry, shape_geometry
 
 _STEPS = np.array([1e-8, 1e-6, 1e-6, 1e-6, 1e-3])
 

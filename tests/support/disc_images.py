@@ -6,8 +6,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.cameras.camera import Camera
-from core.cameras.stereo import StereoPair
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.cameras.stereo import StereoPair
 
 
 @njit(cache=True, nogil=True)

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.field.region.cuts import Cuts
-from core.strain import surface_strain
-from core.strain.options import StrainOptions
-from server.formats.results.writing import Provenance, write_field
+from stereorig.core.arrays import Float
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.core.strain import surface_strain
+from stereorig.core.strain.options import StrainOptions
+from stereorig.server.formats.results.writing import Provenance, write_field
 from tests.support.gauge_field import SUBSET, make_field
 
 ROWS, COLS = 24, 31  # x 40 to 250 px, y 60 to 221 px, 7 px apart

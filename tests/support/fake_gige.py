@@ -17,7 +17,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from drivers.cameras.aravis.gvcp import ControlState, control_state
+from stereorig.drivers.cameras.genicam.gvcp import ControlState, control_state
 
 PROGRAM = "arv-fake-gv-camera-0.8"
 _PREFIX = "srig"

@@ -8,15 +8,15 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.camera import Camera
-from core.cameras.lens import SeidelLens
-from core.cameras.stereo import StereoPair
-from core.field.region.region import PointGrid
-from sim.catalog import make_scene
-from sim.render import RenderOptions, render
-from sim.rig import SimRig
-from sim.scene import Scene
-from sim.truth import Truth, truth_at
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.cameras.lens import SeidelLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.region.region import PointGrid
+from stereorig.sim.catalog import make_scene
+from stereorig.sim.render import RenderOptions, render
+from stereorig.sim.rig import SimRig
+from stereorig.sim.scene import Scene
+from stereorig.sim.truth import Truth, truth_at
 from tests.support.requirements import ROOT
 
 SIZE = (264, 225)  # columns, rows; multiples of three

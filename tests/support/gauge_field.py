@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.field.points.result import Field
-from core.field.region.cuts import Cuts
-from core.status import PointStatus
+from stereorig.core.arrays import Float
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.core.status import PointStatus
 
 SUBSET, STEP = 21, 7
 SIGMA = np.array([2e-4, 3e-4, 9e-4, 3e-4, 2.5e-4, 1.2e-3])

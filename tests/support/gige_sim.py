@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from core.names import CAMERAS, CameraName
-from sim.controllers.esp301 import SimESP301
-from sim.controllers.server import ControllerServer
-from sim.rig import SimRig
-from sim.world import SimWorld
+from stereorig.core.names import CAMERAS, CameraName
+from stereorig.sim.controllers.esp301 import SimESP301
+from stereorig.sim.controllers.server import ControllerServer
+from stereorig.sim.rig import SimRig
+from stereorig.sim.world import SimWorld
 
 _FILL = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32

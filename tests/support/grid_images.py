@@ -16,9 +16,9 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from core.arrays import Float
-from core.cameras.camera import Camera
-from core.target import GridTarget
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.target import GridTarget
 
 PAPER_TARGET = GridTarget(pitch_mm=1.0, lines=(11, 11), line_width_mm=0.03, node_tolerance_mm=0.0)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from server.formats.disk import Disk
+from stereorig.server.formats.disk import Disk
 
 
 class HookedDisk(Disk):

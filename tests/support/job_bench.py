@@ -6,12 +6,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-from server.jobs.events import EventHub
-from server.jobs.hardware import HardwareHold
-from server.jobs.job import Job
-from server.jobs.manager import JobManager
-from server.store.catalog import Catalog
-from server.store.folder import IdMaker
+from stereorig.server.jobs.events import EventHub
+from stereorig.server.jobs.hardware import HardwareHold
+from stereorig.server.jobs.job import Job
+from stereorig.server.jobs.manager import JobManager
+from stereorig.server.store.catalog import Catalog
+from stereorig.server.store.folder import IdMaker
+from tests.support.patience import Deadline
 
 
 class Bench:
@@ -30,8 +31,8 @@ class Bench:
         self.catalog.close()
 
     def end_of(self, job: Job, seconds: float = 20.0) -> dict[str, Any]:
-        deadline = time.monotonic() + seconds
-        while time.monotonic() < deadline:
+        deadline = Deadline(seconds)
+        while deadline.left:
             document = self.jobs.document(job.id).plain()
             if document["state"] in ("succeeded", "failed", "cancelled", "interrupted"):
                 return document

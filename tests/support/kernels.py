@@ -20,20 +20,20 @@ from tests.support.requirements import ROOT
 
 def measure() -> None:
     """Shapes and motions with plane patches, as a service does when it starts; line crossings."""
-    import server.compute.measurement
-    from core.field.region.cuts import Cuts, crosses
+    import stereorig.server.compute.measurement
+    from stereorig.core.field.region.cuts import Cuts, crosses
 
-    server.compute.measurement.compile_here(1)
+    stereorig.server.compute.measurement.compile_here(1)
     crosses([[1.0, 5.0]], [[5.0, 1.0]], Cuts([[[0.0, 0.0], [9.0, 9.0]]]))
 
 
 def curved() -> None:
     """The same with quadratic patches: the shape here, the motion in a process beside it."""
-    from core.matching.fit import fit_shape
-    from core.matching.options import MatchOptions
+    from stereorig.core.matching.fit import fit_shape
+    from stereorig.core.matching.options import MatchOptions
     from tests.support.matching_scene import paper_pair
 
-    command = [sys.executable, "-m", "server.compute.background_compilation", "quadratic"]
+    command = [sys.executable, "-m", "stereorig.server.compute.background_compilation", "quadratic"]
     with subprocess.Popen(command, cwd=ROOT):
         picture = np.random.default_rng(1).normal(128.0, 20.0, (64, 64))
         options = MatchOptions(subset_px=21, patch="quadratic")
@@ -42,11 +42,11 @@ def curved() -> None:
 
 def dense() -> None:
     """The windows of dense fields, over one cell of a prediction that moves nothing."""
-    from core.dense.kernels.finish import AtPoints, Limits, Shape
-    from core.dense.prediction import Prediction
-    from core.dense.windows import finish_windows, measure_windows, node_positions
-    from core.matching.image import prepare
-    from core.matching.options import MatchOptions
+    from stereorig.core.dense.kernels.finish import AtPoints, Limits, Shape
+    from stereorig.core.dense.prediction import Prediction
+    from stereorig.core.dense.windows import finish_windows, measure_windows, node_positions
+    from stereorig.core.matching.image import prepare
+    from stereorig.core.matching.options import MatchOptions
     from tests.support.matching_scene import paper_pair
 
     picture = prepare(np.random.default_rng(1).normal(128.0, 20.0, (64, 64)))
@@ -67,8 +67,8 @@ def dense() -> None:
 
 def targets() -> None:
     """Line grids and boards, drawn by the tests' own renderers."""
-    from core.boards import BoardTarget, detect_board
-    from core.grid import GridOptions, detect_grid
+    from stereorig.core.boards import BoardTarget, detect_board
+    from stereorig.core.grid import GridOptions, detect_grid
     from tests.support.board_images import BoardCamera, board_image
     from tests.support.grid_images import PAPER_TARGET, grid_image, paper_camera
 
@@ -83,10 +83,10 @@ def targets() -> None:
 
 def scenes() -> None:
     """Every scene of the simulated world."""
-    from server.config.rig_file import parse_config
-    from sim.catalog import SCENE_NAMES, TARGET_SCENES
-    from sim.rig import SimRig
-    from sim.world import SimWorld
+    from stereorig.server.config.rig_file import parse_config
+    from stereorig.sim.catalog import SCENE_NAMES, TARGET_SCENES
+    from stereorig.sim.rig import SimRig
+    from stereorig.sim.world import SimWorld
     from tests.support.tiny_rig import tiny_rig
 
     rig = SimRig.from_dict(parse_config(tiny_rig()).model_dump(exclude_none=True))

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from core.grid import GridOptions, detect_grid
-from core.target import GridTarget
+from stereorig.core.grid import GridOptions, detect_grid
+from stereorig.core.target import GridTarget
 from tests.support.independent_rig import (
     Array,
     LineGrid,

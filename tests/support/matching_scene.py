@@ -7,15 +7,16 @@ closed form, 4 x 4 rays a pixel; nothing is warped or interpolated.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.cameras.camera import Camera, RigidTransform
-from core.cameras.lens import OpenCVLens
-from core.cameras.stereo import StereoPair
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.core.cameras.lens import OpenCVLens
+from stereorig.core.cameras.opencv_full import opencv_lens_of
+from stereorig.core.cameras.stereo import StereoPair
 
 SIZE = 160
 
@@ -48,14 +49,14 @@ def opencv_pair(size: int = SIZE) -> StereoPair:
     return _turned_pair(lens1, lens2, size)
 
 
-def rational_pair(size: int = SIZE) -> StereoPair:
+def rational_pair(size: int = SIZE, **bent: float) -> StereoPair:
     """Corners of two wide lenses of OpenCV's eight terms, 25 degrees off their axes; no skew, as OpenCV has none.
 
     What k4, k5 and k6 do there is hundreds of pixels, and their slopes across a subset are percents.
     """
     lens1 = OpenCVLens(5400.0, 5380.0, 2300.0, -1300.0, 0.0, 0.62, 0.21, 4e-4, -7e-4, 0.012, 0.94, 0.38, 0.05)
     lens2 = OpenCVLens(5350.0, 5390.0, -1900.0, 1200.0, 0.0, -0.35, 0.14, -5e-4, 3e-4, -0.05, 0.11, 0.52, -0.21)
-    return _turned_pair(lens1, lens2, size)
+    return _turned_pair(*(opencv_lens_of(asdict(lens) | bent) for lens in (lens1, lens2)), size)
 
 
 def _turned_pair(lens1: OpenCVLens, lens2: OpenCVLens, size: int) -> StereoPair:

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, spline_filter
 
-from core.cameras.stereo import StereoPair
-from core.matching import prepare
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.matching import prepare
 
 _W_STEPS = [1e-7, 1e-5, 1e-5, 1e-2, 1e-2, 1e-2]
 _G_STEPS = [1e-6, 1e-5, 1e-5, 1e-2, 1e-2, 1e-2]

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from core.names import CAMERAS
-from sim.rig import SimRig
+from stereorig.core.names import CAMERAS
+from stereorig.sim.rig import SimRig
 from tests.support.requirements import ROOT
 
 SIZE = (230, 200)

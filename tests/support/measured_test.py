@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from server.config.rig_file import parse_config
-from server.workflows.service import Service
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.workflows.service import Service
 from tests.support.service_rig import SMALL, plate_test, served, wait_for_job, wait_for_rig
 
 API = "/api/v1"

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
-from core.common.factor import Causes
-from core.field.points.result import Field
-from core.model.surface import ModelSurface
-from core.status import PointStatus
-from core.strain import surface_strain
-from core.strain.options import StrainOptions
-from server.formats.results.writing import Provenance, write_field
-from sim.plate import CircularPlate
+from stereorig.core.common.factor import Causes
+from stereorig.core.field.points.result import Field
+from stereorig.core.model.surface import ModelSurface
+from stereorig.core.status import PointStatus
+from stereorig.core.strain import surface_strain
+from stereorig.core.strain.options import StrainOptions
+from stereorig.server.formats.results.writing import Provenance, write_field
+from stereorig.sim.plate import CircularPlate
 from tests.support.strain_fields import make_field
 
 Array = NDArray[np.float64]
@@ -145,7 +145,7 @@ def bench(
     if hole_mm > 0.0:
         # subsets that reach into the hole are not measured
         status[np.hypot(x, y) < hole_mm + 0.71 * SUBSET_PX * MM_PER_PX] = PointStatus.MASKED
-    field = replace(field, status=status, covariance=covariance, common=common, causes=Causes.untold(4))
+    field = replace(field, status=status, covariance=covariance, common=common, causes=Causes.unseparated(4))
     lost = status != 0
     for name in ("xyz_mm", "uvw_mm", "covariance", "common"):
         values = getattr(field, name).copy()

@@ -11,9 +11,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from core.calibration import CalibrationView
-from core.cameras.stereo import StereoPair
-from core.names import CAMERAS
+from stereorig.core.calibration import CalibrationView
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.names import CAMERAS
 from tests.support.calibration_rigs import Array, OpenCVResult, by_frame, opencv_pair
 
 PYTHON = "/usr/bin/python3"

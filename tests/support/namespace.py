@@ -11,6 +11,8 @@ from pathlib import Path
 
 import httpx
 
+from tests.support.requirements import ROOT
+
 _CLONE_NEWNET = 0x40000000
 
 
@@ -21,6 +23,19 @@ def namespaces_missing() -> str | None:
     if os.geteuid() != 0:
         return "root, for network namespaces"
     return None
+
+
+def run_apart(*command: str, timeout_s: float | None = None) -> subprocess.CompletedProcess[str]:
+    """Run a program of this checkout in namespaces of its own; ``command`` begins with the options of unshare."""
+    return subprocess.run(
+        ["unshare", *command],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=timeout_s,
+    )
 
 
 class Namespace:

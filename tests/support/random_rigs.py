@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from core.boards import BoardTarget
-from core.calibration import CalibrationOptions, CalibrationResult, CalibrationView, NominalCamera, calibrate
-from core.calibration.inputs import AnyTarget, nodes_of
-from core.errors import StereorigError
-from core.names import CAMERAS
-from core.target import GridTarget
+from stereorig.core.boards import BoardTarget
+from stereorig.core.calibration import CalibrationOptions, CalibrationResult, CalibrationView, NominalValues, calibrate
+from stereorig.core.calibration.inputs import AnyTarget, nodes_of
+from stereorig.core.errors import StereorigError
+from stereorig.core.names import CAMERAS
+from stereorig.core.target import GridTarget
 from tests.support.calibration_rigs import (
     Array,
     Pose,
@@ -102,7 +102,7 @@ class RandomRig:
     cameras: tuple[TrueCamera, TrueCamera]
     target: AnyTarget
     views: list[CalibrationView]
-    nominals: tuple[NominalCamera, NominalCamera]
+    nominals: tuple[NominalValues, NominalValues]
     options: CalibrationOptions
 
     @property
@@ -184,7 +184,7 @@ def random_rig(seed: int) -> RandomRig:
     if fault == "wrong size":
         views = [replace(v, xy_px=v.xy_px[:-1]) for v in views]
     nominals = [
-        NominalCamera(
+        NominalValues(
             size,
             focal * (1.0 + 0.2 * float(rng.uniform(-1, 1))),
             standoff * (1.0 + 0.2 * float(rng.uniform(-1, 1))) if staged else None,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.cameras.camera import Camera, RigidTransform
-from core.cameras.lens import OpenCVLens
-from core.cameras.stereo import StereoPair
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.core.cameras.lens import OpenCVLens
+from stereorig.core.cameras.stereo import StereoPair
 from tests.support.relief_rig import (
     CYLINDER,
     HOLE,

@@ -9,9 +9,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.stereo import StereoPair
-from core.field.region.region import PointGrid
-from core.status import PointStatus
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.status import PointStatus
 from tests.support.relief_parts import calibrated
 from tests.support.relief_rig import Body, Optics, ReliefCamera, Seen, exposed, picture, truth
 

@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page
 
-from core.field.region.cuts import Cuts
-from server.config.rig_file import parse_config
-from server.formats.results.reading import read_field
-from server.formats.results.writing import Provenance, write_field
-from server.store.indexing.entries import analysis_entry
-from server.workflows.service import Service
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.formats.results.reading import read_field
+from stereorig.server.formats.results.writing import Provenance, write_field
+from stereorig.server.store.indexing.entries import analysis_entry
+from stereorig.server.workflows.service import Service
 from tests.support.page_bench import Watched, undrawn, watched
 from tests.support.service_rig import SMALL, served, wait_for_job, wait_for_rig
 

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from core.errors import CameraError
-from core.names import CAMERAS, CameraName
-from drivers.acquisition.sources import PairSource, StreamedPairs, TriggeredPairs
-from drivers.acquisition.unit import CameraUnit
-from drivers.cameras.protocol import CameraSettings, FrameGrabber, Pixels, TriggerMode
-from server.rig.cameras import CameraPair
-from sim.grabber import SimFrameGrabber, TriggerLine
+from stereorig.core.errors import CameraError
+from stereorig.core.names import CAMERAS, CameraName
+from stereorig.drivers.acquisition.sources import PairSource, StreamedPairs, TriggeredPairs
+from stereorig.drivers.acquisition.unit import CameraUnit
+from stereorig.drivers.cameras.protocol import CameraSettings, FrameGrabber, Pixels, TriggerMode
+from stereorig.server.rig.cameras import CameraPair
+from stereorig.sim.grabber import SimFrameGrabber, TriggerLine
 
 SIZE = (64, 48)
 
@@ -33,14 +33,16 @@ class MovingWorld:
         self._line, self._began_ns = line, time.monotonic_ns()
         # a sum of waves can be shifted by any fraction of a pixel without an interpolator
         rng = np.random.default_rng(7)
-        self._waves = [(*rng.uniform(-1.2, 1.2, 2), rng.uniform(0, 2 * np.pi)) for _ in range(60)]
+        waves = np.array([(*rng.uniform(-1.2, 1.2, 2), rng.uniform(0, 2 * np.pi)) for _ in range(60)])
+        self._across, down, self._phase = waves.T[..., np.newaxis]
+        self._down = np.exp(1j * down * np.arange(SIZE[1]))
 
     def expose(self, cam: CameraName, *, exposure_ms: float, gain_db: float, rng: np.random.Generator | None) -> Pixels:
         assert rng is not None
-        y, x = np.mgrid[0 : SIZE[1], 0 : SIZE[0]].astype(float)
-        x -= self.speed_px_s * (self._line.newest.at_ns - self._began_ns) / 1e9
-        image = sum(np.sin(a * x + b * y + c) for a, b, c in self._waves) * 15.0 + 128.0
-        return np.clip(image + rng.normal(0, 1.0, x.shape), 0, 255).astype(np.uint8)
+        x = np.arange(SIZE[0]) - self.speed_px_s * (self._line.newest.at_ns - self._began_ns) / 1e9
+        waves = self._down.T @ np.exp(1j * (self._across * x + self._phase))  # each wave is a product of its directions
+        image = waves.imag * 15.0 + 128.0
+        return np.clip(image + rng.normal(0, 1.0, image.shape), 0, 255).astype(np.uint8)
 
 
 class Bench:
@@ -90,6 +92,11 @@ class Bench:
             unit.open(CameraSettings(exposure_ms=5.0))
         self.pair = CameraPair(self.units["cam1"], self.units["cam2"], make_source=source, skew_is_set=skew_is_set)
         self.pair.start()
+
+    @property
+    def away(self) -> list[CameraName]:
+        """Cameras that cannot be used."""
+        return [cam for cam, unit in self.units.items() if unit.fault is not None]
 
     def grabber(self, cam: CameraName) -> FrameGrabber:
         return SimFrameGrabber(

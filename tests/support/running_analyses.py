@@ -10,9 +10,10 @@ import httpx
 import netCDF4
 import numpy as np
 
-from server.config.rig_file import parse_config
-from server.workflows.service import Service
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.workflows.service import Service
 from tests.support.copied_tests import CONFIG
+from tests.support.patience import Deadline
 from tests.support.service_rig import served
 
 API = "/api/v1"
@@ -28,8 +29,8 @@ def begin(client: httpx.Client, url: str, **changes: Any) -> tuple[str, dict[str
 
 
 def wait_for_steps(client: httpx.Client, url: str, count: int, seconds: float = 240.0) -> None:
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
+    deadline = Deadline(seconds)
+    while deadline.left:
         if len(client.get(url).json()["steps_finished"]) >= count:
             return
         time.sleep(0.005)

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from core.cameras.camera import RigidTransform
-from core.field.points.images import MeasureImage
-from core.field.points.result import Field
-from core.field.region.region import PointGrid
-from core.measure import MeasureOptions, PreviousStep, ReferencePair
-from core.settings import ReferenceUpdate
-from server.formats.results.reading import read_field
-from server.formats.results.writing import Provenance, write_field
-from sim.scene import Scene
+from stereorig.core.cameras.camera import RigidTransform
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureOptions, PreviousStep, ReferencePair
+from stereorig.core.settings import ReferenceUpdate
+from stereorig.server.formats.results.reading import read_field
+from stereorig.server.formats.results.writing import Provenance, write_field
+from stereorig.sim.scene import Scene
 from tests.bench.accuracy.paper_rig import Rig, plane_scene, true_points, turn
 from tests.bench.speed.scene import rig_of_size
 

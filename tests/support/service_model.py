@@ -16,10 +16,10 @@ import httpx
 from serial.urlhandler import protocol_socket
 from starlette.routing import BaseRoute
 
-import server.formats.disk
-from server.api.app import create_app
-from server.config.rig_file import RigConfig
-from server.workflows.service import Service
+import stereorig.server.formats.disk
+from stereorig.server.api.app import create_app
+from stereorig.server.config.rig_file import RigConfig
+from stereorig.server.workflows.service import Service
 from tests.support.hooked_disk import HookedDisk
 from tests.support.power_loss.recording import ThreadWorker
 
@@ -147,8 +147,8 @@ class Lab:
         self.starts = 0
         self.data = folder / "0"
         self.disk = KillingDisk(self.data)
-        self._real = server.formats.disk.disk, protocol_socket.time
-        server.formats.disk.disk = self.disk
+        self._real = stereorig.server.formats.disk.disk, protocol_socket.time
+        stereorig.server.formats.disk.disk = self.disk
         # pyserial waits 0.3 s after a line is closed; the next start opens another one
         protocol_socket.time = SimpleNamespace(sleep=lambda _seconds: None)
         self._open()
@@ -162,7 +162,7 @@ class Lab:
     def close(self) -> None:
         """End for good."""
         self._end()
-        server.formats.disk.disk, protocol_socket.time = self._real
+        stereorig.server.formats.disk.disk, protocol_socket.time = self._real
         shutil.rmtree(self.folder)
 
     def restart(self, aside: Path | None = None) -> None:

@@ -15,11 +15,12 @@ from typing import Any
 import httpx
 import uvicorn
 
-from core.cameras.camera import ELEVEN_PARAMETER_NAMES
-from server.api.app import create_app
-from server.config.rig_file import RigConfig, parse_config
-from server.http.connections import ConnectionLimits
-from server.workflows.service import Service
+from stereorig.core.cameras.camera import ELEVEN_PARAMETER_NAMES
+from stereorig.server.api.app import create_app
+from stereorig.server.config.rig_file import RigConfig, parse_config
+from stereorig.server.front.front import ConnectionLimits
+from stereorig.server.workflows.service import Service
+from tests.support.patience import Deadline
 from tests.support.tiny_rig import TINY, tiny_rig
 
 # half of the paper rig's pixels: lines of the grid one pixel wide, speckles of four
@@ -33,6 +34,8 @@ SMALL = (
     .replace("cy_px = 71.8", "cy_px = 117.8")
     .replace("cy_px = 72.1", "cy_px = 122.1")
     .replace("line_width_mm = 0.1", "line_width_mm = 0.06")
+    .replace("pitch_mm = 1.4", "pitch_mm = 1.0")
+    .replace("lines = [8, 8]", "lines = [11, 11]")
     .replace("speckle_mm = 0.45", "speckle_mm = 0.26")
 )
 
@@ -76,8 +79,8 @@ def served(service: Service, **app: Any) -> Iterator[httpx.Client]:
 
 def wait_for_rig(client: httpx.Client, seconds: float = 60.0) -> None:
     """Wait until the stage is homed."""
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
+    deadline = Deadline(seconds)
+    while deadline.left:
         rig = client.get("/api/v1/rig").json()
         if rig["connected"] and all(axis["state"] == "ready" for axis in rig["stage"]["axes"]):
             return
@@ -88,8 +91,8 @@ def wait_for_rig(client: httpx.Client, seconds: float = 60.0) -> None:
 
 def wait_for_job(client: httpx.Client, job: dict[str, Any], seconds: float = 240.0) -> dict[str, Any]:
     """Poll a job until it has ended."""
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
+    deadline = Deadline(seconds)
+    while deadline.left:
         document: dict[str, Any] = client.get(f"/api/v1/jobs/{job['id']}").json()
         if document["state"] in ("succeeded", "failed", "cancelled", "interrupted"):
             return document

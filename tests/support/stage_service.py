@@ -11,11 +11,12 @@ from typing import Any
 
 import httpx
 
-from server.config.rig_file import RigConfig, parse_config
-from server.workflows.service import Service
-from sim.controllers.axis import SimAxis
-from sim.controllers.registry import make_controller
-from sim.controllers.server import ControllerServer
+from stereorig.server.config.rig_file import RigConfig, parse_config
+from stereorig.server.workflows.service import Service
+from stereorig.sim.controllers.axis import SimAxis
+from stereorig.sim.controllers.registry import make_controller
+from stereorig.sim.controllers.server import ControllerServer
+from tests.support.patience import Deadline
 from tests.support.service_rig import TINY, served
 from tests.support.stage_bench import Transport
 
@@ -72,8 +73,8 @@ class StageService:
 
     def done(self, job: dict[str, Any], seconds: float = 30.0) -> dict[str, Any]:
         """Wait until a job has ended."""
-        deadline = time.monotonic() + seconds
-        while time.monotonic() < deadline:
+        deadline = Deadline(seconds)
+        while deadline.left:
             document: dict[str, Any] = self.client.get(f"{API}/jobs/{job['id']}").json()
             if document["state"] in ("succeeded", "failed", "cancelled", "interrupted"):
                 return document
@@ -92,9 +93,9 @@ class StageService:
 
 def wait_until(condition: Callable[[], object], seconds: float = 10.0) -> None:
     """Wait until a condition holds."""
-    end = time.monotonic() + seconds
+    deadline = Deadline(seconds)
     while not condition():
-        assert time.monotonic() < end, "waited in vain"
+        assert deadline.left, "waited in vain"
         time.sleep(0.002)
 
 

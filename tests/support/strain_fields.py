@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from core.field.points.result import Field
-from core.field.region.cuts import Cuts
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.cuts import Cuts
 
 Array = NDArray[np.float64]
 MM_PER_PX = 0.033

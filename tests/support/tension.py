@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Float
+from stereorig.core.arrays import Float
 
 TENSION, LATERAL = 2000e-6, -661e-6
 # the system frame in the image: 45 degrees about the line of sight, as a grid on its corner makes it, and a tilt

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.texture import Texture
+from stereorig.sim.texture import Texture
 
 
 def two_point_width_mm(texture: Texture, *, pairs: int = 200_000, seed: int = 5) -> float:

@@ -56,17 +56,22 @@ class UsbCamera:
         0 to 7.
     serial
         What its label says.
+    sizes
+        Width and height of its pictures, the usual one first.
     """
 
-    def __init__(self, port: int, serial: str) -> None:
+    def __init__(self, port: int, serial: str, sizes: tuple[tuple[int, int], ...] = SIZES) -> None:
         self.port = port
         self.serial = serial
+        self.sizes = sizes
         # exposure in 100 us, the mode as bits: 1 manual, 8 aperture priority (automatic exposure)
         self.mode = Dial(1, 0, 0, 0x01 | 0x08, 8)
         self.exposure = Dial(4, 10, 5000, 5, 300, info=0x0B)
         self.brightness = Dial(2, -64, 64, 1, 0)
         self.gain = Dial(2, 0, 100, 1, 20, info=0x0B, clamp_at=60)
+        self.gamma, self.sharpness = Dial(2, 72, 500, 1, 120), Dial(2, 0, 6, 1, 2)
         self._dials = {(1, 2): self.mode, (1, 4): self.exposure, (2, 2): self.brightness, (2, 4): self.gain}
+        self._dials |= {(2, 8): self.sharpness, (2, 9): self.gamma}
         self.frames = 0
         self.truncate = 0  # so many of the next frames lack their second half
         self.silent = False
@@ -198,7 +203,7 @@ class UsbCamera:
     def shape(self) -> tuple[str, int, int]:
         """Name of the format that was committed, width and height."""
         name, _, _ = FORMATS[self._commit[0] - 1]
-        return name, *SIZES[self._commit[1] - 1]
+        return name, *self.sizes[self._commit[1] - 1]
 
     def gray(self, number: int) -> np.ndarray:
         """Brightness of a picture in 8 bits: a pattern that moves, brighter with the exposure."""
@@ -218,12 +223,12 @@ class UsbCamera:
         return wide.tobytes()
 
     def _settled(self, form: int, frame: int, interval: int) -> tuple[int, int, int]:
-        form, frame = min(max(form, 1), len(FORMATS)), min(max(frame, 1), len(SIZES))
+        form, frame = min(max(form, 1), len(FORMATS)), min(max(frame, 1), len(self.sizes))
         return form, frame, min(map(_interval, RATES_HZ), key=lambda one: abs(one - interval))
 
     def _streaming(self, choice: tuple[int, int, int]) -> bytes:
         form, frame, interval = choice
-        width, height = SIZES[frame - 1]
+        width, height = self.sizes[frame - 1]
         size = width * height * FORMATS[form - 1][2]
         return struct.pack("<HBBI5HII", 1, form, frame, interval, 0, 0, 0, 0, 0, size, size + 2)
 
@@ -290,18 +295,17 @@ class UsbCamera:
             return bytes((len(text) + 2, 3)) + text
         return None
 
-    @staticmethod
-    def _configuration() -> bytes:
+    def _configuration(self) -> bytes:
         units = struct.pack("<BBBBHBBHHHB3s", 18, 0x24, 2, 1, 0x0201, 0, 0, 0, 0, 0, 3, b"\x0a\0\0")
-        units += struct.pack("<BBBBBHB2sB", 11, 0x24, 5, 2, 1, 0, 2, b"\x01\x02", 0)
+        units += struct.pack("<BBBBBHB2sB", 11, 0x24, 5, 2, 1, 0, 2, b"\x31\x02", 0)
         units += struct.pack("<BBBBHBBB", 9, 0x24, 3, 3, 0x0101, 0, 2, 0)
         control = bytes((9, 4, 0, 0, 0, 0x0E, 1, 0, 2))
         control += struct.pack("<BBBHHIBB", 13, 0x24, 1, 0x0100, 13 + len(units), 6_000_000, 1, 1) + units
         formats = b""
         for index, (_, code, size) in enumerate(FORMATS, 1):
-            formats += struct.pack("<BBBBB", 27, 0x24, 4, index, len(SIZES)) + code + _GUID_TAIL
+            formats += struct.pack("<BBBBB", 27, 0x24, 4, index, len(self.sizes)) + code + _GUID_TAIL
             formats += bytes((8 * size, 1, 0, 0, 0, 0))
-            for at, (width, height) in enumerate(SIZES, 1):
+            for at, (width, height) in enumerate(self.sizes, 1):
                 count = width * height * size
                 rates = [_interval(rate) for rate in RATES_HZ]
                 formats += struct.pack("<BBBBBHH", 26 + 4 * len(rates), 0x24, 5, at, 0, width, height)

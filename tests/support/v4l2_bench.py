@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from core.names import CameraName
-from drivers.cameras.protocol import CameraOptions, CameraSettings, FeatureValue, FrameGrabber
-from drivers.cameras.v4l2 import make
-from drivers.cameras.v4l2.controls import Controls
-from drivers.cameras.v4l2.device import Device
+from stereorig.core.names import CameraName
+from stereorig.drivers.cameras.protocol import CameraOptions, CameraSettings, FeatureValue, FrameGrabber
+from stereorig.drivers.cameras.v4l2 import make
+from stereorig.drivers.cameras.v4l2.controls import Controls
+from stereorig.drivers.cameras.v4l2.device import V4l2Device
 from tests.support.camera_bench import CameraBench
 
 NODES: dict[CameraName, str] = {"cam1": "/dev/video0", "cam2": "/dev/video1"}
@@ -36,7 +36,7 @@ _CALM: dict[str, FeatureValue] = {
 @contextmanager
 def controls_of(node: str) -> Iterator[Controls]:
     """The controls of a device that another one may be streaming from."""
-    device = Device(node).open()
+    device = V4l2Device(node).open()
     try:
         with device.use():
             yield Controls(device)

@@ -10,8 +10,8 @@ import weakref
 import cv2
 import numpy as np
 
-from core.errors import RegionError
-from server.worker.process import current_task
+from stereorig.core.errors import RegionError
+from stereorig.server.worker.process import current_task
 
 
 def add(a: int, b: int) -> int:
@@ -82,15 +82,15 @@ def warm_up(threads: int) -> None:
 
 def compiled_while_waiting() -> list[int]:
     """Wait for the kernels that are compiled aside, measure, and return what was compiled here all the same."""
-    import server.compute.measurement
-    from core.compiling import report_compiling
-    from core.target import GridTarget
-    from server.compute.grid_kernels import await_grid_kernels, find_drawn_grid
+    import stereorig.server.compute.measurement
+    from stereorig.core.compiling import report_compiling
+    from stereorig.core.target import GridTarget
+    from stereorig.server.compute.grid_kernels import await_grid_kernels, find_drawn_grid
 
     await_grid_kernels(GridTarget(pitch_mm=1.0, lines=(9, 9), line_width_mm=0.05))
-    server.compute.measurement.await_kernels()
+    stereorig.server.compute.measurement.await_kernels()
     compiled: list[int] = []
     with report_compiling(lambda: compiled.append(1)):
         find_drawn_grid()
-        server.compute.measurement.measure_small_steps()
+        stereorig.server.compute.measurement.measure_small_steps()
     return compiled

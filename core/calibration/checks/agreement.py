@@ -1,4 +1,4 @@
-"""Whether the two cameras disagree about where the target was, though each camera's own views are consistent."""
+"""Test for cameras that disagree about the target's pose, although each camera's own views are consistent."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.result import ViewResult
-from core.cameras.camera import normalised_jacobian
-from core.cameras.stereo import StereoPair
-from core.names import CAMERAS
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.result import ViewResult
+from stereorig.core.cameras.camera import normalised_jacobian
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.names import CAMERAS
 
 #: of the squared residuals: 0.7 to 1 for a bumped camera, below 0.2 for lenses that do not fit, bent boards and noise
 DISAGREE_SHARE = 0.5
 
 
 def share_of_own_poses(views: Sequence[ViewResult], points_mm: Float, pair: StereoPair) -> float:
-    """Return the share of the squared residuals that is gone where each camera has poses of the target of its own.
+    """Return the share of the squared residuals that vanishes if each camera gets its own poses of the target.
 
     A target seen in a free pose has one pose for both cameras. A camera that moved between the views, or images of one
     number that show two poses, make the two differ, and next to nothing else does.
@@ -25,7 +25,7 @@ def share_of_own_poses(views: Sequence[ViewResult], points_mm: Float, pair: Ster
     Parameters
     ----------
     views
-        Of a calibration; those of free poses that both cameras saw count.
+        Views of a calibration; only free poses that both cameras saw are used.
     points_mm
         (n, 3) points of the target.
     pair
@@ -34,7 +34,7 @@ def share_of_own_poses(views: Sequence[ViewResult], points_mm: Float, pair: Ster
     Returns
     -------
     float
-        0 where no pose counts.
+        0 if no pose is used.
     """
     seen = [{v.frame for v in views if v.camera == name and v.frame is not None} for name in CAMERAS]
     total = left = 0.0

@@ -1,4 +1,4 @@
-"""What changed between two calibrations of one rig: a camera moved, a lens was turned, the target's pitch is another.
+"""Cause of the difference of two calibrations of one rig: a moved camera, a turned lens, another pitch of the target.
 
 The frame is no part of a camera: the comparison takes each lens's parameters and the pose of camera 2 from camera 1.
 Each cause is a group of these numbers. A cause explains the difference if the others, with all correlations and any
@@ -14,11 +14,11 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Float
-from core.cameras.camera import POSE_NAMES, Camera, angles_from_rotation, rotation_derivatives
-from core.cameras.stereo import StereoPair
-from core.names import CAMERAS
-from core.significance import chi_square_tail
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import POSE_NAMES, Camera, angles_from_rotation, rotation_derivatives
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.names import CAMERAS
+from stereorig.core.significance import chi_square_tail
 
 Cause = Literal["scale", "camera_moved", "focal_length", "image_centre", "distortion", "lens"]
 _FOCAL = ("phd_px", "fx_px", "fy_px")
@@ -26,15 +26,15 @@ _CENTRE = ("cx_px", "cy_px")
 
 
 @dataclass(frozen=True)
-class Change:
+class CameraChange:
     """A difference of the cameras, B minus A.
 
     Attributes
     ----------
     name
-        What it is, its unit at the end.
+        Name of the number, its unit at the end.
     value, sigma
-        The difference, and its standard deviation; None where it is not known.
+        The difference, and its standard deviation; None if that is not known.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Explanation:
-    """A cause, its camera (None: both, or their relative pose), and what it leaves.
+    """A cause, its camera (None: both, or their relative pose), and the test of the remaining numbers.
 
     Attributes
     ----------
@@ -70,14 +70,14 @@ class Changes:
     numbers
         Scale, turn of camera 2 against camera 1, baseline, focal lengths, image centres.
     explanations
-        All causes, the likeliest first; empty where covariances are missing or lens models differ.
+        All causes, the likeliest first; empty if covariances are missing or lens models differ.
     explained
         True if the first explains the whole difference.
     text
         The cause in one sentence.
     """
 
-    numbers: tuple[Change, ...]
+    numbers: tuple[CameraChange, ...]
     explanations: tuple[Explanation, ...]
     explained: bool
     text: str
@@ -86,8 +86,8 @@ class Changes:
 def find_changes(
     a: StereoPair,
     b: StereoPair,
-    known_a: tuple[Sequence[str], Float | None],
-    known_b: tuple[Sequence[str], Float | None],
+    names: tuple[Sequence[str], Sequence[str]],
+    roots: tuple[Float, Float] | None,
     *,
     scale: tuple[float, float | None],
     significant: float,
@@ -98,14 +98,16 @@ def find_changes(
     ----------
     a, b
         The pairs.
-    known_a, known_b
-        Names of the estimated parameters and their covariance, None where it is not known.
+    names
+        Names of the estimated parameters of each.
+    roots
+        (n_a, q) and (n_b, q) effect of unit causes on them; None if a covariance is not known.
     scale
         Relative difference of size in the common volume, and its standard deviation.
     significant
         Probability below which a cause is refused.
     """
-    lenses = [[n for n in names if n.partition(".")[2] not in POSE_NAMES] for names, _ in (known_a, known_b)]
+    lenses = [[n for n in own if n.partition(".")[2] not in POSE_NAMES] for own in names]
     same_lens = lenses[0] == lenses[1]
     shown = lenses[0] if same_lens else [n for n in lenses[0] if n in lenses[1]]
     relative = [_relative(pair) for pair in (a, b)]
@@ -114,11 +116,12 @@ def find_changes(
     shift = relative[1][1] - relative[0][1]
     delta = np.concatenate([[values[1][n] - values[0][n] for n in shown], turn, shift])
     covariance = None
-    if known_a[1] is not None and known_b[1] is not None:
-        J_a, J_b = (_derivatives(pair, shown, names) for pair, (names, _) in ((a, known_a), (b, known_b)))
-        covariance = J_a @ known_a[1] @ J_a.T + J_b @ known_b[1] @ J_b.T
+    if roots is not None:
+        J_a, J_b = (_derivatives(pair, shown, own) for pair, own in zip((a, b), names, strict=True))
+        D = J_b @ roots[1] - J_a @ roots[0]
+        covariance = D @ D.T
     baseline = relative[0][1] / np.linalg.norm(relative[0][1])
-    size = Change("scale_ppm", 1e6 * scale[0], None if scale[1] is None else 1e6 * scale[1])
+    size = CameraChange("scale_ppm", 1e6 * scale[0], None if scale[1] is None else 1e6 * scale[1])
     numbers = (size, *_numbers(shown, delta, covariance, baseline))
     if covariance is None:
         return Changes(numbers, (), explained=False, text=_largest(numbers))
@@ -150,7 +153,7 @@ def _left(explanation: Explanation) -> float:
 
 
 def _contains(e: Explanation, first: Explanation) -> bool:
-    """Return True where a cause is the first one with more freedom."""
+    """Return True if a cause is the first one with more freedom."""
     return (e.cause == "lens" and e.camera == first.camera) or (e.cause == "camera_moved" and first.cause == "scale")
 
 
@@ -183,7 +186,7 @@ def _spins(camera: Camera) -> Float:
     return np.array(columns).T
 
 
-def _numbers(shown: Sequence[str], delta: Float, covariance: Float | None, baseline: Float) -> tuple[Change, ...]:
+def _numbers(shown: Sequence[str], delta: Float, covariance: Float | None, baseline: Float) -> tuple[CameraChange, ...]:
     turn, shift = delta[-6:-3], delta[-3:]
     size = float(np.linalg.norm(turn))
     rows: list[tuple[str, Float, float]] = []
@@ -199,14 +202,14 @@ def _numbers(shown: Sequence[str], delta: Float, covariance: Float | None, basel
     out = []
     for name, row, value in rows:
         sigma = None if covariance is None else float(np.sqrt(max(float(row @ covariance @ row), 0.0)))
-        out.append(Change(name, value, sigma))
+        out.append(CameraChange(name, value, sigma))
     return tuple(out)
 
 
 def _explanations(
     shown: Sequence[str], values: dict[str, float], delta: Float, covariance: Float, translation: Float
 ) -> list[Explanation]:
-    """Test each group of numbers; those of few numbers and those that happen often first."""
+    """Test each group of numbers; groups of few numbers and frequent causes first."""
     size = len(delta)
 
     def unit(indices: Sequence[int]) -> Float:
@@ -256,12 +259,12 @@ def _named(e: Explanation) -> str:
     return words[e.cause]
 
 
-def _shown(change: Change) -> str:
+def _shown(change: CameraChange) -> str:
     sigma = "" if change.sigma is None else f" +- {change.sigma:.2g}"
     return f"{change.name} {change.value:+.4g}{sigma}"
 
 
-def _sentence(e: Explanation, numbers: Sequence[Change], *, explained: bool) -> str:
+def _sentence(e: Explanation, numbers: Sequence[CameraChange], *, explained: bool) -> str:
     wanted: dict[Cause, tuple[str, ...]] = {
         "scale": ("scale_ppm",),
         "camera_moved": ("relative_orientation_deg", "baseline_mm"),
@@ -281,7 +284,7 @@ def _sentence(e: Explanation, numbers: Sequence[Change], *, explained: bool) -> 
     return f"No single change explains it; nearest comes {_named(e)}{part}."
 
 
-def _largest(numbers: Sequence[Change]) -> str:
+def _largest(numbers: Sequence[CameraChange]) -> str:
     """Sentence on the number that differs most in units of its standard deviation."""
     known = [n for n in numbers if n.sigma]
     if not known:

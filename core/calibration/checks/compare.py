@@ -1,33 +1,34 @@
-"""Two calibrations of one rig, compared in space: what they make of the same images, in units of their uncertainty.
+"""Comparison of two calibrations of one rig in space: positions from the same images, in units of their uncertainty.
 
 Single parameters correlate at 0.9998 and more, so that two good calibrations may differ in all of them and agree in
 every point. Points of the common volume are imaged by A's cameras; B's cameras measure these images. The frame is free:
-a rigid motion is taken out. What is left is compared with the covariances of both. Its thousands of coordinates come
-from a few parameters, so the test is made in the space that the parameters span.
+a rigid motion is taken out. The remaining difference is compared with the covariances of both. Its thousands of
+coordinates come from a few parameters, so the test is made in the space that the parameters span.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Float
-from core.calibration.checks.changed import Changes, find_changes
-from core.calibration.result import COVARIANCE_NAMES
-from core.calibration.uncertainty import image_derivatives, point_derivatives
-from core.calibration.volume import CalibratedVolume
-from core.cameras.camera import Camera, RigidTransform
-from core.cameras.stereo import StereoPair
-from core.errors import CalibrationInputError
-from core.significance import chi_square_tail
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.checks.changed import Changes, find_changes
+from stereorig.core.calibration.result import COVARIANCE_NAMES
+from stereorig.core.calibration.uncertainty import image_derivatives, point_derivatives
+from stereorig.core.calibration.volume import CalibratedVolume
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import CalibrationInputError
+from stereorig.core.significance import chi_square_tail
 
 #: probability below which two calibrations differ: three standard deviations of a Gaussian
 SIGNIFICANT = 0.0027
 _MIN_POINTS = 12
 _ROUNDS = 4
-_RANK = 1e-9  # of the largest singular value; what the frame takes away is zero to rounding
+_RANK = 1e-9  # share of the largest singular value; the frame's motions leave zero to rounding
 _TINY = 1e-12  # beyond it, no covariance is known well enough for a probability
 _ACROSS, _DOWN, _DEPTHS = 9, 7, 5
 
@@ -41,24 +42,27 @@ class UncertainPair:
     pair
         The cameras.
     names, covariance
-        Names of the estimated parameters, and their covariance (n, n); None where it is not known.
+        Names of the estimated parameters, and their covariance (n, n); None if it is not known.
+    shared
+        By name of a cause, L (n, k) with L L' its part of the covariance: errors that another calibration may share.
     """
 
     pair: StereoPair
     names: tuple[str, ...] = COVARIANCE_NAMES
     covariance: Float | None = None
+    shared: Mapping[str, Float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Difference:
-    """A difference and its standard deviation as both covariances predict it; None where one is not known."""
+    """A difference and its standard deviation as both covariances predict it; None if a covariance is not known."""
 
     value: float
     sigma: float | None
 
     @property
     def ratio(self) -> float | None:
-        """Value over standard deviation; None where it is not known."""
+        """Value over standard deviation; None if that is not known."""
         return None if not self.sigma else self.value / self.sigma
 
 
@@ -81,6 +85,8 @@ class CalibrationComparison:
         Test of all image differences together, in the space of the parameters; None without both covariances.
     unexplained_px
         Rms image difference that no change of the parameters makes, as of two lens models.
+    shared
+        Causes whose errors were taken for the same in both calibrations, so that they cancel.
     agrees
         True if the differences are those that the covariances predict; None without both.
     changes
@@ -99,6 +105,7 @@ class CalibrationComparison:
     degrees: int | None
     probability: float | None
     unexplained_px: float
+    shared: tuple[str, ...]
     agrees: bool | None
     changes: Changes
     text: str
@@ -138,17 +145,17 @@ def common_points_mm(
     image_sizes_px
         (width, height) of both cameras' images.
     volume_a, volume_b
-        Calibrated volumes; None where one is not known.
+        Calibrated volumes; None if one is not known.
 
     Returns
     -------
     Float
-        (m, 3) those seen by A's cameras, inside A's volume, and inside B's where B sees them.
+        (m, 3) points that A's cameras see, inside A's volume, and whose positions by B are inside B's volume.
 
     Raises
     ------
     CalibrationInputError
-        ``calibrations_apart`` where hardly any is left.
+        ``calibrations_apart`` if hardly any is left.
     """
     images = [camera.project(points_mm) for camera in (a.cam1, a.cam2)]
     keep = np.ones(len(points_mm), dtype=bool)
@@ -171,20 +178,19 @@ def common_points_mm(
 
 
 def compare_calibrations(a: UncertainPair, b: UncertainPair, points_mm: Float) -> CalibrationComparison:
-    """Compare what two calibrations make of the same images.
+    """Compare the positions that two calibrations measure from the same images.
 
     Parameters
     ----------
     a, b
-        The calibrations, independent of each other; what both take from one target (its pitch, its nodes) they share,
-        so that the prediction is then too large.
+        The calibrations. Causes that both have in ``shared`` are one error in both; all else is independent.
     points_mm
         (n, 3) points in A's system frame, see :func:`common_points_mm`.
 
     Raises
     ------
     CalibrationInputError
-        ``calibrations_apart`` where B cannot measure A's images.
+        ``calibrations_apart`` if B cannot measure A's images.
     """
     images = np.stack([camera.project(points_mm).xy for camera in (a.pair.cam1, a.pair.cam2)])
     found = _measured(b.pair, images)
@@ -201,25 +207,27 @@ def compare_calibrations(a: UncertainPair, b: UncertainPair, points_mm: Float) -
     shape = shape - design[:, :6] @ np.linalg.lstsq(design[:, :6], shape, rcond=None)[0]
     epipolar = b.pair.epipolar_residual_px(images[0], images[1])
     scale_row = np.linalg.pinv(design)[6]
-    sigmas = _Predicted.of(a, b, points_mm, moved, b_from_a, design, scale_row)
+    flat = [
+        (turn @ point_derivatives(own.pair, points, own.names)).reshape(shape.size, -1)
+        for own, points, turn in ((a, points_mm, b_from_a.rotation), (b, moved, np.eye(3)))
+    ]
+    shapes = [f - design[:, :6] @ np.linalg.lstsq(design[:, :6], f, rcond=None)[0] for f in flat]
+    roots = _roots(a, b, shapes)
+    sigmas = _Predicted.of(a, b, (points_mm, moved), shapes, roots, scale_row)
     vectors = shape.reshape(-1, 3)
     worst = int(np.argmax(np.linalg.norm(vectors, axis=1)))
     scale = float(scale_row @ shape)
-    statistic, degrees, outside, predicted_px = _test(a, b, points_mm, images, b_from_a)
+    statistic, degrees, outside, predicted_px = _test(a, b, points_mm, images, b_from_a, roots)
     probability = None if statistic is None else chi_square_tail(statistic, degrees)
     agrees = None
     if probability is not None and predicted_px is not None:
         agrees = probability >= SIGNIFICANT and outside <= 3.0 * predicted_px
     changes = find_changes(
-        a.pair,
-        b.pair,
-        (a.names, a.covariance),
-        (b.names, b.covariance),
-        scale=(scale, sigmas.scale),
-        significant=SIGNIFICANT,
+        a.pair, b.pair, (a.names, b.names), roots, scale=(scale, sigmas.scale), significant=SIGNIFICANT
     )
     shape_rms = Difference(float(np.sqrt(np.mean(shape**2))), sigmas.shape_rms_mm)
-    text = _text(shape_rms, agrees, probability, changes)
+    shared = () if roots is None else tuple(name for name in a.shared if name in b.shared)
+    text = _text(shape_rms, agrees, probability, changes, shared)
     return CalibrationComparison(
         points=len(points_mm),
         shape_rms_mm=shape_rms,
@@ -231,6 +239,7 @@ def compare_calibrations(a: UncertainPair, b: UncertainPair, points_mm: Float) -
         degrees=degrees,
         probability=probability,
         unexplained_px=outside,
+        shared=shared,
         agrees=agrees,
         changes=changes,
         text=text,
@@ -239,7 +248,7 @@ def compare_calibrations(a: UncertainPair, b: UncertainPair, points_mm: Float) -
 
 @dataclass(frozen=True, eq=False)
 class _Predicted:
-    """Standard deviations of the differences, (n, 3, 3) and (n,) of each point; None where they are not known."""
+    """Standard deviations of the differences, (n, 3, 3) and (n,) of each point; None if they are not known."""
 
     shape_mm2: Float | None
     scale: float | None
@@ -249,26 +258,19 @@ class _Predicted:
     def of(
         a: UncertainPair,
         b: UncertainPair,
-        points_a: Float,
-        points_b: Float,
-        b_from_a: RigidTransform,
-        design: Float,
+        points: tuple[Float, Float],
+        shapes: Sequence[Float],
+        roots: tuple[Float, Float] | None,
         scale_row: Float,
     ) -> _Predicted:
-        if a.covariance is None or b.covariance is None:
+        if roots is None:
             return _Predicted(None, None, None)
-        n = len(points_a)
-        shape, scale, epipolar = np.zeros((n, 3, 3)), 0.0, np.zeros(n)
-        for own, points, turn in ((a, points_a, b_from_a.rotation), (b, points_b, np.eye(3))):
-            assert own.covariance is not None
-            flat = (turn @ point_derivatives(own.pair, points, own.names)).reshape(3 * n, -1)
-            scale += float(scale_row @ flat @ own.covariance @ (scale_row @ flat))
-            flat = flat - design[:, :6] @ np.linalg.lstsq(design[:, :6], flat, rcond=None)[0]
-            each = flat.reshape(n, 3, -1)
-            shape += each @ own.covariance @ np.swapaxes(each, 1, 2)
-            rows = _epipolar_rows(own, points)
-            epipolar += np.einsum("np,pq,nq->n", rows, own.covariance, rows, optimize=True)
-        return _Predicted(shape, float(np.sqrt(max(scale, 0.0))), epipolar)
+        D = shapes[1] @ roots[1] - shapes[0] @ roots[0]
+        each = D.reshape(-1, 3, D.shape[1])
+        rows = [_epipolar_rows(own, own_points) for own, own_points in zip((a, b), points, strict=True)]
+        epipolar = rows[1] @ roots[1] - rows[0] @ roots[0]
+        scale = float(np.linalg.norm(scale_row @ D))
+        return _Predicted(each @ np.swapaxes(each, 1, 2), scale, (epipolar**2).sum(axis=1))
 
     @property
     def shape_rms_mm(self) -> float | None:
@@ -290,6 +292,40 @@ class _Predicted:
         return None if self.epipolar_px2 is None else float(np.sqrt(max(self.epipolar_px2[k], 0.0)))
 
 
+def _roots(a: UncertainPair, b: UncertainPair, shapes: Sequence[Float]) -> tuple[Float, Float] | None:
+    """Effect of unit causes on the parameters of both, (n_a, q) and (n_b, q); None without both covariances.
+
+    A column of a shared cause has both. Which of its columns belong together follows from the shapes (3 n, n_a) and
+    (3 n, n_b) that the parameters make: the turn of the columns that makes them most alike.
+    """
+    if a.covariance is None or b.covariance is None:
+        return None
+    both = [name for name in a.shared if name in b.shared]
+    own = [
+        _root(
+            c.covariance - sum((c.shared[n] @ c.shared[n].T for n in both), np.zeros_like(c.covariance)), c.covariance
+        )
+        for c in (a, b)
+        if c.covariance is not None
+    ]
+    columns = ([own[0], np.zeros((len(a.names), own[1].shape[1]))], [np.zeros((len(b.names), own[0].shape[1])), own[1]])
+    for name in both:
+        k = max(a.shared[name].shape[1], b.shared[name].shape[1])
+        of_a, of_b = (np.pad(c.shared[name], ((0, 0), (0, k - c.shared[name].shape[1]))) for c in (a, b))
+        left, _, right = np.linalg.svd((shapes[1] @ of_b).T @ (shapes[0] @ of_a))
+        columns[0].append(of_a)
+        columns[1].append(of_b @ left @ right)
+    return np.concatenate(columns[0], axis=1), np.concatenate(columns[1], axis=1)
+
+
+def _root(covariance: Float, whole: Float) -> Float:
+    """L (n, q) with L L' a part of the covariance ``whole``."""
+    sd = np.sqrt(np.diagonal(whole))
+    sd = np.where(sd > 0.0, sd, 1.0)  # px, rad and 1/px^2 in one matrix
+    value, vector = np.linalg.eigh(covariance / sd[:, None] / sd)
+    return np.asarray(sd[:, None] * vector * np.sqrt(np.maximum(value, 0.0)))
+
+
 def _epipolar_rows(own: UncertainPair, points: Float) -> Float:
     """Derivatives (n, p) of the distance from the epipolar line in camera 2 over the parameters."""
     A = np.concatenate([own.pair.cam1.point_jacobian(points), own.pair.cam2.point_jacobian(points)], axis=-2)
@@ -299,7 +335,7 @@ def _epipolar_rows(own: UncertainPair, points: Float) -> Float:
 
 
 def _measured(pair: StereoPair, images: Float) -> Float:
-    """Points (n, 3) nearest to both images in pixels, which is what the covariance speaks of."""
+    """Points (n, 3) nearest to both images in pixels, as the covariance assumes."""
     points = pair.triangulate(images[0], images[1]).xyz_mm
     for _ in range(2):
         A = np.concatenate([pair.cam1.point_jacobian(points), pair.cam2.point_jacobian(points)], axis=-2)
@@ -330,9 +366,14 @@ def _motions(points: Float) -> Float:
 
 
 def _test(
-    a: UncertainPair, b: UncertainPair, points_mm: Float, images: Float, b_from_a: RigidTransform
+    a: UncertainPair,
+    b: UncertainPair,
+    points_mm: Float,
+    images: Float,
+    b_from_a: RigidTransform,
+    roots: tuple[Float, Float] | None,
 ) -> tuple[float | None, int, float, float | None]:
-    """Chi-square of the image differences, its degrees of freedom, what no parameter explains, and the prediction.
+    """Chi-square of the image differences, its degrees of freedom, the part without any parameter, and the prediction.
 
     In images the whole difference is seen at once, epipolar offset and shape. Its basis is the space that the
     parameters of the calibration with most of them span, less the motions of the frame.
@@ -349,9 +390,10 @@ def _test(
     U = U[:, s > _RANK * s[0]]
     inside = U.T @ left
     outside = float(np.sqrt(np.mean((left - U @ inside) ** 2)))
-    if a.covariance is None or b.covariance is None:
+    if roots is None:
         return None, U.shape[1], outside, None
-    C = sum((U.T @ J) @ cov @ (U.T @ J).T for J, cov in zip(spans, (a.covariance, b.covariance), strict=True))
+    D = (U.T @ spans[1]) @ roots[1] - (U.T @ spans[0]) @ roots[0]
+    C = D @ D.T
     sd = np.sqrt(np.diagonal(C))
     statistic = inside / sd @ np.linalg.solve(C / np.outer(sd, sd), inside / sd)
     return float(statistic), U.shape[1], outside, float(np.sqrt(np.trace(C) / left.size))
@@ -360,9 +402,10 @@ def _test(
 def _aligned_in_images(
     pair: StereoPair, points_mm: Float, images: Float, b_from_a: RigidTransform
 ) -> tuple[Float, Float, Float]:
-    """Move A's points to where B images them best.
+    """Move A's points so that B's images of them fit best.
 
-    Returns the points (n, 3), the image differences (4 n,), and an orthonormal basis (4 n, 6) of what motions do.
+    Returns the points (n, 3), the image differences (4 n,), and an orthonormal basis (4 n, 6) of the changes by
+    motions.
     """
     moved = b_from_a.apply(points_mm)
 
@@ -383,11 +426,15 @@ def _aligned_in_images(
     return moved, left - free @ (free.T @ left), free
 
 
-def _text(shape: Difference, agrees: bool | None, probability: float | None, changes: Changes) -> str:
+def _text(
+    shape: Difference, agrees: bool | None, probability: float | None, changes: Changes, shared: tuple[str, ...]
+) -> str:
     um = f"{1e3 * shape.value:.3g} um rms of shape"
     if agrees is None or shape.sigma is None:
         return f"They differ by {um}; the uncertainty of one of them is not known, so nothing is concluded."
     predicted = f"{um} where {1e3 * shape.sigma:.3g} um are predicted"
+    if shared:
+        predicted += f" with the same {' and '.join(shared)} in both"
     if agrees:
         return f"Both calibrations agree: {predicted}, probability of so much {_chance(probability)}."
     return f"The calibrations differ: {predicted}, probability of so much {_chance(probability)}. {changes.text}"

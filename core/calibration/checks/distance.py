@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 
-from core.arrays import Bool, Float
-from core.calibration.fit.dots import dot_offsets_px
-from core.calibration.result import COVARIANCE_NAMES
-from core.calibration.uncertainty import point_derivatives
-from core.cameras.camera import Camera, RigidTransform
-from core.cameras.stereo import StereoPair
-from core.errors import CalibrationInputError
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.calibration.fit.dots import dot_offsets_px
+from stereorig.core.calibration.result import COVARIANCE_NAMES
+from stereorig.core.calibration.uncertainty import point_derivatives
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import CalibrationInputError
 
 MARK_SIGMA_PX = 0.05
 _AGREE_SIGMA = 3.0
@@ -25,7 +25,7 @@ _MIN_TARGET_POINTS = 6
 _MISFIT = 0.2
 #: imported calibrations miss by some tenths of a pixel; exchanged images or a camera that moved by more
 _EPIPOLAR_PX = 2.0
-_NODE_BOUND = float(np.sqrt(3.0))  # of a bound over the standard deviation within it
+_NODE_BOUND = float(np.sqrt(3.0))  # quotient of a bound and the standard deviation within it
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class DistanceCheck:
     Attributes
     ----------
     measured_mm, known_mm
-        The distances; of a target, those of its two outermost points.
+        The distances; for a target, the distance of its two outermost points.
     ratio
         Measured over known; not 1 for a target with another pitch than declared.
     sigma_mm
@@ -49,7 +49,7 @@ class DistanceCheck:
     residual_mm
         Rms distance of a target's points from its description, position and size fitted; None of two marks.
     covariance_known
-        False where the calibration's own uncertainty is not known and does not count.
+        False if the calibration's own uncertainty is not known and does not count.
     """
 
     measured_mm: float
@@ -84,8 +84,8 @@ def check_known_distance(
     distance_mm
         The known distance.
     covariance, names
-        Covariance of the calibration and its parameters' names, those of the paper's lens without them; None counts the
-        marks' localisation only.
+        Covariance of the calibration and its parameters' names; without names the paper's lens is assumed. Without
+        covariance only the marks' localisation counts.
     localisation_sigma_px, distance_sigma_mm
         Standard deviations of the marks' image coordinates and of the known distance.
 
@@ -136,7 +136,7 @@ def check_target_scale(
     pair
         The calibrated cameras.
     xy1_px, xy2_px
-        (..., 2) the same points in both cameras, NaN where one was not found.
+        (..., 2) the same points in both cameras, NaN for a point that was not found.
     nominal_mm
         (..., 2) positions on the target.
     covariance, names
@@ -245,7 +245,7 @@ def _variance(
 
 
 def _similarity(board: Float, points: Float) -> tuple[float, RigidTransform, Float]:
-    """Scale and pose that carry the board (n, 3) to the points, least squares, and what is left (n, 3)."""
+    """Scale and pose that map the board (n, 3) to the points, least squares, and the residuals (n, 3)."""
     middle_b, middle_p = board.mean(axis=0), points.mean(axis=0)
     a, b = board - middle_b, points - middle_p
     U, _, Vt = np.linalg.svd(b.T @ a)

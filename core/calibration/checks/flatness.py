@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from core.calibration.choice.structure import Structure
-from core.calibration.fit.adjust import Adjustment
-from core.errors import CalibrationError
+from stereorig.core.calibration.choice.structure import Structure
+from stereorig.core.calibration.fit.adjust import Adjustment
+from stereorig.core.errors import CalibrationError
 
-_SHARE = 0.7  # of all residuals: a bow of more than this is half of their squares
-_BENT = 4e-3  # of the half side: a board on glass or aluminium keeps a tenth of it
+_SHARE = 0.7  # share of all residuals: a bow of more than this is half of their squares
+_BENT = 4e-3  # share of the half side: a board on glass or aluminium keeps a tenth of it
 _LEAST_PX = 0.05  # less than this does no harm worth a refusal; the verdict names it
 
 
@@ -23,7 +23,7 @@ def check_flatness(structure: Sequence[Structure], adjustment: Adjustment, half_
     Parameters
     ----------
     structure
-        What the residuals hold.
+        Structure found in the residuals.
     adjustment
         The fit, for its noise.
     half_side_mm

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.camera import Camera
-from core.cameras.lens import LensModel, OpenCVLens, SeidelLens
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.cameras.lens import LensModel, OpenCVLens, SeidelLens
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class CheckMeasures:
     Attributes
     ----------
     mean, per_camera
-        Against the nodes that the calibration used (corrected ones where it estimated corrections).
+        Relative to the nodes that the calibration used (corrected ones if it estimated corrections).
     nominal_mean, nominal_per_camera
-        Against the nominal grid.
+        Relative to the nominal grid.
     positions_mm
         Stage positions that entered, ascending, per camera.
     frames

@@ -2,7 +2,7 @@
 
 The grid's image shrinks as 1 / (distance), so each view gives its own distance, up to one common factor. The reciprocal
 of the image scale is a straight line over dZ, with the standoff as the ratio of intercept and slope; a localiser good
-to thousandths of a pixel places a view to some micrometres on that line.
+to thousandths of a pixel locates a view on that line to some micrometres.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.inputs import CalibrationView, NominalCamera
-from core.errors import CalibrationInputError
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.inputs import CalibrationView, NominalValues
+from stereorig.core.errors import CalibrationInputError
 
 _UNITS = ((1e3, "micrometres for millimetres"), (25.4, "mils or inches for millimetres"), (10.0, "a factor of ten"))
-_STRAIGHT, _NEARLY_STRAIGHT = 0.02, 0.1  # of the travel: what the positions may lie off the line
+_STRAIGHT, _NEARLY_STRAIGHT = 0.02, 0.1  # share of the travel that the positions may be off the line
 _VISIBLE = 1e-4  # travel over standoff that image scales show with certainty
 
 
@@ -44,8 +44,8 @@ class PositionCheck:
 def image_scale(view: CalibrationView, nodes_mm: Float, aspect: float) -> tuple[float, float]:
     """Scale of the grid's image at the target's centre, px/mm, and its relative standard deviation.
 
-    The root of the determinant of a homography there; its uncertainty is that of a scale from points with the
-    homography's own residuals.
+    It is the root of the determinant of a homography there; its uncertainty follows from a fit of a scale to points
+    with the homography's own residuals.
     """
     found = view.found
     XY, xy = nodes_mm[found], view.xy_px[found] / [1.0, aspect]
@@ -75,8 +75,27 @@ def seen_distances(views: Sequence[CalibrationView], nodes_mm: Float, aspect: fl
     return 1.0 / scale, float(np.sqrt(np.mean(relative**2)))
 
 
+def focus_px(views: Sequence[CalibrationView]) -> tuple[Float, float]:
+    """Point (2,) that the images of all points move towards as one camera travels, and its standard deviation, px.
+
+    It is the principal point, if the camera travels along its optical axis. A lens's distortion moves it by little.
+    """
+    first = views[0]
+    normals, moments = [], []
+    for view in views[1:]:
+        both = first.found & view.found
+        start, way = first.xy_px[both], view.xy_px[both] - first.xy_px[both]
+        normal = np.stack([-way[:, 1], way[:, 0]], axis=-1)
+        normals.append(normal)
+        moments.append(np.sum(normal * start, axis=-1))
+    N, m = np.concatenate(normals), np.concatenate(moments)
+    focus = np.linalg.lstsq(N, m, rcond=None)[0]
+    variance = float(np.sum((N @ focus - m) ** 2)) / max(len(m) - 2, 1)
+    return focus, float(np.sqrt(variance * np.linalg.norm(np.linalg.pinv(N.T @ N), 2)))
+
+
 def check_positions(
-    views: Sequence[CalibrationView], nodes_mm: Float, nominal: NominalCamera, *, along_axis: bool = True
+    views: Sequence[CalibrationView], nodes_mm: Float, nominal: NominalValues, *, along_axis: bool = True
 ) -> PositionCheck:
     """Compare the declared positions of one camera's views with those seen in the images.
 

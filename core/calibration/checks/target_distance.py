@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.boards import BoardTarget, BoardView, detect_target
-from core.calibration.checks.distance import DistanceCheck, check_target_scale
-from core.calibration.expect import correlation_of_lines
-from core.calibration.inputs import nodes_of, pitch_scale_sigma
-from core.cameras.stereo import StereoPair
-from core.errors import StereorigError
-from core.grid import GridView
-from core.names import CAMERAS
-from core.target import GridTarget
+from stereorig.core.arrays import Float
+from stereorig.core.boards import BoardTarget, BoardView, detect_target
+from stereorig.core.calibration.checks.distance import DistanceCheck, check_target_scale
+from stereorig.core.calibration.expect import correlation_of_lines
+from stereorig.core.calibration.inputs import nodes_of, pitch_scale_sigma
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import StereorigError
+from stereorig.core.grid import GridView
+from stereorig.core.names import CAMERAS
+from stereorig.core.target import GridTarget
 
 
 def check_target_images(
@@ -40,16 +40,17 @@ def check_target_images(
     target
         A target of known size, another than the one that was calibrated with.
     covariance, names
-        As for :func:`core.calibration.checks.distance.check_known_distance`.
+        As for :func:`stereorig.core.calibration.checks.distance.check_known_distance`.
     distance_sigma_mm
-        Standard deviation of the known distance of its two outermost points, beside the target's own tolerances.
+        Standard deviation of the known distance of its two outermost points, in addition to the target's own
+        tolerances.
 
     Raises
     ------
     ImageError, TargetError
-        As :func:`core.boards.detect_target`, the camera named.
+        As :func:`stereorig.core.boards.detect_target`, the camera named.
     CalibrationInputError
-        As :func:`core.calibration.checks.distance.check_target_scale`.
+        As :func:`stereorig.core.calibration.checks.distance.check_target_scale`.
     """
     views = []
     for name, image in zip(CAMERAS, images, strict=True):
@@ -77,7 +78,7 @@ def check_target_images(
 
 
 def _sigma_px(view: GridView | BoardView) -> Float:
-    """Standard deviation of each point, made larger where points share whole lines and so their errors."""
+    """Standard deviation of each point, larger for points that share whole lines and so their errors."""
     if isinstance(view, BoardView):
         return view.sigma_px
     shared = correlation_of_lines(view.target, view.line_model)

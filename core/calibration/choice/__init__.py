@@ -1,1 +1,1 @@
-"""What a fit is made of: views that hold, the lens model, structure left in the residuals."""
+"""Inputs of a fit: consistent views, the lens model, structure left in the residuals."""

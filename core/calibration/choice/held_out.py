@@ -1,4 +1,8 @@
-"""Views that the fit did not use: at stage positions as they stand, free poses with their pose fitted alone."""
+"""Views that the fit did not use: stage positions without any fit, free poses with their pose fitted alone.
+
+If the user names no such views, some are left out in turn: a fifth of the free poses at a time, or each stage position
+except the first and the last, which keep the travel whole.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +11,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.choice.screening import Screened, points_mm
-from core.calibration.fit.adjust import Adjustment, adjust
-from core.calibration.fit.dots import dot_offsets_px
-from core.calibration.fit.free_start import pose_of
-from core.calibration.fit.layout import Layout, State, camera_of, turned
-from core.calibration.fit.problem import Problem, rebased, restricted
-from core.calibration.inputs import CalibrationView
-from core.cameras.camera import Camera, RigidTransform
-from core.errors import StereorigError
-from core.names import CAMERAS
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.choice.screening import Screened, points_mm
+from stereorig.core.calibration.fit.adjust import Adjustment, adjust
+from stereorig.core.calibration.fit.dots import dot_offsets_px
+from stereorig.core.calibration.fit.free_start import pose_of
+from stereorig.core.calibration.fit.layout import Layout, State, camera_of, camera_seeing, turned
+from stereorig.core.calibration.fit.problem import FitData, rebased, restricted
+from stereorig.core.calibration.inputs import CalibrationView
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.core.errors import StereorigError
+from stereorig.core.names import CAMERAS
 
 _FOLDS = 5
 MIN_FRAMES = 6  # with fewer, leaving some out leaves too little
@@ -63,7 +67,7 @@ def fit_target_pose(
     points_mm
         (n, 3) points of the target.
     images_px
-        (n, 2) of either camera, NaN where not found; None where it has no view.
+        (n, 2) image of each camera, NaN for points not found; None for a camera without a view.
     start
         Pose to start from.
     """
@@ -87,31 +91,44 @@ def fit_target_pose(
 
 
 def leave_out_in_turn(screened: Screened) -> list[HeldOutView]:
-    """Fit without a fifth of the free poses at a time, and return those under the cameras fitted without them.
+    """Fit without a fifth of the free poses, or without one stage position, at a time; return the views left out.
 
-    Empty where there are too few poses.
+    Each has its residuals under the cameras fitted without it. Empty if there are too few.
     """
     problem, adjustment = screened.problem, screened.adjustment
     frames = [k for k in problem.frames if k != problem.system_frame or not problem.staged]
-    if len(frames) < MIN_FRAMES:
-        return []
-    folds = [frames[i::_FOLDS] for i in range(_FOLDS)]
+    if len(frames) >= MIN_FRAMES:
+        chosen = [set(frames[i::_FOLDS]) for i in range(_FOLDS)]
+        folds = [[v for v in problem.views if v.frame in fold] for fold in chosen]
+    else:
+        folds = _positions_between(problem)
     out: list[HeldOutView] = []
-    for fold in folds:
+    for held in folds:
         try:
-            out.extend(_fold(screened, problem, adjustment, set(fold)))
+            out.extend(_fold(screened, problem, adjustment, held))
         except StereorigError:
             continue  # without these the others do not determine the cameras; that shows in the uncertainty
     return out
 
 
-def _fold(screened: Screened, problem: Problem, adjustment: Adjustment, fold: set[int]) -> list[HeldOutView]:
+def _positions_between(problem: FitData) -> list[list[CalibrationView]]:
+    """Return both cameras' views of each stage position but the first and the last, counted from the first."""
+    own = [sorted((v for v in problem.staged if v.camera == n), key=lambda v: v.position_mm) for n in CAMERAS]
+    between = [views[1:-1] for views in own]
+    return [[views[k] for views in between if k < len(views)] for k in range(max(map(len, between), default=0))]
+
+
+def _fold(
+    screened: Screened, problem: FitData, adjustment: Adjustment, held: Sequence[CalibrationView]
+) -> list[HeldOutView]:
     layout, state = adjustment.layout, adjustment.state
-    kept = [k for k, v in enumerate(problem.views) if v.frame not in fold]
-    held = [v for v in problem.views if v.frame in fold]
+    kept = [k for k, v in enumerate(problem.views) if not any(v is other for other in held)]
     left = problem.without(held)
     if left.system_frame != problem.system_frame and left.system_frame is not None:
+        old_from_new = state.sys_from_target[left.system_frame]
         state = rebased(state, layout, left.system_frame)
+        assert problem.system_frame is not None  # a frame takes over from another
+        state.sys_from_target[problem.system_frame] = old_from_new.inverse()
     other = left.layout(layout.form.model)
     fitted = adjust(
         other,
@@ -123,14 +140,27 @@ def _fold(screened: Screened, problem: Problem, adjustment: Adjustment, fold: se
         noise_px=adjustment.noise_px,
         rounds=1,
     )
+    if held[0].frame is None:
+        known = staged_views(problem, other, fitted.state, held)
+    else:
+        known = held_out_views(problem, other, fitted.state, held, state)
     rows = dict(zip(map(id, problem.views), screened.rows, strict=True))
-    known = held_out_views(problem, other, fitted.state, held, state)
     # points that the fit left out are no check
     return [replace(h, xy_px=np.where(rows[id(h.view)].found[:, None], h.xy_px, np.nan)) for h in known]
 
 
+def staged_views(problem: FitData, layout: Layout, fitted: State, held: Sequence[CalibrationView]) -> list[HeldOutView]:
+    """Return residuals of views at stage positions under fitted cameras; arguments as of :func:`held_out_views`."""
+    points = points_mm(problem, layout, fitted)
+    return [
+        held_out_view(v, camera_seeing(layout, fitted, CAMERAS.index(v.camera), v.dz_mm, None), points)
+        for v in held
+        if v.dz_mm is not None
+    ]
+
+
 def held_out_views(
-    problem: Problem, layout: Layout, fitted: State, held: Sequence[CalibrationView], start: State | None = None
+    problem: FitData, layout: Layout, fitted: State, held: Sequence[CalibrationView], start: State | None = None
 ) -> list[HeldOutView]:
     """Return free views under fitted cameras, each target's pose fitted to its own two images.
 

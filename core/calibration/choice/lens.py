@@ -2,26 +2,76 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from core.calibration.checks.flatness import check_flatness
-from core.calibration.choice.held_out import HeldOutView, held_out_view, held_out_views, leave_out_in_turn
-from core.calibration.choice.screening import Screened, fit_screened, points_mm
-from core.calibration.choice.structure import Structure, find_structure, lens_significance
-from core.calibration.choice.target_errors import find_target_errors
-from core.calibration.fit.layout import camera_seeing
-from core.calibration.fit.lens_form import LensName
-from core.calibration.fit.problem import Problem, converted, started
-from core.calibration.inputs import CalibrationView
-from core.errors import CalibrationError
-from core.names import CAMERAS
+from stereorig.core.calibration.checks.flatness import check_flatness
+from stereorig.core.calibration.choice.contradictions import (
+    FAILED_LEVEL,
+    bow_of,
+    contradicted,
+    in_words,
+    scale_seen,
+    with_open_scales,
+)
+from stereorig.core.calibration.choice.declared import AXES, SCALE_GROUPS
+from stereorig.core.calibration.choice.held_out import HeldOutView, held_out_views, leave_out_in_turn, staged_views
+from stereorig.core.calibration.choice.pairs import apart_pairs
+from stereorig.core.calibration.choice.screening import Screened, fit_screened, not_of_one_pose, points_mm
+from stereorig.core.calibration.choice.structure import (
+    LENS_TERMS,
+    Group,
+    Score,
+    Structure,
+    find_structure,
+    lens_share_px,
+    lens_significance,
+    no_target,
+    scored,
+)
+from stereorig.core.calibration.choice.target_errors import find_target_errors
+from stereorig.core.calibration.choice.target_shape import with_smooth_errors
+from stereorig.core.calibration.choice.tilted import (
+    TILTED,
+    UNTILTED,
+    as_tilts,
+    has_own_stages,
+    may_be_tilted,
+    moved_by_tilt,
+    with_open_axes,
+)
+from stereorig.core.calibration.fit.layout import State
+from stereorig.core.calibration.fit.lens_form import LensName
+from stereorig.core.calibration.fit.problem import FitData, converted, started, unfolded
+from stereorig.core.calibration.inputs import CalibrationView
+from stereorig.core.errors import CalibrationError
 
 # by chance a right lens is given more terms once in so many calibrations; they cost a little noise, while terms that
 # are missing bias the shape before their own significance is beyond doubt
 LENS_LEVELS: tuple[tuple[LensName, float], ...] = (("opencv5", 0.01), ("opencv8", 1e-3))
+_RICHER: dict[LensName, tuple[LensName, float]] = {
+    "paper": LENS_LEVELS[0],
+    "opencv5": LENS_LEVELS[1],
+    "opencv5_prism": ("opencv12", LENS_LEVELS[1][1]),
+    "opencv5_tilted": ("opencv14", LENS_LEVELS[1][1]),
+    "opencv5_prism_tilted": ("opencv14", LENS_LEVELS[1][1]),
+}
+_PRISM, _HIGHER, _TILT, _BENT_LEVEL = "thin prism", "higher prism", "tilted sensor", 1e-3
+#: the next models by the structure that makes a lens asymmetric beyond decentring
+_BENT: dict[LensName, dict[str, LensName]] = {
+    "paper": {_PRISM: "opencv5_prism", _TILT: "opencv5_tilted"},
+    "opencv5": {_PRISM: "opencv5_prism", _TILT: "opencv5_tilted"},
+    "opencv8": {_PRISM: "opencv12", _TILT: "opencv14"},
+    "opencv5_prism": {_TILT: "opencv5_prism_tilted", _HIGHER: "opencv12"},
+    "opencv5_prism_tilted": {_HIGHER: "opencv14"},
+    "opencv5_tilted": {_PRISM: "opencv5_prism_tilted"},
+    "opencv12": {_TILT: "opencv14"},
+}
+_ITERATIONS = 300
 _WORSE = 1.02  # held-out RBE over the simpler lens's beyond which more terms are refused
 
 
@@ -36,15 +86,18 @@ class Chosen:
     held_out
         Views that the fit did not use.
     structure
-        What its residuals hold beyond noise.
+        Structure of the residuals beyond noise.
     reasons
         Why this lens, as sentences.
+    stage_over_pitch
+        See :func:`stereorig.core.calibration.choice.contradictions.scale_seen`.
     """
 
     screened: Screened
     held_out: tuple[HeldOutView, ...]
     structure: tuple[Structure, ...]
     reasons: tuple[str, ...]
+    stage_over_pitch: tuple[float, float] | None
 
     @property
     def model(self) -> LensName:
@@ -52,11 +105,11 @@ class Chosen:
         return self.screened.adjustment.layout.form.model
 
 
-def choose_lens(problem: Problem, held: Sequence[CalibrationView]) -> Chosen:
+def choose_lens(problem: FitData, held: Sequence[CalibrationView]) -> Chosen:
     """Fit under the lens model that the options ask for, or find the simplest that leaves no structure.
 
-    Where all views agree that points of a target declared exact lie elsewhere, the lens is chosen anew with these
-    errors as unknowns, with a prior from the residuals. With free poses they are corrected, too.
+    If all views agree that points of a target declared exact are displaced, the lens is chosen again with these errors
+    as unknowns, with a prior from the residuals. With free poses they are corrected, too.
 
     Parameters
     ----------
@@ -70,18 +123,41 @@ def choose_lens(problem: Problem, held: Sequence[CalibrationView]) -> Chosen:
     CalibrationInputError, CalibrationError
         Views that do not give a calibration; ``target_not_flat``.
     """
-    chosen = _choose(problem, held)
+    problem, start, odd = started(problem)
+    apart = apart_pairs(problem, start, odd, held)
+    lost = not_of_one_pose(held, apart)
+    begun = _FitStart(start, apart, tuple(v for v in held if v.frame is None or v.frame not in apart))
+    chosen = _corrected(problem, begun)
+    fit = chosen.screened
+    fit = replace(fit, adjustment=with_smooth_errors(fit), dropped=(*fit.dropped, *lost))
+    return replace(chosen, screened=fit)
+
+
+@dataclass(frozen=True)
+class _FitStart:
+    """Start of a fit: the values under the paper's lens, poses left out, and views kept for the check."""
+
+    start: State
+    apart: tuple[int, ...]
+    held: tuple[CalibrationView, ...]
+
+
+def _corrected(problem: FitData, begun: _FitStart) -> Chosen:
+    """Choose the lens, again with the target's errors as unknowns where the views show some."""
+    chosen = _choose(problem, begun)
     half_side_mm = float(np.abs(problem.nodes_mm).max())
     check_flatness(chosen.structure, chosen.screened.adjustment, half_side_mm)
     fit = chosen.screened
-    if fit.adjustment.priors.nodes_free:
+    # residuals of a wrong scale or a bow under the simple lens are no errors of single points
+    other = {found.name for found in chosen.structure} & {*SCALE_GROUPS, "bow"}
+    if fit.adjustment.priors.nodes_free or (problem.staged and other):
         return chosen
     errors = find_target_errors(fit.adjustment, fit.rows, problem.flat_nodes_mm, in_space=bool(problem.frames))
     if errors is None:
         return chosen
     found, node_sigma_mm = errors
     try:
-        corrected = _choose(replace(problem, node_sigma_mm=node_sigma_mm), held)
+        corrected = _choose(replace(problem, node_sigma_mm=node_sigma_mm), begun)
     except CalibrationError:
         # these views do not determine both; the finding stays, and lowers the verdict
         return replace(chosen, structure=(found, *chosen.structure))
@@ -89,40 +165,77 @@ def choose_lens(problem: Problem, held: Sequence[CalibrationView]) -> Chosen:
         return replace(corrected, structure=(found, *corrected.structure))
     if corrected.model != chosen.model:
         # a lens must not take up the target's errors, which every position repeats
-        held_lens = replace(problem, options=replace(problem.options, lens=corrected.model))
-        chosen = replace(_choose(held_lens, held), reasons=corrected.reasons)
+        tilt = corrected.screened.problem.options.axis_tilt_sigma_rad
+        held_lens = replace(problem, options=replace(problem.options, lens=corrected.model, axis_tilt_sigma_rad=tilt))
+        chosen = replace(_choose(held_lens, begun), reasons=corrected.reasons)
     return replace(chosen, structure=(found, *chosen.structure))
 
 
-def _choose(problem: Problem, held: Sequence[CalibrationView]) -> Chosen:
-    turned, start, odd = started(problem)
-    paper = turned.layout("paper")
+def _choose(problem: FitData, begun: _FitStart) -> Chosen:
+    start, held = begun.start, begun.held
+    paper = problem.layout("paper")
 
-    def fit(model: LensName) -> Screened:
-        layout = turned.layout(model)
-        return fit_screened(turned, layout, start if model == "paper" else converted(start, paper, layout), odd)
+    def fit(model: LensName, problem: FitData = problem) -> Screened:
+        layout = problem.layout(model)
+        first = start if model == "paper" else unfolded(problem, layout, converted(start, paper, layout))
+        if "tau_x_rad" not in layout.form.distortion_names:
+            return fit_screened(problem, layout, first, begun.apart)
+        # poses, centres and decentring make room for a tilt along a curved valley
+        patient = replace(problem, options=replace(problem.options, max_iterations=_ITERATIONS))
+        fitted = fit_screened(patient, layout, first, begun.apart)
+        return replace(fitted, problem=replace(fitted.problem, options=problem.options))
 
     wanted = problem.options.lens
     if wanted != "auto":
-        screened = fit(wanted)
-        return _result(screened, held, (f"The lens model {wanted} was asked for.",))
+        asked = _Candidate(fit(wanted), held)
+        known: list[Structure] = []
+        if wanted != "paper" and problem.staged:
+            # a lens that was asked for takes a contradiction up as one that was found does
+            with suppress(CalibrationError):
+                known = _Candidate(fit("paper"), held).no_lens(LENS_LEVELS[0][1])
+        result = _result(asked, (f"The lens model {wanted} was asked for.",), known)
+        moved_mm, tilted = _with_tilt(asked, fit)
+        if tilted is None:
+            return result
+        text = (
+            "A tilted sensor in place of stages off the optical axes would leave the same residuals and move the shape "
+            f'by {1e3 * moved_mm:.2g} um, more than is reported. The lens "auto" has both as unknowns.'
+        )
+        return replace(result, structure=(*result.structure, Structure(AXES, None, {}, 1.0, 0.0, text)))
     reasons: list[str] = []
     best = _Candidate(fit("paper"), held)
-    for model, level in LENS_LEVELS:
-        probability, worst = best.significance
-        name = best.screened.adjustment.layout.form.model
-        if probability > level:
+    while True:
+        name = best.model
+        model, level = _RICHER.get(name, (name, 0.0))
+        probability, worst = best.significance if model != name else (1.0, None)
+        models = [model]
+        names: Sequence[str] = LENS_TERMS
+        bent = best.bent if probability > level or name != "paper" else []
+        if bent and bent[0].probability < (probability if probability <= level else 1.0):
+            probability, worst, level = bent[0].probability, bent[0], _BENT_LEVEL
+            models, names = [_BENT[name][b.name] for b in bent], tuple(b.name for b in bent)
+        elif worst is None or probability > level:
             reasons.append(f"{name}: more lens terms would explain no more than chance does (p = {probability:.2g}).")
+            break
+        if found := best.no_lens(level, names):
+            reasons.append(f"{name}: its residuals are no lens's: {found[0].name}, p = {found[0].probability:.1g}.")
             break
         reasons.append(
             f"{name}: its residuals ask for further lens terms ({worst.name} of {worst.camera}, p = {probability:.1g}, "
             f"{worst.rms_px:.4f} px rms)."
         )
-        try:
-            trial = _Candidate(fit(model), held)
-        except CalibrationError as error:
-            reasons.append(f"{model} is not determined by these views: {error.cause}")
+        fits: list[Screened] = []
+        why = ""
+        for one in models:  # a prism and a tilt look much alike to first order
+            try:
+                fits.append(fit(one))
+            except CalibrationError as error:
+                why = error.cause
+        if not fits:
+            reasons.append(f"{' or '.join(models)} is not determined by these views: {why}")
             break
+        trial = _Candidate(min(fits, key=lambda f: float(np.sum(f.adjustment.noise_px**2))), held)
+        model = trial.model
         before, after = best.held_out_rbe_px, trial.held_out_rbe_px
         if before is not None and after is not None:
             better = after <= _WORSE * before
@@ -131,20 +244,100 @@ def _choose(problem: Problem, held: Sequence[CalibrationView]) -> Chosen:
                 reasons.append(f"{name} was kept: views left out of the fit do not confirm {model}.")
                 break
         best = trial
-    else:
-        reasons.append("opencv8: the richest lens model.")
-    return _result(best.screened, held, tuple(reasons), best.held)
+    moved_mm, tilted = _with_tilt(best, fit)
+    if tilted is None:
+        return _or_tilted(_result(best, tuple(reasons)), fit)
+    reasons.append(
+        f"{best.model}: a tilted sensor would leave the same residuals and move the shape by {1e3 * moved_mm:.2g} um: "
+        "its tilt and those of the stages are unknowns."
+    )
+    seen = [s for s in in_words(best.screened, best.contradicted, best.asked[1]) if s.name == AXES]
+    result = _result(_Candidate(tilted, held), tuple(reasons))
+    return replace(result, structure=(*seen, *result.structure))
+
+
+def _with_tilt(best: _Candidate, fit: Callable[..., Screened]) -> tuple[float, Screened | None]:
+    """Return the shape's change by a tilted sensor, mm, and the fit with one; None if it hardly matters."""
+    found = best.screened
+    if best.model in TILTED and may_be_tilted(found, best.contradicted):
+        if any(s.name == "bow" for s in best.no_lens(0.0)):
+            return 0.0, None  # a bow shows as axes that are off
+        with suppress(CalibrationError):
+            tilted = fit(TILTED[best.model], with_open_axes(found.problem, found))
+            moved_mm = moved_by_tilt(found, tilted)
+            if moved_mm is not None:
+                return moved_mm, tilted
+    return 0.0, None
+
+
+def _or_tilted(result: Chosen, fit: Callable[..., Screened]) -> Chosen:
+    """Add to a contradiction of the scales that sensors which are tilted would leave the same residuals, if so."""
+    found, model = result.screened, TILTED.get(result.model)
+    if model is None or not has_own_stages(found) or not {s.name for s in result.structure} & {*SCALE_GROUPS}:
+        return result
+    with suppress(CalibrationError):
+        tilted = fit(model, with_open_axes(found.problem, found))
+        if text := as_tilts(tilted, with_open_scales(fit(UNTILTED[model]))):
+            named = [
+                replace(s, sentence=f"{s.sentence} {text}") if s.name in SCALE_GROUPS else s for s in result.structure
+            ]
+            return replace(result, structure=tuple(named))
+    return result
 
 
 class _Candidate:
     def __init__(self, screened: Screened, held: Sequence[CalibrationView]) -> None:
         self.screened = screened
-        self.held = _held_out(screened, held)
+        self.given = held
+
+    @cached_property
+    def held(self) -> list[HeldOutView]:
+        return _held_out(self.screened, self.given)
+
+    @cached_property
+    def asked(self) -> tuple[list[Group], Score]:
+        s = self.screened
+        return scored(s.adjustment, s.rows, s.problem.flat_nodes_mm, s.problem.nominals)
+
+    @property
+    def model(self) -> LensName:
+        return self.screened.adjustment.layout.form.model
+
+    @cached_property
+    def bent(self) -> list[Structure]:
+        """Thin prism and tilted sensor, each if the residuals ask for it and it is no error of the target."""
+        s, known = self.screened, _BENT.get(self.model, {})
+        found: list[Structure] = []
+        if known:
+            tilted = _TILT in known
+            groups, score = scored(s.adjustment, s.rows, s.problem.flat_nodes_mm, s.problem.nominals, tilted=tilted)
+            for name in known:
+                probability, best = lens_significance(groups, score, (), (name,))
+                best = replace(best, probability=min(1.0, probability * len(known)))
+                if best.probability <= _BENT_LEVEL and no_target(groups, score, best, staged=bool(s.problem.staged)):
+                    found.append(best)
+        return sorted(found, key=lambda b: b.probability)
 
     @property
     def significance(self) -> tuple[float, Structure]:
-        s = self.screened
-        return lens_significance(s.adjustment, s.rows, s.problem.flat_nodes_mm, s.problem.nominals)
+        return lens_significance(*self.asked)
+
+    @cached_property
+    def contradicted(self) -> list[tuple[Structure, Group]]:
+        return contradicted(*self.asked)
+
+    def no_lens(self, level: float, names: Sequence[str] = LENS_TERMS) -> list[Structure]:
+        """Return causes of the residuals other than lens terms, which ask for no richer lens; empty without any."""
+        given = [group for _, group in self.contradicted]
+        if not given:
+            bow = bow_of(*self.asked) if self.screened.problem.staged else None
+            return [bow] if bow is not None and bow.rms_px > lens_share_px(*self.asked) else []
+        # a millimetre measured twice explains more than all terms of a lens, or it would not be among these. With
+        # stages off their axes a tilt of the sensor, alike to first order, is not asked for
+        lens = any(g.name in names for g in self.asked[0])
+        if given[-1].name in SCALE_GROUPS or not lens or lens_significance(*self.asked, given, names)[0] > level:
+            return in_words(self.screened, self.contradicted, self.asked[1])
+        return []
 
     @property
     def held_out_rbe_px(self) -> float | None:
@@ -158,25 +351,21 @@ class _Candidate:
 
 def _held_out(screened: Screened, held: Sequence[CalibrationView]) -> list[HeldOutView]:
     a, problem = screened.adjustment, screened.problem
-    staged = []
-    for view in held:
-        if view.dz_mm is not None:
-            camera = camera_seeing(a.layout, a.state, CAMERAS.index(view.camera), view.dz_mm, None)
-            staged.append(held_out_view(view, camera, points_mm(problem, a.layout, a.state)))
+    staged = staged_views(problem, a.layout, a.state, held)
     free = [v for v in held if v.frame is not None]
     if free:
         return staged + held_out_views(problem, a.layout, a.state, free)
     return staged if staged else leave_out_in_turn(screened)
 
 
-def _result(
-    screened: Screened,
-    held: Sequence[CalibrationView],
-    reasons: tuple[str, ...],
-    held_out: list[HeldOutView] | None = None,
-) -> Chosen:
-    out = _held_out(screened, held) if held_out is None else held_out
-    found = find_structure(
-        screened.adjustment, screened.rows, screened.problem.flat_nodes_mm, screened.problem.nominals
-    )
-    return Chosen(screened, tuple(out), tuple(found), reasons)
+def _result(best: _Candidate, reasons: tuple[str, ...], known: Sequence[Structure] = ()) -> Chosen:
+    """Return the choice with the structure of its residuals, after contradictions that a simpler lens showed."""
+    groups, score = best.asked
+    # a richer lens mixes contradictions that the simple one separated
+    found = [] if known else in_words(best.screened, best.contradicted, score)
+    wrong = any(f.name in SCALE_GROUPS and f.probability < FAILED_LEVEL for f in (*known, *found))
+    if not wrong:  # the terms' names mean nothing for a rig that contradicts itself
+        found += find_structure(groups, score, [group for _, group in best.contradicted])
+    names = {f.name for f in known}
+    structure = (*known, *(f for f in found if f.name not in names))
+    return Chosen(best.screened, tuple(best.held), structure, reasons, scale_seen(groups, score))

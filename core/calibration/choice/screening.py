@@ -1,7 +1,7 @@
 """The adjustment with bad views and points of free poses left out, each with its reason.
 
-Stage positions are few and each is needed; what is wrong with them is named elsewhere. Of free poses there are many:
-a view whose points lie far further off than the others' is dropped, a point that does is left out of its view.
+Stage positions are few and each is needed; their errors are named elsewhere. Free poses are many: a view with much
+larger residuals than the others is dropped, and such a point is left out of its view.
 """
 
 from __future__ import annotations
@@ -11,22 +11,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.fit.adjust import NOISE_ROUNDS, Adjustment, adjust
-from core.calibration.fit.dots import dot_offsets_px
-from core.calibration.fit.free_start import MIN_POSES
-from core.calibration.fit.layout import Layout, State, camera_seeing
-from core.calibration.fit.model import linearise_all
-from core.calibration.fit.observations import ViewRows
-from core.calibration.fit.problem import Problem, rebased, restricted
-from core.calibration.inputs import CalibrationView
-from core.errors import CalibrationInputError
-from core.names import CAMERAS
-from core.robust import MAD_TO_SIGMA
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.fit.adjust import NOISE_ROUNDS, Adjustment, adjust
+from stereorig.core.calibration.fit.dots import dot_offsets_px
+from stereorig.core.calibration.fit.free_start import MIN_POSES
+from stereorig.core.calibration.fit.layout import Layout, State, camera_of, camera_seeing
+from stereorig.core.calibration.fit.model import linearise_all
+from stereorig.core.calibration.fit.observations import ViewRows
+from stereorig.core.calibration.fit.problem import FitData, rebased, restricted
+from stereorig.core.calibration.inputs import CalibrationView
+from stereorig.core.errors import CalibrationInputError
+from stereorig.core.names import CAMERAS
+from stereorig.core.robust import MAD_TO_SIGMA
 
-_BAD_VIEW = 4.0  # of the median view's rms residual over its noise
+_BAD_VIEW = 4.0  # multiple of the median view's rms residual over its noise
+_WELL_FOUND_PX = 0.03  # a third of a good view's residual: no view with points this near is blurred or bent
 _BAD_POINT = 7.0  # robust standard deviations of its own view
-_MAX_BAD_POINTS = 0.2  # of a view; with more the view itself is bad
+_MAX_BAD_POINTS = 0.2  # share of a view's points; with more bad points the whole view counts as bad
 _ROUNDS = 6
 _DOT_ROUNDS = 2
 
@@ -57,14 +58,14 @@ class Screened:
         The other views.
     """
 
-    problem: Problem
+    problem: FitData
     rows: tuple[ViewRows, ...]
     adjustment: Adjustment
     dropped: tuple[DroppedView, ...]
 
 
 def fit_screened(
-    problem: Problem,
+    problem: FitData,
     layout: Layout,
     start: State,
     odd: Sequence[int] = (),
@@ -81,22 +82,16 @@ def fit_screened(
     odd
         Free poses that did not fit the cameras' relative pose from the start.
     noise_px, rounds
-        See :func:`core.calibration.fit.adjust.adjust`.
+        See :func:`stereorig.core.calibration.fit.adjust.adjust`.
 
     Raises
     ------
     CalibrationInputError
-        ``too_few_poses`` where too few views hold.
+        ``too_few_poses`` if too few views hold.
     CalibrationError
-        As :func:`core.calibration.fit.adjust.adjust`.
+        As :func:`stereorig.core.calibration.fit.adjust.adjust`.
     """
-    dropped = [
-        DroppedView(
-            v.label, v.camera, int(v.frame), "the cameras show different poses: the target moved between the exposures"
-        )
-        for v in problem.views
-        if v.frame is not None and v.frame in odd
-    ]
+    dropped = not_of_one_pose(problem.views, odd)
     outside = [v for v in problem.views if v.frame is not None and v.frame in odd]
     lost = [v for v in problem.views if v.frame is not None and v not in outside and not _known(v, problem, start)]
     dropped += [
@@ -146,20 +141,31 @@ def fit_screened(
     return Screened(current, tuple(rows), adjustment, tuple(dropped))
 
 
-def points_mm(problem: Problem, layout: Layout, state: State) -> Float:
+def not_of_one_pose(views: Sequence[CalibrationView], frames: Sequence[int]) -> list[DroppedView]:
+    """Return the views of free poses that the cameras saw differently, as left out."""
+    out = []
+    for v in views:
+        if v.frame is not None and v.frame in frames:
+            pair = " and ".join(o.label for name in CAMERAS for o in views if o.frame == v.frame and o.camera == name)
+            reason = f"{pair} do not show one pose: the target moved between the exposures"
+            out.append(DroppedView(v.label, v.camera, v.frame, reason))
+    return out
+
+
+def points_mm(problem: FitData, layout: Layout, state: State) -> Float:
     """Points (n, 3) of the target as a state has them: with the pitch's scale and the nodes' corrections."""
     return np.asarray(problem.flat_nodes_mm * (1.0 + state.x[layout.pitch_scale]) + state.nodes_mm)
 
 
-def _known(view: CalibrationView, problem: Problem, state: State) -> bool:
+def _known(view: CalibrationView, problem: FitData, state: State) -> bool:
     return view.frame == problem.system_frame or view.frame in state.sys_from_target
 
 
-def _without(problem: Problem, views: Sequence[CalibrationView]) -> Problem:
+def _without(problem: FitData, views: Sequence[CalibrationView]) -> FitData:
     if not views:
         return problem
     left = problem.without(views)
-    if not left.staged:
+    if not left.staged and not left.cameras_held:
         frames = [{v.frame for v in left.views if v.camera == name} for name in CAMERAS]
         both = len(frames[0] & frames[1])
         if both < MIN_POSES:
@@ -171,7 +177,7 @@ def _without(problem: Problem, views: Sequence[CalibrationView]) -> Problem:
     return left
 
 
-def _follow(problem: Problem, left: Problem, layout: Layout, state: State) -> tuple[Layout, State]:
+def _follow(problem: FitData, left: FitData, layout: Layout, state: State) -> tuple[Layout, State]:
     """Layout and state of a problem with fewer views."""
     if left.system_frame != problem.system_frame and left.system_frame is not None:
         state = rebased(state, layout, left.system_frame)
@@ -180,7 +186,7 @@ def _follow(problem: Problem, left: Problem, layout: Layout, state: State) -> tu
 
 
 def _rows(
-    problem: Problem, layout: Layout, state: State, excluded: dict[str, Float], *, corrected: bool
+    problem: FitData, layout: Layout, state: State, excluded: dict[str, Float], *, corrected: bool
 ) -> list[ViewRows]:
     out = []
     for view, row in zip(problem.views, problem.rows, strict=True):
@@ -193,16 +199,22 @@ def _rows(
     return out
 
 
-def _bad(
-    problem: Problem, rows: Sequence[ViewRows], adjustment: Adjustment
-) -> tuple[list[tuple[CalibrationView, str]], dict[str, Float]]:
-    """Views of free poses that lie far off, with the reason, and points to leave out of the others."""
+def view_sizes(problem: FitData, rows: Sequence[ViewRows], adjustment: Adjustment) -> tuple[Float, list[Float]]:
+    """Return the residuals' lengths over the noise: of each view their rms, and (n,) of its points."""
     rms, sizes = np.zeros(len(rows)), []
     lins = linearise_all(adjustment.layout, adjustment.state, rows, problem.flat_nodes_mm)
     for k, (row, lin) in enumerate(zip(rows, lins, strict=True)):
         size = np.sqrt(row.weight) * np.linalg.norm(lin.residual_px, axis=1) / adjustment.noise_px[row.camera]
         sizes.append(size)
         rms[k] = np.sqrt(np.mean(size[row.found] ** 2)) if row.found.any() else np.inf
+    return rms, sizes
+
+
+def _bad(
+    problem: FitData, rows: Sequence[ViewRows], adjustment: Adjustment
+) -> tuple[list[tuple[CalibrationView, str]], dict[str, Float]]:
+    """Return free poses with large residuals, with the reason, and points to leave out of the others."""
+    rms, sizes = view_sizes(problem, rows, adjustment)
     free = np.array([row.frame is not None for row in rows])
     if not free.any():
         return [], {}
@@ -216,9 +228,12 @@ def _bad(
         robust = MAD_TO_SIGMA * float(np.median(own)) / 1.2  # median of a Rayleigh length over its sigma
         outlying = row.found & (sizes[k] > _BAD_POINT * max(robust, 0.5 * typical))
         few = 0 < outlying.sum() <= _MAX_BAD_POINTS * row.found.sum()
-        if few:
-            points[view.label] = outlying.astype(np.float64)
-        elif rms[k] > _BAD_VIEW * typical:
+        # at the rim of a wide lens a pixel may have no ray under the fitted lens: such a point cannot be judged
+        lens = camera_of(adjustment.layout, adjustment.state.x, row.camera).lens
+        no_ray = row.found & ~lens.normalised_from_image(row.xy_px).valid
+        if few or no_ray.any():
+            points[view.label] = (no_ray | outlying if few else no_ray).astype(np.float64)
+        elif rms[k] > _BAD_VIEW * typical and px > _WELL_FOUND_PX:
             bad.append(
                 (
                     view,

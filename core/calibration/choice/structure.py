@@ -1,34 +1,55 @@
 """Structure left in the residuals of a fit: which term of lens or target would explain it, and how surely.
 
-Each term is a further unknown, held at zero. From the normal equations at the minimum follows what it would come out
-as if it were freed (score test), and by an F test if that is more than chance. Lens terms are asked first, then a
-smooth field of fifth degree over the image, which finds what has no name.
+Each term is a further unknown, held at zero. Its value if it were freed follows from the normal equations at the
+minimum (score test), and an F test decides if that is more than chance. Lens terms are tested first, then a smooth
+field of fifth degree over the image, which finds structure without a name.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.calibration.fit.adjust import Adjustment
-from core.calibration.fit.layout import camera_of
-from core.calibration.fit.lens_form import LensName
-from core.calibration.fit.model import linearise_all
-from core.calibration.fit.normal import Extra, Normal, assemble, inverse
-from core.calibration.fit.observations import ViewRows
-from core.calibration.inputs import NominalCamera
-from core.names import CAMERAS
-from core.significance import f_tail
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.choice.declared import DECLARED, declared_terms
+from stereorig.core.calibration.fit.adjust import Adjustment
+from stereorig.core.calibration.fit.layout import camera_of
+from stereorig.core.calibration.fit.lens_form import LensName
+from stereorig.core.calibration.fit.model import linearise_all
+from stereorig.core.calibration.fit.normal import Extra, Normal, assemble, inverse
+from stereorig.core.calibration.fit.observations import ViewRows
+from stereorig.core.calibration.inputs import NominalValues
+from stereorig.core.cameras.lens import LensModel
+from stereorig.core.names import CAMERAS
+from stereorig.core.significance import f_tail
 
 SIGNIFICANT = 1e-4
 _DEGREE = 5
 _LEAST_LEFT = 1e-3
+_ROUNDING = 1e-12  # relative, of differences of sums
+_MORE = 1.2  # a sheared grid that a stage shows both cameras the same way is a skew of both, and some noise
+_LOOSE_WEIGHT = 1e-2**-2  # weight of an aspect ratio's loosest prior; a narrower prior fixes the ratio
 _SMOOTH = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i) if i + j >= 2]
+
+
+@dataclass(frozen=True)
+class Freed:
+    """Terms of a structure, estimated together with those of all others found.
+
+    Attributes
+    ----------
+    values
+        (q,) posterior means; terms that the views hardly separate from others are small.
+    pulled
+        (m,) bias of the fit's unknowns because the fit lacks the terms.
+    """
+
+    values: Float
+    pulled: Float
 
 
 @dataclass(frozen=True)
@@ -38,16 +59,21 @@ class Structure:
     Attributes
     ----------
     name
-        ``decentring``, ``radial``, ``higher radial``, ``thin prism``, ``aspect``, ``skew``, ``bow``, ``unequal
-        pitch``, ``target points`` or ``smooth``.
+        ``decentring``, ``radial``, ``higher radial``, ``thin prism``, ``higher prism``, ``tilted sensor``, ``aspect``,
+        ``skew``, ``bow``, ``unequal pitch``, ``target points``, ``smooth``, or of a declared quantity,
+        :mod:`stereorig.core.calibration.choice.declared`.
     camera
         ``cam1`` or ``cam2``; None for the target.
     terms
         Value and standard deviation of each term, by its name.
     probability
-        Of as much by chance.
+        Probability of as large a gain by chance.
     rms_px
-        What the terms move the image points by.
+        Rms shift of the image points by the terms.
+    sentence
+        The finding in words of its own; empty for the usual ones.
+    freed
+        The terms estimated with all structure found; None if they are no unknowns of one fit.
     """
 
     name: str
@@ -55,10 +81,14 @@ class Structure:
     terms: dict[str, tuple[float, float]]
     probability: float
     rms_px: float
+    sentence: str = ""
+    freed: Freed | None = field(default=None, compare=False, repr=False)
 
     @property
     def text(self) -> str:
         """The finding in one sentence."""
+        if self.sentence:
+            return self.sentence
         if self.name == "target points":
             sizes = [f"{1e3 * value:.2g} um {key.removesuffix('_mm')}" for key, (value, _) in self.terms.items()]
             return (
@@ -72,30 +102,31 @@ class Structure:
 
 
 @dataclass(frozen=True)
-class _Group:
+class Group:
+    """Terms that are tested together, and their places; ``camera`` is None for terms that both cameras share."""
+
     name: str
     camera: int | None
     names: tuple[str, ...]
     columns: NDArray[np.intp]
 
 
+_PRISM, _ASPECT, _SKEW = ("thin prism", ("s1", "s3")), ("aspect", ("aspect",)), ("skew", ("skew",))
+_HIGHER, _HIGHER_PRISM = ("higher radial", ("r8", "r10")), ("higher prism", ("s2", "s4"))
 #: groups of lens terms that a model lacks
 _LENS_GROUPS: dict[LensName, tuple[tuple[str, tuple[str, ...]], ...]] = {
-    "paper": (
-        ("decentring", ("p1", "p2")),
-        ("radial", ("k2", "k3")),
-        ("thin prism", ("s1", "s3")),
-        ("aspect", ("aspect",)),
-        ("skew", ("skew",)),
-    ),
-    "opencv5": (
-        ("higher radial", ("r8", "r10")),
-        ("thin prism", ("s1", "s3")),
-        ("aspect", ("aspect",)),
-        ("skew", ("skew",)),
-    ),
-    "opencv8": (("thin prism", ("s1", "s3")), ("aspect", ("aspect",)), ("skew", ("skew",))),
+    "paper": (("decentring", ("p1", "p2")), ("radial", ("k2", "k3")), _PRISM, _ASPECT, _SKEW),
+    "opencv5": (_HIGHER, _PRISM, _ASPECT, _SKEW),
+    "opencv8": (_PRISM, _ASPECT, _SKEW),
+    "opencv5_prism": (_HIGHER, _HIGHER_PRISM, _ASPECT, _SKEW),
+    "opencv5_tilted": (_HIGHER, _PRISM, _ASPECT, _SKEW),
+    "opencv5_prism_tilted": (_HIGHER, _HIGHER_PRISM, _ASPECT, _SKEW),
+    "opencv12": (_ASPECT, _SKEW),
+    "opencv14": (_ASPECT, _SKEW),
 }
+# to first order a homography, most of which decentring, pose and centre take up; to second order a skew, which no
+# sensor's pixels have
+_TILT = ("tilted sensor", ("tau_x_rad", "tau_y_rad", "skew"))
 #: of the groups above, those that the next model would take up
 LENS_TERMS = ("decentring", "radial", "higher radial")
 
@@ -112,10 +143,22 @@ def _lens_term(name: str, n: Float, focal_px: float) -> Float:
         "p2": (r2 + 2.0 * x * x, 2.0 * x * y),
         "s1": (r2, zero),
         "s3": (zero, r2),
+        "s2": (r2 * r2, zero),
+        "s4": (zero, r2 * r2),
         "aspect": (zero, y),
         "skew": (y, zero),
+        "tau_x_rad": (x * y, y * y),
+        "tau_y_rad": (-x * x, -x * y),
     }
     return focal_px * np.stack(fields[name], axis=-1)
+
+
+def image_fields(found: Structure, lens: LensModel, normalised: Float, size_px: tuple[int, int]) -> Float:
+    """Return the shift of a camera's images (n, 2) at depth 1 for a unit of each term of a structure, (n, 2, q)."""
+    if found.name == "smooth":
+        return _smooth(lens.image_from_normalised(normalised).xy, size_px)
+    focal_px = lens.kernel_parameters()[1]
+    return np.stack([_lens_term(name, normalised, focal_px) for name in found.terms], axis=-1)
 
 
 def _smooth(xy_px: Float, size_px: tuple[int, int]) -> Float:
@@ -129,69 +172,108 @@ def _smooth(xy_px: Float, size_px: tuple[int, int]) -> Float:
     return out
 
 
-def find_structure(
-    adjustment: Adjustment, views: Sequence[ViewRows], nominal_nodes_mm: Float, nominals: Sequence[NominalCamera]
-) -> list[Structure]:
-    """Return what the residuals hold beyond noise, most certain first.
+def find_structure(groups: Sequence[Group], score: Score, given: Sequence[Group] = ()) -> list[Structure]:
+    """Return the structure in the residuals beyond noise and declared quantities, most certain first.
 
     Parameters
     ----------
-    adjustment
-        The minimum.
-    views, nominal_nodes_mm, nominals
-        As it was fitted to.
+    groups, score
+        See :func:`scored`.
+    given
+        Groups that are known to be there.
     """
-    groups, score = _scored(adjustment, views, nominal_nodes_mm, nominals)
-    named, smooth = [g for g in groups if g.name != "smooth"], [g for g in groups if g.name == "smooth"]
-    accepted: list[_Group] = []
+    others = [g for g in groups if g.name not in DECLARED]
+    named, smooth = [g for g in others if g.name != "smooth"], [g for g in others if g.name == "smooth"]
+    accepted = list(given)
     found: list[Structure] = []
+    weights: list[Float] = []
     for candidates in (named, smooth):
         left = list(candidates)
         while left:
             tests = [(score.test(g, accepted), g) for g in left]
-            best, group = min(tests, key=lambda t: t[0].probability)
+            best, group = min(tests, key=lambda t: (t[0].probability, -t[0].rms_px))
             if not best.probability < SIGNIFICANT:
                 break
             found.append(best)
+            weights.append(score.weights(group, accepted))
             accepted.append(group)
             left.remove(group)
-    return found
+    freed = score.freed(accepted[len(given) :], weights, given)
+    return [replace(one, freed=terms) for one, terms in zip(found, freed, strict=True)]
 
 
 def lens_significance(
-    adjustment: Adjustment, views: Sequence[ViewRows], nominal_nodes_mm: Float, nominals: Sequence[NominalCamera]
+    groups: Sequence[Group], score: Score, given: Sequence[Group] = (), names: Sequence[str] = LENS_TERMS
 ) -> tuple[float, Structure]:
-    """Probability of what the next lens model's terms would explain by chance, the smaller of both cameras'.
+    """Return the probability that chance explains as much as the next lens model's terms, the smaller of both cameras'.
+
+    Parameters
+    ----------
+    groups, score, given
+        As of :func:`find_structure`.
+    names
+        Names of the terms' groups.
 
     Returns
     -------
     probability, structure
         The smallest of the groups' (each times the number of groups), and that group.
     """
-    groups, score = _scored(adjustment, views, nominal_nodes_mm, nominals)
-    chosen = [g for g in groups if g.name in LENS_TERMS]
-    tests = [score.test(g, []) for g in chosen]
-    joint = [
-        score.test(
-            _Group(
-                "+".join(g.name for g in chosen if g.camera == c),
-                c,
-                tuple(n for g in chosen if g.camera == c for n in g.names),
-                np.concatenate([g.columns for g in chosen if g.camera == c]),
-            ),
-            [],
-        )
-        for c in range(2)
-    ]
+    tests = [score.test(g, given) for g in groups if g.name in names]
+    joint = [score.test(g, given) for g in joint_terms(groups)] if names is LENS_TERMS else []
     best = min([*tests, *joint], key=lambda s: s.probability)
     return min(1.0, best.probability * len(tests)), best
 
 
-def _scored(
-    adjustment: Adjustment, views: Sequence[ViewRows], nominal_nodes_mm: Float, nominals: Sequence[NominalCamera]
-) -> tuple[list[_Group], _Score]:
-    """Groups of terms that may be asked for, and their score tests at the minimum."""
-    groups, extras, n_extra = _extras(adjustment, views, nominal_nodes_mm, nominals)
+def lens_share_px(groups: Sequence[Group], score: Score) -> float:
+    """Rms shift of both cameras' image points by all terms of the next lens model; 0 without any."""
+    moved = [score.test(g, []).rms_px ** 2 for g in joint_terms(groups)]
+    return float(np.sqrt(np.mean(moved))) if moved else 0.0
+
+
+def joint_terms(groups: Sequence[Group]) -> list[Group]:
+    """Return all terms of the next lens model, one group for each camera."""
+    out = []
+    for c in range(2):
+        own = [g for g in groups if g.name in LENS_TERMS and g.camera == c]
+        if not own:
+            continue
+        names = tuple(n for g in own for n in g.names)
+        out.append(Group("+".join(g.name for g in own), c, names, np.concatenate([g.columns for g in own])))
+    return out
+
+
+def no_target(groups: Sequence[Group], score: Score, found: Structure, *, staged: bool) -> bool:
+    """Return True if a term of both lenses explains more than errors of the target or declared quantities do."""
+
+    def squares(group: Group) -> float:
+        return score.test(group, []).rms_px ** 2 * score.points([0, 1] if group.camera is None else [group.camera])
+
+    by_lenses = sum(squares(g) for g in groups if g.name == found.name) / (_MORE if staged else 1.0)
+    rivals = [g for g in groups if g.name in ("bow", "unequal pitch", *DECLARED)]
+    return not any(score.test(g, []).probability <= found.probability and squares(g) > by_lenses for g in rivals)
+
+
+def scored(
+    adjustment: Adjustment,
+    views: Sequence[ViewRows],
+    nominal_nodes_mm: Float,
+    nominals: Sequence[NominalValues],
+    *,
+    tilted: bool = False,
+) -> tuple[list[Group], Score]:
+    """Return the groups of terms that may be tested, and their score tests at a minimum.
+
+    Parameters
+    ----------
+    adjustment
+        The minimum.
+    views, nominal_nodes_mm, nominals
+        The views, nominal points and nominal cameras of the fit.
+    tilted
+        True tests a tilted sensor as well.
+    """
+    groups, extras, n_extra = _extras(adjustment, views, nominal_nodes_mm, nominals, tilted=tilted)
     normal = assemble(
         adjustment.layout,
         adjustment.state,
@@ -202,39 +284,47 @@ def _scored(
         extras=extras,
         n_extra=n_extra,
     )
-    return groups, _Score(normal, adjustment, [sum(v.count for v in views if v.camera == c) for c in range(2)])
+    return groups, Score(normal, adjustment, [sum(v.count for v in views if v.camera == c) for c in range(2)])
 
 
 def _extras(
-    adjustment: Adjustment, views: Sequence[ViewRows], nominal_nodes_mm: Float, nominals: Sequence[NominalCamera]
-) -> tuple[list[_Group], list[Extra], int]:
+    adjustment: Adjustment,
+    views: Sequence[ViewRows],
+    nominal_nodes_mm: Float,
+    nominals: Sequence[NominalValues],
+    *,
+    tilted: bool,
+) -> tuple[list[Group], list[Extra], int]:
     layout, state = adjustment.layout, adjustment.state
     first = layout.size
-    groups: list[_Group] = []
+    groups: list[Group] = []
     at = first
     per_camera: list[list[str]] = [[], []]
     starts = [0, 0]
     for c, name in enumerate(CAMERAS):
         del name
         starts[c] = at
-        for label, terms in _LENS_GROUPS[layout.form.model]:
-            if label == "aspect" and adjustment.priors.free[layout.lens(c)][layout.form.aspect_index]:
+        for label, terms in (*_LENS_GROUPS[layout.form.model], *([_TILT] if tilted else [])):
+            if label == "aspect" and _loose(adjustment, layout.lens(c).stop - 1):
                 continue
-            groups.append(_Group(label, c, terms, np.arange(at, at + len(terms))))
+            groups.append(Group(label, c, terms, np.arange(at, at + len(terms))))
             per_camera[c].extend(terms)
             at += len(terms)
-        groups.append(_Group("smooth", c, (), np.arange(at, at + 2 * len(_SMOOTH))))
+        groups.append(Group("smooth", c, (), np.arange(at, at + 2 * len(_SMOOTH))))
         at += 2 * len(_SMOOTH)
     board = adjustment.priors.nodes_free == 0
     board_at = at
     if board:
-        groups.append(_Group("bow", None, ("XX_mm", "XY_mm", "YY_mm"), np.arange(at, at + 3)))
-        groups.append(_Group("unequal pitch", None, ("stretch", "shear"), np.arange(at + 3, at + 5)))
+        groups.append(Group("bow", None, ("XX_mm", "XY_mm", "YY_mm"), np.arange(at, at + 3)))
+        groups.append(Group("unequal pitch", None, ("stretch", "shear"), np.arange(at + 3, at + 5)))
         at += 5
     half = np.abs(nominal_nodes_mm[:, :2]).max()
     X, Y = (nominal_nodes_mm[:, :2] / half).T
+    lins = linearise_all(layout, state, views, nominal_nodes_mm)
+    declared = declared_terms(adjustment, views, lins, at)
+    groups.extend(Group(label, None, terms, own) for label, terms, own in declared.groups)
     extras = []
-    for view, lin in zip(views, linearise_all(layout, state, views, nominal_nodes_mm), strict=True):
+    for k, (view, lin) in enumerate(zip(views, lins, strict=True)):
         c = view.camera
         values = state.x[layout.lens(c)]
         size = nominals[c].image_size_px
@@ -251,11 +341,19 @@ def _extras(
             columns.append(np.arange(board_at, board_at + 5))
         extra = np.concatenate(parts, axis=-1)
         extra[~view.found] = 0.0
-        extras.append(Extra(np.concatenate(columns), extra))
-    return groups, extras, at - first
+        extras.append(
+            Extra(np.concatenate([*columns, declared.columns[k]]), np.concatenate([extra, declared.values[k]], axis=-1))
+        )
+    return groups, extras, at + declared.count - first
 
 
-class _Score:
+def _loose(adjustment: Adjustment, place: int) -> bool:
+    """Return True if only the views determine an unknown."""
+    priors = adjustment.priors
+    return bool(priors.free[place] and priors.weight[place] < _LOOSE_WEIGHT)
+
+
+class Score:
     """Score tests on one set of normal equations."""
 
     def __init__(self, normal: Normal, adjustment: Adjustment, counts: Sequence[int]) -> None:
@@ -264,27 +362,36 @@ class _Score:
         C = inverse(S[np.ix_(free, free)])
         E = np.arange(len(free)) >= adjustment.layout.size
         cross = S[np.ix_(E, free)]
+        self._pulls = np.zeros((adjustment.layout.size, int(E.sum())))
+        self._pulls[np.flatnonzero(free)] = C @ cross.T
         self._first = adjustment.layout.size
         self._matrix = S[np.ix_(E, E)] - cross @ C @ cross.T
+        # for a term that the fit or the freed groups can produce, only rounding is left
+        self._rounding = _ROUNDING * np.diagonal(S)[E]
         self._right = g[E] - cross @ (C @ g[free])
         self._redundancy = adjustment.redundancy
         self._noise = adjustment.noise_px
         self._counts = counts
 
-    def test(self, group: _Group, given: Sequence[_Group]) -> Structure:
+    def points(self, cameras: Sequence[int]) -> float:
+        """Return how many image points some cameras have."""
+        return float(sum(self._counts[c] for c in cameras))
+
+    def chance_px(self, group: Group) -> float:
+        """Rms shift of the image points by a group's terms if the residuals are noise."""
+        cameras = [group.camera] if group.camera is not None else [0, 1]
+        count = self.points(cameras)
+        return float(np.mean([self._noise[c] for c in cameras]) * np.sqrt(len(group.columns) / max(count, 1.0)))
+
+    def test(self, group: Group, given: Sequence[Group]) -> Structure:
         """Test one group with others freed too."""
         own = group.columns - self._first
-        others = np.concatenate([g.columns for g in given] or [np.zeros(0, dtype=np.intp)]) - self._first
-        others = others.astype(np.intp)
-        M, r = self._matrix[np.ix_(own, own)], self._right[own]
-        base = 0.0
-        if others.size:
-            K = np.linalg.pinv(self._matrix[np.ix_(others, others)], rcond=1e-10, hermitian=True)
-            cross = self._matrix[np.ix_(own, others)]
-            M = M - cross @ K @ cross.T
-            r = r - cross @ (K @ self._right[others])
-            base = float(self._right[others] @ K @ self._right[others])
-        scale = 1.0 / np.sqrt(np.maximum(np.diagonal(M), 1e-300))
+        M, r, base = self._left([group], given)
+        left_over = np.diagonal(M)
+        unseen = left_over <= self._rounding[own]
+        scale = 1.0 / np.sqrt(np.maximum(np.where(unseen, self._rounding[own], left_over), 1e-300))
+        variance = scale**2
+        scale[unseen] = 0.0
         values, vectors = np.linalg.eigh(M * scale[:, None] * scale)
         shown = values > 1e-9 * max(float(values[-1]), 1e-300)
         half = (vectors[:, shown] / np.sqrt(values[shown])) * scale[:, None]
@@ -294,14 +401,47 @@ class _Score:
         q = int(shown.sum())
         cameras = [group.camera] if group.camera is not None else [0, 1]
         redundancy = float(sum(self._redundancy[c] for c in cameras))
-        # linear to first order: what a term explains of large residuals leaves no less than a part of them
+        # linear to first order: large residuals keep at least a part of their squares after a term is taken out
         left = max(redundancy - base - gain, _LEAST_LEFT * redundancy)
         freedom = max(redundancy - q, 1.0)
         statistic = (gain / q) / (left / freedom) if q else 0.0
         probability = f_tail(statistic, q, freedom) if q else 1.0
-        sigma = np.sqrt(np.diagonal(C)) * np.sqrt(left / freedom)
+        sigma = np.sqrt(np.where(unseen, variance, np.diagonal(C))) * np.sqrt(left / freedom)
         noise = float(np.mean([self._noise[c] for c in cameras]))
-        count = float(sum(self._counts[c] for c in cameras))
+        count = self.points(cameras)
         terms = {n: (float(v), float(s)) for n, v, s in zip(group.names, estimate, sigma, strict=False)}
         name = None if group.camera is None else CAMERAS[group.camera]
+        if group.name == "smooth":
+            gain -= q * left / freedom  # its many terms take up as much of mere noise
         return Structure(group.name, name, terms, probability, noise * float(np.sqrt(max(gain, 0.0) / max(count, 1.0))))
+
+    def weights(self, group: Group, given: Sequence[Group]) -> Float:
+        """Return prior weights (q,) of terms: each alone is as large as the group's gain beyond the others."""
+        M, r, _ = self._left([group], given)
+        q = len(r)
+        gain = float(r @ np.linalg.pinv(M, rcond=1e-9, hermitian=True) @ r)
+        alone = np.diagonal(self._left([group], ())[0])
+        return np.asarray(np.maximum(alone, 1e-300) * q / max(gain - q, 0.1 * q))
+
+    def freed(self, groups: Sequence[Group], weights: Sequence[Float], given: Sequence[Group]) -> list[Freed]:
+        """Return the terms of groups as they are expected together, by their prior weights."""
+        if not groups:
+            return []
+        M, r, _ = self._left(groups, given)
+        estimate = np.linalg.solve(M + np.diag(np.concatenate(weights)), r)
+        parts = np.split(estimate, np.cumsum([len(g.columns) for g in groups])[:-1])
+        return [Freed(e, self._pulls[:, g.columns - self._first] @ e) for e, g in zip(parts, groups, strict=True)]
+
+    def _left(self, groups: Sequence[Group], given: Sequence[Group]) -> tuple[Float, Float, float]:
+        """Return matrix and right-hand side of some groups' terms with others freed, and the gain by the others."""
+        own, others = (
+            np.concatenate([np.zeros(0, dtype=np.intp), *(g.columns - self._first for g in part)]).astype(np.intp)
+            for part in (groups, given)
+        )
+        M, r = self._matrix[np.ix_(own, own)], self._right[own]
+        if not others.size:
+            return M, r, 0.0
+        K = np.linalg.pinv(self._matrix[np.ix_(others, others)], rcond=1e-10, hermitian=True)
+        cross = self._matrix[np.ix_(own, others)]
+        right = self._right[others]
+        return M - cross @ K @ cross.T, r - cross @ (K @ right), float(right @ K @ right)

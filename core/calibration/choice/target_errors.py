@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.choice.structure import SIGNIFICANT, Structure
-from core.calibration.fit.adjust import Adjustment
-from core.calibration.fit.normal import assemble
-from core.calibration.fit.observations import ViewRows
-from core.significance import f_tail
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.choice.structure import SIGNIFICANT, Structure
+from stereorig.core.calibration.fit.adjust import Adjustment
+from stereorig.core.calibration.fit.normal import assemble
+from stereorig.core.calibration.fit.observations import ViewRows
+from stereorig.core.significance import f_tail
 
 NAME = "target points"
-_WEAK = 1e-9  # weight of a prior that says nothing, 1/mm^2
-_MARGIN = 1.2  # what the poses and lenses took of the errors is missing in the estimate
+_WEAK = 1e-9  # weight of an uninformative prior, 1/mm^2
+_MARGIN = 1.2  # compensates the part of the errors that poses and lenses have absorbed
 
 
 def find_target_errors(
@@ -37,7 +37,7 @@ def find_target_errors(
     -------
     structure, node_sigma_mm
         The finding, and the standard deviations of the points within the target's plane and across it to take as a
-        prior; None where the points are as declared.
+        prior; None if the points are as declared.
     """
     open_nodes = replace(adjustment.priors, node_weight=np.array([_WEAK, _WEAK, _WEAK if in_space else np.inf]))
     normal = assemble(adjustment.layout, adjustment.state, views, nominal_nodes_mm, open_nodes, adjustment.noise_px)

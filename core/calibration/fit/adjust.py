@@ -3,11 +3,11 @@
 Priors enter as observations: the image centre, the stages' axes, scales and steps, the pitch, and the nodes' tolerance,
 which also fixes the freedoms that camera poses and node corrections share.
 
-An axis' tilt is held at its prior's mean unless the views show one, and is carried into the covariance whole. It moves
-the centre, and what it leaves in the images is the distortion's decentring: the product of a centre's shift and of a
-distortion that the target's errors made. A fit of both takes the distortion so found for true, lets the tilt account
-for more of these errors, and its covariance claims to have learnt from it: lengths were 1.3 times worse and their
-stated uncertainty too small.
+An axis' tilt is held at its prior's mean unless the views show one, and is carried into the covariance whole. A tilt
+moves the centre; its remaining effect on the images is decentring, the product of the centre's shift and a distortion
+that the target's errors may have caused. A fit of both treats that distortion as true, explains more of the target's
+errors by the tilt, and states a covariance as if the views had determined the tilt: lengths were 1.3 times worse and
+their stated uncertainty too small.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.fit.layout import Layout, Priors, State
-from core.calibration.fit.normal import Covariance, Normal, assemble, covariance, prior_part
-from core.calibration.fit.observations import ViewRows
-from core.errors import CalibrationError
-from core.names import Cause
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.calibration.fit.layout import Layout, Priors, State
+from stereorig.core.calibration.fit.normal import Covariance, Normal, assemble, covariance, prior_part
+from stereorig.core.calibration.fit.observations import ViewRows
+from stereorig.core.errors import CalibrationError
+from stereorig.core.names import Cause
 
 NOISE_ROUNDS = 4
 _MIN_NOISE_PX = 1e-4  # no localiser is better; keeps noise-free observations and loose priors in one system
-_LAST, _NEAR = 10, 0.1  # last steps, and what they may still gain: a tenth of what one standard deviation costs
+_LAST, _NEAR = 10, 0.1  # last steps, and the gain that they may still have: a tenth of one standard deviation's cost
 _LENS_AND_POSE = 10.0  # unknowns of a camera that correlated observations feel
-# what both axes' tilts must gain of the sum of squares to be shown: chance reaches it once in a hundred (4 unknowns)
+# gain of both axes' tilts in the sum of squares that counts as shown: chance reaches it once in a hundred (4 unknowns)
 _SHOWN_TILT = 13.28
-# or what is left of the prior's standard deviation where the views tell most: with a lens that surely distorts, or a
-# field wide enough, they know the tilt better than the prior does
-_TOLD_TILT = 0.5
+# or this share of the prior's standard deviation is left in the direction that the views determine best: with a lens
+# that surely distorts, or a field wide enough, they determine the tilt better than the prior does
+_LEFT_TILT = 0.5
 _SURE = 2.0  # standard deviations of a distortion that may be the target's errors
 
 
@@ -43,11 +43,12 @@ class Adjustment:
     Attributes
     ----------
     layout, state, priors
-        The unknowns, their values, and what was known before.
+        The unknowns, their values and their priors.
     covariance
-        (m, m) of the unknowns, zero for what is held.
+        (m, m) of the unknowns, zero for held ones.
     by_prior
-        (m, m) parts of it by what was known before: of the stage, and of the target. All else is the views' noise.
+        (m, m) parts of it by the priors of the stage and of the target. The rest is the views' noise. All else is the
+        views' noise.
     node_sigma_mm
         (n, k) of the nodes' corrections, k of X, Y, Z.
     noise_px
@@ -94,13 +95,13 @@ def adjust(
     nominal_nodes_mm
         (n, 3) nominal points of the target.
     priors
-        What is known of the unknowns.
+        Priors of the unknowns.
     max_iterations
-        Of each round.
+        Limit of iterations in each round.
     noise_px
         (2,) noise to start from; from the residuals of the start without it.
     rounds
-        Times that the noise is estimated anew.
+        Times that the noise is estimated again.
 
     Raises
     ------
@@ -108,44 +109,39 @@ def adjust(
         Codes ``calibration_singular``, ``calibration_not_converged``.
     """
     held = _without_tilts(layout, priors)
-    if held is priors:
-        return _adjusted(layout, start, views, nominal_nodes_mm, priors, max_iterations, noise_px, rounds)
     fit = _adjusted(layout, start, views, nominal_nodes_mm, held, max_iterations, noise_px, rounds)
-    normal = assemble(layout, fit.state, views, nominal_nodes_mm, priors, fit.noise_px)
-    _, g, _ = normal.reduced()
-    gained = float(g @ covariance(normal).unknowns @ g)
-    known = replace(fit.state, x=_surely_distorted(layout, fit.state.x, fit.covariance))
-    told = _told(assemble(layout, known, views, nominal_nodes_mm, priors, fit.noise_px), held)
-    if gained > _SHOWN_TILT or told < _TOLD_TILT:
-        return _adjusted(
-            layout, fit.state, views, nominal_nodes_mm, priors, max_iterations, fit.noise_px, rounds, fit.iterations
-        )
-    spread = _of_held(normal, fit.covariance)
-    return replace(
-        fit,
-        priors=priors,
-        covariance=fit.covariance + spread,
-        by_prior={**fit.by_prior, "stage": fit.by_prior["stage"] + spread},
-    )
+    if held is not priors:
+        normal = assemble(layout, fit.state, views, nominal_nodes_mm, priors, fit.noise_px)
+        _, g, _ = normal.reduced()
+        gained = float(g @ covariance(normal).unknowns @ g)
+        known = replace(fit.state, x=_surely_distorted(layout, fit.state.x, fit.covariance))
+        left = _left_share(assemble(layout, known, views, nominal_nodes_mm, priors, fit.noise_px), held)
+        if gained > _SHOWN_TILT or left < _LEFT_TILT:
+            fit = _adjusted(
+                layout, fit.state, views, nominal_nodes_mm, priors, max_iterations, fit.noise_px, rounds, fit.iterations
+            )
+    normal = assemble(layout, fit.state, views, nominal_nodes_mm, priors.opened, fit.noise_px)
+    unknowns, by_prior = _with_held(layout, normal, fit.covariance, fit.by_prior)
+    return replace(fit, priors=priors, covariance=unknowns, by_prior=by_prior)
 
 
 def expected_covariance(
     layout: Layout, state: State, views: Sequence[ViewRows], nominal_nodes_mm: Float, priors: Priors, noise_px: Float
 ) -> tuple[Float, dict[Cause, Float]]:
-    """Return what :func:`adjust` would state of views without any residual at a state.
+    """Return the covariance that :func:`adjust` would state for views without any residual at a state.
 
     Parameters
     ----------
     layout, state, views, nominal_nodes_mm, priors
-        As those of :func:`adjust`.
+        As in :func:`adjust`.
     noise_px
-        (2,) of the views.
+        (2,) noise of the views.
 
     Returns
     -------
     tuple
-        The covariance (m, m) of the unknowns, and its parts by what is known before of stage and target. An axis' tilt
-        is held at its prior by the same rule; it shows in no residual, and the views alone may tell it.
+        The covariance (m, m) of the unknowns, and its parts by the priors of stage and target. An axis' tilt is held at
+        its prior by the same rule; it shows in no residual, but the views alone may determine it.
 
     Raises
     ------
@@ -159,18 +155,17 @@ def expected_covariance(
         return found.unknowns, parts_of_priors(layout, normal, found)
 
     held = _without_tilts(layout, priors)
+    unknowns, by_prior = stated(held)
     if held is not priors:
-        unknowns, by_prior = stated(held)
         surely = replace(state, x=_surely_distorted(layout, state.x, unknowns))
-        if not _told(assemble(layout, surely, views, nominal_nodes_mm, priors, noise_px), held) < _TOLD_TILT:
-            normal = assemble(layout, state, views, nominal_nodes_mm, priors, noise_px)
-            spread = _of_held(normal, unknowns)
-            return unknowns + spread, {**by_prior, "stage": by_prior["stage"] + spread}
-    return stated(priors)
+        if _left_share(assemble(layout, surely, views, nominal_nodes_mm, priors, noise_px), held) < _LEFT_TILT:
+            unknowns, by_prior = stated(priors)
+    normal = assemble(layout, state, views, nominal_nodes_mm, priors.opened, noise_px)
+    return _with_held(layout, normal, unknowns, by_prior)
 
 
 def _without_tilts(layout: Layout, priors: Priors) -> Priors:
-    """Return priors that hold the axes' tilts where they lie; the same priors where there is none to hold."""
+    """Return priors that hold the axes' tilts at the mean; the same priors if no tilt is free."""
     tilts = [k for c in range(2) for k in range(layout.tilt(c).start, layout.tilt(c).stop)]
     if not priors.free[tilts].any():
         return priors
@@ -180,7 +175,7 @@ def _without_tilts(layout: Layout, priors: Priors) -> Priors:
 
 
 def _surely_distorted(layout: Layout, found: Float, fitted: Float) -> Float:
-    """Return the unknowns (m,) with the distortion less what errors, by the covariance (m, m), may have made of it."""
+    """Return the unknowns (m,) with the distortion reduced by its possible error, from the covariance (m, m)."""
     x = found.copy()
     sigma = np.sqrt(np.diagonal(fitted))
     for c in range(2):
@@ -190,24 +185,33 @@ def _surely_distorted(layout: Layout, found: Float, fitted: Float) -> Float:
     return x
 
 
-def _told(normal: Normal, held: Priors) -> float:
-    """Return the least share of the prior's standard deviation that is left of what ``held`` holds."""
+def _left_share(normal: Normal, held: Priors) -> float:
+    """Return the smallest remaining share of the prior's standard deviation for the unknowns that ``held`` holds."""
     tilts = np.flatnonzero(normal.free & ~held.free)
     root = np.sqrt(normal.prior[tilts])
     left = covariance(normal).unknowns[np.ix_(tilts, tilts)] * root[:, None] * root
     return float(np.sqrt(np.linalg.eigvalsh(left)[0]))
 
 
-def _of_held(normal: Normal, fitted: Float) -> Float:
-    """Return what unknowns with a prior that a fit held put into its covariance (m, m): themselves, and what they move.
+def _with_held(
+    layout: Layout, normal: Normal, fitted: Float, by_prior: dict[Cause, Float]
+) -> tuple[Float, dict[Cause, Float]]:
+    """Add the effect of held unknowns with a prior to a fit's covariance (m, m) and its parts.
 
-    ``normal`` has them free, ``fitted`` (m, m) is the covariance of the fit.
+    ``normal`` has them free; their errors move the other unknowns, too.
     """
     held = np.flatnonzero(normal.free & (np.diagonal(fitted) == 0.0))
+    if not held.size:
+        return fitted, by_prior
     moved = np.zeros((len(fitted), len(held)))
     moved[held, range(len(held))] = 1.0
     moved -= fitted @ normal.reduced()[0][:, held]
-    return np.asarray((moved / normal.prior[held]) @ moved.T)
+    of_stage = np.isin(held, layout.stage)
+
+    def spread(some: Bool) -> Float:
+        return np.asarray((moved[:, some] / normal.prior[held[some]]) @ moved[:, some].T)
+
+    return fitted + spread(of_stage) + spread(~of_stage), {**by_prior, "stage": by_prior["stage"] + spread(of_stage)}
 
 
 def _adjusted(
@@ -245,8 +249,8 @@ def _adjusted(
         except CalibrationError:
             if iterations > before or np.array_equal(noise, unfit):
                 raise
-            # views that do not fit each other: far from a localiser's noise the minimum is hard to reach, and what is
-            # wrong shows there
+            # views that contradict each other: far from a localiser's noise the minimum is hard to reach, and the
+            # residuals there show the cause
             state, normal, steps = _minimise(layout, start, unfit, evaluate, max_iterations)
         iterations += steps
         redundancy = counts - covariance(normal).taken
@@ -276,7 +280,7 @@ def _adjusted(
 
 
 def parts_of_priors(layout: Layout, normal: Normal, found: Covariance) -> dict[Cause, Float]:
-    """Return the parts (m, m) of the unknowns' covariance that what was known of stage and target put there."""
+    """Return the parts (m, m) of the unknowns' covariance from the priors of stage and target."""
     return {
         "stage": prior_part(normal, found, layout.stage),
         "target": prior_part(normal, found, [layout.pitch_scale], nodes=True),
@@ -313,7 +317,8 @@ def _minimise(
             break
         recent = [*recent[-_LAST + 1 :], max(gain, 0.0)]
     else:
-        # where a model does not fit, steps shrink slowly, and its misfit, told as noise, is far more than is left
+        # if the model does not fit, steps shrink slowly, and its misfit, counted as noise, is far larger than the
+        # remaining gain
         if sum(recent) <= _NEAR:
             return state, normal, max_iterations
     raise CalibrationError(

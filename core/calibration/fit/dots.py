@@ -1,12 +1,12 @@
-"""What a camera's view of dots has to be corrected by."""
+"""Corrections to a camera's view of dots."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from core.arrays import Float
-from core.boards.eccentricity import dot_centre_offset_px
-from core.cameras.camera import Camera
+from stereorig.core.arrays import Float
+from stereorig.core.boards.eccentricity import dot_centre_offset_px
+from stereorig.core.cameras.camera import Camera
 
 
 def dot_offsets_px(camera: Camera, nodes_mm: Float, radius_mm: float) -> Float:

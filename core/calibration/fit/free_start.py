@@ -9,17 +9,19 @@ from typing import Any
 import cv2
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.inputs import CalibrationView, NominalCamera
-from core.cameras.camera import RigidTransform
-from core.cameras.lens import LensModel
-from core.errors import CalibrationError, CalibrationInputError
-from core.names import CAMERAS
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.inputs import CalibrationView, NominalValues
+from stereorig.core.cameras.camera import RigidTransform
+from stereorig.core.cameras.lens import LensModel
+from stereorig.core.errors import CalibrationError, CalibrationInputError
+from stereorig.core.names import CAMERAS
 
 MIN_POSES = 3
 _MAX_POINTS = 120  # a view, for the start
 _SAME_TURN_RAD = np.radians(3.0)
-_SAME_SHIFT = 0.1  # of the distance to the target
+_SAME_SHIFT = 0.1  # share of the distance to the target
+_RATIOS = (1.0, 0.6, 1.7)  # multiples of the nominal aspect ratio, to start from
+_SURELY = 0.5  # share of the other start's residuals
 _LEAST_TILT_RAD = np.radians(3.0)
 _LEAST_POINTS = 6
 
@@ -30,7 +32,7 @@ class FreeStart:
 
     Attributes
     ----------
-    focal_px, k1
+    focal_px, k1, aspect
         (2,) of each camera.
     cam2_from_cam1
         Relative pose.
@@ -44,6 +46,7 @@ class FreeStart:
 
     focal_px: Float
     k1: Float
+    aspect: Float
     cam2_from_cam1: RigidTransform
     cam1_from_target: dict[int, RigidTransform]
     half_turned: frozenset[int]
@@ -51,7 +54,12 @@ class FreeStart:
 
 
 def start_free(
-    views: Sequence[CalibrationView], nodes_mm: Float, nominals: Sequence[NominalCamera], *, symmetric: bool
+    views: Sequence[CalibrationView],
+    nodes_mm: Float,
+    nominals: Sequence[NominalValues],
+    *,
+    symmetric: bool,
+    open_aspect: bool = True,
 ) -> FreeStart:
     """Find the start of both cameras from free poses alone.
 
@@ -65,6 +73,8 @@ def start_free(
         Nominal cameras; only the pinhole distance and the aspect ratio are used.
     symmetric
         True if the target looks the same turned by half a turn.
+    open_aspect
+        True if the aspect ratio may have any value.
 
     Raises
     ------
@@ -80,12 +90,15 @@ def start_free(
             code="too_few_poses",
             remedy="Take at least three views with the target tilted differently, better fifteen.",
         )
-    single = [_single_camera(frames[name], nodes_mm, n) for name, n in zip(CAMERAS, nominals, strict=True)]
+    single = [
+        _single_camera(frames[name], nodes_mm, n, open_aspect=open_aspect)
+        for name, n in zip(CAMERAS, nominals, strict=True)
+    ]
     _check_tilts(single[0].poses, single[1].poses)
     pairs = {k: (single[0].poses[k], single[1].poses[k]) for k in both}
     relative, flipped, agreeing = _consensus(pairs, symmetric=symmetric)
     if len(agreeing) < max(MIN_POSES, (len(both) + 1) // 2):
-        _raise_inconsistent(frames["cam2"], pairs, nodes_mm, nominals[1], len(agreeing), symmetric=symmetric)
+        _raise_inconsistent(frames["cam2"], pairs, nodes_mm, nominals[1], len(agreeing), open_aspect=open_aspect)
     poses = dict(single[0].poses)
     for k, pose in single[1].poses.items():
         if k not in poses:
@@ -93,6 +106,7 @@ def start_free(
     return FreeStart(
         focal_px=np.array([s.focal_px for s in single]),
         k1=np.array([s.k1 for s in single]),
+        aspect=np.array([s.aspect for s in single]),
         cam2_from_cam1=relative,
         cam1_from_target=poses,
         half_turned=frozenset(flipped),
@@ -104,6 +118,7 @@ def start_free(
 class _Single:
     focal_px: float
     k1: float
+    aspect: float
     poses: dict[int, RigidTransform]
 
 
@@ -116,7 +131,9 @@ def _points(view: CalibrationView, nodes_mm: Float, aspect: float) -> tuple[Floa
     return XY, xy
 
 
-def _single_camera(views: Mapping[int, CalibrationView], nodes_mm: Float, nominal: NominalCamera) -> _Single:
+def _single_camera(
+    views: Mapping[int, CalibrationView], nodes_mm: Float, nominal: NominalValues, *, open_aspect: bool
+) -> _Single:
     numbers = sorted(views)
     objects, images = [], []
     for k in numbers:
@@ -134,14 +151,25 @@ def _single_camera(views: Mapping[int, CalibrationView], nodes_mm: Float, nomina
         | cv2.CALIB_FIX_K3
     )
     best: tuple[float, Any, Any, Any, Any] | None = None
-    for focal in (nominal.phd_px, 1.6 * nominal.phd_px, nominal.phd_px / 1.6):
-        K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
+
+    def attempt(fx: float, fy: float, flags: int, share: float) -> None:
+        nonlocal best
+        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         try:
             rms, K, dist, rvecs, tvecs = cv2.calibrateCamera(objects, images, size, K, np.zeros(5), flags=flags)
         except cv2.error:
-            continue
-        if np.isfinite(rms) and (best is None or rms < 0.98 * best[0]):
+            return
+        if np.isfinite(rms) and (best is None or rms < share * best[0]):
             best = (float(rms), np.asarray(K), np.asarray(dist), rvecs, tvecs)
+
+    focals = (nominal.phd_px, 1.6 * nominal.phd_px, nominal.phd_px / 1.6)
+    for focal in focals:
+        attempt(focal, focal, flags, 0.98)
+    if open_aspect:
+        # the fit finds a ratio near the nominal one by itself; only one that the views surely show is a better start
+        for focal in focals:
+            for ratio in _RATIOS:
+                attempt(focal, focal * ratio, flags & ~cv2.CALIB_FIX_ASPECT_RATIO, _SURELY)
     if best is None:
         raise CalibrationError(
             "OpenCV finds no start for a camera from its views of the target.",
@@ -153,11 +181,11 @@ def _single_camera(views: Mapping[int, CalibrationView], nodes_mm: Float, nomina
         k: RigidTransform(np.asarray(cv2.Rodrigues(np.asarray(r))[0]), np.asarray(t).ravel())
         for k, r, t in zip(numbers, rvecs, tvecs, strict=True)
     }
-    return _Single(float(K[0, 0]), float(dist.ravel()[0]), poses)
+    return _Single(float(K[0, 0]), float(dist.ravel()[0]), nominal.aspect * float(K[1, 1] / K[0, 0]), poses)
 
 
 def pose_of(view: CalibrationView, nodes_mm: Float, lens: LensModel) -> RigidTransform | None:
-    """Return the target's pose in a camera's frame by its lens; None where the points do not give one."""
+    """Return the target's pose in a camera's frame by its lens; None if the points do not give one."""
     XY, _ = nodes_mm[view.found], None
     rays = lens.normalised_from_image(view.xy_px[view.found])
     if int(rays.valid.sum()) < _LEAST_POINTS:
@@ -223,7 +251,7 @@ def _consensus(
                     if near(candidate, trial):
                         support.append((other, flip))
                         break
-            # of two that fit alike, the one with fewer frames turned
+            # if two fit alike, the one with fewer frames turned is taken
             if (len(support), -sum(f for _, f in support)) > (len(best), -sum(f for _, f in best)):
                 best = support
     members = [relatives(k)[flip] for k, flip in best]
@@ -238,10 +266,10 @@ def _raise_inconsistent(
     second: Mapping[int, CalibrationView],
     pairs: Mapping[int, tuple[RigidTransform, RigidTransform]],
     nodes_mm: Float,
-    nominal: NominalCamera,
+    nominal: NominalValues,
     agreeing: int,
     *,
-    symmetric: bool,
+    open_aspect: bool,
 ) -> None:
     width = nominal.image_size_px[0]
     unmirrored = {}
@@ -249,7 +277,7 @@ def _raise_inconsistent(
         view = second[k]
         xy = np.stack([width - 1.0 - view.xy_px[..., 0], view.xy_px[..., 1]], axis=-1)[::-1]
         unmirrored[k] = CalibrationView(view.camera, None, xy, frame=k)
-    poses = _single_camera(unmirrored, nodes_mm, nominal).poses
+    poses = _single_camera(unmirrored, nodes_mm, nominal, open_aspect=open_aspect).poses
     _, _, mirrored = _consensus({k: (pairs[k][0], poses[k]) for k in pairs}, symmetric=True)
     if len(mirrored) > max(agreeing, len(pairs) // 2):
         raise CalibrationInputError(
@@ -257,7 +285,6 @@ def _raise_inconsistent(
             code="image_mirrored",
             remedy="Switch mirroring off at the camera, or flip its images back.",
         )
-    del symmetric
     raise CalibrationInputError(
         f"Only {agreeing} of {len(pairs)} poses fit one relative pose of the cameras.",
         code="pair_inconsistent",

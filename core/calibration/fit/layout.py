@@ -1,9 +1,11 @@
-"""The unknowns of the adjustment: which there are, where each lies in one vector, and their priors.
+"""The unknowns of the adjustment: the list, the place of each in one vector, and their priors.
 
-Of each camera its lens (:mod:`core.calibration.fit.lens_form`), its pose at dZ = 0 (angles of Eq. (1) and T) and the
-tilt of its own stage's axis; of a single stage its direction in the system frame; the stages' scales and the error of
-each position that was read back; the scale of the target's pitch; and six of each free pose of the target. The nodes'
-corrections are kept apart, since they are eliminated.
+For each camera: its lens (:mod:`stereorig.core.calibration.fit.lens_form`), its pose at dZ = 0 (angles of Eq. (1) and
+T) and the tilt of its own stage's axis; for a single stage its direction in the system frame; the stages' scales and
+the error of each position that was read back; the scale of the target's pitch; and six unknowns for each free pose of
+the target. (1) and T) and the tilt of its own stage's axis; of a single stage its direction in the system frame; the
+stages' scales and the error of each position that was read back; the scale of the target's pitch; and six of each free
+pose of the target. The nodes' corrections are not in the vector, since they are eliminated.
 """
 
 from __future__ import annotations
@@ -13,15 +15,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from core.arrays import Bool, Float
-from core.calibration.fit.lens_form import LensForm
-from core.calibration.fit.unit_vector import direction
-from core.calibration.inputs import CalibrationOptions, Moves, NominalCamera
-from core.cameras.camera import Camera, RigidTransform, rotation_from_angles
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.calibration.fit.lens_form import LensForm
+from stereorig.core.calibration.fit.unit_vector import direction
+from stereorig.core.calibration.inputs import CalibrationOptions, Moves, NominalValues
+from stereorig.core.cameras.camera import Camera, RigidTransform, rotation_from_angles
 
 N_POSE = 6
+#: of a measured aspect ratio whose standard deviation is not stated: section 3.2.2 repeats to some 1e-5, and a grid
+#: tilted by a degree biases it by 1.5e-4; square pixels are exact
+ASPECT_SIGMA = 1e-4
 _LOOSE_ASPECT_SIGMA = 0.05  # where free poses show it: no sensor's pixels are further from the nominal ratio
-_DIRECTION_SIGMA_RAD = 0.5  # of a single stage's axis about the target's normal
+_DIRECTION_SIGMA_RAD = 0.5  # direction of a single stage's axis relative to the target's normal
 
 
 @dataclass(frozen=True)
@@ -33,7 +38,7 @@ class Layout:
     form
         Lens model, the same for both cameras.
     moves
-        What the stage moves.
+        Part of the rig that the stage moves.
     frames
         Numbers of the free poses that are unknowns.
     steps
@@ -94,7 +99,7 @@ class Layout:
         return c if self.moves == "cameras" else 0
 
     def step(self, axis: int, dz_mm: float) -> int | None:
-        """Index of a position's error, None where it is not among the steps."""
+        """Index of a position's error, None if the position is not among the steps."""
         try:
             return self.motion + 5 + self.steps.index((axis, dz_mm))
         except ValueError:
@@ -196,22 +201,30 @@ def camera_seeing(layout: Layout, state: State, c: int, dz_mm: float | None, fra
 
 @dataclass(frozen=True)
 class Priors:
-    """What is known of the unknowns before the views.
+    """Priors of the unknowns, before the views.
 
     Attributes
     ----------
     mean, weight
         (size,); weight is 1 over the variance, 0 without a prior.
     free
-        (size,) False for what is held.
+        (size,) False for held unknowns.
+    carried
+        (size,) 1 over the variance of held unknowns whose uncertainty is propagated into the covariance; 0 elsewhere.
     node_weight
-        (3,) 1 over the variance of a node's corrections along X, Y and Z; infinite where it is held.
+        (3,) 1 over the variance of a node's corrections along X, Y and Z; infinite for a held one.
     """
 
     mean: Float
     weight: Float
     free: Bool
+    carried: Float
     node_weight: Float
+
+    @property
+    def opened(self) -> Priors:
+        """Priors with all that is carried as unknowns."""
+        return replace(self, free=self.free | (self.carried > 0.0), weight=self.weight + self.carried)
 
     @property
     def nodes_free(self) -> int:
@@ -221,7 +234,7 @@ class Priors:
 
 def priors(
     layout: Layout,
-    nominals: Sequence[NominalCamera],
+    nominals: Sequence[NominalValues],
     options: CalibrationOptions,
     *,
     pitch_scale_sigma: float,
@@ -236,9 +249,10 @@ def priors(
     pitch_scale_sigma
         Relative standard deviation of the target's pitch; 0 holds it.
     node_sigma_mm
-        Of a node's correction within the target's plane and out of it; 0 holds them.
+        Standard deviations of a node's correction within the target's plane and out of it; 0 holds them.
     """
     sigma, mean = np.full(layout.size, np.inf), np.zeros(layout.size)
+    carried = np.zeros(layout.size)
     staged = bool(layout.steps)
     for c, nominal in enumerate(nominals):
         aspect = (
@@ -250,6 +264,8 @@ def priors(
         span = layout.lens(c)
         mean[span.start + 1 : span.start + 3] = nominal.centre_px
         mean[span.stop - 1] = nominal.aspect
+        if options.aspect_sigma is None and not layout.frames and nominal.aspect != 1.0:
+            carried[span.stop - 1] = ASPECT_SIGMA**-2
         sigma[layout.tilt(c)] = options.axis_tilt_sigma_rad if staged and layout.moves == "cameras" else 0.0
     sigma[layout.direction] = _DIRECTION_SIGMA_RAD if staged and layout.moves != "cameras" else 0.0
     for axis in range(2):
@@ -263,4 +279,4 @@ def priors(
     weight[known] = sigma[known] ** -2
     node = np.array([node_sigma_mm[0], node_sigma_mm[0], node_sigma_mm[1]])
     with np.errstate(divide="ignore"):
-        return Priors(mean, weight, free, node**-2.0)
+        return Priors(mean, weight, free, carried, node**-2.0)

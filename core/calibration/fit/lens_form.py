@@ -11,23 +11,35 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.lens import LensModel, OpenCVLens, SeidelLens
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.lens import LensModel, OpenCVLens, SeidelLens
+from stereorig.core.cameras.opencv_full import PRISM_TERMS, TILT_TERMS, OpenCVFullLens
 
-LensName = Literal["paper", "opencv5", "opencv8"]
+LensName = Literal[
+    "paper", "opencv5", "opencv8", "opencv5_prism", "opencv5_tilted", "opencv5_prism_tilted", "opencv12", "opencv14"
+]
 LENS_NAMES: tuple[LensName, ...] = get_args(LensName)
-LensChoice = Literal["auto", "paper", "opencv5", "opencv8"]
-LENS_CHOICES: tuple[LensChoice, ...] = get_args(LensChoice)
+LensChoice = Literal["auto"] | LensName
+LENS_CHOICES: tuple[LensChoice, ...] = ("auto", *LENS_NAMES)
 
+_FIVE = ("k1", "k2", "p1", "p2", "k3")
+_EIGHT = (*_FIVE, "k4", "k5", "k6")
 _DISTORTION: dict[LensName, tuple[str, ...]] = {
     "paper": ("kappa_per_px2",),
-    "opencv5": ("k1", "k2", "p1", "p2", "k3"),
-    "opencv8": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "opencv5": _FIVE,
+    "opencv8": _EIGHT,
+    "opencv5_prism": (*_FIVE, "s1", "s3"),
+    "opencv5_tilted": (*_FIVE, *TILT_TERMS),
+    "opencv5_prism_tilted": (*_FIVE, "s1", "s3", *TILT_TERMS),
+    "opencv12": (*_EIGHT, *PRISM_TERMS),
+    "opencv14": (*_EIGHT, *PRISM_TERMS, *TILT_TERMS),
 }
-# standard deviation of what a term moves the image's corner by, relative to its distance from the centre: far beyond
-# any lens that measures, and a hold where the views do not show the term at all
+# standard deviation of a term's shift of the image's corner, relative to its distance from the centre: far larger than
+# in any lens used for measuring, and a limit if the views do not show the term at all
 _RADIAL_SHARE, _DECENTRING_SHARE = 0.5, 0.05
 _POWERS = {"kappa_per_px2": 2, "k1": 2, "k2": 4, "k3": 6, "k4": 2, "k5": 4, "k6": 6}
+_DECENTRING_POWERS = {"p1": 1, "p2": 1, "s1": 1, "s2": 3, "s3": 1, "s4": 3}
+_TILT_SIGMA_RAD = 0.1  # a sensor is mounted to some hundredths, an adapter for tilted focus turns it by up to 0.3
 
 
 @dataclass(frozen=True)
@@ -76,7 +88,8 @@ class LensForm:
         terms = {n: float(v) for n, v in zip(self.distortion_names, values[3:-1], strict=True)}
         if self.model == "paper":
             return SeidelLens(focal, cx, cy, terms["kappa_per_px2"], aspect)
-        return OpenCVLens(focal, focal * aspect, cx, cy, **terms)
+        kind = OpenCVFullLens if terms.keys() & {*PRISM_TERMS, *TILT_TERMS} else OpenCVLens
+        return kind(focal, focal * aspect, cx, cy, **terms)
 
     def names(self, *, aspect_estimated: bool) -> tuple[str, ...]:
         """Names of the lens's own parameters that are estimated, as its class spells them."""
@@ -114,8 +127,10 @@ class LensForm:
         corner = corner_px / focal_px
         sigma = [np.inf, centre_px, centre_px]
         for name in self.distortion_names:
-            if name in ("p1", "p2"):
-                sigma.append(_DECENTRING_SHARE / corner)
+            if name in _DECENTRING_POWERS:
+                sigma.append(_DECENTRING_SHARE / corner ** _DECENTRING_POWERS[name])
+            elif name in TILT_TERMS:
+                sigma.append(_TILT_SIGMA_RAD)
             elif name == "kappa_per_px2":
                 sigma.append(_RADIAL_SHARE / corner_px**2)
             else:

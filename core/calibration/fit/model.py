@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.calibration.fit.layout import Layout, State, camera_of, shift_cam_mm, travel_mm
-from core.calibration.fit.observations import ViewRows
-from core.calibration.fit.unit_vector import direction, direction_jacobian
-from core.cameras.camera import normalised_jacobian, rotation_derivatives
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.fit.layout import Layout, State, camera_of, shift_cam_mm, travel_mm
+from stereorig.core.calibration.fit.observations import ViewRows
+from stereorig.core.calibration.fit.unit_vector import direction, direction_jacobian
+from stereorig.core.cameras.camera import normalised_jacobian, rotation_derivatives
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def linearise(layout: Layout, state: State, view: ViewRows, nominal_nodes_mm: Fl
 
 
 def linearise_all(layout: Layout, state: State, views: Sequence[ViewRows], nominal_nodes_mm: Float) -> list[Linearised]:
-    """Evaluate views as :func:`linearise` does, those of one camera together."""
+    """Evaluate views as :func:`linearise` does, all views of a camera at once."""
     out: list[Linearised | None] = [None] * len(views)
     for c in range(2):
         own = [k for k, view in enumerate(views) if view.camera == c]

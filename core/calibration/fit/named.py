@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.fit.layout import Layout, Priors
-from core.cameras.camera import POSE_NAMES
-from core.names import CAMERAS, Cause
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.fit.layout import Layout, Priors
+from stereorig.core.cameras.camera import POSE_NAMES
+from stereorig.core.names import CAMERAS, Cause
 
 
 def parameter_names(layout: Layout, priors: Priors) -> tuple[str, ...]:
@@ -22,7 +22,7 @@ def parameter_names(layout: Layout, priors: Priors) -> tuple[str, ...]:
 
 
 def named_covariance(layout: Layout, priors: Priors, x: Float, covariance: Float) -> Float:
-    """Covariance of the parameters in :func:`parameter_names` from that of the unknowns (m, m) at ``x``."""
+    """Covariance of the parameters in :func:`parameter_names` from the covariance (m, m) of the unknowns at ``x``."""
     J = named_derivatives(layout, priors, x)
     return np.asarray(J @ covariance @ J.T)
 
@@ -49,4 +49,4 @@ def named_derivatives(layout: Layout, priors: Priors, x: Float) -> Float:
 
 
 def _aspect_estimated(layout: Layout, priors: Priors, c: int) -> bool:
-    return bool(priors.free[layout.lens(c)][layout.form.aspect_index])
+    return bool(priors.opened.free[layout.lens(c)][layout.form.aspect_index])

@@ -1,8 +1,8 @@
 """Normal equations of the adjustment, with the nodes' corrections eliminated.
 
-Where a view's positions are independent of each other, a node's corrections meet only its own observations and are
-eliminated node by node (Schur complement). Intersections of a line grid found from the pieces beside them share pieces
-with their neighbours; their precision couples nodes along a line, and the nodes are then eliminated together.
+If a view's positions are independent of each other, a node's corrections occur only in its own observations and are
+eliminated node by node (Schur complement). Intersections of a line grid are found from pieces of line that neighbours
+share; their precision couples nodes along a line, and the nodes are then eliminated together.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from core.arrays import Bool, Float
-from core.calibration.fit.layout import Layout, Priors, State
-from core.calibration.fit.model import Linearised, linearise_all
-from core.calibration.fit.observations import ViewRows
-from core.errors import CalibrationError
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.calibration.fit.layout import Layout, Priors, State
+from stereorig.core.calibration.fit.model import Linearised, linearise_all
+from stereorig.core.calibration.fit.observations import ViewRows
+from stereorig.core.errors import CalibrationError
 
 
 @dataclass(frozen=True)
 class Extra:
-    """Further unknowns, at zero and held: what the residuals say of them is asked after the fit.
+    """Further unknowns, held at zero, which the residuals are tested for after the fit.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Normal:
     Attributes
     ----------
     U
-        (2, m, m) of each camera's observations, without priors.
+        (2, m, m) from each camera's observations, without priors.
     g
         (m,) right-hand side, with priors.
     W
@@ -100,7 +100,7 @@ class Normal:
     node_prior
         (k,) weights of the nodes' priors.
     free
-        (m,) True for what is unknown.
+        (m,) True for unknowns that are not held.
     cost
         Weighted squares of residuals and priors.
     squares
@@ -175,11 +175,11 @@ class Covariance:
     Attributes
     ----------
     unknowns
-        (m, m), zero for what is held.
+        (m, m), zero for held unknowns.
     node_sigma_mm
         (n, k).
     taken
-        (2,) observations that the fit took up, of each camera.
+        (2,) number of observations that the fit uses up, for each camera.
     """
 
     unknowns: Float
@@ -201,7 +201,7 @@ def assemble(
 ) -> Normal:
     """Build the normal equations of all views at a state; ``extras`` are held unknowns after the layout's own.
 
-    ``lins`` are the views' derivatives where they are known already.
+    ``lins`` are the views' derivatives if they are known already.
     """
     n, k, m = len(nominal_nodes_mm), priors.nodes_free, layout.size + n_extra
     if lins is None:
@@ -342,8 +342,8 @@ def covariance(normal: Normal) -> Covariance:
 def prior_part(normal: Normal, found: Covariance, unknowns: Sequence[int], *, nodes: bool = False) -> Float:
     """Return the part (m, m) of the unknowns' covariance that priors put there, of some unknowns and of the nodes.
 
-    The estimate's errors are N^-1 times what each observation is off by, a prior being one; so its share of
-    N^-1 (A' W A + sum of priors) N^-1 = N^-1.
+    The estimate's errors are N^-1 times the error of each observation, a prior being one of them; so its part of the
+    covariance is its term of N^-1 (A' W A + sum of priors) N^-1 = N^-1.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""One view's observed positions as rows of the adjustment, with what is known of their errors."""
+"""One view's observed positions as rows of the adjustment, with the covariance of their errors."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from core.arrays import Bool, Float
-from core.calibration.inputs import CalibrationView
-from core.names import CAMERAS
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.calibration.inputs import CalibrationView
+from stereorig.core.names import CAMERAS
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class ViewRows:
     weight
         (n,) mean 1 over the points of the camera; 0 where not found.
     lines
-        Full covariance along lines, in units of the same reference variance; None where points are independent.
+        Full covariance along lines, in units of the same reference variance; None if points are independent.
     correlation
         Observed coordinates per independent one.
     """

@@ -1,4 +1,4 @@
-"""What is to be adjusted: views, nominal points and settings; its unknowns under a lens model, and their start."""
+"""Problem of the adjustment: views, nominal points and settings; its unknowns under a lens model, and their start."""
 
 from __future__ import annotations
 
@@ -7,22 +7,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.fit.free_start import pose_of, start_free
-from core.calibration.fit.layout import Layout, Priors, State, camera_of, priors
-from core.calibration.fit.lens_form import LensForm, LensName
-from core.calibration.fit.observations import ViewRows, collect
-from core.calibration.fit.single import fit_single
-from core.calibration.fit.start import start_pose
-from core.calibration.inputs import CalibrationOptions, CalibrationView, Moves, NominalCamera
-from core.cameras.camera import RigidTransform, angles_from_rotation
-from core.names import CAMERAS
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.fit.free_start import pose_of, start_free
+from stereorig.core.calibration.fit.layout import Layout, Priors, State, camera_of, priors
+from stereorig.core.calibration.fit.lens_form import LensForm, LensName
+from stereorig.core.calibration.fit.model import linearise_all
+from stereorig.core.calibration.fit.observations import ViewRows, collect
+from stereorig.core.calibration.fit.single import fit_single
+from stereorig.core.calibration.fit.start import start_pose
+from stereorig.core.calibration.inputs import CalibrationOptions, CalibrationView, Moves, NominalValues
+from stereorig.core.cameras.camera import RigidTransform, angles_from_rotation
+from stereorig.core.cameras.opencv_full import TILT_TERMS
+from stereorig.core.names import CAMERAS
 
 _PAPER = LensForm("paper")
 
 
 @dataclass(frozen=True)
-class Problem:
+class FitData:
     """Views to fit, with all that is given.
 
     Attributes
@@ -34,23 +36,29 @@ class Problem:
     nominals, options
         Nominal cameras and settings.
     moves
-        What the stage moves; ``free`` where there are no stage positions.
+        Part of the rig that the stage moves; ``free`` without stage positions.
     node_sigma_mm
         Prior on a node's correction within the plane, and out of it; 0 holds them.
     pitch_scale_sigma
         Relative prior on the pitch.
     system_frame
-        Number of the free pose that defines the system frame; None where the stage's views do.
+        Number of the free pose that defines the system frame; None if the stage's views define it.
+    cameras_held
+        True holds both cameras' poses: each has its own target's poses, and nothing ties the cameras.
+    sensor_tilt_sigma_rad
+        Prior on a sensor's tilt, each way; None: the lens model's prior, which is nearly uninformative.
     """
 
     views: tuple[CalibrationView, ...]
     nodes_mm: Float
-    nominals: tuple[NominalCamera, NominalCamera]
+    nominals: tuple[NominalValues, NominalValues]
     options: CalibrationOptions
     moves: Moves
     node_sigma_mm: tuple[float, float] = (0.0, 0.0)
     pitch_scale_sigma: float = 0.0
     system_frame: int | None = None
+    cameras_held: bool = False
+    sensor_tilt_sigma_rad: float | None = None
 
     @property
     def flat_nodes_mm(self) -> Float:
@@ -83,15 +91,22 @@ class Problem:
 
     def priors(self, layout: Layout) -> Priors:
         """Return the priors of the unknowns."""
-        return priors(
+        known = priors(
             layout,
             self.nominals,
             self.options,
             pitch_scale_sigma=self.pitch_scale_sigma,
             node_sigma_mm=self.node_sigma_mm,
         )
+        for c in range(2):
+            if self.cameras_held:
+                known.free[layout.pose(c)] = False
+            if self.sensor_tilt_sigma_rad is not None:
+                tilts = [3 + k for k, name in enumerate(layout.form.distortion_names) if name in TILT_TERMS]
+                known.weight[layout.lens(c)][tilts] = self.sensor_tilt_sigma_rad**-2
+        return known
 
-    def without(self, views: Sequence[CalibrationView]) -> Problem:
+    def without(self, views: Sequence[CalibrationView]) -> FitData:
         """Return the problem without some views; the frame that defines the system frame stays one of those left."""
         left = tuple(v for v in self.views if not any(v is other for other in views))
         frames = sorted({v.frame for v in left if v.frame is not None})
@@ -101,7 +116,7 @@ class Problem:
         return replace(self, views=left, system_frame=first)
 
 
-def started(problem: Problem) -> tuple[Problem, State, tuple[int, ...]]:
+def started(problem: FitData) -> tuple[FitData, State, tuple[int, ...]]:
     """Return the problem with its points counted alike, a start under the paper's lens, and frames that do not fit."""
     if problem.staged:
         state = _from_stage(problem)
@@ -119,6 +134,20 @@ def converted(state: State, layout: Layout, other: Layout) -> State:
     tail = other.size - other.motion
     x[other.motion :] = state.x[layout.motion : layout.motion + tail]
     return State(x, dict(state.sys_from_target), state.nodes_mm.copy())
+
+
+def unfolded(problem: FitData, layout: Layout, state: State) -> State:
+    """Return a state converted from the paper's lens, with a k2 where k1 alone has no image for a point of the views.
+
+    In a wide lens k1 alone folds back within the image; 1 + k1 r^2 + k1^2 r^4 never does.
+    """
+    if all(lin.valid for lin in linearise_all(layout, state, problem.rows, problem.flat_nodes_mm)):
+        return state
+    x = state.x.copy()
+    for c in range(2):
+        k1 = layout.lens(c).start + 3
+        x[k1 + 1] = x[k1] ** 2
+    return replace(state, x=x)
 
 
 def restricted(state: State, layout: Layout, other: Layout) -> State:
@@ -152,7 +181,7 @@ def pose_numbers(pose: RigidTransform) -> Float:
     return np.array([*angles_from_rotation(pose.rotation), *pose.translation_mm])
 
 
-def _from_stage(problem: Problem) -> State:
+def _from_stage(problem: FitData) -> State:
     layout = problem.layout("paper")
     x = np.zeros(layout.size)
     rows = problem.rows
@@ -174,7 +203,7 @@ def _from_stage(problem: Problem) -> State:
     return State(x, {}, np.zeros_like(problem.flat_nodes_mm))
 
 
-def _with_poses(problem: Problem, state: State) -> State:
+def _with_poses(problem: FitData, state: State) -> State:
     """Add the free poses by the cameras that the stage's views gave."""
     layout = problem.layout("paper")
     poses: dict[int, RigidTransform] = {}
@@ -188,10 +217,11 @@ def _with_poses(problem: Problem, state: State) -> State:
     return State(state.x, poses, state.nodes_mm)
 
 
-def _from_free(problem: Problem) -> tuple[Problem, State, tuple[int, ...]]:
+def _from_free(problem: FitData) -> tuple[FitData, State, tuple[int, ...]]:
     nodes = problem.nodes_mm
     symmetric = bool(np.allclose(nodes[::-1, ::-1], -nodes, atol=1e-9))
-    start = start_free(problem.views, nodes, problem.nominals, symmetric=symmetric)
+    open_aspect = problem.options.aspect_sigma is None
+    start = start_free(problem.views, nodes, problem.nominals, symmetric=symmetric, open_aspect=open_aspect)
     views = tuple(
         replace(v, xy_px=v.xy_px[::-1, ::-1], sigma_px=_turned(v.sigma_px))
         if v.camera == "cam2" and v.frame in start.half_turned
@@ -207,7 +237,7 @@ def _from_free(problem: Problem) -> tuple[Problem, State, tuple[int, ...]]:
     for c, pose in enumerate((cam1, start.cam2_from_cam1 @ cam1)):
         nominal = problem.nominals[c]
         focal, k1 = float(start.focal_px[c]), float(start.k1[c])
-        values = _PAPER.start(focal, nominal.centre_px, nominal.aspect)
+        values = _PAPER.start(focal, nominal.centre_px, float(start.aspect[c]))
         values[3] = -k1 / focal**2
         x[layout.lens(c)], x[layout.pose(c)] = values, pose_numbers(pose)
     sys_from_cam1 = cam1.inverse()

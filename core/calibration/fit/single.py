@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.fit.layout import Layout, State
-from core.calibration.fit.model import linearise_all
-from core.calibration.fit.observations import ViewRows
-from core.calibration.inputs import NominalCamera
-from core.errors import CalibrationError
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.fit.layout import Layout, State
+from stereorig.core.calibration.fit.model import linearise_all
+from stereorig.core.calibration.fit.observations import ViewRows
+from stereorig.core.calibration.inputs import NominalValues
+from stereorig.core.errors import CalibrationError
 
 _OUTSIDE_PX = 1e6  # residual of a point that has no image, so that a step there is never taken
 _DIRECTION_PRIOR_PX = 0.05 / 0.5  # over the prior's radians; settled in the adjustment of both cameras
@@ -22,7 +22,7 @@ def fit_single(
     c: int,
     views: Sequence[ViewRows],
     nodes_mm: Float,
-    nominal: NominalCamera,
+    nominal: NominalValues,
     start_poses: Sequence[Float],
     *,
     centre_sigma_px: float,

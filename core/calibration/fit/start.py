@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.inputs import CalibrationView, NominalCamera
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.inputs import CalibrationView, NominalValues
 
 
 def affine_of_view(view: CalibrationView, nodes_mm: Float, aspect: float) -> tuple[Float, Float]:
@@ -23,11 +23,11 @@ def affine_of_view(view: CalibrationView, nodes_mm: Float, aspect: float) -> tup
     return solution[:2].T, solution[2]
 
 
-def start_pose(view: CalibrationView, nodes_mm: Float, nominal: NominalCamera, gamma_rad: float) -> Float:
+def start_pose(view: CalibrationView, nodes_mm: Float, nominal: NominalValues, gamma_rad: float) -> Float:
     """Return the pose (6,) to start from: alpha, beta, gamma, x0, y0, z0.
 
-    With beta = 0 the rows of Eq. (1) give, whatever gamma is, the rows' direction of the image of X_sys as sin(alpha)
-    and that of Y_sys as cos(alpha).
+    With beta = 0 the rows of Eq. (1) give, for any gamma, the rows' direction of the image of X_sys as sin(alpha) and
+    that of Y_sys as cos(alpha).
     """
     A, b = affine_of_view(view, nodes_mm, nominal.aspect)
     alpha = float(np.arctan2(A[1, 0], A[1, 1]))

@@ -1,18 +1,18 @@
-"""A guided acquisition of free poses: what the views show so far, and which view would help most."""
+"""Guided acquisition of free poses: the information of the views so far, and the next view that would help most."""
 
-from core.calibration.guide.coverage import Coverage, coverage_of
-from core.calibration.guide.estimate import Estimate, estimate
-from core.calibration.guide.guide import Guidance, GuideOptions, guide
-from core.calibration.guide.proposals import Proposal
-from core.calibration.guide.sight import Likeness, at_rest, most_alike
+from stereorig.core.calibration.guide.coverage import ViewCoverage, coverage_of
+from stereorig.core.calibration.guide.estimate import Estimate, estimate
+from stereorig.core.calibration.guide.guide import Guidance, GuideOptions, guide
+from stereorig.core.calibration.guide.proposals import Proposal
+from stereorig.core.calibration.guide.sight import Likeness, at_rest, most_alike
 
 __all__ = [
-    "Coverage",
     "Estimate",
     "Guidance",
     "GuideOptions",
     "Likeness",
     "Proposal",
+    "ViewCoverage",
     "at_rest",
     "coverage_of",
     "estimate",

@@ -1,4 +1,4 @@
-"""What the views taken cover: the images' parts, the depths and the target's tilts."""
+"""Coverage of the views taken: parts of the images, depths and tilts of the target."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.guide.estimate import Estimate
-from core.calibration.guide.sightline import Sightline, sightline
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.guide.estimate import Estimate
+from stereorig.core.calibration.guide.sightline import Sightline, sightline
 
 CELLS = (8, 6)  # columns, rows
-_DEPTHS = (0.8, 0.9, 0.97, 1.03, 1.1, 1.2)  # of the specimen's distance
+_DEPTHS = (0.8, 0.9, 0.97, 1.03, 1.1, 1.2)  # multiples of the specimen's distance
 _FACING_RAD = np.radians(10.0)  # a tilt below it is none
 TILTS = ("facing", "right", "lower right", "down", "lower left", "left", "upper left", "up", "upper right")
 
 
 @dataclass(frozen=True, eq=False)
-class Coverage:
-    """What the views taken cover.
+class ViewCoverage:
+    """Coverage of the views taken.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Coverage:
     tilts: dict[str, int]
 
 
-def coverage_of(estimate: Estimate, sizes_px: tuple[tuple[int, int], tuple[int, int]]) -> Coverage:
+def coverage_of(estimate: Estimate, sizes_px: tuple[tuple[int, int], tuple[int, int]]) -> ViewCoverage:
     """Count where the target's points were seen, and the poses' depths and tilts.
 
     Parameters
@@ -64,7 +64,7 @@ def coverage_of(estimate: Estimate, sizes_px: tuple[tuple[int, int], tuple[int, 
     for pose in estimate.sys_from_target.values():
         depths[int(np.searchsorted(_DEPTHS, line.distance_mm(pose.translation_mm) / line.depth_mm))] += 1
         tilts[tilt_name(line, pose.rotation)] += 1
-    return Coverage(cells, (cells > 0).mean(axis=(1, 2)), _DEPTHS, tuple(depths.tolist()), tilts)
+    return ViewCoverage(cells, (cells > 0).mean(axis=(1, 2)), _DEPTHS, tuple(depths.tolist()), tilts)
 
 
 def tilt_name(line: Sightline, rotation: Float) -> str:

@@ -7,27 +7,27 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.choice.lens import LENS_LEVELS
-from core.calibration.choice.screening import DroppedView, fit_screened
-from core.calibration.choice.structure import lens_significance
-from core.calibration.fit.adjust import NOISE_ROUNDS
-from core.calibration.fit.free_start import MIN_POSES, pose_of
-from core.calibration.fit.layout import Layout, Priors, State, camera_of
-from core.calibration.fit.lens_form import LensName
-from core.calibration.fit.observations import ViewRows
-from core.calibration.fit.problem import Problem, converted, pose_numbers, started
-from core.calibration.inputs import AnyTarget, CalibrationOptions, CalibrationView, NominalCamera, extent_mm
-from core.calibration.prepare import problem_of
-from core.cameras.camera import RigidTransform, rotation_from_angles
-from core.cameras.stereo import StereoPair
-from core.errors import CalibrationError, CalibrationInputError
-from core.names import CAMERAS
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.choice.lens import LENS_LEVELS
+from stereorig.core.calibration.choice.screening import DroppedView, fit_screened
+from stereorig.core.calibration.choice.structure import lens_significance, scored
+from stereorig.core.calibration.fit.adjust import NOISE_ROUNDS
+from stereorig.core.calibration.fit.free_start import MIN_POSES, pose_of
+from stereorig.core.calibration.fit.layout import Layout, Priors, State, camera_of
+from stereorig.core.calibration.fit.lens_form import LensName
+from stereorig.core.calibration.fit.observations import ViewRows
+from stereorig.core.calibration.fit.problem import FitData, converted, pose_numbers, started
+from stereorig.core.calibration.inputs import AnyTarget, CalibrationOptions, CalibrationView, NominalValues, extent_mm
+from stereorig.core.calibration.prepare import problem_of
+from stereorig.core.cameras.camera import RigidTransform, rotation_from_angles
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import CalibrationError, CalibrationInputError
+from stereorig.core.names import CAMERAS
 
-_PHD_SIGMA = 0.3  # of a nominal pinhole distance, "good to a few tens of percent"
-_FILLS = 0.5  # of the image's narrower side, by a target whose distance nobody gave
-_HALF_ANGLE_DEG = 10.0  # between each camera and the target's normal, where nobody gave it
-_NOISE_PX = 0.05  # of a board's corner, before any residual is known
+_PHD_SIGMA = 0.3  # share of a nominal pinhole distance, "good to a few tens of percent"
+_FILLS = 0.5  # share of the image's narrower side that the target fills if its distance is not given
+_HALF_ANGLE_DEG = 10.0  # between each camera and the target's normal if it is not given
+_NOISE_PX = 0.05  # noise of a board's corner, before any residual is known
 _LEAST_FOR_LENS, _LENS_EVERY = 5, 2  # poses before further lens terms are asked for, and until they are again
 _HALF_TURN = RigidTransform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
 
@@ -39,13 +39,13 @@ class Estimate:
     Attributes
     ----------
     problem, layout, state, priors
-        The views, the unknowns, their values, and what is known of them beside the views.
+        The views, the unknowns, their values and their priors.
     rows
         Observations of ``problem.views``.
     noise_px
         (2,) standard deviation of a coordinate; a board's usual one before there are residuals.
     adjusted
-        False where too few views determine the cameras, and the lenses are the nominal ones.
+        False if too few views determine the cameras, and the lenses are the nominal ones.
     cam1_from_target
         The target's pose in camera 1's frame in each free pose that has one, by its number.
     half_turned
@@ -53,10 +53,10 @@ class Estimate:
     dropped
         Views that do not fit the others, with the reason.
     reason
-        Why there is no adjustment; empty where there is one.
+        Reason for a missing adjustment; empty if there is one.
     """
 
-    problem: Problem
+    problem: FitData
     layout: Layout
     state: State
     priors: Priors
@@ -75,7 +75,7 @@ class Estimate:
 
     @property
     def sys_from_target(self) -> dict[int, RigidTransform]:
-        """The target's pose in the system frame, that of the first pose being the identity."""
+        """The target's pose in the system frame; the first pose is the identity."""
         poses = dict(self.state.sys_from_target)
         if self.problem.system_frame is not None:
             poses[self.problem.system_frame] = RigidTransform.identity()
@@ -85,7 +85,7 @@ class Estimate:
 def estimate(
     views: Sequence[CalibrationView],
     target: AnyTarget,
-    nominals: tuple[NominalCamera, NominalCamera],
+    nominals: tuple[NominalValues, NominalValues],
     options: CalibrationOptions,
     previous: Estimate | None = None,
 ) -> Estimate:
@@ -96,8 +96,8 @@ def estimate(
     views
         Views of both cameras, of free poses only.
     target, nominals, options
-        See :func:`core.calibration.calibrate`; ``lens = "auto"`` begins with the paper's lens and takes further terms
-        once the residuals ask for them.
+        See :func:`stereorig.core.calibration.calibrate`; ``lens = "auto"`` begins with the paper's lens and takes
+        further terms once the residuals ask for them.
     previous
         The estimate with fewer views; a start that spares the search.
 
@@ -129,7 +129,7 @@ def estimate(
 # an adjustment ---------------------------------------------------------------------------------------------------
 
 
-def _adjusted(problem: Problem, previous: Estimate | None) -> Estimate:
+def _adjusted(problem: FitData, previous: Estimate | None) -> Estimate:
     model: LensName = "paper" if problem.options.lens == "auto" else problem.options.lens
     noise, rounds = None, NOISE_ROUNDS
     if previous is not None and previous.adjusted:
@@ -153,7 +153,7 @@ def _adjusted(problem: Problem, previous: Estimate | None) -> Estimate:
             if not _comes_after(richer, adjustment.layout.form.model):
                 continue
             probability, _ = lens_significance(
-                adjustment, screened.rows, screened.problem.flat_nodes_mm, problem.nominals
+                *scored(adjustment, screened.rows, screened.problem.flat_nodes_mm, problem.nominals)
             )
             if probability > level:
                 break
@@ -187,12 +187,12 @@ def _comes_after(richer: LensName, model: LensName) -> bool:
     return order.index(richer) > order.index(model)
 
 
-def _turned_frames(problem: Problem, turned: Problem) -> frozenset[int]:
+def _turned_frames(problem: FitData, turned: FitData) -> frozenset[int]:
     kept = {id(v) for v in problem.views}
     return frozenset(v.frame for v in turned.views if v.frame is not None and id(v) not in kept)
 
 
-def _continued(problem: Problem, previous: Estimate) -> tuple[Problem, State, frozenset[int]]:
+def _continued(problem: FitData, previous: Estimate) -> tuple[FitData, State, frozenset[int]]:
     """Return the problem and a start from an earlier estimate, new poses added by its cameras."""
     pair = previous.pair
     lenses = pair.cam1.lens, pair.cam2.lens
@@ -225,10 +225,10 @@ def _continued(problem: Problem, previous: Estimate) -> tuple[Problem, State, fr
 # nominal cameras -------------------------------------------------------------------------------------------------
 
 
-def _nominal(problem: Problem, target: AnyTarget, reason: str) -> Estimate:
-    """Return nominal lenses and, from the views' own poses, where the cameras stand."""
+def _nominal(problem: FitData, target: AnyTarget, reason: str) -> Estimate:
+    """Return nominal lenses and the cameras' poses from the views' own poses."""
     nodes, nominals = problem.nodes_mm, problem.nominals
-    form = Problem((), nodes, nominals, problem.options, "free").layout("paper").form
+    form = FitData((), nodes, nominals, problem.options, "free").layout("paper").form
     lenses = [form.lens(form.start(n.phd_px, n.centre_px, n.aspect)) for n in nominals]
     symmetric = _symmetric(nodes)
     pairs: dict[int, tuple[RigidTransform, RigidTransform]] = {}
@@ -240,7 +240,7 @@ def _nominal(problem: Problem, target: AnyTarget, reason: str) -> Estimate:
         if poses[0] is None or poses[1] is None:
             continue
         one, two = poses[0], poses[1]
-        # of a symmetric target's two counts the one that turns the cameras less against each other
+        # a symmetric target may be counted in two ways: take the one with the smaller angle between the cameras
         if symmetric and _angle(two @ _HALF_TURN @ one.inverse()) < _angle(two @ one.inverse()):
             half_turned.add(k)
             two = two @ _HALF_TURN
@@ -280,14 +280,14 @@ def _nominal(problem: Problem, target: AnyTarget, reason: str) -> Estimate:
     )
 
 
-def _placed(nominal: NominalCamera, sign: float, target: AnyTarget) -> RigidTransform:
+def _placed(nominal: NominalValues, sign: float, target: AnyTarget) -> RigidTransform:
     """Pose of a camera towards a target that faces it where the specimen will be."""
     depth = nominal.standoff_mm or nominal.phd_px * extent_mm(target) / (_FILLS * min(nominal.image_size_px))
     angle = sign * _HALF_ANGLE_DEG if nominal.angle_deg is None else nominal.angle_deg
     return RigidTransform(rotation_from_angles(0.0, 0.0, np.radians(angle)), np.array([0.0, 0.0, depth]))
 
 
-def _with_focal_prior(known: Priors, layout: Layout, nominals: Sequence[NominalCamera]) -> Priors:
+def _with_focal_prior(known: Priors, layout: Layout, nominals: Sequence[NominalValues]) -> Priors:
     """Without an adjustment the pinhole distance is known as well as its nominal value."""
     weight, mean = known.weight.copy(), known.mean.copy()
     for c, nominal in enumerate(nominals):

@@ -8,22 +8,22 @@ from typing import Literal
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.choice.held_out import MIN_FRAMES
-from core.calibration.guide.coverage import Coverage, coverage_of
-from core.calibration.guide.estimate import Estimate, estimate
-from core.calibration.guide.information import Spread, information
-from core.calibration.guide.proposals import Proposal, propose
-from core.calibration.inputs import AnyTarget, CalibrationOptions, CalibrationView, NominalCamera
-from core.calibration.uncertainty import volume_points_mm
-from core.errors import CalibrationError
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.choice.held_out import MIN_FRAMES
+from stereorig.core.calibration.guide.coverage import ViewCoverage, coverage_of
+from stereorig.core.calibration.guide.estimate import Estimate, estimate
+from stereorig.core.calibration.guide.information import Spread, information
+from stereorig.core.calibration.guide.proposals import Proposal, propose
+from stereorig.core.calibration.inputs import AnyTarget, CalibrationOptions, CalibrationView, NominalValues
+from stereorig.core.calibration.uncertainty import volume_points_mm
+from stereorig.core.errors import CalibrationError
 
 Quantity = Literal["z", "shape"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GuideOptions:
-    """What is to be reached, and where.
+    """Goal of an acquisition, and the volume that it holds for.
 
     Attributes
     ----------
@@ -31,10 +31,10 @@ class GuideOptions:
         ``z``: rms uncertainty of Z over the specimen's volume; ``shape``: of X, Y and Z. The rigid motion common to
         all points is taken out of both: a shape or a displacement does not feel it.
     goal_um
-        The acquisition ends once the quantity is below; None: it ends when somebody says so.
+        The acquisition ends once the quantity is below; None: it ends when the user stops it.
     specimen_mm
-        (p, 3) points of the specimen's volume in the frame of the first view; without them the volume of the target
-        in the first view, as of a calibration's own figures.
+        (p, 3) points of the specimen's volume in the frame of the first view; without them the volume of the target in
+        the first view, as for a calibration's own figures.
     """
 
     quantity: Quantity = "z"
@@ -53,20 +53,20 @@ class Guidance:
     views
         Number of poses that both cameras saw and that fit.
     coverage
-        What they cover.
+        Parts of the images, depths and tilts that they cover.
     spread
-        Uncertainty by the views taken; None where they do not determine it.
+        Uncertainty from the views taken; None if they do not determine it.
     proposal
-        The next view; None where no pose of the target would be seen whole by both cameras.
+        The next view; None if both cameras would see the target whole in no pose.
     text
         The same in a sentence.
     reached
-        True where the goal is met.
+        True if the goal is met.
     """
 
     estimate: Estimate
     views: int
-    coverage: Coverage
+    coverage: ViewCoverage
     spread: Spread | None
     proposal: Proposal | None
     text: str
@@ -76,13 +76,13 @@ class Guidance:
 def guide(
     views: Sequence[CalibrationView],
     target: AnyTarget,
-    nominals: tuple[NominalCamera, NominalCamera],
+    nominals: tuple[NominalValues, NominalValues],
     calibration: CalibrationOptions | None = None,
     options: GuideOptions | None = None,
     *,
     previous: Estimate | None = None,
 ) -> Guidance:
-    """Say where an acquisition of free poses stands, and which view it should take next.
+    """Return the state of an acquisition of free poses, and the view that it should take next.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def guide(
         Views taken so far, none or more, of free poses. The first pose is the system frame: the target held where the
         specimen will be.
     target, nominals, calibration
-        As :func:`core.calibration.calibrate` will get them.
+        As :func:`stereorig.core.calibration.calibrate` will get them.
     options
         The goal.
     previous

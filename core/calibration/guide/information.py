@@ -1,7 +1,8 @@
-"""What views say of the cameras, as normal equations to which further views can be added one at a time.
+"""Information in the views about the cameras, as normal equations to which further views can be added one at a time.
 
-Each free pose is eliminated from its own views; what is left, cameras, pitch and the target's corrections, adds up from
-pose to pose. The covariance after a further view is so had without a new adjustment.
+Each free pose is eliminated from its own views; the remaining equations for cameras, pitch and the target's corrections
+add up from pose to pose. So the covariance after a further view needs no new adjustment. The covariance after a further
+view is so had without a new adjustment.
 """
 
 from __future__ import annotations
@@ -13,17 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from core.arrays import Bool, Float
-from core.calibration.fit.layout import Layout, Priors, State
-from core.calibration.fit.model import Linearised, linearise_all
-from core.calibration.fit.named import named_derivatives, parameter_names
-from core.calibration.fit.normal import Normal, assemble, inverse
-from core.calibration.fit.observations import ViewRows
-from core.calibration.guide.estimate import Estimate
-from core.calibration.uncertainty import point_derivatives
-from core.cameras.camera import RigidTransform
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.calibration.fit.layout import Layout, Priors, State
+from stereorig.core.calibration.fit.model import Linearised, linearise_all
+from stereorig.core.calibration.fit.named import named_derivatives, parameter_names
+from stereorig.core.calibration.fit.normal import Normal, assemble, inverse
+from stereorig.core.calibration.fit.observations import ViewRows
+from stereorig.core.calibration.guide.estimate import Estimate
+from stereorig.core.calibration.uncertainty import point_derivatives
+from stereorig.core.cameras.camera import RigidTransform
 
-_MOST_POINTS = 100  # of a target: of more, every other stands for its neighbours too
+_MOST_POINTS = 100  # points of a target; a larger target is thinned to every other point
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,14 +45,14 @@ class Spread:
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Normal equations of what all poses share.
+    """Normal equations of the unknowns that all poses share.
 
     Attributes
     ----------
     estimate
-        Where they were built.
+        The estimate at which they were built.
     points
-        Indices of the target's points that stand for all.
+        Indices of the target's points that represent all of them.
     matrix
         (s + n k, s + n k) of the shared unknowns that are free, then of the points' corrections.
     free
@@ -87,20 +88,20 @@ class Information:
         return Spread(1e3 * z, 1e3 * shape)
 
     def of_poses(self, poses: Sequence[RigidTransform], seen_px: Sequence[tuple[Float, Float]]) -> list[Float]:
-        """Return what both cameras' views of the target in one further pose would add to ``matrix``, for each pose.
+        """Return, for each further pose of the target, the matrix that both cameras' views would add to ``matrix``.
 
         Parameters
         ----------
         poses
             ``sys_from_target``.
         seen_px
-            Of each pose, (n, 2) image positions of all points in each camera, NaN where not seen.
+            For each pose, (n, 2) image positions of all points in each camera, NaN for points not seen.
         """
         e, kept = self.estimate, self.points
         nominal = e.problem.flat_nodes_mm[kept]
         shared, k = len(self.free), e.priors.nodes_free
         first = e.problem.system_frame is None
-        # all poses are linearised together; each stands in the normal equations of its own
+        # all poses are linearised together; each has its own normal equations
         numbers = tuple(range(len(poses)))
         together = replace(e.layout, frames=() if first else numbers, steps=())
         x = np.zeros(together.size)
@@ -118,6 +119,7 @@ class Information:
             np.zeros(alone.size),
             np.zeros(alone.size),
             np.ones(alone.size, dtype=bool),
+            np.zeros(alone.size),
             np.where(np.arange(3) < k, 0.0, np.inf),
         )
         state = State(x[: alone.size], {}, state.nodes_mm)
@@ -166,12 +168,13 @@ def information(estimate: Estimate, volume_mm: Float) -> Information:
 
 
 def _thinned(noise_px: Float, e: Estimate, kept: NDArray[np.intp]) -> Float:
-    """Noise with which some points tell as much as all do."""
+    """Noise with which some points contain as much information as all do."""
     return np.asarray(noise_px * np.sqrt(len(kept) / len(e.problem.flat_nodes_mm)))
 
 
 def _part(row: ViewRows, kept: NDArray[np.intp]) -> ViewRows:
-    # along lines the covariance would have to be thinned as well; as many independent points tell about as much
+    # along lines the covariance would have to be thinned as well; as many independent points hold about the same
+    # information
     return replace(row, xy_px=row.xy_px[kept], found=row.found[kept], weight=row.weight[kept], lines=None)
 
 
@@ -189,7 +192,7 @@ def _without_poses(normal: Normal, shared: int, free: Bool) -> Float:
         coupling = np.concatenate([U[np.ix_(here, poses)], flat[poses].T])
     if not len(poses):
         return np.asarray(M)
-    # poses meet each other in no view, and six numbers of one lie beside each other
+    # no view contains two poses, and the six unknowns of a pose are consecutive
     left = coupling.T.reshape(-1, 6, len(M))
     index = poses.reshape(-1, 6)
     blocks = U[index[:, :, None], index[:, None, :]]

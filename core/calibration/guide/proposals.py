@@ -7,19 +7,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.fit.layout import turned
-from core.calibration.guide.estimate import Estimate
-from core.calibration.guide.information import Information, Spread
-from core.calibration.guide.sightline import Sightline, sightline
-from core.cameras.camera import RigidTransform
-from core.errors import CalibrationError
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.fit.layout import turned
+from stereorig.core.calibration.guide.estimate import Estimate
+from stereorig.core.calibration.guide.information import Information, Spread
+from stereorig.core.calibration.guide.sightline import Sightline, sightline
+from stereorig.core.cameras.camera import RigidTransform
+from stereorig.core.errors import CalibrationError
 
 TILTS_DEG = (20.0, 38.0)
 _STEEPEST_DEG = 55.0  # to a camera's line of sight; beyond it squares and dots are too narrow to be found well
-_NEARER, _FARTHER = 0.87, 1.15  # of the specimen's distance: what a lens focused there still images sharply enough
-_ASIDE = (0.28, 0.15)  # of the field of view
-_BORDER = 0.01  # of the image that stays free about the target
+_NEARER, _FARTHER = 0.87, 1.15  # of the specimen's distance: range that a lens focused there still images sharply
+_ASIDE = (0.28, 0.15)  # shares of the field of view
+_BORDER = 0.01  # share of the image that stays free about the target
 _REFINED = 4  # best poses in the middle that are tried in the images' other parts, too
 _SIDES = {"left": (-1.0, 0.0), "right": (1.0, 0.0), "up": (0.0, -1.0), "down": (0.0, 1.0)}
 _PARTS = {
@@ -47,7 +47,7 @@ class Proposal:
     outlines_px
         (2, 4, 2) the corners of the field of points in each camera's image.
     predicted
-        Uncertainty over the specimen's volume with this view added; None where it is not determined.
+        Uncertainty over the specimen's volume with this view added; None if it is not determined.
     """
 
     sys_from_target: RigidTransform
@@ -77,12 +77,12 @@ class _Candidate:
 
 
 def propose(info: Information, sizes_px: tuple[tuple[int, int], tuple[int, int]], quantity: str) -> Proposal | None:
-    """Return the pose whose view would lower the uncertainty most; None where no pose is seen whole by both cameras.
+    """Return the pose whose view would lower the uncertainty most; None if both cameras see no pose whole.
 
     Parameters
     ----------
     info
-        Of the views taken.
+        Information of the views taken.
     sizes_px
         (width, height) of each camera's image.
     quantity
@@ -101,7 +101,7 @@ def propose(info: Information, sizes_px: tuple[tuple[int, int], tuple[int, int]]
 
 
 def _rated(info: Information, candidates: Iterable[_Candidate | None]) -> list[_Candidate]:
-    """Return the candidates that both cameras see, each with the uncertainty after it where it is determined."""
+    """Return the candidates that both cameras see, each with the uncertainty after it if that is determined."""
     seen = [c for c in candidates if c is not None]
     added = info.of_poses([c.proposal.sys_from_target for c in seen], [c.seen_px for c in seen])
     rated = []

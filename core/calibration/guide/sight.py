@@ -7,30 +7,30 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.fit.free_start import pose_of
-from core.calibration.guide.estimate import Estimate
-from core.calibration.inputs import AnyTarget, CalibrationView, extent_mm, nodes_of
-from core.cameras.camera import RigidTransform
-from core.names import CAMERAS
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.fit.free_start import pose_of
+from stereorig.core.calibration.guide.estimate import Estimate
+from stereorig.core.calibration.inputs import AnyTarget, CalibrationView, extent_mm, nodes_of
+from stereorig.core.cameras.camera import RigidTransform
+from stereorig.core.names import CAMERAS
 
 REST_PX = 1.0
-_NEW_TURN_RAD = np.radians(8.0)  # a board's pose is known to a small part of a degree, and 8 change what a lens shows
-_NEW_SHIFT = 0.12  # of the target's extent, across the line of sight
-_NEW_DEPTH = 0.06  # of the distance
+_NEW_TURN_RAD = np.radians(8.0)  # a pose is known to a small part of a degree; a turn of 8 shows more of the lens
+_NEW_SHIFT = 0.12  # share of the target's extent, across the line of sight
+_NEW_DEPTH = 0.06  # share of the distance
 
 
 @dataclass(frozen=True)
 class Likeness:
-    """The pose taken that a new one is most like.
+    """The taken pose that is most similar to a new one.
 
     Attributes
     ----------
     frame
-        Its number; None where there is none yet.
+        Its number; None without any pose taken.
     difference
-        Difference of both poses, 1 where they are just different enough: the largest of turn, shift and distance, each
-        over what makes a pose a new one. Infinite without any.
+        Difference of both poses, 1 if they are just different enough: the largest of turn, shift and distance, each
+        relative to the least difference of a new pose. Infinite without any.
     """
 
     frame: int | None
@@ -43,7 +43,7 @@ class Likeness:
 
 
 def at_rest(earlier_px: Sequence[Float], now_px: Sequence[Float], *, limit_px: float = REST_PX) -> tuple[bool, float]:
-    """Return whether the target stood still between two successive detections, and by how much it moved.
+    """Return True if the target did not move between two successive detections, and its move.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def at_rest(earlier_px: Sequence[Float], now_px: Sequence[Float], *, limit_px: f
     Returns
     -------
     still, moved_px
-        ``moved_px`` of the camera that saw it move more; infinite where it was not found both times.
+        Move in the camera that saw the larger one; infinite if the target was not found both times.
     """
     moves = []
     for before, after in zip(earlier_px, now_px, strict=True):
@@ -71,7 +71,7 @@ def at_rest(earlier_px: Sequence[Float], now_px: Sequence[Float], *, limit_px: f
 
 
 def pose_seen(points_px: Sequence[Float], nodes_mm: Float, estimate: Estimate) -> RigidTransform | None:
-    """Pose of the target in camera 1's frame by a pair of detections, None where the points do not give one."""
+    """Pose of the target in camera 1's frame by a pair of detections, None if the points do not give one."""
     pair = estimate.pair
     for c, (name, camera) in enumerate(zip(CAMERAS, (pair.cam1, pair.cam2), strict=True)):
         if int(np.isfinite(points_px[c]).all(axis=-1).sum()) < 6:
@@ -92,7 +92,7 @@ def most_alike(points_px: Sequence[Float], target: AnyTarget, estimate: Estimate
     target
         The target.
     estimate
-        Of the views taken.
+        Estimate of the views taken.
     """
     poses = estimate.cam1_from_target
     pose = pose_seen(points_px, nodes_of(target), estimate)

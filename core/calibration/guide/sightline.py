@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.guide.estimate import Estimate
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.guide.estimate import Estimate
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,1 +1,1 @@
-"""Compiled code of the dense field; :mod:`core.dense.windows` is the narrow function before it."""
+"""Compiled code of the dense field; :mod:`stereorig.core.dense.windows` is the narrow function before it."""

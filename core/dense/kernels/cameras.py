@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from core.matching.kernels.naming import inner
-from core.matching.kernels.warp import image_of
+from stereorig.core.matching.kernels.naming import inner
+from stereorig.core.matching.kernels.warp import image_of
 
 
 @inner
@@ -21,7 +21,7 @@ def positions(lens1, lens2, R, t, ray, state, shift, images, out, slopes):
     shift
         (2,) camera 2's normalised shift for an offset of one.
     images
-        1 (camera 2's reference), or 3 (camera 1's and camera 2's current image besides).
+        1 (camera 2's reference), or 3 (also camera 1's and camera 2's current image).
     out
         (6,) out, px.
     slopes

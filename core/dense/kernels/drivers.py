@@ -1,7 +1,7 @@
 """The compiled entry points: a band of rows of vectors, and the positions of the ordinary field's points.
 
-As those of :mod:`core.matching.kernels.drivers`: they release the GIL, run on ranges of their own, and are kept on disk
-under a stamp of all sources.
+As in :mod:`stereorig.core.matching.kernels.drivers`, they release the GIL, run on ranges of their own, and are kept on
+disk under a stamp of all sources.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from core.dense.kernels.cameras import positions
-from core.dense.kernels.finish import finish
-from core.dense.kernels.windows import make_windows
-from core.matching.kernels.drivers import kernel_sources
-from core.matching.kernels.naming import entry, entry_with_arrays, stamp_of
-from core.matching.kernels.point import epipolar_shift
+from stereorig.core.dense.kernels.cameras import positions
+from stereorig.core.dense.kernels.finish import finish
+from stereorig.core.dense.kernels.windows import make_windows
+from stereorig.core.matching.kernels.drivers import kernel_sources
+from stereorig.core.matching.kernels.naming import entry, entry_with_arrays, stamp_of
+from stereorig.core.matching.kernels.point import epipolar_shift
 
 _STAMP = stamp_of([*kernel_sources(), *sorted(Path(__file__).parent.glob("*.py"))])
 _SHAPE, _MOTION = make_windows(1), make_windows(3)
@@ -56,4 +56,4 @@ def _entries(stamp: int):  # type: ignore[no-untyped-def]
 
 
 shape_rows, motion_rows, project, finish_rows = _entries(_STAMP)
-"""See :mod:`core.dense.kernels.windows`, :func:`core.dense.kernels.cameras.positions`, :func:`.finish.finish`."""
+"""See :mod:`.kernels.windows`, :func:`.kernels.cameras.positions`, :func:`.kernels.finish.finish`."""

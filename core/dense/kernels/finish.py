@@ -1,6 +1,6 @@
 """The last pass over the vectors of a band of rows: checks, and the covariance at the ordinary field's level.
 
-What the ordinary field's points say is taken between them, linear along both axes.
+Values of the ordinary field's points are interpolated linearly along both axes.
 """
 
 from __future__ import annotations
@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from core.matching.kernels.naming import inner
-from core.status import PointStatus
+from stereorig.core.matching.kernels.naming import inner
+from stereorig.core.status import PointStatus
 
 OK = int(PointStatus.OK)
 EXTRAPOLATED = int(PointStatus.EXTRAPOLATED)
@@ -20,10 +20,10 @@ NEIGHBOUR_MISMATCH = int(PointStatus.NEIGHBOUR_MISMATCH)
 
 
 class AtPoints(NamedTuple):
-    """What the ordinary field's points (r, c) say of the vectors between them, without gaps.
+    """Values at the ordinary field's points (r, c) for the vectors between them, without gaps.
 
-    Variance over that of the normal equations (..., 1 or 2: positions, displacements), residual's squares per weight
-    (..., images), epipolar offset, noise in grey levels; vectors' distance over the points'.
+    Variance over the normal equations' (..., 1 or 2: positions, displacements), residual's squares per weight (...,
+    images), epipolar offset, noise in grey levels; vectors' distance over the points'.
     """
 
     ratio: Any
@@ -34,7 +34,7 @@ class AtPoints(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """What a vector must hold.
+    """Limits that a vector must meet.
 
     Least correlation; largest standard deviation, increment and change of the epipolar offset, px; largest residual
     over the points' (images,).

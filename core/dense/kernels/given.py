@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from core.matching.kernels.given import ComparedImage, ReferenceImage
+from stereorig.core.matching.kernels.given import ComparedImage, ReferenceImage
 
 
 class Lattice(NamedTuple):
     """Points of the ordinary field and vectors between them.
 
     Column and row of the first point, px; distance of points and of vectors, px; first column of vectors whose windows
-    lie in the image, and the one after the last; points of the prediction beyond the field on each side.
+    are inside the image, and the one after the last; points of the prediction beyond the field on each side.
     """
 
     x0: float
@@ -27,10 +27,10 @@ class DenseGiven(NamedTuple):
     """Images, cameras, prediction and settings.
 
     ``blocked`` (rows, cols) uint8 of camera 1's image, 1 where a pixel does not count, or empty. ``nodes``, ``seen``,
-    ``cells``: see :class:`core.dense.prediction.Prediction`. ``state`` (r, c, 8) at the points: w0, G00, G10, G20, the
-    epipolar offset; camera 2's normalised shift for a pixel across the epipolar line, x and y, and its pixels for a
-    unit of w0. ``levels`` (1 + images,) grey levels that are taken off the images, so that sums keep their digits.
-    ``variances``: of the images' noise at weight 1, or all one.
+    ``cells``: see :class:`stereorig.core.dense.prediction.Prediction`. ``state`` (r, c, 8) at the points: w0, G00, G10,
+    G20, the epipolar offset; camera 2's normalised shift for a pixel across the epipolar line, x and y, and its pixels
+    for a unit of w0. ``levels`` (1 + images,) grey levels that are taken off the images, so that sums keep their
+    digits. ``variances``: of the images' noise at weight 1, or all one.
     """
 
     reference: ReferenceImage
@@ -70,7 +70,7 @@ class DenseSpace(NamedTuple):
 
 
 class DenseOut(NamedTuple):
-    """Results over (rows, cols) vectors, NaN where there is none.
+    """Results over (rows, cols) vectors, NaN for vectors without one.
 
     ``values`` (..., 6) position and displacement, mm, system frame; ``covariance`` (..., 21) its upper triangle for
     noise of variance 1; ``epipolar`` px; ``zncc``, ``misfit`` (residual's squares per weight, reference grey levels),

@@ -1,6 +1,6 @@
 """Whole rows of pixels, eight at a time: their interpolation, and their products added to the sums of columns.
 
-Rows are float32, sums double. An intrinsic tells LLVM what a compiler cannot know of numba's arrays, that they do not
+Rows are float32, sums double. An intrinsic passes LLVM the fact, unknown to the compiler, that numba's arrays do not
 overlap.
 """
 
@@ -13,14 +13,16 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from core.matching.kernels.loops import data, lanes, spline
-from core.matching.kernels.vectors import DOUBLE, FLOAT, INT, LANES, LONG, Vec, at, load, spread, store
+from stereorig.core.matching.kernels.loops import data, lanes, spline
+from stereorig.core.matching.kernels.vectors import DOUBLE, FLOAT, INT, LANES, LONG, Vec, at, load, spread, store
 
 COUNT, P, F, FF, GXX, GXY, GYY, GX, GY, FGX, FGY = range(11)
 """Sums of a column of pixels: how many count, weights, and weighted products of f and of its gradients."""
 FIRST, EACH = 11, 5
 G, GG, FG, GGX, GGY = range(EACH)
-"""Of each image, from ``FIRST + EACH k`` on: weighted products of its grey levels with 1, themselves, f, gradients."""
+"""Rows of each image, from ``FIRST + EACH k`` on: weighted products of its grey levels with 1, themselves, f,
+gradients.
+"""
 
 
 N_ROWS = 6

@@ -1,11 +1,11 @@
 """The vectors of a band of rows: warp once, sum once, one Gauss-Newton step each.
 
-Row by row of pixels, each image is interpolated where the prediction sees it, and the products that the normal
-equations need are added to the sums of columns, which run down the image over a window's height. Along a row of vectors
-these sums run over a window's width. All sums are in double precision.
+Row by row of pixels, each image is interpolated at the predicted places, and the products that the normal equations
+need are added to the sums of columns, which run down the image over a window's height. Along a row of vectors these
+sums run over a window's width. All sums are in double precision.
 
-A vector's increment is a shift: the prediction's slopes and curvature stand. Increments with slopes of their own have
-the same bias, and more noise (docs/explanation/decisions/0041-dense-field.md).
+A vector's increment is a shift: the prediction's slopes and curvature are kept. Increments with slopes of their own
+have the same bias, and more noise (docs/explanation/decisions/0041-dense-field.md).
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from core.dense.kernels import rows as q
-from core.dense.kernels.cameras import factor, invert_lower, positions
-from core.dense.kernels.given import DenseSpace
-from core.dense.kernels.rows import N_ROWS, add_row, columns_of, interpolate_cubic, interpolate_quintic
-from core.matching.image import PAD
-from core.matching.kernels.naming import inner, kernel
-from core.matching.kernels.noise import CONTRAST, DENSITY, N_LEVELS, joint_weights
-from core.matching.kernels.point import LOW_TEXTURE, OK, OUTSIDE_IMAGE, SINGULAR
-from core.matching.kernels.vectors import LANES
-from core.matching.kernels.warp import undistort
-from core.status import PointStatus
+from stereorig.core.dense.kernels import rows as q
+from stereorig.core.dense.kernels.cameras import factor, invert_lower, positions
+from stereorig.core.dense.kernels.given import DenseSpace
+from stereorig.core.dense.kernels.rows import N_ROWS, add_row, columns_of, interpolate_cubic, interpolate_quintic
+from stereorig.core.matching.image import PAD
+from stereorig.core.matching.kernels.naming import inner, kernel
+from stereorig.core.matching.kernels.noise import CONTRAST, DENSITY, N_LEVELS, joint_weights
+from stereorig.core.matching.kernels.point import LOW_TEXTURE, OK, OUTSIDE_IMAGE, SINGULAR
+from stereorig.core.matching.kernels.vectors import LANES
+from stereorig.core.matching.kernels.warp import undistort
+from stereorig.core.status import PointStatus
 
 MASKED = int(PointStatus.MASKED)
 _MIN_CONTRAST2 = 1e-6
-_OFF_IMAGE = 1.0 / 4096.0  # how much a pixel that another image does not show counts: the window's sum tells it
+_OFF_IMAGE = 1.0 / 4096.0  # weight of a pixel that another image does not show: the window's sum then reveals it
 
 
 class DenseKernels(NamedTuple):
@@ -63,7 +63,7 @@ def _cubic(a, b, c, e, u):
 
 @inner
 def _places(y, lattice, nodes, seen, image, size, lead, lines, row, tap, tx, ty):
-    """First taps and fractions of one image along a row of pixels; ``row[0]`` says which of them count."""
+    """First taps and fractions of one image along a row of pixels; ``row[0]`` marks the pixels that count."""
     _, high, wide, stride = image
     k, cols = size
     along = (y - lattice.y0) / lattice.spacing + lattice.rim
@@ -99,7 +99,7 @@ def _places(y, lattice, nodes, seen, image, size, lead, lines, row, tap, tx, ty)
 
 @inner
 def _row_of_pixels(y, reference, blocked, images, lattice, nodes, seen, grey, order, n_images, row, space):
-    """Fill one row of pixels: what counts, the reference, and the images where the prediction sees them."""
+    """Fill one row of pixels: the weights, the reference, and the images at the predicted places."""
     pixels, grad_x, grad_y, weights = reference
     lines, tap, tx, ty = space
     cols = pixels.shape[1]

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from core.arrays import Bool, Float
-from core.robust import median
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.robust import median
 
 SIGMAS_OF_QUARTER, SIGMAS_OF_TENTH = 0.6745, 1.2816  # below the middle of a normal distribution
 _REACH_SUBSETS, _MIN_REACH, _MAX_REACH = 1.5, 3, 24
@@ -18,7 +18,7 @@ _FEW = 12
 def spacing_of(xy_px: Float, shape: tuple[int, int]) -> float:
     """Return the median distance of neighbouring points, px, from their positions (n, 2) row by row.
 
-    Points of a later reference lie where they have moved; those that it does not show may lie anywhere.
+    Points of a later reference are at their moved positions; points that it does not show may be anywhere.
     """
     rows, cols = shape
     grid = xy_px.reshape(rows, cols, 2)
@@ -36,8 +36,8 @@ def reach_of(subset_px: int, spacing_px: float) -> int:
 def least_about(values: Float, ok: Bool, shape: tuple[int, int], reach: int, *, every: int = 1) -> tuple[Float, Float]:
     """Return (n,) level and scatter of the values about each point, from those that are least.
 
-    What loses more than it must at many points in a row, as an edge or an open crack, raises their middle, and is no
-    measure of their scatter: the quarter and the tenth of them that lose least are.
+    A feature that costs correlation at many points in a row, as an edge or an open crack, raises their middle and
+    widens their scatter; so only the quarter and the tenth with the least loss are used.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def least_about(values: Float, ok: Bool, shape: tuple[int, int], reach: int, *, 
     reach
         Points, as in :func:`block_medians`.
     every
-        Of so many rows and columns one counts: enough for the quantiles of some subsets' points.
+        Only one of so many rows and columns is used: enough for the quantiles of some subsets' points.
     """
     counted = np.zeros(shape, bool)
     counted[::every, ::every] = True
@@ -69,7 +69,7 @@ def block_medians(
     otherwise: float | None = None,
     quantile: float = 0.5,
 ) -> Float:
-    """Return (n,) the median of the known values about each point; ``otherwise`` where there are too few.
+    """Return (n,) the median of the known values about each point; ``otherwise`` if there are too few.
 
     Parameters
     ----------
@@ -78,11 +78,11 @@ def block_medians(
     shape
         Rows and columns.
     reach
-        Points; the median is that of a block ``reach`` points wide and of as many about it.
+        Number of points; the median is over a block ``reach`` points wide and as many on each side of it.
     otherwise
-        Value where fewer than a dozen are known; None: the median of all that are known.
+        Value if fewer than a dozen are known; None: the median of all that are known.
     quantile
-        Another one than the median.
+        The quantile in place of the median.
     """
     return _block_quantiles(
         values,
@@ -103,14 +103,14 @@ def _block_quantiles(
     otherwise: Callable[[], Sequence[float] | Float],
     quantiles: tuple[float, ...],
 ) -> list[Float]:
-    """Several quantiles of the same blocks, each with its value where there are too few."""
+    """Several quantiles of the same blocks, each with its value for blocks with too few."""
     rows, cols = shape
     beside = reach // 2
     width = reach + 2 * beside + 1
-    # all blocks at once; what is not known, or beyond the grid, is sorted behind everything
+    # all blocks at once; unknown values, and places outside the grid, are sorted to the end
     padded = np.full((rows + reach + width, cols + reach + width), np.inf)
     padded[beside : beside + rows, beside : beside + cols] = np.where(known, values, np.inf).reshape(shape)
-    total = np.zeros((padded.shape[0] + 1, padded.shape[1] + 1), np.int64)  # of the points known before
+    total = np.zeros((padded.shape[0] + 1, padded.shape[1] + 1), np.int64)  # number of the points known before
     total[beside + 1 : beside + rows + 1, beside + 1 : beside + cols + 1] = known.reshape(shape)
     np.cumsum(total, axis=0, out=total)
     np.cumsum(total, axis=1, out=total)

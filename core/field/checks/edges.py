@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.arrays import Bool, Float
-from core.errors import RegionError
-from core.field.checks.unreached import leaves_an_image
-from core.field.points.fitter import Fitter, PointFits
-from core.field.region.region import PointGrid
-from core.matching.blur import Blur
-from core.status import PointStatus
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.errors import RegionError
+from stereorig.core.field.checks.unreached import leaves_an_image
+from stereorig.core.field.points.fitter import Fitter, PointFits
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.matching.blur import Blur
+from stereorig.core.status import PointStatus
 
 
 def clear_of_edges(fits_image: Bool, grid: PointGrid, shape: tuple[int, int], subset_px: int, blur: Blur) -> Bool:

@@ -1,10 +1,10 @@
-"""Points whose epipolar offset is not what their neighbours show: wrong matches.
+"""Points whose epipolar offset differs from their neighbours': wrong matches.
 
 A lens that is modelled a little wrong, or cameras that moved, put all points off their epipolar lines, by offsets of
-any smooth shape. So a point is compared with the points about it alone, and what a lens cannot do counts: an offset
-that jumps from one point to the next. Right points of two parts, on both sides of a crack or behind an edge, may differ
-by what the misfit changes from one place in an image to another. Wrong matches that agree with one another share their
-pixels: their group is smaller than a subset, and its surroundings are what it is compared with.
+any smooth shape. So a point is compared only with the points about it, and only a change that a lens cannot cause
+counts: an offset that jumps from one point to the next. Right points of two parts, on both sides of a crack or behind
+an edge, may differ by the change of the misfit from one place in an image to another. Wrong matches that agree with one
+another share their pixels: their group is smaller than a subset, and is compared with its surroundings.
 """
 
 from __future__ import annotations
@@ -15,30 +15,31 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from core.arrays import Bool, Float
-from core.field.checks.block_median import block_medians, reach_of, spacing_of
-from core.field.checks.groups import Indices, connected, neighbour_pairs
-from core.field.checks.local_surface import Prediction, predict_from_neighbours
-from core.field.region.visibility import Visibility
-from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight, median
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.field.checks.block_median import block_medians, reach_of, spacing_of
+from stereorig.core.field.checks.groups import Indices, connected, neighbour_pairs
+from stereorig.core.field.checks.local_surface import SurfacePrediction, predict_from_neighbours
+from stereorig.core.field.region.visibility import Visibility
+from stereorig.core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight, median
 
 STEEPEST = 0.003
 """px of offset a px of the image that a misfit changes by: a pixel at the corner of a lens of 5th degree."""
 _BENDING_PX = 100.0  # px of the image over which a misfit may become so steep
-_STEP_PX = 0.1  # between parts of a field that lie at other depths: a lens misfit at two places in camera 2's image
-_SMALL_STEP_PX = 0.02  # of a group smaller than a subset, which is one match that many points share
+_STEP_PX = 0.1  # between parts of a field at different depths: a lens misfit at two places in camera 2's image
+_SMALL_STEP_PX = 0.02  # for a group smaller than a subset, which is one match that many points share
 _ROUNDS = 4
-_SWEEPS = 4  # of the robust fit
+_SWEEPS = 4  # of the robust fit's weights
 _FEW = 12
 _SUPPORT = 1.0  # variance of a prediction over a point's own, up to which it is a test
-_NOISIER = 3.0  # times the field's: what the points about a point may scatter by, before they are no judges
-_SIDE, _SIDE_SUBSETS = 0.25, 1.5  # of the points about a point, and in subsets: the part that is a side of a step
+_NOISIER = 3.0  # multiple of the field's scatter: with a larger one, the points about a point are not used to judge it
+# least part that is a side of a step: share of the points about a point, and width in subsets
+_SIDE, _SIDE_SUBSETS = 0.25, 1.5
 _MOST_PX = 0.5
 _TINY_PX = 1e-6
 
 
 class EpipolarLimits(NamedTuple):
-    """Distance from what the neighbours show that is allowed: so many standard deviations, and a floor, px."""
+    """Allowed difference from the neighbours' offset: so many standard deviations, and a floor, px."""
 
     sigmas: float
     floor_px: float
@@ -55,7 +56,7 @@ def epipolar_mismatches(
     limits: EpipolarLimits,
     visibility: Visibility | None = None,
 ) -> Bool:
-    """Return (n,) True where a valid point's epipolar offset is not what its neighbours show.
+    """Return (n,) True for valid points whose epipolar offset differs from their neighbours'.
 
     Parameters
     ----------
@@ -107,7 +108,7 @@ def _off(
     def prior(usual_px: float) -> dict[str, float]:
         return {"slope_precision": (usual_px / slope_px) ** 2, "bend_precision": (usual_px / bend_px) ** 2}
 
-    # groups without a jump between neighbours, but for what the surface of all changes by from one to the other
+    # groups without a jump between neighbours, apart from the slope of the surface through all points
     reported = median(sigma[ok])
     at_first = predict_from_neighbours(
         e.reshape(shape), _precision(sigma, reported, ok).reshape(shape), reach, **prior(reported)
@@ -122,12 +123,12 @@ def _off(
     size = np.asarray(np.bincount(group, weights=ok), np.float64)
     large = size >= min(max(width**2, float(_FEW)), size.max())
     precision = _precision(sigma, usual, ok)
-    # every point against the nearest large group's surface, those of a large group against their own's
+    # every point is compared with the nearest large group's surface, points of a large group with their own group's
     predicted, variance = np.zeros(len(ok)), np.full(len(ok), np.inf)
     scatter = np.ones(len(ok))
     for g in np.flatnonzero(large):
         own = group == g
-        same = noisier == 1.0 and own[ok].all()  # as that of all at first
+        same = noisier == 1.0 and own[ok].all()  # the fit over all points was made at first
         value, spread = _surface(
             e, sigma, np.where(own, precision, 0.0), shape, reach, usual, prior(usual), at_first if same else None
         )
@@ -157,11 +158,11 @@ def _surface(
     reach: int,
     usual: float,
     prior: dict[str, float],
-    first: Prediction | None,
+    first: SurfacePrediction | None,
 ) -> tuple[Float, Float]:
     """Robust surface of a group's points: value (n,), and its variance over ``usual`` squared.
 
-    ``first`` is what their neighbours predict while none is off, where it is known.
+    ``first`` is the prediction from all neighbours with full weights, if it is already known.
     """
     weights = precision
     for sweep in range(_SWEEPS):
@@ -177,13 +178,13 @@ def _surface(
             scale *= _local_scatter((e - value) / scale, precision > 0.0, shape, reach)
         settled = biweight(((e - value) / (BIWEIGHT_REACH * scale)) ** 2)
         if sweep == 0 and settled[precision > 0.0].min(initial=1.0) > 0.0:
-            break  # nothing stands out
+            break  # no point is off
         weights = precision * settled
     return value, variance
 
 
 def _local_scatter(scaled: Float, known: Bool, shape: tuple[int, int], reach: int) -> Float:
-    """Return (n,) the robust scatter of the points about each, over what is expected; from 1 to three times."""
+    """Return (n,) the robust scatter of the points about each, over the expected one; from 1 to three times."""
     middle = block_medians(np.abs(scaled), known, shape, reach, otherwise=1.0)
     return np.clip(MAD_TO_SIGMA * middle, 1.0, _NOISIER)
 
@@ -191,9 +192,9 @@ def _local_scatter(scaled: Float, known: Bool, shape: tuple[int, int], reach: in
 def _on_a_side(
     e: Float, ok: Bool, index: Indices, limit: Float, shape: tuple[int, int], reach: int, width: float
 ) -> Indices:
-    """Return those points that agree with a good part of the points about them, more than one match can be.
+    """Return the points that agree with more of the points about them than a single wrong match could cover.
 
-    Beside a step that is hardly larger than the noise the surface of all is the larger side's.
+    Next to a step that is hardly larger than the noise, the surface through all points follows the larger side.
     """
     if len(index) == 0:
         return index
@@ -216,8 +217,8 @@ def _on_a_side(
 
 
 def _middle(differences: Float) -> Float:
-    """Median (m,) over windows, zero where nothing is known."""
-    flat = np.sort(differences.reshape(len(differences), -1), axis=1)  # what is not known comes last
+    """Median (m,) over windows, zero for windows without known values."""
+    flat = np.sort(differences.reshape(len(differences), -1), axis=1)  # unknown values are sorted to the end
     known = np.isfinite(flat).sum(axis=1)
     return np.where(known > 0, flat[np.arange(len(flat)), known // 2 - (known > 0) * (known % 2 == 0)], 0.0)
 
@@ -232,7 +233,7 @@ def _level_jumps(
     supported: Bool,
     noise_px: float,
 ) -> Bool:
-    """Return (n,) True for groups that lie off the points nearest to them by more than any misfit changes by."""
+    """Return (n,) True for groups that differ from the points nearest to them by more than any misfit changes."""
     bad = np.zeros(len(ok), bool)
     order = np.argsort(-size, kind="stable")
     accepted: Indices = np.flatnonzero(ok & (group == order[0]))

@@ -6,16 +6,16 @@ quadratic surface through the points' offsets has little noise left, so hundredt
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
-from core.arrays import Bool, Float
-from core.field.checks.block_median import block_medians
-from core.field.points.result import Field
-from core.field.region.trend import smooth_terms
-from core.robust import MAD_TO_SIGMA
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.field.checks.block_median import block_medians
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.trend import smooth_terms
+from stereorig.core.robust import MAD_TO_SIGMA
 
 Level = Literal["ok", "warning", "failed"]
 
@@ -24,12 +24,13 @@ _MIN_POINTS_FOR_SURFACE = 60
 _MIN_POINTS = 4
 MISFIT_PX, MISFIT_MAX_PX = 0.01, 0.02
 """Variation beyond a quadratic from which on it is stated: root mean square, and local over the noise."""
+_ROWS_ALONE = 0.25  # share of the growth over the rows: limit along the rows, which noise and a slanted view cause
 _BLOCKS, _MIN_REACH = 12, 3  # blocks along the longer side of the field, points of a block at least
 
 
 @dataclass(frozen=True)
 class EpipolarCheck:
-    """A field's epipolar offset beside the calibration's own.
+    """Comparison of a field's epipolar offset with the calibration's own.
 
     Attributes
     ----------
@@ -39,14 +40,14 @@ class EpipolarCheck:
     offset_px
         Root mean square of the smooth part of the offset in camera 2, over the valid points.
     own_px
-        The calibration's own, from the residuals of its grid; None where it is not known (it counts as zero).
+        The calibration's own, from the residuals of its grid; None if it is not known (it counts as zero).
     reason
-        One sentence, and another where there is a misfit.
+        One sentence, and a second one for a misfit.
     misfit_px, misfit_max_px
-        Root mean square and largest value of what the offset's local medians leave over the smooth part, less the
-        noise: a shape that no moved camera makes, so an error of the lens model or of the calibration.
+        Root mean square and largest value of the remainder of the offset's local medians after the smooth part, less
+        the noise: a shape that no moved camera causes, so an error of the lens model or of the calibration.
     misfit_um
-        ``misfit_px`` on the surface; None where the points' distance is not known.
+        ``misfit_px`` on the surface; None if the points' distance is not known.
     """
 
     level: Level
@@ -56,6 +57,12 @@ class EpipolarCheck:
     misfit_px: float = 0.0
     misfit_max_px: float = 0.0
     misfit_um: float | None = None
+
+    def with_finding(self, finding: str) -> EpipolarCheck:
+        """Return the check with a further finding in its reason: at least a warning; the same check without one."""
+        if not finding:
+            return self
+        return replace(self, level="warning" if self.level == "ok" else self.level, reason=f"{self.reason}; {finding}")
 
     def document(self) -> dict[str, Any]:
         """Return the check as plain numbers and texts."""
@@ -70,8 +77,10 @@ def check_epipolar(field: Field, rbe_px: float | None, *, imported: bool = False
     field
         As measured.
     rbe_px
-        The calibration's reprojection error (RBE), of held-out positions where there are any. It is one image's, both
-        have it, and the offset is stated in one: so the calibration's own offset is up to its sum over both.
+        The calibration's reprojection error (RBE), of held-out positions if there are any. It is the error of one
+        image, both cameras have it, and the offset is stated in one image: so the calibration's own offset is up to its
+        sum over both. It is one image's, both have it, and the offset is stated in one: so the calibration's own offset
+        is up to its sum over both.
     imported
         True for another program's calibration: its own offset is not known, so that a large one is a warning at most,
         and no sign that a camera moved.
@@ -114,8 +123,43 @@ def check_epipolar(field: Field, rbe_px: float | None, *, imported: bool = False
     return EpipolarCheck(level, found, own, text, rms, largest, um)
 
 
+def rows_not_together(field: Field, rbe_px: float | None) -> str | None:
+    """Return a sentence about a camera whose rows were not exposed at one instant; None without such a sign.
+
+    A rolling shutter shifts the rows of a moving specimen in proportion to their delay. Offset and displacement, which
+    both contain the shift, then grow over the rows and not along them. A changed lens or a moved camera changes both
+    directions. Offset and displacement, which share that, then grow over the rows and not along them. Another lens or
+    place of a camera changes both ways.
+
+    Parameters
+    ----------
+    field, rbe_px
+        As in :func:`check_epipolar`.
+    """
+    valid = field.valid & np.isfinite(field.epipolar_px)
+    if field.uvw_mm is None or int(valid.sum()) < _MIN_POINTS_FOR_SURFACE:
+        return None
+    xy = np.column_stack([field.x_px[valid], field.y_px[valid]])
+    terms = smooth_terms(xy)
+    parts = np.linalg.lstsq(terms, field.epipolar_px[valid], rcond=1e-9)[0]
+    grown = abs(float(parts[2]))
+    # bends change by a quarter of their coefficient from the middle to a side
+    others = max(abs(float(parts[1])), 0.25 * float(np.abs(parts[3:]).max()))
+    if grown - 2.0 * (rbe_px or 0.0) < FAILED_PX or others > _ROWS_ALONE * grown:
+        return None
+    place, moved = (np.linalg.lstsq(terms[:, :3], a[valid], rcond=1e-9)[0] for a in (field.xyz_mm, field.uvw_mm))
+    along_x, along_y = (float(np.linalg.norm(moved[k])) / max(float(np.linalg.norm(place[k])), 1e-12) for k in (1, 2))
+    share = grown / max(float(np.ptp(xy[:, 1])), 1.0)  # by so much each row is displaced more than the one before
+    if along_x > 2.0 * _ROWS_ALONE * share or along_y < _ROWS_ALONE * share:
+        return None
+    return (
+        f"the rows of camera 1 or of camera 2 were not exposed at one instant: the offset grows by {grown:.2f} px over "
+        "the rows and not along them, and so does the displacement, as with a rolling shutter before a moving specimen"
+    )
+
+
 def _misfit(valid: Bool, rest_px: Float) -> tuple[float, float]:
-    """Root mean square and largest value of the local medians of what is left (n,) at valid points, less noise."""
+    """Root mean square and largest value of the local medians of the remainder (n,) at valid points, less noise."""
     rows, cols = valid.shape
     if len(rest_px) < _MIN_POINTS_FOR_SURFACE:
         return 0.0, 0.0

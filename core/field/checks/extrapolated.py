@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from core.calibration.volume import CalibratedVolume
-from core.field.points.result import Field
-from core.status import PointStatus
+from stereorig.core.calibration.volume import CalibratedVolume
+from stereorig.core.field.points.result import Field
+from stereorig.core.status import PointStatus
 
 
 def mark_extrapolated(field: Field, volume: CalibratedVolume | None) -> Field:
-    """Return the field with the points that lie, or lay at the reference, outside the calibrated volume marked.
+    """Return the field with those points marked that are, or were at the reference, outside the calibrated volume.
 
     Their status becomes EXTRAPOLATED. The calibration's part of their uncertainty, which grows without bound there, is
     in the field's common factor as everywhere.

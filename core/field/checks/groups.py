@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from core.arrays import Bool
-from core.field.region.visibility import Visibility
+from stereorig.core.arrays import Bool
+from stereorig.core.field.region.visibility import Visibility
 
 Indices = NDArray[np.intp]
 

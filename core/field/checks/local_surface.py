@@ -1,4 +1,4 @@
-"""What the neighbours show of a quantity that varies smoothly over the image, whatever the shape of its variation.
+"""Prediction of a quantity from its neighbours if it varies smoothly over the image, with any shape of variation.
 
 About every point a quadratic is fitted to the neighbours within some subsets, without the point itself. Slopes and
 bends have a prior, so that a fit with few neighbours on one side stays a fit, with the uncertainty that it has there.
@@ -11,21 +11,21 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from core.arrays import Float, Float32
+from stereorig.core.arrays import Float, Float32
 
 _ORDERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 _TERMS = len(_ORDERS)
 
 
-class Prediction(NamedTuple):
-    """What the neighbours predict of a value.
+class SurfacePrediction(NamedTuple):
+    """Prediction of a value from its neighbours.
 
     Attributes
     ----------
     value
         (r, c).
     variance
-        (r, c) its variance over that of a value of weight 1; large where there are few neighbours.
+        (r, c) its variance over the variance of a value of weight 1; large with few neighbours.
     """
 
     value: Float
@@ -34,13 +34,13 @@ class Prediction(NamedTuple):
 
 def predict_from_neighbours(
     values: Float, weights: Float, reach: int, *, slope_precision: float, bend_precision: float
-) -> Prediction:
+) -> SurfacePrediction:
     """Fit a quadratic to the neighbours of each point of a grid, and evaluate it at the point.
 
     Parameters
     ----------
     values
-        (r, c); what has weight 0 may be anything finite.
+        (r, c); values of weight 0 may be any finite number.
     weights
         (r, c) inverse variances, relative to a value of weight 1.
     reach
@@ -51,7 +51,7 @@ def predict_from_neighbours(
     Returns
     -------
     Prediction
-        Of each point, without its own value.
+        Value and variance for each point, without its own value.
     """
     u = np.arange(-reach, reach + 1) / reach
     window = (1.0 - np.abs(u) ** 3 / 1.05) ** 3  # the tricube of local regression, which ends softly
@@ -75,14 +75,13 @@ def predict_from_neighbours(
         [[moments[a[0] + b[0], a[1] + b[1]] for b in _ORDERS] for a in _ORDERS], right, prior
     )
     shape = values.shape
-    return Prediction(value.reshape(shape), variance.reshape(shape))
+    return SurfacePrediction(value.reshape(shape), variance.reshape(shape))
 
 
 def _solve_first(matrix: list[list[Float]], right: list[Float], prior: tuple[float, ...]) -> tuple[Float, Float]:
     """Return the first unknown of many symmetric systems, and the first element of the inverse.
 
-    Elimination from the last unknown up, over all systems at once: what is left of the first row is its Schur
-    complement.
+    Elimination from the last unknown up, over all systems at once: the remaining first row is its Schur complement.
     """
     m = {(i, j): matrix[i][j] + (prior[i] if i == j else 0.0) for i in range(_TERMS) for j in range(i + 1)}
     r = list(right)

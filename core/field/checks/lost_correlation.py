@@ -1,33 +1,39 @@
-"""Points that correlate less than they must: something else is seen in a part of the subset.
+"""Points whose correlation is too low: a part of the subset shows something else.
 
-A right match loses correlation to noise, the more the less texture its subset has; to the view, as a surface that turns
-away from one camera is blurred over more of its texture; and to what all points about it lose, such as defocus. A point
-within these is kept, however much worse than the best ones it is, and what its residuals do to it is in its standard
-deviation (:mod:`core.field.checks.residual_test`). Far beyond, it is no match of one surface.
+A right match loses correlation by noise, the more the less texture its subset has; by the view, as a surface that turns
+away from one camera is blurred over more of its texture; and by effects that all points about it have, such as defocus.
+A point within these limits is kept, even if it is much worse than the best ones; its standard deviation contains the
+effect of its residuals (:mod:`stereorig.core.field.checks.residual_test`). Far above the limits it is no match of one
+surface.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
-from core.arrays import Bool, Float
-from core.cameras.stereo import StereoPair
-from core.field.checks.block_median import block_medians, least_about, reach_of, spacing_of
-from core.field.points.fitter import PointFits
-from core.field.points.starts import view_cosines
-from core.robust import MAD_TO_SIGMA
-from core.status import PointStatus
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.checks.block_median import block_medians, least_about, reach_of, spacing_of
+from stereorig.core.field.checks.local_surface import predict_from_neighbours
+from stereorig.core.field.points.fitter import PointFits
+from stereorig.core.field.points.starts import view_cosines
+from stereorig.core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight
+from stereorig.core.status import PointStatus
 
 _LOST_TO_VIEW = 0.015
-"""1 - zncc over the squared excess of the blur's variance, relative to one camera's own: three times what real speckle
-loses on faces of 45 degrees."""
+"""1 - zncc over the squared excess of the blur's variance, relative to one camera's own: three times the loss of real
+speckle on faces of 45 degrees.
+"""
 _MOST_EXCESS = 3.0  # a surface that is seen at half the width
-_LEAST_IN_TIME = 0.675  # of the bound where something may have changed the view
+_LEAST_IN_TIME = 0.675  # share of the bound if the view may have changed
 _FINE = 2.0
 _SHAPE_FACTOR, _SHAPE_LOSS = 12.0, 0.04
 _WIDER = 3  # so far about a point that a crack is in a small part of it
+_SWEEPS = 4  # of the robust smooth course
+_COURSE_SCATTER = 0.2  # scatter of the logarithm about a course caused by defocus: twice the scatter of textures
 _FEW = 12
 _LEAST = 1e-7
 _LOST = 0.25  # share of the points about a point from which on the others are no measure
@@ -35,7 +41,7 @@ _UNTRIED = (PointStatus.MASKED, PointStatus.OUTSIDE_IMAGE, PointStatus.LOW_TEXTU
 
 
 class CorrelationLimits(NamedTuple):
-    """Limit of 1 - zncc over what the points about a point lose: standard deviations of its logarithm, and bounds."""
+    """Limit of 1 - zncc over the loss of the points about a point: standard deviations of its logarithm, and bounds."""
 
     sigmas: float
     min_factor: float
@@ -53,7 +59,7 @@ def lost_correlation(
     subset_px: int,
     limits: CorrelationLimits,
 ) -> Bool:
-    """Return (n,) True for valid points that have lost more correlation than they must.
+    """Return (n,) True for valid points that have lost more correlation than the limits allow.
 
     Parameters
     ----------
@@ -70,7 +76,7 @@ def lost_correlation(
     subset_px
         Width of the subset.
     limits
-        Allowed loss over that of the points about a point, at its own texture.
+        Allowed loss over the loss of the points about a point, at its own texture.
     """
     ok = points.ok
     bad = np.zeros(len(ok), bool)
@@ -90,7 +96,7 @@ def lost_correlation(
         excess = np.log(loss / level)
         scatter = MAD_TO_SIGMA * block_medians(np.abs(excess), ok, shape, reach, otherwise=np.inf)
         allowed = np.clip(np.exp(limits.sigmas * scatter), limits.min_factor, limits.max_factor)
-        if points.zncc.shape[1] == 1:  # what takes less than this from a shape is found in the parts of its subset
+        if points.zncc.shape[1] == 1:  # a smaller loss in a shape is found in the parts of its subset
             allowed = np.maximum(allowed, np.minimum(_SHAPE_FACTOR, _SHAPE_LOSS / level))
         if k == 1:
             best, strict = _of_the_best(loss, texture, ok, shape, _WIDER * reach, limits)
@@ -98,7 +104,7 @@ def lost_correlation(
             first = np.where(ok, np.maximum(1.0 - points.zncc[:, 0], _LEAST), 1.0)
             fine = first > _FINE * _of_the_best(first, texture, ok, shape, _WIDER * reach, limits)[0]
             level, allowed = np.where(fine, level, best), np.where(fine, allowed, strict)
-        if k == 2:  # of camera 2 nothing but what is new
+        if k == 2:  # camera 2's loss at the reference is not counted again
             level = np.maximum(level, 1.0 - points.zncc[:, 0])
         expected[:, k] = level * allowed
     if points.zncc.shape[1] > 1:
@@ -109,11 +115,42 @@ def lost_correlation(
         valid = np.flatnonzero(ok)
         view = np.zeros_like(points.zncc)
         view[valid] = _excess_blur(points, pair, rays, valid) ** 2
-        # what the points about a point lose to the view is in what they lose
+        # the loss of the points about a point already contains their loss by the view
         about = [block_medians(v, ok, shape, reach) for v in view.T]
         lost = _LOST_TO_VIEW * np.maximum(view - np.stack(about, axis=1), 0.0)
         bad[suspect] = (1.0 - points.zncc[suspect] > expected[suspect] + lost[suspect]).any(axis=1)
+    if bad.any() and points.zncc.shape[1] > 1:
+        bad &= ~_loses_as_smoothly(points, shape, reach, texture, limits)
     return bad
+
+
+def _loses_as_smoothly(
+    points: PointFits, shape: tuple[int, int], reach: int, texture: Float, limits: CorrelationLimits
+) -> Bool:
+    """(n,) True at points whose loss follows a smooth course through the points about it, as defocus by height.
+
+    A crack or a flake is narrow compared with the points that the course is fitted to: its points are off the course,
+    and no point next to them counts as smooth.
+    """
+    ok = points.ok
+    smooth = ok.copy()
+    for k in range(1, points.zncc.shape[1]):
+        values = np.log(np.where(ok, np.maximum(1.0 - points.zncc[:, k], _LEAST), 1.0) * texture)
+        values -= np.median(values[ok])
+        weights = ok.astype(float)
+        for _ in range(_SWEEPS):
+            course = predict_from_neighbours(
+                values.reshape(shape), weights.reshape(shape), _WIDER * reach, slope_precision=1e-3, bend_precision=1e-3
+            ).value.ravel()
+            scatter = MAD_TO_SIGMA * float(np.median(np.abs(values - course)[ok]))
+            weights = ok * biweight(((values - course) / max(BIWEIGHT_REACH * scatter, 1e-9)) ** 2)
+        if scatter > _COURSE_SCATTER:
+            return np.zeros_like(ok)
+        off = ok & (values > course + max(limits.sigmas * scatter, np.log(limits.min_factor)))
+        width = 2 * reach + 1
+        smooth &= cv2.dilate(off.astype(np.uint8).reshape(shape), np.ones((width, width), np.uint8)).ravel() == 0
+    many = _where_many_are_lost(points, shape, reach, texture, limits)
+    return smooth & (1.0 - points.zncc[:, 1:] <= many).all(axis=1)
 
 
 def _where_many_are_lost(
@@ -121,8 +158,8 @@ def _where_many_are_lost(
 ) -> Float:
     """(n, k - 1) largest loss in time where many points are lost; inf elsewhere.
 
-    What is left of a part that something else is seen in is no measure of what is usual there: the parts that kept most
-    of their points are, and what the point lost between the cameras before anything happened.
+    In a part that shows something else, the few points left are not typical: the limit comes from parts that kept most
+    of their points, and from the point's own loss between the cameras at the reference.
     """
     ok = points.ok
     tried = ~np.isin(points.status, _UNTRIED)
@@ -170,5 +207,5 @@ def _narrower(m: Float) -> Float:
 
 
 def _excess(width: Float) -> Float:
-    """Of the wider view's blur, on the scale of the finer one: either of the two may be the one that is turned away."""
+    """Excess of the wider view's blur, on the scale of the finer view: either camera may be the one turned away."""
     return np.minimum(np.maximum(width, 1.0 / width) ** 2 - 1.0, _MOST_EXCESS)

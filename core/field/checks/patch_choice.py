@@ -1,10 +1,10 @@
 """Choice of a field's patch: the user's, or the one with the smaller total error on this field.
 
 A plane patch on a curved surface has a bias of half the curvature times the subset's second moment; a curved patch has
-none, and about twice the noise. The bias is estimated from the field that plane patches measured. Where it could
-exceed the noise, ``auto`` compares both on the field itself: a sample of its points is fitted both ways. Because of
-noise the two results differ by the difference of their covariances (the plane patch is the more precise of the two as
-long as it has no bias, so their difference is independent of it); what they differ by beyond that is the bias.
+none, and about twice the noise. The bias is estimated from the field that plane patches measured. If it could exceed
+the noise, ``auto`` compares both on the field itself: a sample of its points is fitted both ways. Because of noise the
+two results differ by the difference of their covariances (the plane patch is the more precise of the two as long as it
+has no bias, so their difference is independent of it); any further difference is the bias.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from core.arrays import Float
-from core.field.checks.plane_error import PlaneError
-from core.field.checks.residual_test import AS_NOISE, residual_factors
-from core.field.points.fitter import Fitter, PointFits
-from core.field.points.patch import PatchChoice, UsedPatch, format_length
-from core.matching.geometry import covariance_xyz, covariance_xyzuvw, motion_geometry, shape_geometry
+from stereorig.core.arrays import Float
+from stereorig.core.field.checks.plane_error import PlaneError
+from stereorig.core.field.checks.residual_test import AS_NOISE, residual_factors
+from stereorig.core.field.points.fitter import Fitter, PointFits
+from stereorig.core.field.points.patch import PatchChoice, UsedPatch, format_length
+from stereorig.core.matching.geometry import covariance_xyz, covariance_xyzuvw, motion_geometry, shape_geometry
 
 _SAMPLE = 256
 _MIN_POINTS = 16
@@ -37,9 +37,9 @@ def advise(choice: PatchChoice, estimate: PlaneError | None) -> PatchChoice:
     Parameters
     ----------
     choice
-        The user's.
+        The user's choice.
     estimate
-        Bias and noise of the field's plane patches; None where they could not be estimated.
+        Bias and noise of the field's plane patches; None if they could not be estimated.
     """
     if estimate is None or choice.patch == "quadratic":
         return choice
@@ -65,7 +65,7 @@ def choose_patch(fitter: Fitter, points: PointFits, xy_px: Float, estimate: Plan
     xy_px
         (n, 2) their image coordinates in camera 1.
     estimate
-        Bias and noise of the plane patches, or None where the field is too small to estimate them.
+        Bias and noise of the plane patches, or None if the field is too small to estimate them.
 
     Returns
     -------
@@ -94,7 +94,7 @@ def choose_patch(fitter: Fitter, points: PointFits, xy_px: Float, estimate: Plan
     if good.mean() < _SHARE or good.sum() < _MIN_POINTS:
         share = f"{100.0 * (1.0 - good.mean()):.0f} %"
         return _simple(plane, f"{plane}: quadratic patches do not converge on {share} of the points tried", len(index))
-    # what neither patch explains, as a subset across an edge, tells nothing of curvature
+    # points that neither patch fits, as a subset across an edge, show nothing of curvature
     explained = good & (curved.noise <= _EXPLAINED * np.median(curved.noise[good]))
     kept = np.flatnonzero(explained if explained.sum() >= _MIN_POINTS else good)
     a, b = flat.take(kept), curved.take(kept)
@@ -170,9 +170,9 @@ def _compared(fitter: Fitter, xy: Float, a: PointFits, b: PointFits) -> tuple[Fl
 
 
 def _count_residuals(curved_fitter: Fitter, a: PointFits, b: PointFits, xy_px: Float) -> None:
-    """Raise the variances of both patches to what the residuals of the curved one show, where these are not noise.
+    """Raise the variances of both patches by the residuals of the curved one if these are not noise.
 
-    What blur or the view take from the texture is noise of both results, and no curvature.
+    The loss of texture by blur or the view is noise of both results, and no curvature.
     """
     factor = residual_factors(curved_fitter, b, xy_px)
     root = np.sqrt(np.where(factor > AS_NOISE[1], factor, 1.0))

@@ -2,7 +2,7 @@
 
 A plane patch averages the surface below it: its bias is half the second derivative times the subset's second moment,
 (h^2 - 1) / 12 px^2 for a subset h wide, along both axes. Inverse depth w and the columns G of the motion are linear in
-the image for planes that move, whatever their tilt, so it is their Laplacian over neighbouring points that counts. The
+the image for planes that move, at any tilt, so the bias follows from their Laplacian over neighbouring points. The
 neighbours are taken a subset's width away, where their noise is their own.
 """
 
@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from core.arrays import Float
-from core.field.points.fitter import PointFits
+from stereorig.core.arrays import Float
+from stereorig.core.field.points.fitter import PointFits
 
 _MIN_POINTS = 16
 _TRIMMED = 0.02
@@ -57,7 +57,7 @@ def plane_error(
     Returns
     -------
     PlaneError or None
-        None where too few points have neighbours, or the neighbours lie too far away.
+        None if too few points have neighbours, or the neighbours are too far away.
     """
     separation = max(1, int(np.ceil(subset_px / spacing_px)))
     rows, cols = shape

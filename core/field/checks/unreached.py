@@ -1,20 +1,21 @@
-"""Status of points that growth did not reach, where their patch leaves an image."""
+"""Status of points that growth did not reach because their patch leaves an image."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from core.arrays import Bool, Float
-from core.field.points.fitter import Fitter, PointFits
-from core.field.points.starts import move_matrix, move_w
-from core.status import PointStatus
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.field.points.fitter import Fitter, PointFits
+from stereorig.core.field.points.starts import move_matrix, move_w
+from stereorig.core.status import PointStatus
 
 _REACH_SUBSETS = 4.0
+_UNKNOWN = 0.05  # share of the distance that a patch is extended by: possible change of the motion there
 
 
-def mark_outside(fitter: Fitter, points: PointFits, xy_px: Float, usable: Bool) -> None:
-    """Give unreached points the status OUTSIDE_IMAGE where the nearest valid patch, extended, leaves an image.
+def mark_outside(fitter: Fitter, points: PointFits, xy_px: Float, usable: Bool, *, however_far: bool = False) -> None:
+    """Give unreached points the status OUTSIDE_IMAGE if the nearest valid patch, extended, leaves an image.
 
     Parameters
     ----------
@@ -24,6 +25,9 @@ def mark_outside(fitter: Fitter, points: PointFits, xy_px: Float, usable: Bool) 
         (n) points, changed in place.
     xy_px, usable
         (n, 2) px of camera 1, and (n,) True where a point may be measured.
+    however_far
+        Points at any distance from the nearest valid one, for which nothing is searched any more, where a twentieth of
+        that distance does not bring them back; else those within some subsets of it.
     """
     open_ = np.flatnonzero(usable & (points.status == PointStatus.NOT_SEEDED))
     valid = np.flatnonzero(points.ok)
@@ -32,12 +36,18 @@ def mark_outside(fitter: Fitter, points: PointFits, xy_px: Float, usable: Bool) 
     subset = fitter.options.subset_px
     distance, nearest = cKDTree(xy_px[valid]).query(xy_px[open_])
     near = np.asarray(distance) < _REACH_SUBSETS * subset
+    if however_far:
+        margin_px, near = np.where(near, 0.0, -_UNKNOWN * distance)[:, None], np.ones_like(near)
+    else:
+        margin_px = np.zeros((int(near.sum()), 1))
     open_, parent = open_[near], valid[np.asarray(nearest)[near]]
-    outside = leaves_an_image(fitter, xy_px[open_], xy_px[parent], points.take(parent))
+    outside = leaves_an_image(fitter, xy_px[open_], xy_px[parent], points.take(parent), margin_px)
     points.status[open_[outside]] = PointStatus.OUTSIDE_IMAGE
 
 
-def leaves_an_image(fitter: Fitter, xy_px: Float, from_px: Float, patches: PointFits, margin_px: float = 0.0) -> Bool:
+def leaves_an_image(
+    fitter: Fitter, xy_px: Float, from_px: Float, patches: PointFits, margin_px: float | Float = 0.0
+) -> Bool:
     """Return (n,) True where a subset on the extended patch of another point leaves an image.
 
     Parameters
@@ -49,7 +59,7 @@ def leaves_an_image(fitter: Fitter, xy_px: Float, from_px: Float, patches: Point
     patches
         (n) valid fits.
     margin_px
-        Distance from the images' borders that they must keep.
+        Distance from the images' borders that they must keep: of all, or (n, 1) of each.
     """
     outside = np.zeros(len(xy_px), bool)
     half = fitter.options.subset_px // 2
@@ -63,8 +73,8 @@ def leaves_an_image(fitter: Fitter, xy_px: Float, from_px: Float, patches: Point
     return outside
 
 
-def _outside(fitter: Fitter, before: Float, now: Float | None, margin_px: float) -> Bool:
-    """Return (n,) True where a point (n, 3), camera 1's frame, lies outside an image or too near to its border."""
+def _outside(fitter: Fitter, before: Float, now: Float | None, margin_px: float | Float) -> Bool:
+    """Return (n,) True if a point (n, 3), camera 1's frame, is outside an image or too near to its border."""
     pose, lens1, lens2 = fitter.pair.cam2_from_cam1, fitter.pair.cam1.lens, fitter.pair.cam2.lens
     views = [(pose.apply(before), lens2, fitter.ref2.shape)]
     if now is not None:

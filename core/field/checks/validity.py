@@ -13,19 +13,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.cameras.stereo import StereoPair
-from core.field.checks.epipolar_mismatch import EpipolarLimits, epipolar_mismatches
-from core.field.checks.groups import connected, neighbour_pairs
-from core.field.checks.lost_correlation import CorrelationLimits, lost_correlation
-from core.field.points.fitter import PointFits
-from core.field.points.scales import depth_per_px, px_per_ray
-from core.field.region.neighbours import N_QUANTITIES, compare_with_neighbours, sorting_network
-from core.field.region.visibility import Visibility
-from core.robust import MAD_TO_SIGMA, median
-from core.settings import DEFAULT_MAX_SIGMA_PX
-from core.status import PointStatus
-from core.threads import run_ranges
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.checks.epipolar_mismatch import EpipolarLimits, epipolar_mismatches
+from stereorig.core.field.checks.groups import connected, neighbour_pairs
+from stereorig.core.field.checks.lost_correlation import CorrelationLimits, lost_correlation
+from stereorig.core.field.points.fitter import PointFits
+from stereorig.core.field.points.scales import depth_per_px, px_per_ray
+from stereorig.core.field.region.neighbours import N_QUANTITIES, compare_with_neighbours, sorting_network
+from stereorig.core.field.region.visibility import Visibility
+from stereorig.core.robust import MAD_TO_SIGMA, median
+from stereorig.core.settings import DEFAULT_MAX_SIGMA_PX
+from stereorig.core.status import PointStatus
+from stereorig.core.threads import run_ranges
 
 _FEW = 12
 _NETWORK = sorting_network(24)
@@ -43,10 +43,10 @@ class ValidityOptions:
     epipolar_floor_px
         Added to it, so that a noise-free field keeps its second-best points.
     correlation_sigmas
-        Allowed excess of log(1 - zncc) over what the points about a point lose, at its own texture, in robust standard
-        deviations.
+        Allowed excess of log(1 - zncc) over the loss of the points about a point, at its own texture, in robust
+        standard deviations.
     correlation_min_factor, correlation_max_factor
-        1 - zncc up to the first times that is never rejected; above the second always, but for what the view takes.
+        1 - zncc up to the first times that is never rejected; above the second always, apart from the loss by the view.
     neighbour_sigmas
         Allowed disagreement with the neighbours' patches, in robust standard deviations.
     neighbour_floor_px
@@ -164,7 +164,7 @@ def neighbour_disagreement(
     """Return (n, 4) disagreement with the neighbours and its local spread in px, and the number of neighbours compared.
 
     The four are depth, by its effect in camera 2's image, and displacement along x, y and depth, likewise. ``scale`` is
-    :func:`disagreement_scale` of the points, where it is known already.
+    :func:`disagreement_scale` of the points, if it is known already.
     """
     rows, cols = shape
     n = rows * cols
@@ -192,7 +192,7 @@ def neighbour_disagreement(
 
 
 def disagreement_scale(pair: StereoPair, rays: Float, w0: Float) -> Float:
-    """Return (n, 4) px per unit of what neighbours are compared by, at inverse depths (n,); NaN where these are."""
+    """Return (n, 4) px per unit of the quantities compared between neighbours, at inverse depths (n,); NaN at NaN."""
     scale = np.full((len(w0), N_QUANTITIES), np.nan)
     ok = np.flatnonzero(np.isfinite(w0))
     if len(ok):

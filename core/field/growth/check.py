@@ -6,15 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from core.field.checks.blank_centres import reject_blank_centres
-from core.field.checks.edges import reject_near_edges
-from core.field.checks.residual_test import residual_test
-from core.field.checks.unreached import mark_outside
-from core.field.checks.validity import apply_validity_checks
-from core.field.growth.grow import grow
-from core.field.growth.state import FieldInputs, GrowthState
-from core.field.parts.straddling import reject_straddling
-from core.field.points.fitter import PointFits
+from stereorig.core.field.checks.blank_centres import reject_blank_centres
+from stereorig.core.field.checks.edges import reject_near_edges
+from stereorig.core.field.checks.residual_test import residual_test
+from stereorig.core.field.checks.unreached import mark_outside
+from stereorig.core.field.checks.validity import apply_validity_checks
+from stereorig.core.field.growth.grow import grow
+from stereorig.core.field.growth.state import FieldInputs, GrowthState
+from stereorig.core.field.parts.straddling import reject_straddling
+from stereorig.core.field.points.fitter import PointFits
+from stereorig.core.field.points.result import Unsure
 
 
 def check(inputs: FieldInputs, points: PointFits) -> None:
@@ -75,8 +76,11 @@ def check_edges(inputs: FieldInputs, state: GrowthState) -> None:
         check(inputs, state.points)
 
 
-def check_residuals(inputs: FieldInputs, state: GrowthState) -> None:
-    """Test the residuals of points and of parts of subsets, then reject points whose patch leaves the images."""
+def check_residuals(inputs: FieldInputs, state: GrowthState) -> Unsure | None:
+    """Test the residuals of points and of parts of subsets, then reject points whose patch leaves the images.
+
+    Returns the usual match's standard deviation if it is above the limit.
+    """
     tested = residual_test(
         state.fitter,
         state.points,
@@ -95,10 +99,12 @@ def check_residuals(inputs: FieldInputs, state: GrowthState) -> None:
         texture=inputs.texture,
         spacing_px=inputs.grid.spacing_px,
         noise_factor=float(np.nanmax(tested.factor[:-1], initial=1.0)),
+        limit_px=tested.limit_px,
         cancel=inputs.cancel,
     )
     if rejected:
         check(inputs, state.points)  # isolated points fail the neighbour check
-    mark_outside(state.fitter, state.points, inputs.xy_px, inputs.usable)
+    mark_outside(state.fitter, state.points, inputs.xy_px, inputs.usable, however_far=True)
     if inputs.options.blur is not None:
         reject_near_edges(state.fitter, state.points, inputs.xy_px, inputs.options.blur)
+    return tested.unsure

@@ -1,8 +1,8 @@
 """Growth of a large field in two passes: over a coarse part of its points, then all others from the nearest of those.
 
-Growth goes wave by wave, each from the values of the one before, so that it cannot be shared out. A subset's width
-apart it meets few points; from these all others start at once, each by itself. Points that do not match from there are
-left to growth over all.
+Growth goes wave by wave, each from the values of the one before, so that it cannot be shared out. Points a subset's
+width apart are few; from them all others start at once, each by itself. Points that do not match from there are left to
+growth over all.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from core.field.growth.grow import Attempts, fit_in_batches, grow, min_parent_zncc
-from core.field.growth.state import SAMPLE_FAR_PX, FieldInputs, GrowthState
-from core.field.points.starts import move_matrix, move_w
-from core.progress import raise_if_cancelled
+from stereorig.core.field.growth.grow import Attempts, fit_in_batches, grow, min_parent_zncc
+from stereorig.core.field.growth.state import SAMPLE_FAR_PX, FieldInputs, GrowthState
+from stereorig.core.field.points.starts import move_matrix, move_w
+from stereorig.core.progress import raise_if_cancelled
 
 Index = NDArray[np.intp]
 
@@ -24,7 +24,7 @@ _PARENTS = 4  # the nearest ones; the first that no cut separates counts
 
 def is_large(inputs: FieldInputs) -> bool:
     """Return True if a field is measured in two passes: it has many points, several of them across a subset."""
-    return _every(inputs) > 1 and int(inputs.usable.sum()) >= inputs.options.split_from
+    return _every(inputs) > 1 and int(inputs.usable.sum()) >= inputs.options.coarse_from
 
 
 def grow_coarse_first(inputs: FieldInputs, state: GrowthState) -> None:
@@ -34,7 +34,7 @@ def grow_coarse_first(inputs: FieldInputs, state: GrowthState) -> None:
     lattice = np.arange(rows * cols).reshape(rows, cols)[every // 2 :: every, every // 2 :: every]
     coarse = lattice.ravel()
     inputs.progress("grow", 0, int(inputs.usable.sum()))
-    _from_nearest(inputs, state, coarse, shared=False)
+    _from_nearest(inputs, state, coarse)
     part = points.take(coarse)
     grow(
         state.fitter,
@@ -47,7 +47,7 @@ def grow_coarse_first(inputs: FieldInputs, state: GrowthState) -> None:
     )
     points.put(coarse, part)
     raise_if_cancelled(inputs.cancel)
-    _from_nearest(inputs, state, np.arange(len(inputs.xy_px)), shared=True)
+    _from_nearest(inputs, state, np.arange(len(inputs.xy_px)))
 
 
 def _every(inputs: FieldInputs) -> int:
@@ -67,8 +67,8 @@ def _coarse_attempts(inputs: FieldInputs, lattice: Index) -> Attempts:
     return attempts
 
 
-def _from_nearest(inputs: FieldInputs, state: GrowthState, index: Index, *, shared: bool) -> None:
-    """Fit those of the points ``index`` that are not valid, each from the nearest valid one in reach."""
+def _from_nearest(inputs: FieldInputs, state: GrowthState, index: Index) -> None:
+    """Fit the points ``index`` that are not valid, each from the nearest valid one in reach."""
     points, xy = state.points, inputs.xy_px
     quality = points.quality
     if not (quality > 0.0).any():
@@ -88,7 +88,6 @@ def _from_nearest(inputs: FieldInputs, state: GrowthState, index: Index, *, shar
         w,
         G,
         far_px=SAMPLE_FAR_PX,
-        shared=shared,
         report=lambda done: inputs.progress("grow", min(valid + done, total), total),
         cancel=inputs.cancel,
     )

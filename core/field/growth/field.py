@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from core.errors import SeedError
-from core.field.checks.unreached import mark_outside
-from core.field.growth.check import check, check_edges, check_residuals, fill, grow_field
-from core.field.growth.coarse_first import grow_coarse_first, is_large
-from core.field.growth.patch import choose_patch, refit_curved
-from core.field.growth.reach import hidden, reach_further
-from core.field.growth.seed import Seeds, match_seeds, seed_motion, seed_shape
-from core.field.growth.state import FieldInputs, GrowthState, begin, fresh_attempts
-from core.field.points.assemble import assemble
-from core.field.points.result import Field
-from core.field.seeding.diagnosis import diagnose, seed_error
-from core.status import PointStatus
+from stereorig.core.errors import SeedError
+from stereorig.core.field.checks.unreached import mark_outside
+from stereorig.core.field.growth.check import check, check_edges, check_residuals, fill, grow_field
+from stereorig.core.field.growth.coarse_first import grow_coarse_first, is_large
+from stereorig.core.field.growth.patch import choose_patch, refit_curved, take_off_bias
+from stereorig.core.field.growth.reach import hidden, reach_further
+from stereorig.core.field.growth.seed import Seeds, match_seeds, seed_motion, seed_shape
+from stereorig.core.field.growth.state import FieldInputs, GrowthState, begin, fresh_attempts
+from stereorig.core.field.points.assemble import assemble
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.seeding.diagnosis import diagnose, seed_error
+from stereorig.core.status import PointStatus
 
 _LEFT_OVER = 0.02
 _MOSTLY = 0.5
@@ -39,7 +39,7 @@ def assemble_field(inputs: FieldInputs, state: GrowthState, shape: Field | None)
     field = assemble(
         state.points, pair=inputs.pair, grid=inputs.grid, fits_image=inputs.fits_image, shape=shape, patch=state.patch
     )
-    return replace(field, failed_seeds_px=state.failed_seeds_px)
+    return replace(field, failed_seeds_px=state.failed_seeds_px, unsure=state.unsure)
 
 
 def fill_field(inputs: FieldInputs, state: GrowthState, *, shape: Field | None = None) -> GrowthState:
@@ -50,7 +50,7 @@ def fill_field(inputs: FieldInputs, state: GrowthState, *, shape: Field | None =
     inputs, state
         With seeds.
     shape
-        Of a motion: the shape that was measured before.
+        For a motion: the shape that was measured before.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def fill_field(inputs: FieldInputs, state: GrowthState, *, shape: Field | None =
     if not state.checked and is_large(inputs):
         grow_coarse_first(inputs, state)
     state = choose_patch(inputs, fill(inputs, state))
-    if not state.checked:  # measured anew
+    if not state.checked:  # measured again
         state = fill(inputs, state)
     mark_outside(state.fitter, state.points, inputs.xy_px, inputs.usable)
     if shape is not None:
@@ -77,7 +77,8 @@ def fill_field(inputs: FieldInputs, state: GrowthState, *, shape: Field | None =
     elif shape is None:
         reach_further(inputs, state)
     check_edges(inputs, state)
-    check_residuals(inputs, state)
+    state = replace(state, unsure=check_residuals(inputs, state))
+    state = take_off_bias(inputs, state)
     inputs.progress("done", int(state.points.ok.sum()), int(inputs.usable.sum()))
     return state
 
@@ -89,7 +90,7 @@ def _unreached(inputs: FieldInputs, state: GrowthState) -> float:
 
 
 def _no_seed(inputs: FieldInputs) -> SeedError:
-    """Return the error for a field without a start, with what its images show about the cause."""
+    """Return the error for a field without a start, with the cause as far as its images show it."""
     usable = inputs.usable
     found = diagnose(
         inputs.pair,

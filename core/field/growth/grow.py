@@ -12,15 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float
-from core.field.points.crew import ToFit, fit_here, fit_shared
-from core.field.points.fitter import FitsPoints, PointFits
-from core.field.points.starts import move_matrix, move_w
-from core.field.region.visibility import Visibility
-from core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
-from core.robust import MAD_TO_SIGMA, median
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.field.points.fitter import FitsPoints, PointFits
+from stereorig.core.field.points.starts import move_matrix, move_w
+from stereorig.core.field.region.visibility import Visibility
+from stereorig.core.progress import CancelToken, Progress, no_progress, raise_if_cancelled
+from stereorig.core.robust import MAD_TO_SIGMA, median
+from stereorig.core.status import PointStatus
 
 _OFFSETS = np.array([(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)])  # k and k ^ 2 are opposite
+MAX_BATCH = 4096
+"""Points fitted between two looks at the cancel token: a cancel takes effect within a second even on a slow machine."""
 _ALL_AT_ONCE = 512
 _FAR_PX = 3.0
 _COUNT_AGAIN = 1.05
@@ -37,23 +39,25 @@ def fit_in_batches(
     G: Float | None,
     *,
     far_px: float,
-    shared: bool = False,
     report: Callable[[int], None] | None = None,
     cancel: CancelToken | None = None,
 ) -> Bool:
     """Fit the points ``index`` from starts and store the results; return (m,) True for the valid ones.
 
-    A fit that ends further than ``far_px`` from its start has left the basin it was started in. Points that are
-    ``shared`` may be fitted by others. ``report`` is called with the number of points fitted so far.
+    A fit that ends further than ``far_px`` from its start has left the basin it was started in. ``report`` is called
+    with the number of points fitted so far.
     """
-    good, done = np.zeros(len(index), bool), 0
-    fit = fit_shared if shared else fit_here
-    for part, fits in fit(fitter, ToFit(xy_px[index], w, G, far_px), cancel):
+    good = np.zeros(len(index), bool)
+    for first in range(0, len(index), MAX_BATCH):
+        raise_if_cancelled(cancel)
+        part = slice(first, first + MAX_BATCH)
+        xy, start_w, start_G = xy_px[index[part]], w[part], None if G is None else G[part]
+        fits = fitter.fit(xy, start_w, start_G)
+        fits.reject(fits.ok & fitter.far_from_start(xy, fits, start_w, start_G, far_px), PointStatus.NOT_CONVERGED)
         points.put(index[part], fits)
         good[part] = fits.ok
         if report is not None:
-            done += len(fits.status)
-            report(min(done, len(index)))
+            report(min(first + MAX_BATCH, len(index)))
     return good
 
 
@@ -64,7 +68,7 @@ class Attempts:
     Attributes
     ----------
     neighbours
-        (n, 8) index of each point's neighbours, -1 outside the grid and where a cut lies between.
+        (n, 8) index of each point's neighbours, -1 outside the grid and for neighbours across a cut.
     tried
         (n, 8) True for those from which the point was started before.
     left
@@ -91,7 +95,7 @@ class Attempts:
         return Attempts(neighbours, np.zeros(neighbours.shape, bool), np.full(n, ATTEMPTS, np.int8))
 
     def renew(self, which: Bool) -> None:
-        """Forget the starts of the points ``which`` (n,): fresh seeds lie near them."""
+        """Forget the starts of the points ``which`` (n,), since new seeds are near them."""
         self.tried[which] = False
         self.left[which] = ATTEMPTS
 

@@ -1,8 +1,8 @@
-"""What growth left unmeasured, looked at again with fresh seeds until nothing more matches.
+"""Search in points that growth did not reach, with new seeds until nothing more matches.
 
-Growth does not cross a step, a steep ridge or a gap. Connected groups of open points that lie clear of all valid ones
-get seeds of their own. A group in which none of them matches is hopeless (occluded, say) and remembered: the work is
-bounded by the number of groups, not by that of their points.
+Growth does not cross a step, a steep ridge or a gap. Connected groups of open points at a distance from all valid ones
+get seeds of their own. A group in which no seed matches is hopeless (occluded, say) and remembered: the work is limited
+by the number of groups, not by the number of their points.
 """
 
 from __future__ import annotations
@@ -11,27 +11,28 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool
-from core.field.growth.check import check, grow_field
-from core.field.growth.state import FieldInputs, GrowthState
-from core.field.points.fitter import PointFits
-from core.field.seeding.local_search import deeper_range, depth_range, search_shapes
-from core.field.seeding.predicted import predicted_motion, seen_elsewhere
-from core.progress import raise_if_cancelled
-from core.status import PointStatus
+from stereorig.core.arrays import Bool
+from stereorig.core.field.growth.check import check, grow_field
+from stereorig.core.field.growth.state import FieldInputs, GrowthState
+from stereorig.core.field.points.fitter import PointFits
+from stereorig.core.field.seeding.local_search import deeper_range, depth_range, search_shapes
+from stereorig.core.field.seeding.predicted import predicted_motion, seen_elsewhere
+from stereorig.core.progress import raise_if_cancelled
+from stereorig.core.status import PointStatus
 
 _ROUNDS = 12
-_CLEAR_SUBSETS = 0.6  # from the nearest valid point: nearer ones have had their starts, or lie across an edge
-_PITCH_SUBSETS = 0.5  # of the positions that are searched: a subset on a small face meets one of them
+_CLEAR_SUBSETS = 0.6  # from the nearest valid point: nearer ones have been started already, or are across an edge
+_PITCH_SUBSETS = 0.5  # pitch of the positions that are searched: a subset on a small face meets one of them
 _A_GROUP = 24
 _A_ROUND = 16  # positions, and one more for so many points of the field
 _POINTS_PER_POSITION = 200
-_FIELD_SHARE = 5.0  # times the field's median of 1 - zncc: what a match without neighbours may have
-_CHANCE_ZNCC = 0.8  # what a subset of some twenty speckles reaches by chance, over all depths and tilts
+_FIELD_SHARE = 5.0  # times the field's median of 1 - zncc: limit for a match without neighbours
+_CHANCE_ZNCC = 0.8  # limit that a subset of some twenty speckles reaches by chance, over all depths and tilts
 _OPEN = (
     PointStatus.NOT_SEEDED,
     PointStatus.NOT_CONVERGED,
     PointStatus.LOW_CORRELATION,
+    PointStatus.SIGMA_TOO_LARGE,
     PointStatus.EPIPOLAR_MISMATCH,
     PointStatus.NEIGHBOUR_MISMATCH,
 )
@@ -74,7 +75,7 @@ def _open(inputs: FieldInputs, state: GrowthState) -> Bool:
 
 
 def _groups(inputs: FieldInputs, state: GrowthState, hopeless: Bool) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Return (n,) the group of each open point that lies clear of valid ones, 0: in none, and that distance, points."""
+    """Return (n,) the group of each open point at a distance from valid ones, 0: in none, and that distance, points."""
     shape = inputs.grid.shape
     clear = max(_CLEAR_SUBSETS * inputs.options.subset_px / inputs.grid.spacing_px, 1.0)
     distance = np.asarray(
@@ -90,7 +91,7 @@ def _groups(inputs: FieldInputs, state: GrowthState, hopeless: Bool) -> tuple[ND
 def _positions(inputs: FieldInputs, label: NDArray[np.int32], distance: NDArray[np.float32]) -> NDArray[np.intp]:
     """Return the points to be searched: those farthest from valid ones in the cells of each group, few in a large one.
 
-    That is where the middle of a face lies that growth did not reach.
+    Such a point is in the middle of a face that growth did not reach.
     """
     core = np.flatnonzero(label > 0)
     xy, own = inputs.xy_px[core], label[core]

@@ -10,27 +10,27 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from core.arrays import Bool, Float
-from core.errors import SeedError
-from core.field.growth.check import check
-from core.field.growth.grow import fit_in_batches
-from core.field.growth.patch import keep_patch, refit_curved
-from core.field.growth.state import SAMPLE_FAR_PX, FieldInputs, GrowthState
-from core.field.points.features import Box
-from core.field.points.fitter import PointFits
-from core.field.points.images import features_of
-from core.field.points.result import Field
-from core.field.points.starts import Starts
-from core.field.seeding.predict import predict
-from core.field.seeding.scattered_matches import (
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.errors import SeedError
+from stereorig.core.field.growth.check import check
+from stereorig.core.field.growth.grow import fit_in_batches
+from stereorig.core.field.growth.patch import keep_patch, refit_curved
+from stereorig.core.field.growth.state import SAMPLE_FAR_PX, FieldInputs, GrowthState
+from stereorig.core.field.points.features import Box
+from stereorig.core.field.points.fitter import PointFits
+from stereorig.core.field.points.images import features_of
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.starts import Starts
+from stereorig.core.field.seeding.predict import predict
+from stereorig.core.field.seeding.scattered_matches import (
     ScatteredMotion,
     ScatteredShape,
     scattered_motion,
     scattered_shape,
     stretched_motion,
 )
-from core.field.seeding.search_region import box_around, half_serves, scales, seen_by_camera2
-from core.field.seeding.seeds import (
+from stereorig.core.field.seeding.search_region import box_around, half_serves, scales, seen_by_camera2
+from stereorig.core.field.seeding.seeds import (
     Seed,
     as_seeds,
     nearest_points,
@@ -41,15 +41,15 @@ from core.field.seeding.seeds import (
     sweep_shape,
     swept_positions,
 )
-from core.matching.fit import no_motion
-from core.progress import raise_if_cancelled
-from core.status import PointStatus
+from stereorig.core.matching.fit import no_motion
+from stereorig.core.progress import raise_if_cancelled
+from stereorig.core.status import PointStatus
 
 Seeds = Sequence[Seed | Sequence[float]] | NDArray[Any]
 
 _MIN_MATCHES = 12
-_SAMPLE_SHARE = 0.3  # of a sample: the rest may be hidden, or have moved by itself, and is seeded after growth
-_SEEDED_SHARE = 0.7  # of a region's cells: faces beside one another need seeds of their own
+_SAMPLE_SHARE = 0.3  # share of a sample: the rest may be hidden, or have moved by itself, and is seeded after growth
+_SEEDED_SHARE = 0.7  # share of a region's cells: neighbouring faces need seeds of their own
 _NEAREST = 3
 _REACH_STEPS = 2.0
 _SEARCHED = 6  # positions
@@ -60,7 +60,7 @@ def seed_shape(inputs: FieldInputs, state: GrowthState, seeds: Seeds | None) -> 
     inputs.progress("seeds", 0, 1)
     if seeds is not None:
         state = _given_shape(inputs, state, as_seeds(seeds))
-    # a user's seed comes first: of a texture that repeats itself it says which period is right
+    # a user's seed comes first: for a texture that repeats itself it determines the right period
     if not state.points.ok.any() and match_seeds(inputs, state) == 0:
         _swept_shape(inputs, state)
     inputs.progress("seeds", 1, 1)
@@ -81,7 +81,7 @@ def seed_motion(
         w, G = previous.starts.w.reshape(n, -1), previous.starts.G.reshape(n, 3, -1)
         tried = _sample_holds(inputs, state, w, G)
         if len(tried):
-            return _go_on(inputs, state, w, G, tried)
+            return _from_previous(inputs, state, w, G, tried)
     inputs.progress("seeds", 0, 1)
     if seeds is not None:
         state = _given_motion(inputs, state, as_seeds(seeds))
@@ -117,7 +117,7 @@ def match_seeds(inputs: FieldInputs, state: GrowthState) -> int:
 def _match_seeds_at(
     inputs: FieldInputs, state: GrowthState, scale: int, box1: Box, box2: Box, *, stretched: bool = True
 ) -> int:
-    """Seed from matches at one scale; ``stretched``: also of stretched copies, where there are no others."""
+    """Seed from matches at one scale; ``stretched``: also from stretched copies if there are no other matches."""
     raise_if_cancelled(inputs.cancel)
     known_w, pair = inputs.known_w, inputs.pair
     wanted = [(inputs.ref1, box1)]
@@ -148,10 +148,10 @@ def _match_seeds_at(
     return found
 
 
-def _go_on(inputs: FieldInputs, state: GrowthState, w: Float, G: Float, tried: NDArray[np.intp]) -> GrowthState:
+def _from_previous(inputs: FieldInputs, state: GrowthState, w: Float, G: Float, tried: NDArray[np.intp]) -> GrowthState:
     """Start all points from the previous step's values; a fitted sample of them is valid already.
 
-    Points in the midst of those of the sample ``tried`` that failed are hidden, probably: growth gets there if not.
+    Points near those of the sample ``tried`` that failed are probably hidden: they are left to growth.
     """
     if state.patch.patch == "quadratic":
         state = refit_curved(inputs, state)
@@ -172,7 +172,6 @@ def _go_on(inputs: FieldInputs, state: GrowthState, w: Float, G: Float, tried: N
         w[index],
         G[index],
         far_px=SAMPLE_FAR_PX,
-        shared=True,
         report=lambda done: inputs.progress("previous", done, len(index)),
         cancel=inputs.cancel,
     )
@@ -181,7 +180,7 @@ def _go_on(inputs: FieldInputs, state: GrowthState, w: Float, G: Float, tried: N
 
 
 def _stayed(inputs: FieldInputs, state: GrowthState) -> bool:
-    """Return True if the surface is about where it was; not tried on a texture that repeats itself."""
+    """Return True if the surface is about in the same place; not tried on a texture that repeats itself."""
     w = inputs.known_w
     if w is None:
         return False
@@ -236,7 +235,7 @@ def _put_one(state: GrowthState, i: np.intp, found: PointFits) -> None:
 
 
 def _rather_whole(inputs: FieldInputs, usable: Bool) -> Bool:
-    """Of usable points those with a wholly visible subset, where there are any: searches compare whole squares."""
+    """Usable points with a wholly visible subset, if there are any, else all: searches compare whole squares."""
     whole = usable if inputs.visibility is None else usable & inputs.visibility.whole
     return whole if whole.any() else usable
 

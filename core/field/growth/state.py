@@ -8,21 +8,24 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Bool, Float
-from core.cameras.stereo import StereoPair
-from core.field.checks.edges import clear_of_edges
-from core.field.growth.grow import Attempts
-from core.field.points.crew import Crew
-from core.field.points.fitter import Fitter, PointFits
-from core.field.points.images import MeasureImage, different, refuse_stale, same_size
-from core.field.points.patch import PatchChoice, UsedPatch, asked_for
-from core.field.points.result import Field
-from core.field.region.find_visible import with_visibility
-from core.field.region.region import PointGrid, check_region
-from core.field.region.visibility import Visibility
-from core.field.settings import MeasureOptions
-from core.matching.image import ImageData
-from core.progress import CancelToken, Progress, no_progress
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.checks.edges import clear_of_edges
+from stereorig.core.field.checks.residual_test import OF_USUAL
+from stereorig.core.field.growth.grow import Attempts
+from stereorig.core.field.points.fitter import Fitter, PointFits
+from stereorig.core.field.points.images import MeasureImage, different, refuse_stale, same_size
+from stereorig.core.field.points.patch import PatchChoice, UsedPatch, asked_for
+from stereorig.core.field.points.result import Field, Unsure
+from stereorig.core.field.points.scales import depth_per_px
+from stereorig.core.field.region.find_visible import with_visibility
+from stereorig.core.field.region.region import PointGrid, check_region
+from stereorig.core.field.region.visibility import Visibility
+from stereorig.core.field.settings import MeasureOptions
+from stereorig.core.matching.image import ImageData
+from stereorig.core.progress import CancelToken, Progress, no_progress
+from stereorig.core.robust import median
+from stereorig.core.settings import single_sigma_px
 
 Image = ArrayLike | ImageData | MeasureImage
 
@@ -42,21 +45,21 @@ class FieldInputs:
     ref1, ref2
         Both cameras' images at the reference.
     current
-        Both cameras' current images; none of a shape.
+        Both cameras' current images; empty for a shape.
     matcher
         The prepared images, with the patch that is tried first.
     fits_image
-        (r, c) True where a point is allowed and its subset lies in the image.
+        (r, c) True at allowed points whose subset is inside the image.
     xy_px, rays
         (n, 2) px, (n, 3) normalised: the points in camera 1's image.
     texture
         (n,) grey-level variance of the subsets.
     usable
-        (n,) True where a point may be measured.
+        (n,) True for points that may be measured.
     hoped_for
-        (n,) True where new seeds are searched for.
+        (n,) True for points at which new seeds are searched for.
     known_w
-        (n, k) the shape measured before, NaN where it has no point; None without one.
+        (n, k) the shape measured before, NaN at points without one; None without a shape.
     progress, cancel
         Receiver of progress reports, and the means to stop.
     """
@@ -85,19 +88,32 @@ class FieldInputs:
 
     @cached_property
     def repeating(self) -> Bool:
-        """(n,) True where the texture repeats itself, so that no seed may lie there."""
+        """(n,) True at points whose texture repeats itself, which must not be seeds."""
         out = np.zeros(len(self.xy_px), bool)
         out[self.usable] = self.ref1.repeating(self.xy_px[self.usable], self.options.subset_px)
         return out
 
     def on_shape(self, shape: Field, previous: Field | None) -> FieldInputs:
-        """Return the inputs of a motion: the points that the shape has; those lost in the previous step come second."""
+        """Return the inputs of a motion: the points that the shape has; those lost in the previous step come second.
+
+        A match may be as unsure as the shape's usual ones make it, in a sure shape no more than a single point.
+        """
         usable = self.usable & shape.valid.ravel()
+        known_w = None if shape.starts is None else shape.starts.w.reshape(len(self.xy_px), -1)
+        options = self.matcher.options
+        if known_w is not None and usable.any():
+            most_px = self.options.validity.max_sigma_px
+            sd_mm = np.sqrt(np.trace(shape.covariance[..., :3, :3], axis1=-2, axis2=-1)).ravel()[usable]
+            w0 = known_w[usable, 0]
+            usual_px = np.nan_to_num(median(sd_mm * w0**2 / depth_per_px(self.pair, self.rays[usable], w0)))
+            limit_px = float(np.clip(OF_USUAL * usual_px, single_sigma_px(most_px), most_px))
+            options = replace(options, max_sigma_px=limit_px)
         return replace(
             self,
+            matcher=replace(self.matcher, options=options),
             usable=usable,
             hoped_for=usable if previous is None else usable & previous.valid.ravel(),
-            known_w=None if shape.starts is None else shape.starts.w.reshape(len(self.xy_px), -1),
+            known_w=known_w,
         )
 
 
@@ -110,11 +126,8 @@ def prepare(
     *,
     progress: Progress | None = None,
     cancel: CancelToken | None = None,
-    crew: Crew | None = None,
 ) -> FieldInputs:
     """Check and prepare the inputs of a field: a shape, or with current images a motion.
-
-    ``crew`` are those who may fit tiles of many points; None: nobody.
 
     Raises
     ------
@@ -157,11 +170,11 @@ def prepare(
         ref2=prepared[1],
         cur1=prepared[2] if now else None,
         cur2=prepared[3] if now else None,
-        options=options.match_options(),
+        # the check of residuals limits a single point further
+        options=replace(options.match_options(), max_sigma_px=options.validity.max_sigma_px),
         min_zncc=options.min_zncc,
         visibility=grid.visibility,
         keep_rejected=options.keep_rejected,
-        crew=crew if int(usable.sum()) >= options.split_from else None,
     )
     compared = None if blur is None else matcher.ref1
     texture = ref1.subset_variance(xy_px, subset_px, compared)
@@ -203,6 +216,8 @@ class GrowthState:
         True if all valid points have passed the validity checks.
     failed_seeds_px
         (x, y) of the seeds that were given and did not match.
+    unsure
+        The usual match's standard deviation and the limit if it is above it, else None.
     """
 
     fitter: Fitter
@@ -211,6 +226,7 @@ class GrowthState:
     attempts: Attempts
     checked: bool
     failed_seeds_px: tuple[tuple[float, float], ...] = ()
+    unsure: Unsure | None = None
 
 
 def begin(inputs: FieldInputs) -> GrowthState:
@@ -227,7 +243,7 @@ def begin(inputs: FieldInputs) -> GrowthState:
 
 
 def fresh_attempts(inputs: FieldInputs) -> Attempts:
-    """Return attempts that let growth try every point anew; those lost in an earlier step once only."""
+    """Return attempts with which growth tries every point again; points lost in an earlier step only once."""
     attempts = Attempts.on(inputs.grid.shape, inputs.visibility)
     attempts.left[inputs.usable & ~inputs.hoped_for] = 1
     return attempts

@@ -1,1 +1,1 @@
-"""Parts of a subset: what each of them does to its match."""
+"""Parts of a subset, and the effect of each on its match."""

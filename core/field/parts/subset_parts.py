@@ -1,21 +1,22 @@
-"""What a part of a subset does to its match: the match without it, to first order, from the residuals.
+"""Effect of a part of a subset on its match: the match without it, to first order, from the residuals.
 
-A part that lies on another face, moves otherwise, or shows something else pulls the whole subset's match towards its
-own. Without the part the match then moves by more than the noise explains (Hausman's test of two estimates of which
-one holds the other's data; with single rows left out it is known as DFBETA).
+A part on another face, with another motion, or with something else in front pulls the whole subset's match towards its
+own. Without the part the match then moves by more than the noise explains (Hausman's test of two estimates of which one
+holds the other's data; with single rows left out it is known as DFBETA).
 
-A thing in front of the subset's centre, as a wire, may pull it nowhere. The result is then that of the surface behind:
-the centre does not show what was matched. It is held against the match of that half of the subset which matches best
-(least trimmed squares): what the thing does to gain and match, and so to all residuals, is no measure of the usual.
+A thing in front of the subset's centre, as a wire, may pull it nowhere. The result then belongs to the surface behind:
+the centre does not show the matched surface. The centre is compared with the match of the half of the subset that
+matches best (least trimmed squares), since the thing changes gain and match, and so all residuals.
 
-A curved patch on a fold of the surface takes up most of it: the parabola next to |t|, -1 < t < 1, is 3/16 off in the
-middle, and what is left of the residuals is small in each part. Without half of the subset the rest must be extended to
-the centre, which noise spoils. One more unknown, a fold through the centre, tells: the change of the match with it is
-held against its standard deviation like that without a part (an added variable's test).
+A curved patch on a fold of the surface absorbs most of it: the parabola next to |t|, -1 < t < 1, is 3/16 off in the
+middle, and the remaining residuals are small in each part. Without half of the subset the rest must be extended to the
+centre, which noise spoils. One more unknown, a fold through the centre, shows it: the change of the match with it is
+compared with its standard deviation like the change without a part (an added variable's test).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -23,20 +24,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammainc, gammaincinv
 
-from core.arrays import Bool, Float
-from core.field.parts.subset_residuals import SubsetResiduals
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.field.points.subset_residuals import SubsetResiduals
 
 _CELLS = 6  # across a subset
-_MOST = 0.6  # of a subset's cells in a part
-_LEAST_SHARE = 0.02  # of the whole's variance: the linear step is no better
-_TINY_VARIANCE = 1.0 / 12.0  # of rounding
-_CENTRES = (1.0 / 6.0, 1.0 / 10.0)  # half of a subset's centre that must be what it seems, over the subset
-_CENTRE_LOSS = 0.2  # of the texture's variance
-_CENTRE_SIGMAS = 5.0  # of the mean square of so many pixels, over that of the half that matches best
+_MOST = 0.6  # share of a subset's cells in a part
+_LEAST_SHARE = 0.02  # share of the whole's variance: the linear step is no better
+_TINY_VARIANCE = 1.0 / 12.0  # variance by rounding
+# half widths of a subset's centre that must show the matched surface, over the subset
+_CENTRES = (1.0 / 6.0, 1.0 / 10.0)
+_CENTRE_LOSS = 0.2  # share of the texture's variance
+_CENTRE_SIGMAS = 5.0  # standard deviations of the mean square of so many pixels, over the half that matches best
 _STEPS = 3  # towards that half
 _SOLVED_AT_ONCE = 1024  # normal equations
 _FOLDS = 8  # directions
-_FAINT = 0.5  # of what the smallest other centre adds to a subset's residuals: gain and match take up some of it
+_FAINT = 0.5  # share of the smallest other centre's addition to a subset's residuals: gain and match absorb some of it
 
 
 class Pull(NamedTuple):
@@ -53,8 +55,8 @@ class Pull(NamedTuple):
     part
         (m, 2) the most significant one.
     centre
-        (m,) mean square of the residuals of the subset's centre in the match of its best half, over the most that one
-        surface with white noise shows.
+        (m,) mean square of the residuals of the subset's centre in the match of its best half, over the largest that
+        one surface with white noise has.
     """
 
     significance: Float
@@ -64,8 +66,8 @@ class Pull(NamedTuple):
     centre: Float
 
 
-def pull_of_parts(found: SubsetResiduals, visible: Bool, degree: int, *, folds: bool = False) -> Pull:
-    """Return what the parts of subsets do to their match, in one comparison.
+def pull_of_parts(found: SubsetResiduals, visible: Bool, degree: int, *, folds: Sequence[int] = ()) -> Pull:
+    """Return the effect of the parts of subsets on their match, in one comparison.
 
     Parameters
     ----------
@@ -74,9 +76,9 @@ def pull_of_parts(found: SubsetResiduals, visible: Bool, degree: int, *, folds: 
     visible
         (m, s, s) True where a pixel counts.
     degree
-        Of the patch.
+        Degree of the patch.
     folds
-        Try a fold of the shift along, through the centre, too.
+        Directions (0 along, 1 across) of which a fold of the shift, through the centre, is tried too.
     """
     columns = _columns(found, degree)
     sums, counts = _sums_of_cells(columns, visible)
@@ -97,8 +99,9 @@ def pull_of_parts(found: SubsetResiduals, visible: Bool, degree: int, *, folds: 
         kept = np.stack([whole - sums[:, mask].sum(axis=1) for mask in some])
         left = n - some.astype(np.float64) @ counts.T
         changes.append(_change(kept, left, ridge, centre, usual))
-    if folds:
-        changes.append(_change(_with_folds(columns, visible, whole), n, size * np.eye(k + 1), centre, usual))
+    for direction in folds:
+        folded = _with_folds(columns, centre[direction], visible, whole)
+        changes.append(_change(folded, n, size * np.eye(k + 1), centre, usual))
     shift, significance = (np.moveaxis(np.concatenate(each), 0, -1) for each in zip(*changes, strict=True))
     part = significance.argmax(axis=-1)
     return Pull(
@@ -136,13 +139,17 @@ def _change(
     return shift, np.where((pixels > 3 * k)[..., None], sure, 0.0)
 
 
-def _with_folds(columns: Float, visible: Bool, whole: Float) -> Float:
-    """Products (p, m, q + 1, q + 1) with a fold of the shift along, in each direction, before the residual.
+def _with_folds(columns: Float, folded: int, visible: Bool, whole: Float) -> Float:
+    """Products (p, m, q + 1, q + 1) with a fold of a shift, over lines of each direction, before the residual.
 
     Parameters
     ----------
-    columns, visible
-        (m, s, s, q) and (m, s, s).
+    columns
+        (m, s, s, q).
+    folded
+        The column of that shift.
+    visible
+        (m, s, s).
     whole
         (m, q, q) products of the columns.
     """
@@ -151,7 +158,7 @@ def _with_folds(columns: Float, visible: Bool, whole: Float) -> Float:
     others = [*range(q - 1), q]
     out = np.zeros((_FOLDS, m, q + 1, q + 1))
     for one, angle in zip(out, np.pi / _FOLDS * np.arange(_FOLDS), strict=True):
-        fold = columns[..., 0] * np.abs(np.cos(angle) * u + np.sin(angle) * v) * visible
+        fold = columns[..., folded] * np.abs(np.cos(angle) * u + np.sin(angle) * v) * visible
         one[np.ix_(range(m), others, others)] = whole
         cross = (fold.reshape(m, 1, -1) @ columns.reshape(m, -1, q))[:, 0]
         one[:, q - 1, others] = one[:, others, q - 1] = cross
@@ -174,7 +181,7 @@ def _sums_of_cells(columns: Float, visible: Bool) -> tuple[Float, Float]:
     """Products (m, cells, q, q) of the columns summed over the cells, and the cells' pixels (m, cells)."""
     m, width, _ = visible.shape
     table = columns if visible.all() else columns * visible[..., None]
-    edges = np.round(np.linspace(0, width, _CELLS + 1)).astype(int)
+    edges = _edges(width)
     q = table.shape[-1]
     sums, counts = np.empty((m, _CELLS, _CELLS, q, q)), visible
     for axis in (1, 2):
@@ -212,6 +219,22 @@ def _parts() -> NDArray[np.bool_]:
     return np.asarray(np.unique(np.array(small), axis=0))
 
 
+def outside_centre() -> Bool:
+    """Return (p + folds,) True of the parts that hold no cell of the subset's centre; no fold is one."""
+    middle = _parts().reshape(-1, _CELLS, _CELLS)[:, 2:-2, 2:-2]
+    return np.concatenate([~middle.any(axis=(1, 2)), np.zeros(2 * _FOLDS, bool)])
+
+
+def pixels_without(part: NDArray[np.intp], width: int) -> Bool:
+    """Return (m, width, width) True at the pixels of subsets that are not in their parts (m,)."""
+    cell = np.repeat(np.arange(_CELLS), np.diff(_edges(width)))
+    return np.asarray(~_parts()[part][:, _CELLS * cell[:, None] + cell])
+
+
+def _edges(width: int) -> NDArray[np.intp]:
+    return np.round(np.linspace(0, width, _CELLS + 1)).astype(int)
+
+
 def _centre(
     found: SubsetResiduals, columns: Float, visible: Bool, sums: Float, counts: Float, match: Float, ridge: Float
 ) -> Float:
@@ -233,12 +256,12 @@ def _reach(part: float, width: int) -> int:
 
 
 def _best_half(sums: Float, counts: Float, match: Float, ridge: Float) -> tuple[Float, Float]:
-    """Match (m, k) of the half of the cells with the least residuals, and (m,) what these say of all residuals' square.
+    """Match (m, k) of the half of the cells with the least residuals, and (m,) all residuals' mean square from it.
 
     Parameters
     ----------
     sums, counts
-        Of the cells.
+        Sums and numbers of pixels of the cells.
     match
         (m, k) where to start.
     ridge

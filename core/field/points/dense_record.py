@@ -1,4 +1,4 @@
-"""Record of a dense field: how its vectors were made, and what their neighbours have in common."""
+"""Record of a dense field: the measurement of its vectors, and the error that neighbours share."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NEIGHBOURS = (
 
 @dataclass(frozen=True, kw_only=True)
 class DenseRecord:
-    """How a dense field was made.
+    """Record of a dense field's measurement.
 
     Attributes
     ----------
@@ -28,14 +28,15 @@ class DenseRecord:
     spacing_px
         Distance of the ordinary field's points, which made the prediction.
     variance_ratio
-        Median of the ordinary field's variance over the vectors' own normal equations', (grey levels)^2: image noise
-        and all that the ordinary field's tests found beside it.
+        Median of the ordinary field's variance over the variance from the vectors' own normal equations, (grey
+        levels)^2: image noise and all errors that the ordinary field's tests found in addition. None if no vector has
+        one.
     """
 
     step_px: int
     window_px: int
     spacing_px: float
-    variance_ratio: float
+    variance_ratio: float | None
 
     def document(self) -> dict[str, Any]:
         """Return the record as plain values."""

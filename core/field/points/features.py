@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float, Float32
-from core.threads import run_ranges
+from stereorig.core.arrays import Float, Float32
+from stereorig.core.threads import run_ranges
 
 MAX_KEYPOINTS = 4000
 """The time of matching grows with the square; this number is enough for the seeds of a field."""
@@ -94,7 +94,7 @@ def detect_all(pictures: Sequence[Picture], *, scale: int = 1, max_keypoints: in
     Parameters
     ----------
     pictures
-        Images (rows, cols), grey levels of any depth, and the box of each in which keypoints may lie.
+        Images (rows, cols), grey levels of any depth, and the box of each that is searched for keypoints.
     scale
         Work on the images at a ``scale``-th of their size.
     max_keypoints
@@ -171,7 +171,7 @@ def match(a: Features, b: Features, *, ratio: float = _RATIO) -> NDArray[np.int6
     best = np.empty(n_a, np.int64)
     top = np.empty(n_a, np.float32)
     second = np.empty(n_a, np.float32)
-    max_features = np.empty((-(-n_a // _CHUNK), n_b), np.float32)  # of each column over a chunk of rows
+    max_features = np.empty((-(-n_a // _CHUNK), n_b), np.float32)  # largest of each column over a chunk of rows
     transposed = np.ascontiguousarray(b.descriptors.T)
 
     def compare(first: int, last: int) -> None:

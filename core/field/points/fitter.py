@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float
-from core.cameras.stereo import StereoPair
-from core.field.points.scales import far_from_start, plausible
-from core.field.region.visibility import Visibility
-from core.matching.arguments import VisiblePixels
-from core.matching.fit import fit_motion, fit_shape
-from core.matching.image import ImageData
-from core.matching.options import MatchOptions
-from core.status import PointStatus
-
-if TYPE_CHECKING:
-    from core.field.points.crew import Crew
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.scales import far_from_start, plausible
+from stereorig.core.field.region.visibility import Visibility
+from stereorig.core.matching.arguments import VisiblePixels
+from stereorig.core.matching.fit import fit_motion, fit_shape
+from stereorig.core.matching.image import ImageData
+from stereorig.core.matching.options import MatchOptions
+from stereorig.core.status import PointStatus
 
 MAX_EPIPOLAR_PX = 3.0
 _RATE_FROM, _RATE_QUANTILE = 30, 0.9
@@ -47,7 +44,7 @@ class PointFits:
     rate
         (n,) convergence rate of a motion, as the matching gives it.
     rejected_w, rejected_g, rejected_epipolar_px, rejected_zncc
-        The same numbers as they were when a check rejected the point, NaN where none did; None: not kept.
+        The same numbers at the moment a check rejected the point, NaN for other points; None: not kept.
     """
 
     w: Float
@@ -95,17 +92,22 @@ class PointFits:
 
     @property
     def quality(self) -> Float:
-        """(n,) the worst comparison's correlation, -1 where there is none."""
+        """(n,) the worst comparison's correlation, -1 for points without one."""
         return np.where(self.ok, np.nan_to_num(self.worst_zncc, nan=-1.0), -1.0)
 
     @property
     def worst_zncc(self) -> Float:
-        """(n,) the worst comparison's correlation, NaN where one is not known."""
-        # of columns: along rows of three numbers it takes twenty times as long
+        """(n,) the worst comparison's correlation, NaN if one is not known."""
+        # along columns: along rows of three numbers it takes twenty times as long
         return np.asarray(np.ascontiguousarray(self.zncc.T).min(axis=0))
 
+    @property
+    def plane(self) -> Bool:
+        """(n,) True where the patch is plane: without second-order terms, or all of them exactly zero."""
+        return np.asarray((self.w[:, 3:] == 0.0).all(axis=1) & (self.G[:, :, 3:] == 0.0).all(axis=(1, 2)))
+
     def put(self, index: NDArray[np.intp], other: PointFits) -> None:
-        """Write ``other``'s points to the indices ``index``; what is kept of rejected ones stays until they are ok."""
+        """Write ``other``'s points to indices ``index``; numbers kept of rejected points stay until these are ok."""
         for f in fields(self):
             if not f.name.startswith("rejected_"):
                 getattr(self, f.name)[index] = getattr(other, f.name)
@@ -117,6 +119,16 @@ class PointFits:
             if theirs is not None:
                 there = np.isfinite(other.rejected_epipolar_px)  # type: ignore[arg-type]
                 mine[index[there]] = theirs[there]
+
+    def put_plane(self, index: NDArray[np.intp], other: PointFits) -> None:
+        """Write ``other``'s points, of plane patches, to the same indices here; their second-order terms are zero."""
+        for f in fields(self):
+            mine, theirs = getattr(self, f.name), getattr(other, f.name)
+            if mine is not None and theirs is not None:
+                if mine.shape != theirs.shape:
+                    mine[index] = 0.0
+                    mine = mine[..., : theirs.shape[-1]]
+                mine[index] = theirs[index]
 
     def take(self, index: NDArray[np.intp]) -> PointFits:
         """Return a copy of the points ``index``."""
@@ -165,8 +177,6 @@ class Fitter:
         Keep the numbers of points that a check rejects.
     visibility
         The points' visibility; None: all of every subset.
-    crew
-        Those who may take tiles of many points; None: nobody.
     """
 
     pair: StereoPair
@@ -178,7 +188,6 @@ class Fitter:
     min_zncc: float
     visibility: Visibility | None = None
     keep_rejected: bool = False
-    crew: Crew | None = None
 
     @property
     def comparisons(self) -> int:
@@ -202,6 +211,14 @@ class Fitter:
     def curved(self) -> Fitter:
         """Return the same matcher with curved patches."""
         return replace(self, options=replace(self.options, patch="quadratic"))
+
+    def by_patch(self, points: PointFits, index: NDArray[np.intp]) -> list[tuple[Fitter, NDArray[np.intp]]]:
+        """Return the matchers that measured the points ``index`` (m,), each with its points' places in ``index``."""
+        plane = points.plane[index] if self.terms == 6 and self.comparisons == 3 else np.zeros(len(index), bool)
+        if not plane.any():
+            return [(self, np.arange(len(index)))]
+        flat = replace(self, options=replace(self.options, patch="affine"))
+        return [(flat, np.flatnonzero(plane)), (self, np.flatnonzero(~plane))]
 
     def converging(self, rate: Float) -> Fitter:
         """Return the same matcher for points that converge as a sample (m,) of them did, see :func:`learned_rate`."""
@@ -270,10 +287,10 @@ class Fitter:
 
 
 def learned_rate(rate: Float, known: float | None, options: MatchOptions) -> float:
-    """Return what is to be assumed after a point's first step, of points that converged at ``rate`` (m,), NaN or not.
+    """Return the convergence rate assumed after a point's first step, from other points' ``rate`` (m,), NaN if unknown.
 
-    Nine in ten of them converged at least that fast. No slower rate is taken than what is assumed anyhow, and from a
-    few points none: the one that is ``known`` stays.
+    Nine in ten of them converged at least that fast. The result is never slower than the default, and with few points
+    the ``known`` rate is kept.
     """
     finite = rate[np.isfinite(rate)]
     if len(finite) < _RATE_FROM:

@@ -9,14 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.arrays import Bool, Float
-from core.errors import ImageError
-from core.field.points.features import Box, Features, Picture, detect_all
-from core.field.region.repeats import Peaks, repeats
-from core.matching.blur import Blur
-from core.matching.image import ImageData, prepare
-from core.noise import NoiseModel
-from core.settings import Interpolation
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.errors import ImageError
+from stereorig.core.field.points.features import Box, Features, Picture, detect_all
+from stereorig.core.field.region.repeats import Peaks, repeats
+from stereorig.core.matching.blur import Blur
+from stereorig.core.matching.defects import find_defects
+from stereorig.core.matching.image import ImageData, prepare
+from stereorig.core.noise import NoiseModel
+from stereorig.core.settings import Interpolation
 
 _TILE = 48
 _MIN_STRUCTURE = 0.2
@@ -35,7 +36,8 @@ class MeasureImage:
     name
         Its name in errors.
     noise
-        The camera's noise in this very image, where no other model is given.
+        The camera's noise in this very image, if no other model is given. If it knows the sensor's fixed pattern and
+        defective pixels, an image given as grey levels is taken without them.
 
     Raises
     ------
@@ -50,22 +52,31 @@ class MeasureImage:
         self.noise = noise
         self._prepared: dict[tuple[Interpolation, NoiseModel | None, Blur | None], ImageData] = {}
         self._features: dict[tuple[Box, int], Features] = {}
-        self._variance: list[tuple[int, Blur | None, Float, Float]] = []  # of one set of points at most
+        self._variance: list[tuple[int, Blur | None, Float, Float]] = []  # for at most one set of points
         self._contrast: dict[tuple[float, float, float, float] | None, tuple[float, float, float]] = {}
         self._peaks: Peaks = {}
+        self.defects: NDArray[np.int64] | None = None
         if isinstance(image, MeasureImage):
             self.noise = image.noise if noise is None else noise
             self.pixels: NDArray[Any] = image.pixels
+            self.defects = image.defects
             self._prepared, self._features, self._variance = image._prepared, image._features, image._variance
             self._contrast, self._peaks = image._contrast, image._peaks
         elif isinstance(image, ImageData):
             self.pixels = image.pixels if image.unblurred is None else np.ascontiguousarray(image.unblurred)
+            self.defects = image.defects
             kind: Interpolation = "cubic" if image.order == 3 else "quintic"
             if image.blur is None:
-                self.noise = image.noise  # prepared with a model by hand, it keeps it where none is given
+                self.noise = image.noise  # an image prepared with a noise model keeps it if no other one is given
                 self._prepared[kind, image.noise, None] = image
         else:
             self.pixels = _checked(np.asarray(image), name)
+            sensor = None if noise is None else noise.sensor
+            if sensor is not None:
+                self.pixels = sensor.subtracted_from(self.pixels, name)
+            found = find_defects(self.pixels, None if sensor is None else sensor.defects)
+            if found is not None:
+                self.defects, self.pixels = found
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -79,13 +90,13 @@ class MeasureImage:
         noise = self.noise if noise is None else noise
         key = interpolation, noise, blur
         if key not in self._prepared:
-            self._prepared[key] = prepare(self.pixels, interpolation, noise, blur)
+            self._prepared[key] = prepare(self.pixels, interpolation, noise, blur, self.defects)
         return self._prepared[key]
 
     def subset_variance(self, xy_px: Float, subset_px: int, blurred: ImageData | None = None) -> Float:
         """Return the grey-level variance (n,) in the square of ``subset_px`` about the pixels nearest to points (n, 2).
 
-        The result is kept for the last points given: those of a sequence are the same in every step.
+        The result is kept for the last points given: in a sequence they are the same in every step.
 
         Parameters
         ----------
@@ -125,7 +136,7 @@ class MeasureImage:
     def contrast(self, box: tuple[float, float, float, float] | None = None) -> tuple[float, float, float]:
         """Return smallest and largest grey level and largest correlation of neighbouring pixels, in a box.
 
-        None: in the whole image. Computed on the first call; zero structure where there is one grey level.
+        None: in the whole image. Computed on the first call; structure is zero if there is only one grey level.
         """
         if box not in self._contrast:
             pixels = self.pixels

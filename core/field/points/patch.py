@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
-from core.settings import PatchSetting
+from stereorig.core.settings import PatchSetting
 
 UsedPatch = Literal["plane", "rigid", "affine", "quadratic"]
 
@@ -20,20 +20,22 @@ class PatchChoice:
     Attributes
     ----------
     patch
-        The field was measured with it: ``plane`` (shape) or ``stretch``, ``rigid`` (motion), or ``curved``.
+        Patch that the field was measured with: ``plane`` (shape), ``affine`` or ``rigid`` (motion), or ``quadratic``.
     asked
-        The setting: one of these, or ``auto``.
+        The setting: ``auto``, ``affine``, ``rigid`` or ``quadratic``.
     reason
         A sentence for the user.
     sample
-        Number of points fitted both ways; 0 where the field's own curvature decided.
+        Number of points fitted both ways; 0 if the field's own curvature decided.
     plane_error_mm
         Bias of plane patches because of curvature, rms, less noise; of the position for a shape, of the displacement
-        for a motion. None where it is not known, as the next two.
+        for a motion. None if it is not known, as the next two.
     plane_noise_mm, quadratic_noise_mm
-        Standard deviation of the same from image noise, rms, with plane and with curved patches.
+        Standard deviation of the same from image noise, rms, with plane and with quadratic patches.
     quadratic_advised
-        True if plane patches were asked for and curved ones would have the smaller total error.
+        True if plane patches were asked for and quadratic ones would have the smaller total error.
+    taken_off_mm
+        Bias that was subtracted from the displacements of plane patches, rms; None if none was.
     kept
         True if the choice was made in an earlier step of the sequence and kept.
     """
@@ -46,6 +48,7 @@ class PatchChoice:
     plane_noise_mm: float | None = None
     quadratic_noise_mm: float | None = None
     quadratic_advised: bool = False
+    taken_off_mm: float | None = None
     kept: bool = False
 
     def document(self) -> dict[str, Any]:

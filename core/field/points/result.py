@@ -4,30 +4,31 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float, Floats
-from core.common.factor import Causes
-from core.field.points.dense_record import DenseRecord
-from core.field.points.patch import PatchChoice
-from core.field.points.smoothing_record import Smoothing
-from core.field.points.starts import Starts
-from core.field.region.cuts import Cuts
-from core.status import PointStatus
+from stereorig.core.arrays import Bool, Float, Floats
+from stereorig.core.common.factor import Causes
+from stereorig.core.field.points.dense_record import DenseRecord
+from stereorig.core.field.points.patch import PatchChoice
+from stereorig.core.field.points.smoothing_record import Smoothing
+from stereorig.core.field.points.starts import Starts
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.core.status import PointStatus
 
 
 @dataclass(frozen=True, eq=False)
 class References:
-    """References that a step was matched against, where that was not the first one alone.
+    """References that a step was matched against, if they include others than the first one.
 
     Attributes
     ----------
     step
         Number of the step whose images the step was matched against.
     steps
-        (r, c) int32, the same for each point: it may be an older one for a point that was found again. Of a point
+        (r, c) int32, the same for each point: it may be an older one for a point that was found again. For a point
         without numbers, the newest reference that shows it.
     noise_px2, pattern_px2
         (r, c, 2, 2) propagated covariance, px^2, of the points' positions in camera 1's image of this step: the part
@@ -35,7 +36,7 @@ class References:
         noise and from changes of the surface's pattern.
     added_share
         (r, c, 3, 3) B with L B L' the part of the covariance of U, V, W that references after the first one added, and
-        L L' the whole, L a lower triangle; NaN without a point. None where it is not known: it is in no file.
+        L L' the whole, L a lower triangle; NaN without a point. None if it is not known: it is in no file.
     """
 
     step: int
@@ -47,12 +48,12 @@ class References:
 
 @dataclass(frozen=True, eq=False)
 class Rejected:
-    """What was measured at (r, c) points that a check rejected; NaN elsewhere.
+    """Numbers measured at (r, c) points that a check rejected; NaN elsewhere.
 
     Attributes
     ----------
     xyz_mm, uvw_mm
-        (r, c, 3) position and, of a motion, displacement, system frame.
+        (r, c, 3) position and, for a motion, displacement, system frame.
     zncc
         (r, c, k).
     epipolar_px
@@ -65,9 +66,16 @@ class Rejected:
     epipolar_px: Float
 
 
+class Unsure(NamedTuple):
+    """Standard deviation of a field's usual match, px, and the largest that is allowed for it."""
+
+    usual_px: float
+    limit_px: float
+
+
 @dataclass(frozen=True)
 class Field:
-    """Shape, and where a motion was measured displacement, at (r, c) points.
+    """Shape, and displacement if a motion was measured, at (r, c) points.
 
     A point whose status is neither ``OK`` nor ``EXTRAPOLATED`` has NaN in every number but ``x_px, y_px``.
 
@@ -76,7 +84,7 @@ class Field:
     x_px, y_px
         (r, c) positions of the points in camera 1's reference image.
     status
-        (r, c) int8, :class:`core.status.PointStatus`.
+        (r, c) int8, :class:`stereorig.core.status.PointStatus`.
     xyz_mm
         (r, c, 3) surface point at the reference, system frame.
     normal_sys
@@ -103,35 +111,39 @@ class Field:
     stretch
         (r, c, 3) in-plane stretch e11, e22, e12 in the patch's tangent frame, or None.
     curvature_per_mm
-        (r, c, 2) principal curvatures of the reference's surface, the larger first, positive where it bulges towards
-        the cameras; None unless the patches were curved.
+        (r, c, 2) principal curvatures of the reference's surface, the larger first, positive for a bulge towards the
+        cameras; None unless the patches were curved.
     patch
         Patch that the field was measured with, and the reason; None in a field from an older file.
+    patch_degree
+        (r, c) int8: 1 for a plane patch, 2 for a quadratic one, 0 without a point; None if all have the field's patch.
     references
-        References that the step was matched against; None where that is the first reference, for all points.
+        References that the step was matched against; None if all points were matched against the first reference.
     smoothing
         Smoothing of the displacement; None: it is as measured.
     cuts
-        Cracks and borders of holes, which no subset or neighbour crosses; None where there are none.
+        Cracks and borders of holes, which no subset or neighbour crosses; None without any.
     common
-        (r, c, 3 or 6, k) common factor F, mm for unit causes: what the points share of the uncertainty, from the
-        calibration. The whole covariance of points i and j is that of their matching plus F_i F_j'. None where the
+        (r, c, 3 or 6, k) common factor F, mm for unit causes: the uncertainty that the points share, from the
+        calibration. The whole covariance of points i and j is their matching's covariance plus F_i F_j'. None if the
         calibration's covariance is not known.
     causes
         Causes of its columns.
     frozen
-        (r, c, 3, 3) part of the own covariance of U, V, W that is noise of the reference pair, the same in all steps
-        of a test; mm^2. That of X, Y, Z, and of both with each other, is so as a whole. None where it is not told
-        apart.
+        (r, c, 3, 3) part of the own covariance of U, V, W by noise of the reference pair, the same in all steps of a
+        test; mm^2. The covariances of X, Y, Z, and of both with each other, are such noise as a whole. None if it is
+        not known separately.
     rejected
-        What was measured at rejected points; None unless it was asked for.
+        Numbers measured at rejected points; None unless they were asked for.
     dense
-        How the vectors of a dense field were made; None in an ordinary field.
+        Record of a dense field's measurement; None in an ordinary field.
     starts
         The matcher's own unknowns, (r, c, ...), from which the next step of a sequence starts; not part of a result
         file, None in a field that was read from one.
     failed_seeds_px
         (x, y) of the seeds that were given and did not match; the field was then measured from others.
+    unsure
+        The usual match's standard deviation and the limit if it is above it, else None; not part of a result file.
     """
 
     x_px: Float
@@ -152,6 +164,7 @@ class Field:
     stretch: Float | None = None
     curvature_per_mm: Float | None = None
     patch: PatchChoice | None = None
+    patch_degree: NDArray[np.int8] | None = None
     references: References | None = None
     smoothing: Smoothing | None = None
     cuts: Cuts | None = None
@@ -162,6 +175,7 @@ class Field:
     dense: DenseRecord | None = None
     starts: Starts | None = None
     failed_seeds_px: tuple[tuple[float, float], ...] = ()
+    unsure: Unsure | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -180,19 +194,19 @@ class Field:
 
     @property
     def total_covariance(self) -> Float:
-        """(r, c, n, n) the points' own covariance and the common part; the own alone where that is not known."""
+        """(r, c, n, n) the points' own covariance plus the common part, if that is known."""
         if self.common is None:
             return self.covariance
         return np.asarray(self.covariance + self.common @ np.swapaxes(self.common, -1, -2))
 
     @property
-    def tells_reference(self) -> bool:
-        """True if the reference pair's part of the own covariance is told apart."""
+    def knows_reference(self) -> bool:
+        """True if the reference pair's part of the own covariance is known separately."""
         return not self.has_motion or self.frozen is not None
 
     @property
     def frozen_covariance(self) -> Float | None:
-        """(r, c, n, n) the reference pair's part of the own covariance; None where it is not told apart."""
+        """(r, c, n, n) the reference pair's part of the own covariance; None if it is not known separately."""
         if not self.has_motion:
             return self.covariance
         if self.frozen is None:
@@ -203,13 +217,13 @@ class Field:
 
     @property
     def reference_alone(self) -> Field | None:
-        """The field with the reference pair's noise alone in its covariance; None where it is not told apart."""
+        """The field with only the reference pair's noise in its covariance; None if that is not known separately."""
         frozen = self.frozen_covariance
         return None if frozen is None else replace(self, covariance=frozen, frozen=None, common=None, causes=None)
 
     @cached_property
     def common_variance(self) -> Floats | None:
-        """(r, c, 3 or 6) variances of the common part; None where it is not known."""
+        """(r, c, 3 or 6) variances of the common part; None if it is not known."""
         return None if self.common is None else np.einsum("...nk,...nk->...n", self.common, self.common)
 
     @cached_property

@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from core.arrays import Bool, Float
-from core.cameras.stereo import StereoPair
-from core.matching.arguments import lens_of, own
-from core.matching.kernels.drivers import kernel_sources
-from core.matching.kernels.naming import entry, inner, stamp_of
-from core.matching.kernels.warp import image_of, lens_jacobian
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.matching.arguments import lens_of, own
+from stereorig.core.matching.kernels.drivers import kernel_sources
+from stereorig.core.matching.kernels.naming import entry, inner, stamp_of
+from stereorig.core.matching.kernels.warp import image_of, lens_jacobian
 
 MIN_COSINE = 0.1
 """Between a patch's normal and a camera's ray, below which the patch is too steep."""
 MAX_SHEAR = 4.0
-_STEP = 1e-6  # of the inverse depth: its derivative from two positions, to six digits
+_STEP = 1e-6  # relative step of the inverse depth: its derivative from two positions, to six digits
 _LEAST_PX = 1e-12
 
 
@@ -66,7 +66,7 @@ def far_from_start(
     pair, rays
         As in :func:`depth_per_px`.
     w, G, start_w, start_G
-        (n, 3 or 6), and (n, 3, 3 or 6) of a motion: see :mod:`core.field.points.starts`. None of a shape.
+        (n, 3 or 6), and (n, 3, 3 or 6) of a motion: see :mod:`stereorig.core.field.points.starts`. None of a shape.
     limit_px
         In camera 1's current image, and in camera 2's by the change of depth.
     """
@@ -80,16 +80,16 @@ def far_from_start(
 
 
 def plausible(pair: StereoPair, rays: Float, w: Float, G: Float | None) -> Bool:
-    """Return (n,) True where a fit can be a patch of a surface.
+    """Return (n,) True for fits that can be a patch of a surface.
 
-    Its front faces both cameras; currently it lies before camera 1, is not mirrored, and is not stretched too far.
+    Its front faces both cameras; currently it is in front of camera 1, not mirrored, and not stretched too far.
 
     Parameters
     ----------
     pair, rays
         As in :func:`depth_per_px`.
     w, G
-        As in :func:`far_from_start`; ``G`` None of a shape.
+        As in :func:`far_from_start`; ``G`` None for a shape.
     """
     n, motion = len(w), G is not None
     g = np.zeros((n, 3 * w.shape[1])) if G is None else _flat(G)
@@ -133,7 +133,7 @@ def _root_of_area(j11, j12, j21, j22):
 
 @inner
 def is_plausible(centre2, x, y, w, g, motion):
-    """Return True where one fit can be a patch of a surface; see :func:`plausible`.
+    """Return True if one fit can be a patch of a surface; see :func:`plausible`.
 
     ``centre2`` (3,) mm is camera 2 in camera 1's frame, ``w`` (3 or 6,), ``g`` three times as many, row by row.
     """

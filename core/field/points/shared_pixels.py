@@ -2,8 +2,8 @@
 
 A patch's value at its centre is a weighted sum of its pixels' noise. For a plane patch the weights are even over the
 subset, so that two subsets' errors correlate by the share of common pixels. A curved patch fits the second order too;
-its weights at the centre are those of the even Legendre polynomials up to degree 2, larger in the middle and negative
-at the corners, and its errors correlate over less than its subset.
+its weights at the centre follow the even Legendre polynomials up to degree 2, larger in the middle and negative at the
+corners, and its errors correlate over less than its subset.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Float
-from core.errors import InputError
-from core.field.points.result import Field
-from core.field.points.smoothing_record import Smoothing, weight_products, weight_square
+from stereorig.core.arrays import Float
+from stereorig.core.errors import InputError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.smoothing_record import Smoothing, weight_products, weight_square
 
-_P2_WEIGHT = -2.5  # (2 n + 1) P_n(0) of n = 2, beside 1 of n = 0
+_P2_WEIGHT = -2.5  # (2 n + 1) P_n(0) for n = 2, relative to 1 for n = 0
 _AT_ONCE = 256
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
@@ -34,8 +34,8 @@ class SharedPixels:
     curved
         True for patches of the second order.
     smoothing
-        Smoothing of the displacements; None: they are as measured. The correlation is then that of smoothed
-        displacements, in whole windows; that of positions is ``positions``'.
+        Smoothing of the displacements; None: they are as measured. With it, this is the correlation of smoothed
+        displacements, in whole windows; ``positions`` gives the positions'.
     """
 
     subset_px: float
@@ -127,7 +127,7 @@ class SharedPixels:
         Parameters
         ----------
         field
-            The grid; its points must lie on a regular grid.
+            The grid; its points must be on a regular grid.
         values
             (r, c, ...) zero at points that take no part.
         """
@@ -155,12 +155,12 @@ def _products(shift: Float) -> tuple[Float, Float, Float]:
 
 
 def steps_px(field: Field) -> tuple[float, float]:
-    """Return the distances of neighbouring columns and rows; 1 where there is but one.
+    """Return the distances of neighbouring columns and rows; 1 for a single one.
 
     Raises
     ------
     InputError
-        ``grid_irregular`` if the points do not lie on a regular grid along rows and columns.
+        ``grid_irregular`` if the points are not on a regular grid along rows and columns.
     """
     x, y = field.x_px[0], field.y_px[:, 0]
     step_x = float(x[-1] - x[0]) / (len(x) - 1) if len(x) > 1 else 1.0

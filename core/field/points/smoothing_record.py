@@ -13,10 +13,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from core.arrays import Float
-from core.errors import InputError
-from core.field.region.window import fit_terms, window_offsets
-from core.settings import SMOOTHING_WINDOW
+from stereorig.core.arrays import Float
+from stereorig.core.errors import InputError
+from stereorig.core.field.region.window import fit_terms, window_offsets
+from stereorig.core.settings import SMOOTHING_WINDOW
 
 Order = Literal[1, 2]
 
@@ -30,13 +30,13 @@ class Smoothing:
     window
         Points across the square window, odd.
     order
-        Of the polynomial: 1 plane, 2 quadratic.
+        Order of the polynomial: 1 plane, 2 quadratic.
     spacing_px, subset_px
-        Of the field.
+        Spacing and subset of the field.
     resolution_px
         Width of the area that one value averages, (window - 1) spacing + subset.
     resolution_mm
-        The same on the surface, median of the field; None where no point is valid.
+        The same on the surface, median of the field; None if no point is valid.
     whole, reduced, raw
         Numbers of points with values of whole windows; of windows that edges, holes or cuts have reduced; and with
         their own value, because a fit over the points left would be noisier.

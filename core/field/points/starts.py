@@ -1,11 +1,11 @@
 """Start values of the matching at a point, and their transfer to another point.
 
-The unknowns are those of the matching: inverse depth and its slopes ``w = (w0, w1, w2)`` over camera 1's normalised ray
+The unknowns are the matching's: inverse depth and its slopes ``w = (w0, w1, w2)`` over camera 1's normalised ray
 offsets (X, Y) from the point's own ray, and the 3 x 3 matrix ``G`` that maps the patch to its current position. The
-point on the patch at offset (X, Y) lies at ``(Xc + X, Yc + Y, 1) / w(X, Y)`` in the reference and at ``G (1, X, Y) /
-w(X, Y)`` currently, both in camera 1's frame. Both are linear for a plane patch, so a patch's own unknowns give a
-neighbour's on the same plane exactly. A curved patch has the terms X^2, X Y and Y^2 besides: ``w`` has 6 numbers, ``G``
-3 x 6.
+point on the patch at offset (X, Y) is at ``(Xc + X, Yc + Y, 1) / w(X, Y)`` in the reference and at ``G (1, X, Y) / w(X,
+Y)`` currently, both in camera 1's frame. Both are linear for a plane patch, so a patch's own unknowns give a
+neighbour's on the same plane exactly. A curved patch also has the terms X^2, X Y and Y^2: ``w`` has 6 numbers, ``G`` 3
+x 6.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.stereo import StereoPair
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.stereo import StereoPair
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +58,9 @@ def current_position(w: Float, G: Float) -> Float:
 
 
 def image_positions(pair: StereoPair, w: Float, column: Float) -> tuple[Float, Float]:
-    """Return where both cameras see points (n, 2) px, given ``w`` (n, ...) and a column (n, 3) of ``G``.
+    """Return the images (n, 2) px of points in both cameras, given ``w`` (n, ...) and a column (n, 3) of ``G``.
 
-    With the first column of ``G`` those of the current images; with the points' rays those of the reference.
+    With the first column of ``G`` the current images; with the points' rays the reference's images.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         one = column[:, :2] / column[:, 2:]

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.arrays import Bool, Float
-from core.errors import RegionError
-from core.field.region.line_crossings import cross
-from core.threads import run_ranges
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.errors import RegionError
+from stereorig.core.field.region.line_crossings import cross
+from stereorig.core.threads import run_ranges
 
 _AT_ONCE = 8192
 
@@ -26,7 +26,7 @@ class Cuts:
     Attributes
     ----------
     lines_px
-        Polylines (n, 2), n >= 2, x and y in px; one that ends where it begins is the border of a hole.
+        Polylines (n, 2), n >= 2, x and y in px; one that ends at its beginning is the border of a hole.
 
     Raises
     ------
@@ -46,12 +46,12 @@ class Cuts:
         return np.concatenate(parts) if parts else np.zeros((0, 4))
 
     def __bool__(self) -> bool:
-        """False where there is no line."""
+        """False if there is no line."""
         return len(self.lines_px) > 0
 
 
 def crosses(a_px: ArrayLike, b_px: ArrayLike, cuts: Cuts | None) -> Bool:
-    """Return True where the straight lines from ``a_px`` to ``b_px`` meet a cut.
+    """Return True if the straight lines from ``a_px`` to ``b_px`` meet a cut.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def _line(line: ArrayLike) -> Float:
 
 
 def as_arrays(cuts: Cuts) -> tuple[Float, NDArray[np.int32]]:
-    """Return all lines' points (n, 2) one after the other, and (n,) the index of each one's line."""
+    """Return all lines' points (n, 2) one after the other, and (n,) the index of each point's line."""
     points = np.concatenate(cuts.lines_px) if cuts else np.zeros((0, 2))
     of_line = np.repeat(np.arange(len(cuts.lines_px)), [len(line) for line in cuts.lines_px]).astype(np.int32)
     return points, of_line

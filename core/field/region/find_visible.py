@@ -9,20 +9,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.field.region.line_crossings import find_near, mark_visible, separated_neighbours
-from core.field.region.neighbours import REACH
-from core.field.region.region import PointGrid
-from core.field.region.visibility import AT_ONCE, CHUNK, Visibility, over
-from core.matching.arguments import VisiblePixels
-from core.threads import run_ranges
+from stereorig.core.arrays import Float
+from stereorig.core.field.region.line_crossings import find_near, mark_visible, separated_neighbours
+from stereorig.core.field.region.neighbours import REACH
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.field.region.visibility import AT_ONCE, CHUNK, Visibility, over
+from stereorig.core.matching.arguments import VisiblePixels
+from stereorig.core.threads import run_ranges
 
 MARGIN_PX = 2.0
 """Distance to a cut, or to a mask's black, below which no pixel counts."""
 
 
 def with_visibility(grid: PointGrid, subset_px: int) -> PointGrid:
-    """Return the grid with its visibility; the same grid where that is known, or without cuts and mask."""
+    """Return the grid with its visibility; the same grid if that is known, or without cuts and mask."""
     if grid.visibility is None and not grid.cuts and grid.white is None:
         return grid
     if grid.visibility is not None and grid.visibility.subset_px == subset_px:
@@ -42,7 +42,7 @@ def visible_patches(
     points
         Indices of its points to examine.
     width, margin_px
-        Of the square, odd, and the distance to a cut or to black below which no pixel counts.
+        Width of the square, odd, and the distance to a cut or to black below which no pixel counts.
     at_once
         Points a yield, at most.
 

@@ -5,21 +5,21 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import RegionError
-from core.field.region.outlines import lay_outlines, outlines_of
-from core.field.region.region import PointGrid, check_region
-from core.settings import AnalysisSettings, Region
+from stereorig.core.errors import RegionError
+from stereorig.core.field.region.outlines import lay_outlines, outlines_of
+from stereorig.core.field.region.region import PointGrid, check_region
+from stereorig.core.settings import AnalysisSettings, Region
 
 
 def make_grid(settings: AnalysisSettings, mask: NDArray[np.bool_] | None, image_shape: tuple[int, int]) -> PointGrid:
-    """Lay the points of an analysis and check them against camera 1's reference image.
+    """Place the points of an analysis and check them against camera 1's reference image.
 
     Parameters
     ----------
     settings
-        Of the analysis.
+        Settings of the analysis.
     mask
-        (rows, cols) True where points may lie, or None.
+        (rows, cols) True at allowed pixels, or None.
     image_shape
         Rows and columns of camera 1's image.
 
@@ -50,7 +50,7 @@ def make_grid(settings: AnalysisSettings, mask: NDArray[np.bool_] | None, image_
 
 
 def lay_points(region: Region, spacing_px: int, mask: NDArray[np.bool_] | None) -> PointGrid:
-    """Lay the points of a region; those on a mask's black, in holes, are not allowed.
+    """Place the points of a region; points on a mask's black or in holes are not allowed.
 
     Raises
     ------

@@ -117,7 +117,7 @@ def squared_distance(x, y, piece):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def find_near(first, last, xy, subset, margin, pieces, black_sums, out):
-    """Fill ``out`` (n,) bool: True where a piece or black pixels lie in a point's subset or within ``margin`` px of it.
+    """Fill ``out`` (n,) bool: True if a piece or black pixels are in a point's subset or within ``margin`` px of it.
 
     ``black_sums`` is the integral image of the mask's black, (rows + 1, cols + 1), or empty.
     """
@@ -137,7 +137,7 @@ def find_near(first, last, xy, subset, margin, pieces, black_sums, out):
         for m in range(pieces.shape[0]):
             if near:
                 break
-            # the subset's pixels lie about the pixel nearest to the point
+            # the subset's pixels are centred on the pixel nearest to the point
             near = passes_box(pieces[m], x - half - 0.5, y - half - 0.5, x + half + 0.5, y + half + 0.5)
         out[i] = near
 

@@ -52,7 +52,7 @@ def _sort(keys, network):
 def _order(keys):
     """Turn the bits of float32 into int32 of the same order, or back.
 
-    Those of negative numbers are in reverse order.
+    The bits of negative numbers are in reverse order.
     """
     for s in range(keys.shape[0]):
         for k in range(_BLOCK):
@@ -61,7 +61,7 @@ def _order(keys):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _medians(values, network, n, out):
-    """Sort the columns of (24, block) ``values``; medians of the first ``n`` (block,), 0 where there are none."""
+    """Sort the columns of (24, block) ``values``; medians of the first ``n`` (block,), 0 for an empty column."""
     keys = values.view(np.int32)
     _order(keys)
     _sort(keys, network)
@@ -89,7 +89,8 @@ def compare_with_neighbours(first, last, network, ok, separated, rays, w, G, mot
     ok
         (r, c) bool.
     separated
-        (r, c) uint32, as :func:`core.field.region.line_crossings.separated_neighbours`; empty without cuts and mask.
+        (r, c) uint32, as :func:`stereorig.core.field.region.line_crossings.separated_neighbours`; empty without cuts
+        and mask.
     rays, w, G
         (r, c, 3), (r, c, 3 or more), (r, c, 3, 3 or more).
     motion
@@ -172,9 +173,9 @@ def least_median(first, last, x, v, triplets, flat_below, residual, medians):
     flat_below
         Triplets that span a triangle of less than half this area give no slopes.
     residual
-        (m, k) out: of the best map; not finite where there is none.
+        (m, k) out: residuals under the best map; not finite without one.
     medians
-        (m,) out: its median, inf where there is none.
+        (m,) out: its median, inf without a map.
     """
     samples, dimensions = v.shape[1], v.shape[2]
     r, ordered = np.empty(samples), np.empty(samples)

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.arrays import Bool, Float
-from core.errors import RegionError
-from core.field.region.region import PointGrid
-from core.settings import Outline, Region
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.errors import RegionError
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.settings import Outline, Region
 
 _CHORD_PX = 0.02
-"""A circle's corners: its chords lie nearer to it than anything a subset could tell."""
+"""Distance of a circle's chords from it, by which its corners are spaced: far less than a subset resolves."""
 
 
 def outlines_of(region: Region) -> list[Outline]:
-    """Return a region's outlines, in whichever form they were given; none for a mask alone."""
+    """Return a region's outlines, in any of its forms; none for a mask alone."""
     if region.rectangle is not None or region.polygon is not None:
         return [Outline.model_construct(rectangle=region.rectangle, polygon=region.polygon, circle=None)]
     return list(region.outlines)
 
 
 def corners_px(outline: Outline) -> Float:
-    """Return an outline's corners (n, 2), px; a circle's lie on it, so close that no chord is off by a fiftieth px."""
+    """Return an outline's corners (n, 2), px; a circle's are on it, so close that no chord is off by a fiftieth px."""
     if outline.polygon is not None:
         return np.asarray(outline.polygon, dtype=np.float64)
     if outline.rectangle is not None:
@@ -34,7 +34,7 @@ def corners_px(outline: Outline) -> Float:
 
 
 def lay_outlines(outlines: list[Outline], spacing_px: int) -> PointGrid:
-    """Lay points in the union of outlines; the grid starts at the upper left corner of the box about all of them.
+    """Place points in the union of outlines; the grid starts at the upper left corner of the box about all of them.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def lay_outlines(outlines: list[Outline], spacing_px: int) -> PointGrid:
 
 
 def points_inside(outline: Outline, x_px: Float, y_px: Float) -> Bool:
-    """Return (r, c) True for the points of a grid that lie in an outline or on its border."""
+    """Return (r, c) True for the points of a grid inside an outline or on its border."""
     everywhere = np.ones(x_px.shape, bool)
     box = (float(x_px.min()), float(y_px.min()), float(x_px.max()), float(y_px.max()))
     return _inside(outline, PointGrid(x_px, y_px, everywhere, 1.0, box))
@@ -80,7 +80,7 @@ def _box(outline: Outline) -> tuple[float, float, float, float]:
 
 
 def _inside(outline: Outline, grid: PointGrid) -> Bool:
-    """Return (r, c) True where a point lies in an outline or on its border."""
+    """Return (r, c) True for points inside an outline or on its border."""
     if outline.circle is not None:
         x, y, radius = outline.circle
         return np.asarray(np.hypot(grid.x_px - x, grid.y_px - y) <= radius + 1e-9)

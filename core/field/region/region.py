@@ -9,27 +9,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from core.arrays import Bool, Float
-from core.errors import RegionError
-from core.field.region.cuts import Cuts
-from core.settings import SUBSET_PX
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.errors import RegionError
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.core.settings import SUBSET_PX
 
 if TYPE_CHECKING:
-    from core.field.region.visibility import Visibility
+    from stereorig.core.field.region.visibility import Visibility
 
 _MAX_POINTS = 20_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class PointGrid:
-    """Points on a regular grid of camera 1's reference image, and those of them that may be measured.
+    """Points on a regular grid of camera 1's reference image, with the selection that may be measured.
 
     Attributes
     ----------
     x_px, y_px
         (r, c) columns and rows of the points.
     allowed
-        (r, c) True where a point's centre lies in the region and on the mask's white; the others get the status MASKED.
+        (r, c) True at points inside the region and on the mask's white; the others get the status MASKED.
     spacing_px
         Distance of neighbouring points.
     extent_px
@@ -39,8 +39,8 @@ class PointGrid:
     white
         (rows, cols) of camera 1's image, True where the mask is white; None without a mask.
     visibility
-        Visible pixels of each point's subset, see :func:`core.field.region.find_visible.with_visibility`; None before
-        it is computed, and without cuts and mask.
+        Visible pixels of each point's subset, see :func:`stereorig.core.field.region.find_visible.with_visibility`;
+        None before it is computed, and without cuts and mask.
     """
 
     x_px: Float
@@ -64,7 +64,7 @@ class PointGrid:
 
     @staticmethod
     def rectangle(x0_px: float, y0_px: float, x1_px: float, y1_px: float, *, spacing_px: float) -> PointGrid:
-        """Lay points at X0 + i step up to X1 inclusive, and likewise in Y.
+        """Place points at X0 + i step up to X1 inclusive, and likewise in Y.
 
         Raises
         ------
@@ -92,7 +92,7 @@ class PointGrid:
 
     @staticmethod
     def polygon(vertices_px: ArrayLike, *, spacing_px: float) -> PointGrid:
-        """Lay points inside a polygon (n, 2); the grid starts at its bounding box's upper left corner.
+        """Place points inside a polygon (n, 2); the grid starts at its bounding box's upper left corner.
 
         Raises
         ------
@@ -105,7 +105,7 @@ class PointGrid:
 
     @staticmethod
     def mask(mask: ArrayLike, *, spacing_px: float) -> PointGrid:
-        """Lay points on the white of a mask (rows, cols); the grid starts at the white's upper left corner."""
+        """Place points on the white of a mask (rows, cols); the grid starts at the white's upper left corner."""
         m = np.asarray(mask).astype(bool)
         if m.ndim != 2 or not m.any():
             raise RegionError(
@@ -165,10 +165,10 @@ class PointGrid:
         return replace(self, cuts=Cuts(lines) if lines else None, visibility=None)
 
     def within_mask(self, mask: ArrayLike) -> PointGrid:
-        """Keep only the points whose centre lies on the white (non-zero) of a mask the size of camera 1's image.
+        """Keep only the points whose centre is on the white (non-zero) of a mask the size of camera 1's image.
 
         Their subsets are cut to the white visible from the centre. Points off the mask's array are left unchanged: they
-        lie outside the image, and are rejected for that.
+        are outside the image, and are rejected for that.
         """
         m = np.asarray(mask).astype(bool)
         if m.ndim != 2:
@@ -194,12 +194,12 @@ def check_region(
     subset_px
         Width of the subset.
     mask_shape
-        Of the mask that went into the grid, where there was one.
+        Shape of the mask that went into the grid, if there was one.
 
     Returns
     -------
     NDArray
-        (r, c) bool, True where the point is allowed and its subset lies in the image.
+        (r, c) bool, True at allowed points whose subset is inside the image.
 
     Raises
     ------

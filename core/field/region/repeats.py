@@ -1,6 +1,6 @@
 """Texture that repeats itself: a start on it may be wrong by a period.
 
-Growth from a right start follows such a texture, since neighbours determine the period. A seed must not lie on it:
+Growth from a right start follows such a texture, since neighbours determine the period. A seed must not be on it:
 neither search nor features distinguish its periods, though noise and sampling may seem to.
 """
 
@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from core.arrays import Bool, Float
-from core.robust import spread_indices
-from core.threads import run_ranges
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.robust import spread_indices
+from stereorig.core.threads import run_ranges
 
 _ALIKE = 0.85  # correlation of a square, twice a subset wide, with another one; random speckles reach half of it
 _OWN_PEAK = 0.5  # connected to the square's own position above this: its own peak
@@ -28,7 +28,7 @@ Peaks = dict[tuple[int, int, int], float]
 
 
 def repeats(pixels: NDArray[Any], xy_px: Float, *, subset_px: int, known: Peaks | None = None) -> Bool:
-    """Return (n,) True where camera 1's texture repeats itself within two subsets.
+    """Return (n,) True at positions whose texture in camera 1 repeats itself within two subsets.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def repeats(pixels: NDArray[Any], xy_px: Float, *, subset_px: int, known: Peaks 
     subset_px
         Width of a subset.
     known
-        What was found in this image before; what is found now is added.
+        Results found in this image before; the new ones are added.
     """
     n = len(xy_px)
     if n == 0:

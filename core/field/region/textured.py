@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float, Float32
+from stereorig.core.arrays import Float, Float32
 
 _PER_SUBSET = 10  # samples along a subset's side
 _BAND_PIXELS = 2_000_000
@@ -25,7 +25,7 @@ class TextureMap:
         Distance of the samples: sample (i, j) is about pixel (row, column) = ``stride_px`` (i, j).
     strength
         (r, c) smaller eigenvalue of the mean product of gradients, grey levels squared per px^2, without the noise's
-        share; about zero where there is noise only, or edges of one direction only.
+        share; about zero for noise alone, or edges of one direction only.
     structured
         (r, c) ``strength`` over its sum with the noise's share of the mean squared gradient, the smallest within a
         subset: over a slanted edge, neighbouring rows differ by more than noise.
@@ -57,9 +57,9 @@ def texture_map(image: NDArray[Any], subset_px: int) -> TextureMap:
 
     Notes
     -----
-    Products are taken of a pixel's gradient with those of the pixels to the right and below: these differences have
-    no pixel in common, and the noise of different pixels is independent, so that its mean product is zero whatever its
-    size. All three products of gradients use the same pixels: an edge of any direction has no smaller eigenvalue.
+    A pixel's gradient is multiplied with the gradients of the pixels to the right and below: these differences have no
+    pixel in common, and the noise of different pixels is independent, so that its mean product is zero at any noise
+    level. All three products of gradients use the same pixels: an edge of any direction has no smaller eigenvalue.
     """
     rows, cols = image.shape
     stride = max(1, subset_px // _PER_SUBSET)

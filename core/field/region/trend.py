@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.arrays import Float
+from stereorig.core.arrays import Float
 
 
 def smooth_terms(xy_px: Float) -> Float:

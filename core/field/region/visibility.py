@@ -2,7 +2,7 @@
 
 A pixel of a subset counts if the straight line from the point to it meets no cut and stays on the white. Pixels next to
 a cut do not count either: there the spline and the gradients of an image include pixels beyond it. Two points are
-neighbours only if no cut or black lies between them.
+neighbours only if no cut or black is between them.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float, Float32
-from core.field.region.line_crossings import find_separated, variances
-from core.field.region.neighbours import REACH
-from core.matching.arguments import VisiblePixels
-from core.threads import run_ranges
+from stereorig.core.arrays import Bool, Float, Float32
+from stereorig.core.field.region.line_crossings import find_separated, variances
+from stereorig.core.field.region.neighbours import REACH
+from stereorig.core.matching.arguments import VisiblePixels
+from stereorig.core.threads import run_ranges
 
 MIN_SHARE = 0.25
-"""Of a subset's pixels; a point with a smaller visible share is not measured."""
+"""Least visible share of a subset's pixels; a point with a smaller share is not measured."""
 AT_ONCE = 256
 CHUNK = 4096
 
@@ -35,13 +35,13 @@ class Visibility:
     xy_px, shape, spacing_px
         (n, 2) the points, rows and columns, and their distance.
     pieces_px, white
-        (m, 4) the cuts' straight pieces, and the mask, empty where there is none.
+        (m, 4) the cuts' straight pieces, and the mask, empty without one.
     visible
         Visible pixels of the points with a partly visible subset.
     share
         (n,) share of the subset's pixels that are visible.
     separated
-        (r, c) uint32, bits as :func:`core.field.region.line_crossings.separated_neighbours`.
+        (r, c) uint32, bits as :func:`stereorig.core.field.region.line_crossings.separated_neighbours`.
     """
 
     xy_px: Float
@@ -85,7 +85,7 @@ class Visibility:
         return VisiblePixels(self.visible.patches, self.visible.of_point[index])
 
     def are_separated(self, a_px: Float, b_px: Float) -> Bool:
-        """Return (n,) True where a cut or black lies between positions a and b (n, 2)."""
+        """Return (n,) True if a cut or black is between positions a and b (n, 2)."""
         out = np.zeros(len(a_px), bool)
         a, b = (np.ascontiguousarray(p, dtype=np.float64) for p in (a_px, b_px))
         run_ranges(
@@ -103,7 +103,7 @@ class Visibility:
         return np.asarray((self.separated.ravel() >> np.uint32(bit)) & np.uint32(1), dtype=bool)
 
     def correct_variance(self, variance: Float, image: Float32) -> Float:
-        """Return grey-level variances (n,), those of cut subsets over the visible pixels alone."""
+        """Return grey-level variances (n,), for cut subsets over the visible pixels alone."""
         index = np.flatnonzero(~self.whole)
         xy = np.ascontiguousarray(self.xy_px[index])
         own = np.empty(len(index))
@@ -119,5 +119,5 @@ class Visibility:
 
 
 def over(kernel: Callable[..., None], *arguments: Any) -> Callable[[int, int], None]:
-    """Return a kernel as :func:`core.threads.run_ranges` calls it, with the arguments that follow the range."""
+    """Return a kernel for :func:`stereorig.core.threads.run_ranges`, and the arguments that follow the range."""
     return lambda first, last: kernel(first, last, *arguments)

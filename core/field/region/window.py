@@ -9,13 +9,13 @@ from functools import lru_cache
 
 import numpy as np
 
-from core.arrays import Bool, Float
-from core.field.region.cuts import Cuts, crosses
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.field.region.cuts import Cuts, crosses
 
 
 @lru_cache(maxsize=8)
 def window_offsets(half: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n, 2) rows and columns of a window's points, inner rings first, and (n,) each one's next inwards."""
+    """Return (n, 2) rows and columns of a window's points, inner rings first, and (n,) the next point inwards."""
     side = np.arange(-half, half + 1)
     row, col = (a.ravel() for a in np.meshgrid(side, side, indexing="ij"))
     ring = np.maximum(np.abs(row), np.abs(col))
@@ -62,9 +62,9 @@ def ways_cut(valid: Bool, xy_px: Float, cuts: Cuts | None, half: int) -> Bool | 
 def connected_points(there: Bool, here: np.ndarray, crossed: Bool | None, half: int) -> Bool:
     """Return (m, n) True for the windows' points that are connected to their centres over valid points alone.
 
-    ``there`` is the padded grid, ``here`` (m,) the centres' flat indices in it. The way goes from cell to cell. Over a
-    corner it goes where one of the two cells beside it is valid: an empty line of cells, however it slants, is not
-    passed.
+    ``there`` is the padded grid, ``here`` (m,) the centres' flat indices in it. The way goes from cell to cell. A
+    diagonal step is allowed if one of the two cells next to it is valid: it does not cross an empty line of cells at
+    any slope.
     """
     offsets, before = window_offsets(half)
     flat, width = there.ravel(), there.shape[1]

@@ -1,8 +1,9 @@
-"""What the images of a field without a start have in common: the cause that their feature matches show.
+"""Common features of the images of a field without a start, and the cause that their matches show.
 
-Run only where nothing was seeded. Features are matched over whole images, without the cameras' geometry, and those
-kept that agree with their neighbours. How far these lie from the epipolar lines, as the images are and as if one of
-them or both had been turned or mirrored, names the cause.
+Run only if nothing was seeded. Features are matched over whole images, without the cameras' geometry, and matches that
+agree with their neighbours are kept. Features are matched over whole images, without the cameras' geometry, and those
+kept that agree with their neighbours. Their distance from the epipolar lines, as the images are and as if one of them
+or both had been turned or mirrored, names the cause.
 """
 
 from __future__ import annotations
@@ -14,16 +15,18 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from core.arrays import Bool, Float
-from core.cameras.stereo import StereoPair
-from core.errors import SeedError
-from core.field.points.features import Box, Features, detect
-from core.field.points.images import MeasureImage, features_of
-from core.field.seeding.scattered_matches import ScatteredMotion, scattered_motion
-from core.field.seeding.search_region import scales
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import SeedError
+from stereorig.core.field.points.features import Box, Features, detect
+from stereorig.core.field.points.images import MeasureImage, features_of
+from stereorig.core.field.seeding.image_faults import mosaic_share, period_px
+from stereorig.core.field.seeding.scattered_matches import ScatteredMotion, scattered_motion
+from stereorig.core.field.seeding.search_region import scales
 
 Finding = Literal[
     "few_features",
+    "mosaic",
     "turned",
     "mirrored",
     "off_epipolar_lines",
@@ -37,7 +40,7 @@ _MIN_FEATURES = 50
 _MIN_MATCHES = 20  # agreeing with their neighbours; two unrelated textures give none to a few
 _ON_LINE_PX = 1.0  # median of matches whose geometry is the cameras': features are found to some tenths of a pixel
 _UNDONE_PX = 2.0  # the same of an image that is turned back: SIFT's positions are off by a quarter of a pixel
-_CLEARLY = 0.3  # of the distance as given, at most, to say that an image was turned
+_CLEARLY = 0.3  # share of the distance without any change, at most, for an image that was turned
 _FAR_FEWER = 5
 _MOSTLY = 0.5
 
@@ -59,7 +62,7 @@ class _Change:
         return " and ".join(part for part in ("mirrored" if self.mirrored else "", turned) if part)
 
     def undo(self, xy_px: Float, shape: Shape) -> Float:
-        """Return where positions (n, 2) of the changed image of (rows, cols) lay in the image as it was."""
+        """Return positions (n, 2) of the changed image of (rows, cols) in the original image."""
         x, y = xy_px.T
         rows, cols = shape
         for _ in range(self.quarter_turns):  # undoes np.rot90 by one quarter, counter-clockwise
@@ -77,22 +80,22 @@ _FLIPS = (_Change(mirrored=True), *(_Change(k, mirrored=True) for k in (2, 1, 3)
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found.
+    """Cause found for a field without a start.
 
     Attributes
     ----------
     finding
         Its name, see ``Finding``.
     text, remedy
-        A sentence with the figures, and what to do.
+        A sentence with the figures, and the remedy.
     features
         Features found in camera 1's and camera 2's image of the step.
     matches
-        Of them matched between the cameras and agreeing with their neighbours.
+        Number of features matched between the cameras that agree with their neighbours.
     epipolar_px
         Median distance of these from their epipolar lines; None without enough of them.
     matches_in_time
-        Matches of camera 1's reference with its current image that agree with their neighbours; None of a shape.
+        Matches of camera 1's reference with its current image that agree with their neighbours; None for a shape.
     """
 
     finding: Finding
@@ -141,6 +144,14 @@ def diagnose(
         return Diagnosis(finding, text, remedy, features, len(matched.xy_px), off, in_time)
 
     names = tuple(f"camera {k}'s {'current ' if current else ''}image" for k in (1, 2))
+    raw = [(name, s) for name, image in zip(names, (one, two), strict=True) if (s := mosaic_share(image.pixels))]
+    if raw:
+        return result(
+            "mosaic",
+            f"{' and '.join(name for name, _ in raw)} look{'s' * (len(raw) == 1)} like a raw Bayer mosaic: the pixels "
+            f"of each square of 2 x 2 differ by {raw[0][1]:.0%} of the mean",
+            "Give the camera's grey or developed (demosaiced) images, not its raw ones.",
+        )
     few = [f"{name} shows {n}" for name, n in zip(names, features, strict=True) if n < _MIN_FEATURES]
     if few:
         return result(
@@ -151,6 +162,13 @@ def diagnose(
     looser = max(1.0, scale / 2.0)
     limit, undone = _ON_LINE_PX * looser, _UNDONE_PX * looser
     shapes = one.shape, two.shape
+    period = period_px(one.pixels) if region_px is None else period_px(_part(one, _box(region_px, one)))
+    if period is not None and (len(direct.xy_px) < _MIN_MATCHES or off is None or off > limit):
+        return result(
+            "repeating",
+            f"the texture repeats itself every {period:.1f} px, so that no match tells one period from the next",
+            _NO_PERIOD,
+        )
     if len(direct.xy_px) < _MIN_MATCHES:
         mirrored = _mirrored_matches(found1, two, scale)
         if len(mirrored.xy_px) >= _MIN_MATCHES and len(mirrored.xy_px) > 2 * len(direct.xy_px):
@@ -202,9 +220,7 @@ def diagnose(
         )
     if repeating:
         return result(
-            "repeating",
-            f"{agree}, but the texture repeats itself, and a start may be wrong by a period",
-            "Use a random pattern, or give a seed point with its position in camera 2.",
+            "repeating", f"{agree}, but the texture repeats itself, and a start may be wrong by a period", _NO_PERIOD
         )
     return result(
         "cameras_agree",
@@ -214,18 +230,19 @@ def diagnose(
     )
 
 
+_NO_PERIOD = "Use a random pattern, or give a seed point with its position in camera 2."
 _TURN_BACK = "Give the images as the cameras that were calibrated deliver them."
 
 
 def seed_error(found: Diagnosis, noise_variance: float | None = None) -> SeedError:
-    """Return the error for a field without a start, with what was found.
+    """Return the error for a field without a start, with the cause found.
 
     Parameters
     ----------
     found
         The diagnosis.
     noise_variance
-        Of camera 1's noise model, grey levels squared, if there is one.
+        Variance in camera 1's noise model, grey levels squared, if there is one.
     """
     remedy = found.remedy
     if noise_variance is not None and found.finding == "cameras_agree":
@@ -258,8 +275,12 @@ def _box(region_px: tuple[float, float, float, float], image: MeasureImage) -> B
     return max(int(x0), 0), max(int(y0), 0), min(int(np.ceil(x1)) + 1, cols), min(int(np.ceil(y1)) + 1, rows)
 
 
+def _part(image: MeasureImage, box: Box) -> Any:
+    return image.pixels[box[1] : box[3], box[0] : box[2]]
+
+
 def _each_and_both(changes: Sequence[_Change]) -> list[tuple[_Change, _Change]]:
-    """One image changed, the other one, or both in the same way."""
+    """Pairs of changes: of one image, of the other one, or of both in the same way."""
     one, two = [(change, _AS_IT_IS) for change in changes], [(_AS_IT_IS, change) for change in changes]
     return [*one, *two, *((change, change) for change in changes)]
 
@@ -267,7 +288,7 @@ def _each_and_both(changes: Sequence[_Change]) -> list[tuple[_Change, _Change]]:
 def _off_lines(
     pair: StereoPair, matched: ScatteredMotion, changed: tuple[_Change, _Change], shapes: tuple[Shape, Shape]
 ) -> Float:
-    """Distances (n,) from the epipolar lines with changes undone; infinite where there is no line."""
+    """Distances (n,) from the epipolar lines with changes undone; infinite without a line."""
     xy1 = changed[0].undo(matched.xy_px, shapes[0])
     xy2 = changed[1].undo(matched.xy_current_px, shapes[1])
     off = np.full(len(xy1), np.inf)
@@ -296,7 +317,7 @@ def _that_fits(
     shapes: tuple[Shape, Shape],
     limit_px: float,
 ) -> tuple[_Change, _Change] | None:
-    """Return the change under which matches lie nearest to their lines, if within the limit and before the cameras."""
+    """Return the change with the smallest distances from the lines, if within the limit and in front of the cameras."""
     off = [float(np.median(_off_lines(pair, matched, changed, shapes))) for changed in changes]
     for k in sorted(range(len(off)), key=off.__getitem__):
         if off[k] <= limit_px and _in_front(pair, matched, changes[k], shapes).mean() > _MOSTLY:

@@ -1,6 +1,6 @@
-"""Search along the epipolar line: a start for one point where no feature match helps.
+"""Search along the epipolar line: a start for one point without feature matches nearby.
 
-For every depth at which the point lies in camera 2's image, and for a few tilts about the bisector of the viewing
+For every depth with the point inside camera 2's image, and for a few tilts about the bisector of the viewing
 directions, camera 1's subset is compared with camera 2's grey levels by zero-mean normalised correlation.
 """
 
@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float, Float32
-from core.cameras.stereo import StereoPair
+from stereorig.core.arrays import Float, Float32
+from stereorig.core.cameras.stereo import StereoPair
 
 _TILTS_RAD = (0.0, -0.35, 0.35, -0.7, 0.7)
 _SAMPLES = 17  # per side: enough to distinguish matches, a quarter of the work of all pixels

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.cameras.stereo import StereoPair
-from core.field.points.images import MeasureImage, features_of
-from core.field.seeding.scattered_matches import scattered_shape
-from core.field.seeding.search_region import scales
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.images import MeasureImage, features_of
+from stereorig.core.field.seeding.scattered_matches import scattered_shape
+from stereorig.core.field.seeding.search_region import scales
 
 _MIN_MATCHES = 12
 

@@ -8,15 +8,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from core.arrays import Bool, Float
-from core.field.region.neighbours import least_median
-from core.threads import run_ranges
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.field.region.neighbours import least_median
+from stereorig.core.threads import run_ranges
 
 _TRIPLETS = 48
 _FLAT = 1e-2
 _AT_ONCE = 256
 _WIDER = 4  # times the number of neighbours is searched for those not separated from a position
-_ENOUGH = 0.7  # of the neighbours wanted
+_ENOUGH = 0.7  # share of the neighbours wanted
 
 AreSeparated = Callable[[Float, Float], Bool]
 
@@ -31,7 +31,7 @@ class LocalFits(NamedTuple):
     slope
         (M, d, 2) its derivatives over x and y.
     spread
-        (M,) median residual of the neighbours used, in units of the values; inf where no fit was possible.
+        (M,) median residual of the neighbours used, in units of the values; inf if no fit was possible.
     inliers
         (M,) number of neighbours that agree.
     distance
@@ -68,10 +68,10 @@ def robust_local_fits(
     tolerance
         Residual up to which a neighbour counts as an inlier, in the values' unit.
     seed
-        Of the random triplets: equal input gives equal output.
+        Seed of the random triplets: equal input gives equal output.
     are_separated
-        Function of positions (n, 2) and (n, 2) that returns (n,) True where a cut lies between; samples across one do
-        not take part.
+        Function of positions (n, 2) and (n, 2) that returns (n,) True for pairs with a cut between; samples across one
+        do not take part.
     """
     m, d = len(centres), values.shape[1]
     k = min(neighbours, len(points))

@@ -11,24 +11,24 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from core.arrays import Bool, Float, Float32
-from core.cameras.stereo import StereoPair
-from core.field.points.fitter import Fitter, PointFits
-from core.field.points.scales import depth_per_px
-from core.field.points.starts import image_shift_px
-from core.field.seeding.epipolar_search import distinct, normalise, sample, tilted
+from stereorig.core.arrays import Bool, Float, Float32
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.fitter import Fitter, PointFits
+from stereorig.core.field.points.scales import depth_per_px
+from stereorig.core.field.points.starts import image_shift_px
+from stereorig.core.field.seeding.epipolar_search import distinct, normalise, sample, tilted
 
-_BEYOND = 0.5  # of the range of depths, on either side
+_BEYOND = 0.5  # share of the range of depths, on either side
 _BEYOND_PX = 24.0
-_AS_DEEP_AS_WIDE = 0.5  # of the field's width to either side: where a part is looked for that nothing has shown yet
+_AS_DEEP_AS_WIDE = 0.5  # share of the field's width to either side: range for a part that no match has shown yet
 _MAX_DEPTHS = 600
 _TILT_RAD = 1.05
 _TILT_STEP_RAD = (0.22, 0.52)
-_STEEPEST_RAD = 1.19  # of what both cameras of a pair with a usual angle still see
-_TILT_PX = 2.2  # of disparity at the subset's edge: half a step is refined
+_STEEPEST_RAD = 1.19  # steepest face that both cameras of a pair with a usual angle still see
+_TILT_PX = 2.2  # change of disparity at the subset's edge: half a step is refined
 _CANDIDATES = 4
 _SAMPLES = 11  # per side
-_STEP_PX = 1.5  # of depth: the refinement finds its way over two
+_STEP_PX = 1.5  # step of depth as disparity: the refinement converges over two
 _FAR_PX = 4.0
 _DISTINCT_PX = 2.0
 _AMBIGUOUS = 2.0
@@ -42,7 +42,7 @@ class DepthRange(NamedTuple):
 
 
 def depth_range(pair: StereoPair, rays: Float, w0: Float) -> DepthRange:
-    """Return the range of inverse depths (n,) of a field's points on rays (n, 3), and what lies a little beyond it."""
+    """Return the range of inverse depths (n,) of a field's points on rays (n, 3), with a margin on either side."""
     low, high = float(w0.min()), float(w0.max())
     per_px = float(np.median(depth_per_px(pair, rays, w0)))
     more = max(_BEYOND * (high - low), _BEYOND_PX * per_px)
@@ -58,7 +58,7 @@ def deeper_range(pair: StereoPair, rays: Float, w0: Float) -> DepthRange:
 
 
 def tilts(between_rad: float, subset_px: int) -> Float:
-    """Return (m, 3) unit normals, as :func:`core.field.seeding.epipolar_search.tilted` takes them.
+    """Return (m, 3) unit normals, as :func:`stereorig.core.field.seeding.epipolar_search.tilted` takes them.
 
     The wider the angle between the views, the more a tilt distorts one of them, and the finer the steps.
     """
@@ -75,9 +75,9 @@ def tilts(between_rad: float, subset_px: int) -> Float:
 
 
 def steep_tilts(between_rad: float, subset_px: int) -> Float:
-    """Return (m, 3) unit normals of faces steeper than those of :func:`tilts`, up to 68 degrees.
+    """Return (m, 3) unit normals of faces steeper than those in :func:`tilts`, up to 68 degrees.
 
-    Disparity changes over a subset as the tangent of the tilt, so that is what is stepped.
+    Disparity changes over a subset as the tangent of the tilt, so the tangent is stepped.
     """
     per_unit = max(subset_px // 2 * 2.0 * np.tan(0.5 * between_rad), 1e-3)
     step = float(np.clip(_TILT_PX / per_unit, *_TILT_STEP_RAD))
@@ -103,7 +103,7 @@ def pair_angle(pair: StereoPair, xy_px: Float, w0: float) -> float:
 def search_shapes(
     fitter: Fitter, xy_px: Float, within: DepthRange, *, min_zncc: float, deeper: DepthRange | None = None
 ) -> PointFits:
-    """Find the shapes of points (n, 2) by search along their epipolar lines; NOT_SEEDED where none is clearly best.
+    """Find the shapes of points (n, 2) by search along their epipolar lines; NOT_SEEDED if none is clearly best.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def search_shapes(
     min_zncc
         Correlation below which a match that no neighbour supports is taken for chance.
     deeper
-        Depths that are searched where there is nothing at the first ones, not by steep tilts either.
+        Depths that are searched if there is nothing at the first ones, without steep tilts.
     """
     shape, n = fitter.shape_only(), len(xy_px)
     out = shape.empty(n)

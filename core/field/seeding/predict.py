@@ -10,11 +10,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.cameras.stereo import StereoPair
-from core.field.points.starts import current_position
-from core.field.region.trend import smooth_terms
-from core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.starts import current_position
+from stereorig.core.field.region.trend import smooth_terms
+from stereorig.core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight
 
 _QUADRATIC_FROM, _LINEAR_FROM = 36, 12
 _ROUNDS = 4
@@ -33,7 +33,7 @@ def predict(
     xy_px
         (n, 2) all points.
     G
-        (n, 3, k) at the previous step, NaN where it is not known.
+        (n, 3, k) at the previous step, NaN if it is not known.
     sample
         (m,) indices of the points that were fitted.
     w_current, G_current

@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from core.arrays import Bool, Float, Float32
-from core.cameras.stereo import StereoPair
-from core.field.points.fitter import Fitter, PointFits
-from core.matching.image import ImageData
+from stereorig.core.arrays import Bool, Float, Float32
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.fitter import Fitter, PointFits
+from stereorig.core.matching.image import ImageData
 
 _NEIGHBOURS = 24
 _CANDIDATES = 512
 _VISIBLE = 0.5
-"""Correlation from which a patch is seen where it was searched for; by chance it stays below 0.4."""
+"""Correlation from which a patch counts as seen at the searched place; by chance it stays below 0.4."""
 _FAR_PX = 4.0
 _ELSEWHERE = 0.7
 _LOOKED_FOR = 6
@@ -71,7 +71,7 @@ def predicted_motion(
     *,
     min_zncc: float,
 ) -> PointFits:
-    """Find the motion of the points ``index`` about where the valid points predict it; NOT_SEEDED where none matches.
+    """Find the motion of the points ``index`` near the valid points' prediction; NOT_SEEDED for those without a match.
 
     Parameters
     ----------
@@ -116,10 +116,10 @@ def predicted_motion(
 def seen_elsewhere(
     fitter: Fitter, points: PointFits, xy_px: Float, rays: Float, index: NDArray[np.intp], known_w: Float | None
 ) -> bool:
-    """Return True if camera 1 clearly shows half of some points ``index``, and not where the valid points predict them.
+    """Return True if camera 1 clearly shows half of some points ``index`` away from the valid points' prediction.
 
-    Then a part moved by itself, and features are worth their time. Points that it shows nowhere are hidden; those that
-    it shows where they should be, and that did not match, are hidden from camera 2.
+    Then a part moved by itself, and features are worth their time. Points that it shows nowhere are hidden; points seen
+    at their predicted place that did not match are hidden from camera 2.
     """
     if fitter.cur1 is None or known_w is None or len(index) == 0:
         return False
@@ -159,7 +159,7 @@ def _maps(w: Float, G: Float, rays: Float) -> tuple[Float, Float, Float]:
 
 
 def _searched(fitter: Fitter, xy_px: Float, rays: Float, w: Float, G: Float) -> tuple[Bool, Float]:
-    """Return where both current images show the patches, (n,), and ``G`` moved there."""
+    """Return the places at which both current images show the patches, (n,), and ``G`` moved there."""
     assert fitter.cur1 is not None
     assert fitter.cur2 is not None
     pair, n = fitter.pair, len(xy_px)
@@ -191,7 +191,7 @@ def _searched(fitter: Fitter, xy_px: Float, rays: Float, w: Float, G: Float) -> 
 
 
 def _images(pair: StereoPair, position: Float) -> tuple[Float, Float]:
-    """Return where both cameras see positions (..., 3), camera 1's frame."""
+    """Return both cameras' images of positions (..., 3), camera 1's frame."""
     there = pair.cam2_from_cam1.apply(position.reshape(-1, 3)).reshape(position.shape)
     with np.errstate(divide="ignore", invalid="ignore"):
         return (
@@ -201,7 +201,7 @@ def _images(pair: StereoPair, position: Float) -> tuple[Float, Float]:
 
 
 def _found_in(image: ImageData, xy: Float, own: Float32) -> Float | None:
-    """Return where an image sampled at (k, k, 2) shows a patch, (2,) px; None where it does not."""
+    """Return the place (2,) px of a patch in an image sampled at (k, k, 2); None if the image does not show it."""
     rows, cols = image.shape
     middle = xy[xy.shape[0] // 2, xy.shape[1] // 2]
     if not np.isfinite(xy).all() or not ((middle >= 0) & (middle <= (cols - 1, rows - 1))).all():

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float
-from core.cameras.stereo import StereoPair
-from core.errors import ImageError
-from core.field.points.features import Box, Features, match
-from core.field.points.scales import depth_per_px
-from core.field.points.starts import Starts
-from core.field.seeding.local_fit import AreSeparated, consistent, robust_local_fits
-from core.field.seeding.stretched import stretched_features, stretches
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import ImageError
+from stereorig.core.field.points.features import Box, Features, match
+from stereorig.core.field.points.scales import depth_per_px
+from stereorig.core.field.points.starts import Starts
+from stereorig.core.field.seeding.local_fit import AreSeparated, consistent, robust_local_fits
+from stereorig.core.field.seeding.stretched import stretched_features, stretches
 
 EPIPOLAR_PX = 1.5
 """Distance from the epipolar line up to which a feature match can be right, on images of up to half their size."""
@@ -121,9 +121,9 @@ def _depth_tolerance(pair: StereoPair, xy1: Float, w0: Float, scale: int) -> flo
 def shape_starts(
     pair: StereoPair, shape: ScatteredShape, xy_px: Float, are_separated: AreSeparated | None = None
 ) -> Starts:
-    """Return ``w`` (n, 3) at positions ``xy_px`` (n, 2) from the matches near them; NaN where they do not agree.
+    """Return ``w`` (n, 3) at positions ``xy_px`` (n, 2) from the matches near them; NaN if these do not agree.
 
-    ``are_separated``: see :func:`core.field.seeding.local_fit.robust_local_fits`.
+    ``are_separated``: see :func:`stereorig.core.field.seeding.local_fit.robust_local_fits`.
     """
     w = np.full((len(xy_px), 3), np.nan)
     if len(shape.xy_px) < 4 or len(xy_px) == 0:

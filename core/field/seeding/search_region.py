@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.stereo import StereoPair
-from core.field.points.features import Box
-from core.field.seeding.epipolar_search import DEPTH_SPAN, nominal_depth
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.features import Box
+from stereorig.core.field.seeding.epipolar_search import DEPTH_SPAN, nominal_depth
 
-_COMFORTABLE_PIXELS = 800_000  # of an image: a few thousand keypoints on a fine texture, in a quarter of a second
-_MIN_PIXELS = 100_000  # of the region: some hundred keypoints
-_MAX_PIXELS = 8_000_000  # of an image, first
-_HALF_FROM_PIXELS = 60_000  # of the region
+# pixels of an image: a few thousand keypoints on a fine texture, in a quarter of a second
+_COMFORTABLE_PIXELS = 800_000
+_MIN_PIXELS = 100_000  # pixels of the region: some hundred keypoints
+_MAX_PIXELS = 8_000_000  # pixels of an image at the first scale
+_HALF_FROM_PIXELS = 60_000  # pixels of the region
 _ALONG_A_SIDE = 9
 _DEPTHS = 400
 _MARGIN_PX = 32
@@ -41,7 +42,7 @@ def seen_by_camera2(pair: StereoPair, box: Box, shape2: tuple[int, int]) -> Box:
     both = seen[:, 1:] & seen[:, :-1]
     if not both.any():
         return whole
-    # between two depths, and from the last one inside to the border, lies a step at most
+    # between two depths, and from the last one inside to the border, there is a step at most
     gap = np.linalg.norm(np.diff(xy, axis=1), axis=-1)[both].max() + (x1 - x0 + y1 - y0) / (8 * _ALONG_A_SIDE)
     return box_around(xy[seen], float(gap) + _MARGIN_PX, shape2)
 
@@ -67,7 +68,7 @@ def scales(boxes: tuple[Box, Box], shapes: tuple[tuple[int, int], tuple[int, int
 
 
 def half_serves(boxes: tuple[Box, Box], shapes: tuple[tuple[int, int], tuple[int, int]]) -> bool:
-    """Return True where images that :func:`scales` would not reduce may be tried at half their size first.
+    """Return True if images that :func:`scales` would not reduce may be tried at half their size first.
 
     SIFT doubles an image before it looks for features, and speckles of 3 px and more show at half their size, in a
     quarter of the time.

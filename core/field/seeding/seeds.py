@@ -11,19 +11,25 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from core.arrays import Bool, Float
-from core.cameras.stereo import StereoPair
-from core.errors import RegionError
-from core.field.points.fitter import Fitter, PointFits
-from core.field.points.scales import depth_per_px
-from core.field.points.starts import Starts
-from core.field.region.visibility import Visibility
-from core.field.seeding.epipolar_search import sweep
-from core.field.seeding.scattered_matches import ScatteredMotion, ScatteredShape, combine, motion_starts, shape_starts
-from core.matching.fit import no_motion
-from core.matching.image import ImageData
-from core.settings import AnalysisSettings
-from core.status import PointStatus
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import RegionError
+from stereorig.core.field.points.fitter import Fitter, PointFits
+from stereorig.core.field.points.scales import depth_per_px
+from stereorig.core.field.points.starts import Starts
+from stereorig.core.field.region.visibility import Visibility
+from stereorig.core.field.seeding.epipolar_search import sweep
+from stereorig.core.field.seeding.scattered_matches import (
+    ScatteredMotion,
+    ScatteredShape,
+    combine,
+    motion_starts,
+    shape_starts,
+)
+from stereorig.core.matching.fit import no_motion
+from stereorig.core.matching.image import ImageData
+from stereorig.core.settings import AnalysisSettings
+from stereorig.core.status import PointStatus
 
 _FAR_PX = 4.0
 _POINTS_PER_SEED = 60
@@ -42,9 +48,9 @@ class Seed:
     xy_px
         (x, y) in camera 1's reference image.
     xy2_px
-        The same point in camera 2's reference image, where known.
+        The same point in camera 2's reference image, if known.
     xy_current_px, xy2_current_px
-        The same point in camera 1's and camera 2's current image, where known (both or neither).
+        The same point in camera 1's and camera 2's current image, if known (both or neither).
     """
 
     xy_px: tuple[float, float]
@@ -54,7 +60,7 @@ class Seed:
 
 
 def seeds_of(settings: AnalysisSettings) -> list[Seed] | None:
-    """Return the seeds of an analysis's settings; None where they are to be found."""
+    """Return the seeds in an analysis's settings; None if they are searched for."""
     one = settings.seeds
     if one is None:
         return None
@@ -93,7 +99,7 @@ def nearest_points(
     Raises
     ------
     RegionError
-        ``seed_outside`` if none lies within ``reach_px``.
+        ``seed_outside`` if no point is within ``reach_px``.
     """
     candidates = np.flatnonzero(usable)
     out = []
@@ -171,7 +177,7 @@ def seeds_from_matches(
 ) -> int:
     """Put refined seeds into ``points``, spread over the region; return the number of valid ones.
 
-    ``known_w`` (n, 3 or 6) is the shape where it was measured before (NaN elsewhere).
+    ``known_w`` (n, 3 or 6) is the shape if it was measured before (NaN at points without one).
     """
     if len(shape.xy_px) < 4 and known_w is None:
         return 0
@@ -179,7 +185,7 @@ def seeds_from_matches(
     if len(source) < 4:
         return 0
     support = np.asarray(cKDTree(source).query(xy_px, k=min(8, len(source)))[0])[:, -1]
-    if fitter.visibility is not None:  # next to a cut only where there is nothing else
+    if fitter.visibility is not None:  # next to a cut only if there is no other point
         support = np.where(fitter.visibility.whole, support, support + np.ptp(xy_px))
     found = 0
     for choice in spread(xy_px, usable & (points.status == PointStatus.NOT_SEEDED), support):
@@ -219,7 +225,7 @@ def starts_at(
     known_w: Float | None,
     visibility: Visibility | None = None,
 ) -> Starts:
-    """Return starts at positions from the matches not separated from them, with the measured shape where known."""
+    """Return starts at positions from the matches not separated from them, with the measured shape if known."""
     are_separated = None if visibility is None else visibility.are_separated
     w = shape_starts(pair, shape, xy_px, are_separated).w
     if known_w is not None:

@@ -1,4 +1,4 @@
-"""The specimen in a pair of images, where no region is given: texture in camera 1 that camera 2 sees and matches."""
+"""The specimen in a pair of images without a given region: texture in camera 1 that camera 2 sees and matches."""
 
 from __future__ import annotations
 
@@ -9,39 +9,39 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from core.arrays import Bool, Float
-from core.cameras.stereo import StereoPair
-from core.errors import RegionError
-from core.field.points.features import Box
-from core.field.points.images import MeasureImage, different, features_of
-from core.field.region.textured import TextureMap, texture_map
-from core.field.seeding.diagnosis import diagnose, seed_error
-from core.field.seeding.epipolar_search import sweep
-from core.field.seeding.scattered_matches import ScatteredShape, scattered_shape
-from core.field.seeding.search_region import scales
-from core.robust import spread_indices
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import RegionError
+from stereorig.core.field.points.features import Box
+from stereorig.core.field.points.images import MeasureImage, different, features_of
+from stereorig.core.field.region.textured import TextureMap, texture_map
+from stereorig.core.field.seeding.diagnosis import diagnose, seed_error
+from stereorig.core.field.seeding.epipolar_search import sweep
+from stereorig.core.field.seeding.scattered_matches import ScatteredShape, scattered_shape
+from stereorig.core.field.seeding.search_region import scales
+from stereorig.core.robust import spread_indices
 
-_WEAKEST = 0.06  # of the texture at the matches: what is blurred to four times its width has less
-_DARKEST = 0.1  # of their grey level, down to which a texture may be weaker as the light is
+_WEAKEST = 0.06  # share of the texture at the matches: texture blurred to four times its width has less
+_DARKEST = 0.1  # share of their grey level, down to which a texture may be weaker as the light is
 _MIN_STRUCTURED = 0.2  # noise alone gives 0 within 0.1, a texture of speckles of 3 px half and more
 _MIN_MATCHES = 12
-_MIN_PART = 0.05  # of the largest part's area
+_MIN_PART = 0.05  # share of the largest part's area
 _MIN_PART_SUBSETS = 4.0  # area of a part in subsets
 _MIN_PART_MATCHES = 4
 _REACH_SUBSETS = 2.0  # from the nearest match
 _REACH_SPACINGS = 4.0
-_APART_SUBSETS = 3.0  # of searches where no match is near: on a steep face features may find none
+_APART_SUBSETS = 3.0  # distance of searches in places without matches: on a steep face features may find none
 _SEARCHES = 60
 _SEARCHED_PX = 25
 _CORRELATES = 0.7  # the best of thousands of places in a texture that is another one reaches 0.5
 _NEAREST = 5
-_SPOT = 0.1  # of a subset
-_TOLERANCE_PX = 1.5  # of outlines
+_SPOT = 0.1  # share of a subset
+_TOLERANCE_PX = 1.5  # tolerance of outlines
 
 
 @dataclass(frozen=True, eq=False)
 class Specimen:
-    """What of camera 1's image is the specimen.
+    """The specimen in camera 1's image.
 
     Attributes
     ----------
@@ -50,9 +50,9 @@ class Specimen:
     outlines_px, holes_px
         Corners (n, 2) of its parts, the largest first, and of the holes in them, within some pixels of the mask.
     matches
-        Feature matches with camera 2 that lie on it.
+        Feature matches with camera 2 that are on it.
     text
-        How it was found, with figures.
+        Sentence about the search, with figures.
     """
 
     mask: Bool
@@ -67,7 +67,7 @@ class Specimen:
         return float(self.mask.mean())
 
     def rectangle_px(self, subset_px: int) -> tuple[float, float, float, float]:
-        """Return (x0, y0, x1, y1) about the mask where whole subsets lie in the image.
+        """Return (x0, y0, x1, y1) about the mask within the range of subsets that are inside the image.
 
         Raises
         ------
@@ -99,8 +99,8 @@ def find_specimen(pair: StereoPair, image1: MeasureImage, image2: MeasureImage, 
     Returns
     -------
     Specimen
-        The largest connected parts with a texture of both directions, not much weaker than that of the matches, that
-        camera 2 sees, without the half subset by which a square sees texture beyond its edge.
+        The largest connected parts with a texture of both directions, not much weaker than at the matches, that camera
+        2 sees, without the half subset by which a square sees texture beyond its edge.
 
     Raises
     ------
@@ -215,7 +215,7 @@ def _filled(white: Bool, area: float) -> Bool:
 
 
 def _eroded(white: Bool, half: int) -> Bool:
-    """Take off what a square sees beyond the texture's edge, as far slantwise; the image's border is no edge."""
+    """Remove the rim that a square sees beyond the texture's edge, in all directions; the image's border is no edge."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * half + 1, 2 * half + 1))
     return np.asarray(cv2.erode(white.astype(np.uint8), kernel, borderType=cv2.BORDER_REPLICATE) > 0)
 

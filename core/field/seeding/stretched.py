@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.field.points.features import Box, Features, detect, reduced, with_rim
+from stereorig.core.arrays import Float
+from stereorig.core.field.points.features import Box, Features, detect, reduced, with_rim
 
-_RATIO = 1.75  # of the axes: half of it or twice it is still matched
+_RATIO = 1.75  # ratio of the axes: half of it or twice it is still matched
 _DIRECTIONS = 4
 
 

@@ -1,6 +1,6 @@
-"""Visibility at a later reference: that of the first reference, carried along with the surface.
+"""Visibility at a later reference: the first reference's visibility, moved with the surface.
 
-A crack opens and turns, and its lips separate: lines drawn at the first reference do not show where they are later. So
+A crack opens and turns, and its lips separate: lines drawn at the first reference do not show their later places. So
 each pixel of a segment's subset is taken back to the first reference through the point's own motion, and is visible if
 it is visible there.
 """
@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from core.arrays import Bool, Float
-from core.field.region.find_visible import MARGIN_PX, visible_patches
-from core.field.region.region import PointGrid
-from core.field.region.visibility import Visibility
-from core.matching.arguments import VisiblePixels
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.field.region.find_visible import MARGIN_PX, visible_patches
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.field.region.visibility import Visibility
+from stereorig.core.matching.arguments import VisiblePixels
 
 _MAX_WIDTH_RATIO = 4  # times a subset: width that a segment's subset may cover in the first reference
 _AT_ONCE = 512
@@ -60,7 +60,7 @@ class SegmentVisibility(Visibility):
         return VisiblePixels(self.visible.patches, self.visible.of_point[index])
 
     def are_separated(self, a_px: Float, b_px: Float) -> Bool:
-        """Return (n,) True where a cut or black lies between positions a and b (n, 2) of the later image."""
+        """Return (n,) True if a cut or black is between positions a and b (n, 2) of the later image."""
         return self.first.are_separated(self._at_first(a_px), self._at_first(b_px))
 
     def _at_first(self, xy_px: Float) -> Float:

@@ -1,8 +1,8 @@
 """Composition of motions: totals since the first reference from a motion that began at a later step.
 
-A segment is matched against a later step's images. Its unknowns are those of the matching, about camera 1's rays at
-that step: inverse depth ``w'`` and the matrix ``G'``. With ``D`` the derivative of camera 1's image at the segment's
-reference over its image at step 0 and ``T'`` that of the current point over the image at the segment's reference, the
+A segment is matched against a later step's images. Its unknowns are the matching's, about camera 1's rays at that step:
+inverse depth ``w'`` and the matrix ``G'``. With ``D`` the derivative of camera 1's image at the segment's reference
+over its image at step 0 and ``T'`` the derivative of the current point over the image at the segment's reference, the
 total has
 
     P = G'_0 / w'_0,    G_0 = w_0 P,    G_j = w_j P + w_0 T' D_j
@@ -16,10 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.stereo import StereoPair
-from core.field.points.result import Field
-from core.matching.geometry import plane_from_angles, tangent_frames
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.result import Field
+from stereorig.core.matching.geometry import plane_from_angles, tangent_frames
 
 _POINTS_AT_ONCE = 65536
 _STRIPS = 32
@@ -76,7 +76,7 @@ def point_slopes(w: Float, G: Float) -> Float:
 
 
 def totals_of(field: Field, pair: StereoPair) -> Totals:
-    """Return the totals of a field, NaN where it has none; the same from memory and from its file."""
+    """Return the totals of a field, NaN at points without one; the same from memory and from its file."""
     if field.uvw_mm is None or field.rotation_rad is None or field.stretch is None:
         raise ValueError("a shape has no motion")
     n = field.x_px.size
@@ -156,7 +156,7 @@ def follow_covariance(start: Totals, w: Float, G: Float, covariance: Float, adde
     w, G, covariance
         (n, 3), (n, 3, 3), (n, 5, 5) of the segment, about the points' own rays.
     added
-        (n, 2, 2) covariance to be added to that of the points' positions in camera 1's current image, normalised.
+        (n, 2, 2) covariance to be added to the points' positions in camera 1's current image, normalised.
 
     Notes
     -----
@@ -214,10 +214,10 @@ def common_share(slopes_px: Float, offset_px: Float, subset_px: int) -> tuple[Fl
     Returns
     -------
     common
-        Share of the noise's covariance in the variance of either: the pixels in common over those of the parallelogram.
+        Share of the noise's covariance in the variance of either: the pixels in common over the parallelogram's pixels.
     own
-        Variance of the first match from that image over that of the second: 1, more where the parallelogram has
-        fewer pixels than samples.
+        Variance of the first match from that image over the second's: 1, more if the parallelogram has fewer pixels
+        than samples.
     """
     common, own = np.empty(len(slopes_px)), np.empty(len(slopes_px))
     for start in range(0, len(common), _POINTS_AT_ONCE):
@@ -230,7 +230,7 @@ def _common_share(A: Float, offset: Float, size: float) -> tuple[Float, Float]:
     half = 0.5 * size
     det = A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0]
     reach = half * (np.abs(A[:, 1, 0]) + np.abs(A[:, 1, 1]))
-    middle = -offset  # of the parallelogram, seen from the square's middle
+    middle = -offset  # edges of the parallelogram, seen from the square's middle
     low, high = np.maximum(-half, middle[:, 1] - reach), np.minimum(half, middle[:, 1] + reach)
     height = np.maximum(high - low, 0.0)
     y = low[:, None] + height[:, None] * (np.arange(_STRIPS) + 0.5) / _STRIPS - middle[:, 1, None]

@@ -1,15 +1,15 @@
 """The joint between two blocks of a sequence that were measured side by side.
 
 A block's first step is measured twice: from seeds, so that the steps after it need not wait, and again from the step
-before it once that is there, as a sequence measured in order does. Where both agree, all that was measured from the
-first is what the second leads to.
+before it once that is there, as a sequence measured in order does. If both agree, all results measured from the first
+are the results that the second leads to.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from core.field.points.result import Field
+from stereorig.core.field.points.result import Field
 
 AGREE_SIGMAS = 0.02
 """Root mean square of the differences of displacements over their standard deviations; a next step keeps less of it."""

@@ -8,22 +8,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float
-from core.field.checks.residual_test import residual_test
-from core.field.growth.check import check
-from core.field.growth.grow import Attempts, grow
-from core.field.growth.state import FieldInputs
-from core.field.points.fitter import Fitter, PointFits
-from core.field.points.result import Field
-from core.field.points.starts import move_matrix, move_w
-from core.field.region.region import PointGrid
-from core.field.sequence.compose import Totals, since
-from core.field.sequence.propagated import Propagated, pattern_share
-from core.field.sequence.segment import Segment
-from core.status import PointStatus
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.field.checks.residual_test import residual_test
+from stereorig.core.field.growth.check import check
+from stereorig.core.field.growth.grow import Attempts, grow
+from stereorig.core.field.growth.state import FieldInputs
+from stereorig.core.field.points.fitter import Fitter, PointFits
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.starts import move_matrix, move_w
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.field.sequence.compose import Totals, since
+from stereorig.core.field.sequence.propagated import Propagated, pattern_share
+from stereorig.core.field.sequence.segment import Segment
+from stereorig.core.status import PointStatus
 
 OLDER = 2
-"""Number of references besides the current one that are tried for points that it does not have."""
+"""Number of references, in addition to the current one, that are tried for points that it does not have."""
 _BESIDE = 3  # points
 _CONTROLS = 64
 _FAR_PX = 1.0
@@ -42,7 +42,7 @@ def find_again(
     segment_of: Callable[[int], Segment],
     inputs_of: Callable[[Segment], FieldInputs],
 ) -> None:
-    """Try points that the segment does not have against the newest reference that shows them, beside valid points.
+    """Match points that the segment does not have against the newest reference that shows them, near valid points.
 
     Points found again pass the validity checks like all others.
 
@@ -51,8 +51,8 @@ def find_again(
     segment
         The segment that the step was matched against.
     points, propagated, added_px2
-        The step's n points, in totals, and their covariances of :meth:`core.field.sequence.segment.Segment.total`;
-        results are written there.
+        The step's n points, in totals, and their covariances of
+        :meth:`stereorig.core.field.sequence.segment.Segment.total`; results are written there.
     steps
         (n,) the newest reference that shows each point.
     whole, shape
@@ -68,7 +68,7 @@ def find_again(
     for used in values[np.argsort(-counts)][:OLDER]:
         older = segment_of(int(used))
         usable = missing & (steps == used) & older.has
-        near = _beside(usable, valid & older.has, whole.grid.shape)
+        near = _near_valid(usable, valid & older.has, whole.grid.shape)
         if not near.any():
             continue
         inputs = inputs_of(older)
@@ -118,7 +118,7 @@ def find_again(
         propagated.noise[good], propagated.pattern[good] = known.noise, known.pattern
 
 
-def _beside(missing: Bool, valid: Bool, shape: tuple[int, int]) -> Bool:
+def _near_valid(missing: Bool, valid: Bool, shape: tuple[int, int]) -> Bool:
     """Return (n,) True for valid points within a few grid points of missing ones."""
     disc = np.ones((2 * _BESIDE + 1, 2 * _BESIDE + 1), np.uint8)
     about = cv2.dilate(missing.reshape(shape).astype(np.uint8), disc)
@@ -128,7 +128,7 @@ def _beside(missing: Bool, valid: Bool, shape: tuple[int, int]) -> Bool:
 def _level(fitter: SegmentFitter, points: PointFits, near: NDArray[np.intp], xy_px: Float) -> Float | None:
     """Return (3,) the ratio of 1 - zncc to that against an older reference, median over points valid against both.
 
-    None where fewer than half of them match the older reference: it then is of no use.
+    None if fewer than half of them match the older reference, which is then of no use.
     """
     sample = near[np.linspace(0, len(near) - 1, min(len(near), _CONTROLS)).astype(int)]
     fits = fitter.fit(xy_px[sample], points.w[sample], points.G[sample])
@@ -159,7 +159,7 @@ class SegmentFitter:
         self.comparisons, self.terms = 3, 3
 
     def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
-        """Refine totals from totals; as :meth:`core.field.points.fitter.Fitter.fit`."""
+        """Refine totals from totals; as :meth:`stereorig.core.field.points.fitter.Fitter.fit`."""
         if G is None:
             raise ValueError("a segment measures motions")
         segment = self._segment
@@ -175,5 +175,5 @@ class SegmentFitter:
         return segment.total(fits, index, np.zeros(len(index)), pair=self._fitter.pair, subset_px=self._subset_px)[0]
 
     def far_from_start(self, xy_px: Float, fits: PointFits, w: Float, G: Float | None, limit_px: float) -> Bool:
-        """As :meth:`core.field.points.fitter.Fitter.far_from_start`."""
+        """As :meth:`stereorig.core.field.points.fitter.Fitter.far_from_start`."""
         return self._fitter.far_from_start(xy_px, fits, w, G, limit_px)

@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.cameras.stereo import StereoPair
-from core.common.derivatives import inverse_of_lower, lower_root
-from core.field.points.result import Field
-from core.field.sequence.compose import Totals, common_share, image_slopes, in_step, rotations_of
-from core.matching.geometry import tangent_frames
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.common.derivatives import inverse_of_lower, lower_root
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.sequence.compose import Totals, common_share, image_slopes, in_step, rotations_of
+from stereorig.core.matching.geometry import tangent_frames
 
 _SMOOTHED = 5  # points across, over which the noise of a field is averaged
 _SURELY = 1.1  # times the noise between the cameras: any more is not noise
@@ -31,9 +31,9 @@ class Propagated:
     Attributes
     ----------
     noise
-        Of errors that are independent from segment to segment.
+        Covariance from errors that are independent from segment to segment.
     pattern
-        Of errors by a changed pattern, which are fully correlated from segment to segment.
+        Covariance from errors by a changed pattern, which are fully correlated from segment to segment.
     """
 
     noise: Float
@@ -156,7 +156,7 @@ def first_propagated(field: Field, pair: StereoPair, totals: Totals, subset_px: 
 
 
 def added_share(field: Field, pair: StereoPair, added_px2: Float) -> Float:
-    """Return what references between the first one and a step added to the noise of its displacement, over the whole.
+    """Return the relative noise that references between the first one and a step added to its displacement.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ def added_share(field: Field, pair: StereoPair, added_px2: Float) -> Float:
     -------
     Float
         (r, c, 3, 3) B with L B L' the part and L L' the covariance of U, V, W, L a lower triangle: smoothing, which
-        scales the noise, leaves it. NaN where there is no point.
+        scales the noise, leaves it. NaN without a point.
     """
     assert field.uvw_mm is not None
     assert field.rotation_rad is not None

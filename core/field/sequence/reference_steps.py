@@ -1,7 +1,7 @@
 """Long sequences: the choice of the reference step that a step is matched against.
 
 ``never``: always the first reference. ``always``: the step before. ``auto``: the latest reference as long as it serves;
-where it fails, the step before replaces it, if lost points are found again.
+if it fails, the step before replaces it, if lost points are found again.
 """
 
 from __future__ import annotations
@@ -13,34 +13,32 @@ from typing import Any
 
 import numpy as np
 
-from core.arrays import Bool
-from core.cameras.stereo import StereoPair
-from core.errors import MeasurementError, SeedError
-from core.field.growth.field import assemble_field, motion_field
-from core.field.growth.seed import Seeds
-from core.field.growth.state import FieldInputs, prepare
-from core.field.points.crew import Crew
-from core.field.points.images import MeasureImage
-from core.field.points.result import Field, References
-from core.field.region.find_visible import with_visibility
-from core.field.region.region import PointGrid
-from core.field.sequence.compose import Totals
-from core.field.sequence.lost_points import OLDER, find_again
-from core.field.sequence.propagated import Propagated, added_share, pattern_share
-from core.field.sequence.segment import Segment, begin_segment, measure_segment
-from core.field.sequence.still_visible import still_visible
-from core.field.settings import MeasureOptions
-from core.matching.fit import no_motion
-from core.matching.geometry import plane_from_angles
-from core.progress import CancelToken, Progress
-from core.settings import ReferenceUpdate
-from core.status import PointStatus
+from stereorig.core.arrays import Bool
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import MeasurementError, SeedError
+from stereorig.core.field.growth.field import assemble_field, motion_field
+from stereorig.core.field.growth.seed import Seeds
+from stereorig.core.field.growth.state import FieldInputs, prepare
+from stereorig.core.field.points.assemble import patch_degree
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.result import Field, References
+from stereorig.core.field.region.find_visible import with_visibility
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.field.sequence.compose import Totals
+from stereorig.core.field.sequence.lost_points import OLDER, find_again
+from stereorig.core.field.sequence.propagated import Propagated, added_share, pattern_share
+from stereorig.core.field.sequence.segment import Segment, begin_segment, measure_segment
+from stereorig.core.field.sequence.still_visible import still_visible
+from stereorig.core.field.settings import MeasureOptions
+from stereorig.core.matching.fit import no_motion
+from stereorig.core.matching.geometry import plane_from_angles
+from stereorig.core.progress import CancelToken, Progress
+from stereorig.core.settings import ReferenceUpdate
+from stereorig.core.status import PointStatus
 
 Pair = tuple[MeasureImage, MeasureImage]
 
-MAY_BE_LOST = (
-    0.01  # of the points that a reference has: the share that checks may reject through no fault of the reference
-)
+MAY_BE_LOST = 0.01  # share of the points of a reference that checks may reject without any fault of the reference
 SIGMAS = 3.0  # a larger loss is significant
 BETTER_SIGMAS = 2.0  # and an update must be better by this much
 _KEPT = OLDER + 1
@@ -48,6 +46,7 @@ _BY_THE_MATCH = (
     PointStatus.NOT_SEEDED,
     PointStatus.NOT_CONVERGED,
     PointStatus.LOW_CORRELATION,
+    PointStatus.SIGMA_TOO_LARGE,
     PointStatus.EPIPOLAR_MISMATCH,
     PointStatus.NEIGHBOUR_MISMATCH,
     PointStatus.SINGULAR,
@@ -106,7 +105,6 @@ class Updating:
         seeds: Seeds | None = None,
         progress: Progress | None = None,
         cancel: CancelToken | None = None,
-        crew: Crew | None = None,
     ) -> Field:
         """Measure one step.
 
@@ -116,15 +114,15 @@ class Updating:
             Both cameras' images.
         previous
             The step before; None for the first one after the reference.
-        seeds, progress, cancel, crew
-            As in :func:`core.measure.measure_motion`.
+        seeds, progress, cancel
+            As in :func:`stereorig.core.measure.measure_motion`.
 
         Raises
         ------
         MeasurementError, InputError, Cancelled
-            As :func:`core.measure.measure_motion`.
+            As :func:`stereorig.core.measure.measure_motion`.
         """
-        step = _Step(images, previous, seeds, progress, cancel, crew)
+        step = _Step(images, previous, seeds, progress, cancel)
         if previous is None or self._mode == "never":
             return self._total(step)
         if self._mode == "always":
@@ -156,7 +154,6 @@ class Updating:
         seeds: Seeds | None = None,
         progress: Progress | None = None,
         cancel: CancelToken | None = None,
-        crew: Crew | None = None,
     ) -> Field:
         """Measure a step against a given reference without the steps between, from seeds that are found.
 
@@ -166,25 +163,26 @@ class Updating:
             Both cameras' images.
         reference
             Number of the first reference, or of an earlier step whose images and field can be had.
-        seeds, progress, cancel, crew
+        seeds, progress, cancel
             As in :meth:`measure`.
 
         Returns
         -------
         Field
-            The chain's, as far as the steps between do not matter to it: steps after it can be measured from it, and
-            whether it is the chain's own shows where that arrives (see :mod:`core.field.sequence.joint`).
+            The field as the chain would give it, as far as it does not depend on the steps between: later steps can be
+            measured from it, and the comparison when the chain arrives decides if it is the chain's own (see
+            :mod:`stereorig.core.field.sequence.joint`).
 
         Raises
         ------
         SeedError
-            As :meth:`measure`, and where the reference does not serve: the chain would have looked for a later one.
+            As :meth:`measure`, and if the reference does not serve: the chain would have looked for a later one.
         """
         if reference == self._first:
-            field = self._total(_Step(images, None, seeds, progress, cancel, crew))
+            field = self._total(_Step(images, None, seeds, progress, cancel))
         else:
             begun = PreviousStep(reference, self._field_of(reference))
-            field = self._by_segment(reference, _Step(images, begun, seeds, progress, cancel, crew))
+            field = self._by_segment(reference, _Step(images, begun, seeds, progress, cancel))
         held = self._held_by(reference)
         if self._mode == "auto" and _fails(field, held, held):
             raise SeedError(f"the images have changed too much since step {reference} to be matched against it.")
@@ -204,7 +202,7 @@ class Updating:
         return motion_field(inputs, self._shape, previous, step.seeds)
 
     def _inputs(self, reference: Pair, grid: PointGrid, step: _Step, progress: Progress | None = None) -> FieldInputs:
-        more: Any = {"progress": progress, "cancel": step.cancel, "crew": step.crew}
+        more: Any = {"progress": progress, "cancel": step.cancel}
         return prepare(self._pair, reference, step.images, grid, self._options, **more)
 
     def _segment(self, step: int) -> Segment:
@@ -267,7 +265,6 @@ class Updating:
             previous_step=step.previous.step,
             progress=step.progress,
             cancel=step.cancel,
-            crew=step.crew,
         )
         n, subset = len(segment.has), self._options.subset_px
         zncc = np.where(state.points.ok[:, None], state.points.zncc, np.nan)
@@ -305,7 +302,10 @@ class Updating:
             propagated.pattern.reshape(blocks),
             added_share(field, self._pair, added_px2.reshape(blocks)),
         )
-        return replace(field, references=references)
+        # totals have plane terms alone: the degrees are those that the segment's own points have
+        mixed = state.fitter.terms == 6 and bool((state.points.plane & points.ok).any())
+        degree = patch_degree(state.points, field.valid) if mixed else None
+        return replace(field, references=references, patch_degree=degree)
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,7 +317,6 @@ class _Step:
     seeds: Seeds | None
     progress: Progress | None
     cancel: CancelToken | None
-    crew: Crew | None
 
 
 def _lost(field: Field, before: Bool) -> Bool:

@@ -1,6 +1,6 @@
 """A reference segment: the part of a sequence that is matched against one later step's images.
 
-The material points stay those of the first reference's grid. In camera 1's image at the segment's reference they lie
+The material points are always the first reference's grid. In camera 1's image at the segment's reference they are
 between pixels; a segment's subset is centred on the nearest whole pixel, so that no reference is interpolated, and the
 point is the patch evaluated at most half a pixel off its middle.
 """
@@ -12,22 +12,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float
-from core.cameras.stereo import StereoPair
-from core.errors import RegionError, SeedError
-from core.field.growth.field import fill_field
-from core.field.growth.patch import keep_patch
-from core.field.growth.seed import seed_motion
-from core.field.growth.state import GrowthState, begin, prepare
-from core.field.points.assemble import assemble
-from core.field.points.crew import Crew
-from core.field.points.fitter import PointFits
-from core.field.points.images import MeasureImage
-from core.field.points.result import Field
-from core.field.points.starts import Starts, move_matrix, move_w
-from core.field.region.region import PointGrid
-from core.field.sequence.carried_visibility import carry_visibility
-from core.field.sequence.compose import (
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import RegionError, SeedError
+from stereorig.core.field.growth.field import fill_field
+from stereorig.core.field.growth.patch import keep_patch
+from stereorig.core.field.growth.seed import seed_motion
+from stereorig.core.field.growth.state import GrowthState, begin, prepare
+from stereorig.core.field.points.assemble import assemble
+from stereorig.core.field.points.fitter import PointFits
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.starts import Starts, move_matrix, move_w
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.field.sequence.carried_visibility import carry_visibility
+from stereorig.core.field.sequence.compose import (
     Totals,
     follow,
     follow_covariance,
@@ -37,10 +36,10 @@ from core.field.sequence.compose import (
     since,
     totals_of,
 )
-from core.field.sequence.propagated import Propagated, first_propagated, propagate
-from core.field.settings import MeasureOptions
-from core.progress import CancelToken, Progress
-from core.status import PointStatus
+from stereorig.core.field.sequence.propagated import Propagated, first_propagated, propagate
+from stereorig.core.field.settings import MeasureOptions
+from stereorig.core.progress import CancelToken, Progress
+from stereorig.core.status import PointStatus
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,13 +106,14 @@ class Segment:
     def total(
         self, fits: PointFits, index: NDArray[np.intp], pattern: Float, *, pair: StereoPair, subset_px: int
     ) -> tuple[PointFits, Propagated, Float]:
-        """Return totals of points ``index`` fitted in this segment, their propagated covariance, and what was added.
+        """Return totals of points ``index`` fitted in this segment, their propagated covariance, and the added part.
 
-        ``pattern`` (m,) is their :func:`pattern_share`. Covariances are px^2; what was added (m, 2, 2) is the part of
-        that of the current positions in camera 1 that earlier references did not cancel.
+        ``pattern`` (m,) is their :func:`stereorig.core.field.sequence.propagated.pattern_share`. Covariances are px^2;
+        the added part (m, 2, 2) belongs to the current positions in camera 1: noise that earlier references did not
+        cancel.
         """
         start = self._at(index)
-        w, G = self._own(fits, index)
+        w, G = self._own(fits.w, fits.G, index)
         with np.errstate(invalid="ignore", divide="ignore"):
             after = follow(start, w, G)
             slopes, own = image_slopes(G), position_covariance(G, fits.covariance)
@@ -127,14 +127,19 @@ class Segment:
             )
             to_px = pair.cam1.lens.image_jacobian(after.seen)
         totals = replace(fits, w=after.w.copy(), G=after.G, covariance=covariance)
+        if fits.rejected_w is not None and fits.rejected_g is not None:
+            with np.errstate(invalid="ignore", divide="ignore"):
+                before = follow(start, *self._own(fits.rejected_w, fits.rejected_g, index))
+            totals.rejected_w = np.where(np.isfinite(fits.rejected_w[:, :1]), before.w, np.nan)
+            totals.rejected_g = before.G
         return totals, propagated, to_px @ added @ np.swapaxes(to_px, 1, 2)
 
     def _at(self, index: NDArray[np.intp]) -> Totals:
         return Totals(self.totals.rays[index], self.totals.w[index], self.totals.G[index])
 
-    def _own(self, fits: PointFits, index: NDArray[np.intp]) -> tuple[Float, Float]:
+    def _own(self, w: Float, G: Float, index: NDArray[np.intp]) -> tuple[Float, Float]:
         """Return the segment's plane terms (m, 3), (m, 3, 3) about the points' own rays."""
-        w, G = move_w(fits.w, self.offset[index]), move_matrix(fits.G, self.offset[index])
+        w, G = move_w(w, self.offset[index]), move_matrix(G, self.offset[index])
         return w[:, :3], G[:, :, :3]
 
 
@@ -168,7 +173,7 @@ def begin_segment(
     Raises
     ------
     SeedError
-        If no point's subset lies in camera 1's image at that step.
+        If no point's subset is inside camera 1's image at that step.
     """
     totals = totals_of(field, pair)
     n = len(totals.w)
@@ -188,7 +193,7 @@ def begin_segment(
         else:
             propagated_px = Propagated(r.noise_px2.reshape(n, 2, 2), r.pattern_px2.reshape(n, 2, 2))
     middle = np.median(pixel[has], axis=0)
-    # points that the segment does not have are put inside, where they disturb no scale
+    # points that the segment does not have are put inside, at a place that disturbs no scale
     pixel, position = (np.where(has[:, None], a, middle) for a in (pixel, position))
     rays, own = (pair.cam1.rays_cam(a).xyz_mm for a in (pixel, position))
     J = np.linalg.inv(pair.cam1.lens.image_jacobian(own[:, :2]))
@@ -217,7 +222,7 @@ def begin_segment(
     points.w[has] = move_w(plane, -offset)[has]
     points.status[has] = PointStatus.OK
     flat = assemble(points, pair=pair, grid=segment_grid, fits_image=segment_grid.allowed, shape=None)
-    # a point valid at that step and not in the segment lay too near to the image's border
+    # a point valid at that step and not in the segment was too near to the image's border
     why = np.where(field.valid, PointStatus.OUTSIDE_IMAGE, field.status).ravel()
     status = np.where(has, PointStatus.OK, why).astype(np.int8)
     older = np.full(n, first, np.int32) if field.references is None else field.references.steps.ravel()
@@ -249,7 +254,6 @@ def measure_segment(
     previous_step: int,
     progress: Progress | None,
     cancel: CancelToken | None,
-    crew: Crew | None,
 ) -> GrowthState:
     """Match a pair of images against a segment's reference; return the final state, about the segment's pixels.
 
@@ -259,11 +263,11 @@ def measure_segment(
     Raises
     ------
     SeedError, ImageError, Cancelled
-        As :func:`core.measure.measure_motion`.
+        As :func:`stereorig.core.measure.measure_motion`.
     """
     images = (segment.image1, segment.image2), (cur1, cur2)
     try:
-        inputs = prepare(pair, *images, segment.grid, options, progress=progress, cancel=cancel, crew=crew)
+        inputs = prepare(pair, *images, segment.grid, options, progress=progress, cancel=cancel)
     except RegionError as error:
         raise SeedError(f"no point of step {segment.step} is left to match a later step against.") from error
     start = None if previous_step == segment.step else _started(segment, previous, pair)

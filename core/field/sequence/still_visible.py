@@ -1,4 +1,4 @@
-"""Whether points that a reference lost are still to be seen, before a step is measured anew against a later one."""
+"""Visibility of points that a reference lost, checked before a step is measured again against a later one."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float
-from core.cameras.stereo import StereoPair
-from core.field.points.images import MeasureImage
-from core.field.points.result import Field
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.result import Field
 
 _TRIED = 24
 _REACH_SUBSETS = 2

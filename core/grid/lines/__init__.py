@@ -13,12 +13,12 @@ have no effect and are not needed.
 
 from __future__ import annotations
 
-from core.arrays import Bool
-from core.grid.lines.parabolas import fit_parabolas
-from core.grid.lines.points import LineFit, LinePoints
-from core.grid.lines.polygons import fit_polygons
-from core.grid.lines.straight import fit_straight
-from core.grid.view import LineModel
+from stereorig.core.arrays import Bool
+from stereorig.core.grid.lines.parabolas import fit_parabolas
+from stereorig.core.grid.lines.points import LineFit, LinePoints
+from stereorig.core.grid.lines.polygons import fit_polygons
+from stereorig.core.grid.lines.straight import fit_straight
+from stereorig.core.grid.view import LineModel
 
 __all__ = ["LineFit", "LinePoints", "fit_lines"]
 

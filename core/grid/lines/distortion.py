@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Float
+from stereorig.core.arrays import Float
 
 
 @dataclass(frozen=True)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.arrays import Bool, Float
-from core.grid.lines.points import LineFit, LinePoints, frames, line_index, meet_straight
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.grid.lines.points import LineFit, LinePoints, frames, line_index, meet_straight
 
 
 def fit_parabolas(points: LinePoints, counts: tuple[int, int], node_sigma_px: float, used: Bool) -> LineFit:
-    """Fit a parabola to each line by itself, and meet them; see :func:`core.grid.lines.fit_lines`."""
+    """Fit a parabola to each line by itself, and meet them; see :func:`stereorig.core.grid.lines.fit_lines`."""
     index = line_index(points, counts)
     n_line = sum(counts)
     origin, direction, normal = frames(points, points.xy_px, counts)

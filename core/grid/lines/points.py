@@ -1,4 +1,4 @@
-"""Sub-pixel points on lines, the lines fitted to them, and how lines meet."""
+"""Sub-pixel points on lines, the lines fitted to them, and the lines' intersections."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.grid.view import LineOffsets
+from stereorig.core.arrays import Float
+from stereorig.core.grid.view import LineOffsets
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class LineFit:
         (n_a, n_b, 2) intersections in coordinates without distortion, up to a projective map; equal to ``nodes_px``
         under the parabola model.
     line_offsets
-        Joint covariance along each line, see :class:`core.grid.view.LineOffsets`; of the local model only.
+        Joint covariance along each line, see :class:`stereorig.core.grid.view.LineOffsets`; of the local model only.
     """
 
     nodes_px: Float

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.arrays import Bool, Float
-from core.grid.lines.distortion import Distortion
-from core.grid.lines.points import LineFit, LinePoints, line_index
-from core.grid.view import LineOffsets
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.grid.lines.distortion import Distortion
+from stereorig.core.grid.lines.points import LineFit, LinePoints, line_index
+from stereorig.core.grid.view import LineOffsets
 
 
 def fit_polygons(
@@ -19,6 +19,7 @@ def fit_polygons(
     offset = np.zeros((na, nb, 2))
     covariance_a, covariance_b = np.zeros((na, nb, nb)), np.zeros((nb, na, na))
     residual = fit.residual_px.copy()
+    seen = np.ones((na, nb), dtype=bool)
     for k in range(na + nb):
         mine = index == k
         n_node = nb if k < na else na
@@ -29,13 +30,15 @@ def fit_polygons(
         J[np.arange(len(f)), knot + 1] = f
         W = np.where(used[mine], 1.0 / points.sigma_px[mine] ** 2, 0.0)
         N = (J * W[:, None]).T @ J
-        # a corner without points on either side takes its neighbours' mean: a weak tie of second differences
+        # a corner without points on either side is not seen; a weak tie of second differences keeps the rest solvable
+        beside = ((J > 0.0) & used[mine, None]).any(axis=0)
+        seen[(k, slice(None)) if k < na else (slice(None), k - na)] &= beside
         S = np.diff(np.eye(n_node), 2, axis=0)
         N += 1e-6 * np.median(W) * S.T @ S
         A = np.linalg.solve(N, (J * W[:, None]).T)
         corner = A @ fit.residual_px[mine]
-        # the points' noise is that across the line in the image, where the offsets' covariance holds too: the scale of
-        # the corrected coordinates changes little between a corner and the points beside it
+        # the points' noise is across the line in the image, as is the offsets' covariance: the scale of the corrected
+        # coordinates changes little between a corner and the neighbouring points
         noise = (A * points.sigma_px[mine] ** 2) @ A.T
         residual[mine] = fit.residual_px[mine] - J @ corner
         if k < na:
@@ -53,12 +56,9 @@ def fit_polygons(
     V = np.zeros((na, nb, 2, 2))
     V[..., 0, 0] = np.einsum("ijj->ij", covariance_a)
     V[..., 1, 1] = np.einsum("jii->ij", covariance_b)
-    inner = slice(1, -1)
     offsets = LineOffsets(
-        normal_a=across[inner, inner, 0],
-        normal_b=across[inner, inner, 1],
-        covariance_a=covariance_a[inner, inner, inner],
-        covariance_b=covariance_b[inner, inner, inner],
+        normal_a=across[..., 0, :], normal_b=across[..., 1, :], covariance_a=covariance_a, covariance_b=covariance_b
     )
     covariance = inverse @ V @ np.swapaxes(inverse, -1, -2)
+    nodes[~seen] = straight[~seen] = np.nan
     return LineFit(nodes, covariance, residual, points.sigma_px**2, straight, offsets)

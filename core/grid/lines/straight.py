@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from core.arrays import Bool, Float
-from core.grid.lines.distortion import Distortion, distortion_terms
-from core.grid.lines.points import LineFit, LinePoints, frames, line_index, meet_straight
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.grid.lines.distortion import Distortion, distortion_terms
+from stereorig.core.grid.lines.points import LineFit, LinePoints, frames, line_index, meet_straight
 
 _BASE_TERMS = 5
 _ALL_TERMS = 10

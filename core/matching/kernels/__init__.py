@@ -1,1 +1,1 @@
-"""Compiled code of the matching; :mod:`core.matching.fit` is the narrow function before it."""
+"""Compiled code of the matching; :mod:`stereorig.core.matching.fit` is its typed interface."""

@@ -1,11 +1,11 @@
 """Cluster-robust covariance of a fitted point, from its residuals of any origin.
 
 The fit's own covariance assumes residuals of white noise. A texture that changed, paint that flaked, an object in front
-of a corner of the subset, a view that differs leave residuals that are correlated over some pixels and have more effect
+of a corner of the subset or a different view leave residuals that are correlated over some pixels and have more effect
 on the solution. So the subset is cut into blocks about as wide as a speckle; the score of each block is summed, and the
-covariance of these sums gives that of the solution (a sandwich covariance with clustered errors, Liang and Zeger 1986,
-doi:10.1093/biomet/73.1.13). The scores of the three comparisons are added block by block: residuals that are equal in
-camera 2's reference and current images do not count in the displacement.
+covariance of the solution follows from the covariance of these sums (a sandwich covariance with clustered errors, Liang
+and Zeger 1986, doi:10.1093/biomet/73.1.13). The scores of the three comparisons are added block by block: residuals
+that are equal in camera 2's reference and current images do not count in the displacement.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from core.matching.kernels.given import ClusterRobustSpace
-from core.matching.kernels.linear import solve
-from core.matching.kernels.loops import GX, GY, N_ROWS, WEIGHT
-from core.matching.kernels.naming import kernel
-from core.matching.kernels.noise import (
+from stereorig.core.matching.kernels.given import ClusterRobustSpace
+from stereorig.core.matching.kernels.linear import solve
+from stereorig.core.matching.kernels.loops import GX, GY, N_ROWS, WEIGHT
+from stereorig.core.matching.kernels.naming import kernel
+from stereorig.core.matching.kernels.noise import (
     CONTRAST,
     GAIN,
     SHIFT,
@@ -28,7 +28,7 @@ from core.matching.kernels.noise import (
     noise_from_residuals,
     share_correction,
 )
-from core.matching.kernels.point import (
+from stereorig.core.matching.kernels.point import (
     LOW_TEXTURE,
     OK,
     OUTSIDE_IMAGE,
@@ -37,9 +37,9 @@ from core.matching.kernels.point import (
     epipolar_shift,
     make_sum_pixels,
 )
-from core.matching.kernels.rigid import N_RIGID, nearest_rotation, rigid_chain
-from core.matching.kernels.vectors import LANES
-from core.matching.kernels.warp import lens_jacobian, set_up_warp
+from stereorig.core.matching.kernels.rigid import N_RIGID, nearest_rotation, rigid_chain
+from stereorig.core.matching.kernels.vectors import LANES
+from stereorig.core.matching.kernels.warp import lens_jacobian, set_up_warp
 
 BLOCK_PX = 5.5  # about a good speckle; smaller blocks miss part of the correlation
 MIN_BLOCKS, MAX_BLOCKS = 3, 7  # across the subset
@@ -58,7 +58,7 @@ def make_cluster_robust(degree: int, images: int, parts: PointKernels, freeze: A
     degree, images
         Degree of the patch, and number of comparisons: 1 (shape) or 3 (motion).
     parts
-        Result of :func:`core.matching.kernels.point.make_point`.
+        Result of :func:`stereorig.core.matching.kernels.point.make_point`.
     freeze
         The fit's set-up of the normal equations.
     """
@@ -166,7 +166,7 @@ def make_cluster_robust(degree: int, images: int, parts: PointKernels, freeze: A
                 lens, M[k], of_reference.powers, rows, cols, stride, 1 if order == 3 else 2, warp_space.positions, warp
             )
             worth = sum_blocks(coefficients, subset, order, ref, base, stride, warp, part, sums, scores[k])
-        # the contrast of all is assumed to be the best one's: a lower correlation is the image's own noise
+        # all contrasts are assumed to be the best one's: a lower correlation is the image's own noise
         best = best_correlation(levels, images)
         n = unknowns
         if images == 3 and few == 3 and rigid:

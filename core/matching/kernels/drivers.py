@@ -5,8 +5,8 @@ but its own input, so neither ranges nor threads change a digit.
 
 Only these are cached on disk. numba looks at the date of the cached function's own file alone, and all kernels are
 inlined here; so the cache's key gets a stamp of all their sources, through a closure variable, and a change in any of
-them compiles anew. The kernels themselves are globals: as closure variables they would enter the key too, and theirs
-differs from process to process.
+them compiles again. The kernels themselves are globals: as closure variables they would enter the key too, and their
+own key differs from process to process.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any
 
-from core.matching.kernels.given import FitKernels
-from core.matching.kernels.motion import make_motion
-from core.matching.kernels.naming import entry, stamp_of
-from core.matching.kernels.shape import make_shape
+from stereorig.core.matching.kernels.given import FitKernels
+from stereorig.core.matching.kernels.motion import make_motion
+from stereorig.core.matching.kernels.naming import entry, stamp_of
+from stereorig.core.matching.kernels.shape import make_shape
 
 
 def kernel_sources() -> list[Path]:
     """Return the files that the kernels are made of."""
     here = Path(__file__).parent
-    # besides the kernels' own: what their constants and the layout of a lens come from
+    # in addition to the kernels' own files: the sources of their constants and of the layout of a lens
     return [*sorted(here.glob("*.py")), here.parents[1] / "status.py", here.parents[1] / "cameras" / "lens.py"]
 
 
@@ -61,7 +61,7 @@ def _entry(name: str, kernel: Any, stamp: int) -> Any:
 
 
 def _point(*given: Any) -> tuple[int, int]:
-    """Stand for an entry point's kernel, which is found under this name in globals of the entry point's own."""
+    """Placeholder of an entry point's kernel, which is found under this name in globals of the entry point's own."""
     raise NotImplementedError
 
 

@@ -65,12 +65,12 @@ class Given(NamedTuple):
 
 
 class ReferenceSpace(NamedTuple):
-    """Work space of the reference subset, and results of :func:`set_up_reference`.
+    """Work space of the reference subset, and results of ``set_up_reference``.
 
     Raw sums, a vector for the nodes; then node monomials (M, 16), the change of basis (M, M) from monomials of a
-    pixel's position to those of its ray, the middle of the subset's pixels from the point and half its width (3,) px,
-    the sum of each column (2 M,), of f times it (2 M,), and the Gram matrix (2 M, 2 M); gain and offset are projected
-    out of the last two.
+    pixel's position to monomials of its ray, the middle of the subset's pixels from the point and half its width (3,)
+    px, the sum of each column (2 M,), of f times it (2 M,), and the Gram matrix (2 M, 2 M); gain and offset are
+    projected out of the last two.
     """
 
     raw: Any
@@ -86,10 +86,10 @@ class ReferenceSpace(NamedTuple):
 class Subset(NamedTuple):
     """A point's subset in the reference.
 
-    ``inside``: True if it lies in the image and the lens model's domain; the point's ray ``xc, yc``, the weights' sum
-    ``p``, the remaining mean of f, the sum of squares of f about it, the differences of neighbours against it (1 for
-    white noise), the number of pixels that count, and the grey level that is taken off an image before it is first
-    compared: zero unless the mean is so large against the contrast that the sums would lose it.
+    ``inside``: True if it is inside the image and the lens model's domain; the point's ray ``xc, yc``, the weights' sum
+    ``p``, the remaining mean of f, the sum of squares of f about it, the differences of neighbours relative to it (1
+    for white noise), the number of pixels that count, and the grey level that is subtracted from an image before it is
+    first compared: zero unless the mean is so large relative to the contrast that the sums would lose it.
     """
 
     inside: bool

@@ -11,9 +11,9 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from core.matching.kernels.loops import data
-from core.matching.kernels.naming import inner, kernel
-from core.matching.kernels.vectors import DOUBLE, LONG, Vec, at, load, spread, store
+from stereorig.core.matching.kernels.loops import data
+from stereorig.core.matching.kernels.naming import inner, kernel
+from stereorig.core.matching.kernels.vectors import DOUBLE, LONG, Vec, at, load, spread, store
 
 QUAD = 4
 

@@ -1,11 +1,11 @@
 """The loops over a subset's pixels, which take most of the time.
 
-Written in vectors of eight pixels (:mod:`core.matching.kernels.vectors`), because row loads of four taps are two to
-four times faster than the gathers that a compiler makes of the same loop. One image's comparison is one loop that
-stores nothing: position of the pixel (a cubic polynomial in the offsets within the subset), spline value, residual, and
-its sums with the columns of the Jacobian. The positions of the next eight pixels are computed while the taps of these
-eight are loaded, so that no load waits for an address. No bounds are tested here:
-:func:`core.matching.kernels.warp.set_up_warp` proves beforehand that every tap lies inside the padded image.
+Written in vectors of eight pixels (:mod:`stereorig.core.matching.kernels.vectors`), because row loads of four taps are
+two to four times faster than the gathers that a compiler makes of the same loop. One image's comparison is one loop
+that stores nothing: position of the pixel (a cubic polynomial in the offsets within the subset), spline value,
+residual, and its sums with the columns of the Jacobian. The positions of the next eight pixels are computed while the
+taps of these eight are loaded, so that no load waits for an address. No bounds are tested here:
+:func:`stereorig.core.matching.kernels.warp.set_up_warp` proves beforehand that every tap is inside the padded image.
 
 The reference subset is a (6, width) float32 array with the rows X and Y (offsets from the subset's centre over its half
 width, -1 to 1), f (grey levels, mean taken out), weight, and the derivatives of f with respect to the pixel's position
@@ -22,7 +22,19 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from core.matching.kernels.vectors import FLOAT, INT, LANES, LONG, Vec, at, join, load, spread, store, transpose4
+from stereorig.core.matching.kernels.vectors import (
+    FLOAT,
+    INT,
+    LANES,
+    LONG,
+    Vec,
+    at,
+    join,
+    load,
+    spread,
+    store,
+    transpose4,
+)
 
 X, Y, F, WEIGHT, GX, GY = range(6)
 N_ROWS = 6
@@ -161,7 +173,7 @@ def _comparison(order: int, degree: int) -> Any:
         stride
             int64 row length of ``c``.
         warp
-            (22,) float32, see :func:`core.matching.kernels.warp.set_up_warp`.
+            (22,) float32, see :func:`stereorig.core.matching.kernels.warp.set_up_warp`.
         ref
             The reference subset.
         blocks

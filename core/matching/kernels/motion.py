@@ -9,11 +9,11 @@ import math
 
 import numpy as np
 
-from core.matching.kernels.cluster_robust import make_cluster_robust
-from core.matching.kernels.given import FitKernels
-from core.matching.kernels.linear import covariance_of_last, solve
-from core.matching.kernels.naming import kernel
-from core.matching.kernels.noise import (
+from stereorig.core.matching.kernels.cluster_robust import make_cluster_robust
+from stereorig.core.matching.kernels.given import FitKernels
+from stereorig.core.matching.kernels.linear import covariance_of_last, solve
+from stereorig.core.matching.kernels.naming import kernel
+from stereorig.core.matching.kernels.noise import (
     CONTRAST,
     GAIN,
     SHIFT,
@@ -23,7 +23,7 @@ from core.matching.kernels.noise import (
     share_correction,
     unlike_noise,
 )
-from core.matching.kernels.point import (
+from stereorig.core.matching.kernels.point import (
     LOW_TEXTURE,
     NOT_CONVERGED,
     NOT_SEEDED,
@@ -36,18 +36,19 @@ from core.matching.kernels.point import (
     epipolar_shift,
     make_point,
     settled,
+    shortened,
     texture_status,
 )
-from core.matching.kernels.rigid import N_RIGID, nearest_rotation, rigid_chain, rigid_columns, rotate
-from core.matching.kernels.vectors import LANES
-from core.matching.kernels.warp import lens_jacobian
+from stereorig.core.matching.kernels.rigid import N_RIGID, nearest_rotation, rigid_chain, rigid_columns, rotate
+from stereorig.core.matching.kernels.vectors import LANES
+from stereorig.core.matching.kernels.warp import lens_jacobian
 
 
 def n_motion_out(terms: int) -> int:
     """Numbers a point: ``terms`` of w, 3 x ``terms`` of G, e, zncc (3), noise, covariance (25) of (w0, G0, e).
 
-    Then the variance assumed in the covariance where the noise is not known, and last the rate of convergence: the
-    last step's motion over that of the one before, not set after a single step.
+    Then the variance assumed in the covariance if the noise is not known, and last the rate of convergence: the last
+    step's motion over the motion of the step before, not set after a single step.
     """
     return 4 * terms + 32
 
@@ -117,7 +118,7 @@ def make_motion(degree: int) -> FitKernels:
         gradients, weakest = texture(gram)
         if not (seen.white < WHITE and gradients > 1e-6 * f2):
             return LOW_TEXTURE, 0
-        w, step, small = vectors[0], vectors[1], vectors[2]
+        w, step, small, taken = vectors[0], vectors[1], vectors[2], vectors[3]
         total = 0.0
         for j in range(few):
             w[j] = start_w[j]
@@ -143,7 +144,7 @@ def make_motion(degree: int) -> FitKernels:
         e = 0.0
         for k in range(3):
             levels[k, GAIN], levels[k, SHIFT] = 1.0, seen.first_shift
-        moved, previous, last = np.inf, 0.0, np.inf
+        moved, previous, last, share = np.inf, 0.0, np.inf, 1.0
         status = NOT_CONVERGED
         iterations = 0
         while iterations < setting.max_iterations:
@@ -162,9 +163,15 @@ def make_motion(degree: int) -> FitKernels:
                     return result, iterations
                 moved = 0.0
             gradient(equations, rhs, small)
+            back = 0.0
+            for i in range(n):
+                back += small[i] * taken[i]
             solve(normal, small, n)
             motion = moves_of(columns, small, moves)
-            cut = min(1.0, setting.max_step / motion) if motion > 0.0 else 1.0
+            share = shortened(share, back, motion, previous, iterations)
+            cut = min(share, setting.max_step / motion) if motion > 0.0 else 1.0
+            for i in range(n):
+                taken[i] = small[i]
             if few == 3 and rigid:
                 for r in range(unknowns):
                     s = 0.0
@@ -225,7 +232,7 @@ def make_motion(degree: int) -> FitKernels:
         # px: along and across camera 2's epipolar line, and both ways in camera 1's current image
         sigma = max(math.sqrt(covariance[0]) * along, math.sqrt(covariance[24]))
         sigma = max(sigma, math.sqrt(max(covariance[6], covariance[12])) * lens1[1] / G[2, 0])
-        share = setting.slope_noise * variance * p / weakest
-        return texture_status(status, share, sigma, setting.max_sigma, worst), iterations
+        noise_share = setting.slope_noise * variance * p / weakest
+        return texture_status(status, noise_share, sigma, setting.max_sigma, worst), iterations
 
     return FitKernels(motion_point, parts.work_space, *make_cluster_robust(degree, 3, parts, freeze))

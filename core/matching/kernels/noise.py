@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from core.matching.kernels.naming import inner
+from stereorig.core.matching.kernels.naming import inner
 
 # White noise of variance 1 behind a spline, at fraction t between pixels, along one axis: a + b cos(2 pi t), the first
 # two Fourier terms of the sum of the cardinal spline's squares (the third is 0.004 and less)
@@ -15,11 +15,11 @@ ALIKE_SD = 3.0  # comparisons with residuals as similar as this hold noise alone
 UNLIKE = 1.5  # small differences of the views raise residuals by less, and affect the solution less than noise does
 MIN_CORRELATION = 0.05  # valid matches have several times as much
 MAX_NOISE_SHARE = (
-    0.5  # of the squared gradients; a correlation of 0.5 leaves less, and more is noise mistaken for texture
+    0.5  # share of the squared gradients; a correlation of 0.5 leaves less, and more is noise mistaken for texture
 )
 
-# an image's levels; the misfit is the residuals' sum of squares, then the noise of its interpolated grey levels over
-# that of its pixels, and how many of its pixels show what one pixel of the reference shows
+# an image's levels; the misfit is the residuals' sum of squares, followed by the noise of its interpolated grey levels
+# over the noise of its pixels, and the number of its pixels that show one pixel of the reference
 GAIN, SHIFT, ZNCC, CONTRAST, MISFIT, SMOOTHED, DENSITY = range(7)
 N_LEVELS = 7
 
@@ -28,9 +28,9 @@ N_LEVELS = 7
 def joint_weights(levels, variances, images, weights):
     """Inverse covariance of the comparisons' residuals.
 
-    Residual k is (noise of image k) / contrast_k minus the reference's noise, which all share: covariance
-    diag(v_k / (contrast_k^2 density_k)) + v_ref 1 1^T, with the reference's variance first in ``variances``. The noise
-    of an image that shows the subset on more pixels averages out the more.
+    Residual k is (noise of image k) / contrast_k minus the reference's noise, which all share: covariance diag(v_k /
+    (contrast_k^2 density_k)) + v_ref 1 1^T, with the reference's variance first in ``variances``. The noise of an image
+    that shows the subset on more pixels averages out more.
     """
     total = 1.0 / variances[0]
     for k in range(images):
@@ -76,7 +76,7 @@ def interpolated_noise(warp, half, order):
 def noise_from_residuals(levels, images, n, unknowns):
     """Variance of one image's noise at weight one, in reference grey levels squared, from the residuals.
 
-    Of three comparisons the least noisy count: the others' residuals are raised by small differences of the views,
+    The least noisy of three comparisons counts: the others' residuals are raised by small differences of the views,
     which affect the solution less than noise does.
     """
     freedom = max(n - 2.0 - unknowns / images, 1.0)
@@ -95,7 +95,7 @@ def noise_from_residuals(levels, images, n, unknowns):
 
 @inner
 def best_correlation(levels, images):
-    """Of the comparisons, at least ``MIN_CORRELATION``."""
+    """The best correlation of the comparisons, at least ``MIN_CORRELATION``."""
     best = MIN_CORRELATION
     for k in range(images):
         best = max(best, levels[k, ZNCC])
@@ -106,8 +106,8 @@ def best_correlation(levels, images):
 def unlike_noise(levels, images, n, unknowns):
     """Return the variance by which the noisiest image exceeds the estimate of the least noisy comparison.
 
-    Zero where all are alike. The weights assume equal noise of all images. Where one has clearly more (less light,
-    blur, a surface that changed), the variance of the unknowns that depend on it is the mean of its variance and the
+    Zero if all are alike. The weights assume equal noise of all images. If one has clearly more (less light, blur, a
+    surface that changed), the variance of the unknowns that depend on it is the mean of its variance and the
     reference's, as estimated by its own comparison; so the covariance is that of the noisiest comparison. That image's
     contrast is noise in part, so its residuals, brought to the reference's contrast, are smaller than the noise: by its
     correlation over the best one, which gives the effect of the reference's own noise on a correlation.
@@ -130,14 +130,14 @@ def _one_variance(levels, k):
 
 @inner
 def share_correction(texture, variance, p, slope_noise, expected_share):
-    """Factor on the covariance where the subset's gradients hold another share of noise than the image's mean.
+    """Factor on the covariance for a subset whose gradients have another share of noise than the image's mean.
 
     Parameters
     ----------
     texture
         Sum of the squared gradients, mean of both directions.
     variance, p
-        Of the noise, and the sum of the weights.
+        Variance of the noise, and the sum of the weights.
     slope_noise, expected_share
         ``ImageData.slope_noise`` and ``slope_share``.
     """

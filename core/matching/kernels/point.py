@@ -24,11 +24,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from core.matching.kernels.given import Equations, ReferenceSpace, WarpSpace, WorkSpace
-from core.matching.kernels.linear import QUAD, invert3, make_factor, make_product
-from core.matching.kernels.loops import N_WARP, compare_cubic, compare_quintic, monomials
-from core.matching.kernels.naming import inner, kernel
-from core.matching.kernels.noise import (
+from stereorig.core.matching.kernels.given import Equations, ReferenceSpace, WarpSpace, WorkSpace
+from stereorig.core.matching.kernels.linear import QUAD, invert3, make_factor, make_product
+from stereorig.core.matching.kernels.loops import N_WARP, compare_cubic, compare_quintic, monomials
+from stereorig.core.matching.kernels.naming import inner, kernel
+from stereorig.core.matching.kernels.noise import (
     CONTRAST,
     DENSITY,
     GAIN,
@@ -40,9 +40,9 @@ from core.matching.kernels.noise import (
     ZNCC,
     interpolated_noise,
 )
-from core.matching.kernels.reference import make_reference, subset_array
-from core.matching.kernels.warp import N_NODES, lens_jacobian, set_up_warp
-from core.status import PointStatus
+from stereorig.core.matching.kernels.reference import make_reference, subset_array
+from stereorig.core.matching.kernels.warp import N_NODES, lens_jacobian, set_up_warp
+from stereorig.core.status import PointStatus
 
 OK = int(PointStatus.OK)
 OUTSIDE_IMAGE = int(PointStatus.OUTSIDE_IMAGE)
@@ -52,8 +52,10 @@ SINGULAR = int(PointStatus.SINGULAR)
 NOT_SEEDED = int(PointStatus.NOT_SEEDED)
 LOW_CORRELATION = int(PointStatus.LOW_CORRELATION)
 
-REFREEZE_PX = 0.5  # corner motion after which the frozen normal equations are set up anew
-PREDICTED_PX = 0.05  # last corner motion up to which the correlation at its end is predicted, not compared anew
+REFREEZE_PX = 0.5  # corner motion after which the frozen normal equations are computed again
+PREDICTED_PX = 0.05  # last corner motion up to which the correlation at its end is predicted instead of compared again
+STEADY_FROM = 6  # iteration from which a step that passes the minimum shortens the next ones: most points end before
+OVERSHOT = 0.5  # share of the last step that the next one goes back
 FLAT = 1e-6  # squared contrast below which an image has no texture
 WHITE = 0.86  # squared differences of neighbours over twice the variance: one for white noise, which never matches
 
@@ -98,6 +100,18 @@ def settled(motion, previous, tolerance, first_rate):
 
 
 @inner
+def shortened(share, back, motion, previous, iterations):
+    """Share of a step that is made: less after steps that passed the minimum, which ``back`` < 0 shows.
+
+    A reference less sharp than the image promises too little change: each step is up to three times too long, and the
+    next goes back by more. ``motion`` is of the whole step, ``previous`` of what was made of the last one.
+    """
+    if back < 0.0 and iterations >= STEADY_FROM and share * motion > OVERSHOT * previous:
+        return share * previous / (previous + share * motion)
+    return share
+
+
+@inner
 def texture_status(status, share, sigma_px, max_sigma_px, zncc):
     """Final status: converged or not, rejected for noise mistaken for texture or for a large standard deviation."""
     if status == OK and share < MAX_NOISE_SHARE and sigma_px < max_sigma_px:
@@ -116,7 +130,7 @@ def make_sum_pixels(degree: int) -> Any:
 
     @kernel(f"{degree}")
     def sum_pixels(coefficients, order, base, stride, warp, ref, blocks, sums):
-        """See :mod:`core.matching.kernels.loops`."""
+        """See :mod:`stereorig.core.matching.kernels.loops`."""
         if order == 3:
             cubic(coefficients, np.int64(base), np.int64(stride), warp, ref, np.int64(blocks), sums)
         else:

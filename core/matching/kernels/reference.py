@@ -20,11 +20,11 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from core.matching.kernels.given import Subset
-from core.matching.kernels.loops import GX, GY, N_ROWS, WEIGHT, F, X, Y, monomials, sum_reference
-from core.matching.kernels.naming import inner, kernel
-from core.matching.kernels.vectors import LANES, LONG, at, load, store
-from core.matching.kernels.warp import set_up_nodes, undistort
+from stereorig.core.matching.kernels.given import Subset
+from stereorig.core.matching.kernels.loops import GX, GY, N_ROWS, WEIGHT, F, X, Y, monomials, sum_reference
+from stereorig.core.matching.kernels.naming import inner, kernel
+from stereorig.core.matching.kernels.vectors import LANES, LONG, at, load, store
+from stereorig.core.matching.kernels.warp import set_up_nodes, undistort
 
 LARGE_MEAN = 100.0
 """Mean of a subset over its contrast from which on an image's sums start from the mean. A float32 sum of squares has
@@ -121,7 +121,7 @@ def make_reference(degree: int) -> Any:
         Parameters
         ----------
         reference, patches, which
-            As in :class:`core.matching.kernels.given.Given`, of one point.
+            As in :class:`stereorig.core.matching.kernels.given.Given`, of one point.
         lens
             Camera 1's.
         ref
@@ -151,7 +151,7 @@ def make_reference(degree: int) -> Any:
         count = subset * subset
         if patches.shape[0] > 0:
             count = _count_visible(patches, which, subset, weights.shape[0] > 0, ref)
-        mean = np.float32(0.0)  # of a diagonal: only there to keep the sums small
+        mean = np.float32(0.0)  # shift along the diagonal: only there to keep the sums small
         for i in range(subset):
             mean += pixels[top + i, left + i]
         for i in range(subset * subset, ref.shape[1]):  # the last pixel has no right neighbour: it differs by nothing

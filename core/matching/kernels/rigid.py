@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from core.matching.kernels.naming import inner
+from stereorig.core.matching.kernels.naming import inner
 
 N_RIGID = 10
 

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from core.matching.kernels.cluster_robust import make_cluster_robust
-from core.matching.kernels.given import FitKernels
-from core.matching.kernels.linear import covariance_of_last, solve
-from core.matching.kernels.naming import kernel
-from core.matching.kernels.noise import (
+from stereorig.core.matching.kernels.cluster_robust import make_cluster_robust
+from stereorig.core.matching.kernels.given import FitKernels
+from stereorig.core.matching.kernels.linear import covariance_of_last, solve
+from stereorig.core.matching.kernels.naming import kernel
+from stereorig.core.matching.kernels.noise import (
     CONTRAST,
     GAIN,
     SHIFT,
@@ -19,7 +19,7 @@ from core.matching.kernels.noise import (
     noise_from_residuals,
     share_correction,
 )
-from core.matching.kernels.point import (
+from stereorig.core.matching.kernels.point import (
     LOW_TEXTURE,
     NOT_CONVERGED,
     NOT_SEEDED,
@@ -32,10 +32,11 @@ from core.matching.kernels.point import (
     epipolar_shift,
     make_point,
     settled,
+    shortened,
     texture_status,
 )
-from core.matching.kernels.vectors import LANES
-from core.matching.kernels.warp import lens_jacobian
+from stereorig.core.matching.kernels.vectors import LANES
+from stereorig.core.matching.kernels.warp import lens_jacobian
 
 
 def n_shape_out(terms: int) -> int:
@@ -78,7 +79,7 @@ def make_shape(degree: int) -> FitKernels:
         gradients, weakest = texture(gram)
         if not (seen.white < WHITE and gradients > 1e-6 * f2):
             return LOW_TEXTURE, 0
-        w, step, small = vectors[0], vectors[1], vectors[2]
+        w, step, small, taken = vectors[0], vectors[1], vectors[2], vectors[3]
         total = 0.0
         image2 = images[0]
         for i in range(few):
@@ -94,7 +95,7 @@ def make_shape(degree: int) -> FitKernels:
         known = (blocks_of_pixels, p, offset, f2)
         e = 0.0
         levels[0, GAIN], levels[0, SHIFT] = 1.0, seen.first_shift
-        moved, previous, last = np.inf, 0.0, np.inf
+        moved, previous, last, share = np.inf, 0.0, np.inf, 1.0
         status = NOT_CONVERGED
         iterations = 0
         while iterations < setting.max_iterations:
@@ -112,9 +113,15 @@ def make_shape(degree: int) -> FitKernels:
                     return result, iterations
                 moved = 0.0
             gradient(equations, rhs, step)
+            back = 0.0
+            for i in range(n):
+                back += step[i] * taken[i]
             solve(normal, step, n)
             motion = moves_of(columns, step, moves)
-            cut = min(1.0, setting.max_step / motion) if motion > 0.0 else 1.0
+            share = shortened(share, back, motion, previous, iterations)
+            cut = min(share, setting.max_step / motion) if motion > 0.0 else 1.0
+            for i in range(n):
+                taken[i] = step[i]
             for j in range(1, few):
                 w[j] += cut * step[j - 1]
             w[0] += cut * step[few - 1]
@@ -145,7 +152,7 @@ def make_shape(degree: int) -> FitKernels:
         factor_on *= 1.0 if setting.known_noise else variance
         out[few + 3], out[few + 4], out[few + 5] = factor_on * small[0], factor_on * small[1], factor_on * small[3]
         sigma = max(math.sqrt(out[few + 3]) * along, math.sqrt(out[few + 5]))
-        share = setting.slope_noise * variance * p / weakest
-        return texture_status(status, share, sigma, setting.max_sigma, levels[0, ZNCC]), iterations
+        noise_share = setting.slope_noise * variance * p / weakest
+        return texture_status(status, noise_share, sigma, setting.max_sigma, levels[0, ZNCC]), iterations
 
     return FitKernels(shape_point, parts.work_space, *make_cluster_robust(degree, 1, parts, freeze))

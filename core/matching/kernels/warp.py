@@ -1,7 +1,7 @@
 """Geometry of one patch in one image: lens expansion about a point, undistortion, warp set-up with its bounds.
 
 All in double precision, once per image and iteration; the pixel loop gets the float32 result.
-A lens is the flat array of ``LensModel.kernel_parameters``.
+A lens is the flat array of ``LensModel.kernel_parameters``; a thin prism or a tilted sensor make it longer.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from core.cameras.lens import SEIDEL
-from core.matching.image import PAD
-from core.matching.kernels.loops import data, monomials
-from core.matching.kernels.naming import inner, kernel, outer
-from core.matching.kernels.vectors import DOUBLE, LONG, Vec, at, load, spread, store
+from stereorig.core.cameras.lens import N_KERNEL_PARAMETERS, SEIDEL
+from stereorig.core.matching.image import PAD
+from stereorig.core.matching.kernels.loops import data, monomials
+from stereorig.core.matching.kernels.naming import inner, kernel, outer
+from stereorig.core.matching.kernels.vectors import DOUBLE, LONG, Vec, at, load, spread, store
 
 _NEWTON_STEPS = 20
 _BISECTIONS = 30  # to 1e-9 of the branch; Newton's method does the rest
@@ -30,9 +30,9 @@ _BISECTIONS = 30  # to 1e-9 of the branch; Newton's method does the rest
 class LensExpansion(NamedTuple):
     """A lens about a normalised point.
 
-    ``x, y`` (px), what the radial factor changes by with rho = r^2 - r0^2, ``(l1 rho + l2 rho^2 + l3 rho^3) / (1 + d1
-    rho + d2 rho^2 + d3 rho^3)``, and the matrix ``h11, h12, h22`` that acts on the offset besides: radial factor at the
-    centre plus the tangential terms' slopes. The d are zero unless the lens is rational.
+    ``x, y`` (px), change of the radial factor with rho = r^2 - r0^2, ``(l1 rho + l2 rho^2 + l3 rho^3) / (1 + d1 rho +
+    d2 rho^2 + d3 rho^3)``, and the matrix ``h11, h12, h22`` that multiplies the offset in addition: radial factor at
+    the centre plus the tangential terms' slopes. The d are zero unless the lens is rational.
     """
 
     x: float
@@ -120,20 +120,62 @@ def _slopes(lens, near, u, v):
     return lens[1] * a11 + lens[3] * a12, lens[1] * a12 + lens[3] * a22, lens[2] * a12, lens[2] * a22
 
 
+@inner
+def _full_image(lens, u, v):
+    """Compute :func:`image_of` for a lens with a thin prism or a tilted sensor."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = lens[6], lens[7], lens[8], lens[9], lens[10], lens[12], lens[13], lens[14]
+    s1, s2, s3, s4 = lens[15], lens[16], lens[17], lens[18]
+    t0, t1, t2, t3, t4 = lens[19], lens[20], lens[21], lens[22], lens[23]
+    r2 = u * u + v * v
+    over = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    radial = over * (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)))
+    slope = k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2) - radial * (k4 + r2 * (2.0 * k5 + 3.0 * k6 * r2))
+    slope *= 2.0 * over
+    xd = u * radial + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u) + r2 * (s1 + r2 * s2)
+    yd = v * radial + p1 * (r2 + 2.0 * v * v) + 2.0 * p2 * u * v + r2 * (s3 + r2 * s4)
+    of_x, of_y = 2.0 * s1 + 4.0 * s2 * r2, 2.0 * s3 + 4.0 * s4 * r2
+    mixed = u * v * slope + 2.0 * p1 * u + 2.0 * p2 * v
+    a11, a12 = radial + u * u * slope + 2.0 * p1 * v + 6.0 * p2 * u + of_x * u, mixed + of_x * v
+    a21, a22 = mixed + of_y * u, radial + v * v * slope + 6.0 * p1 * v + 2.0 * p2 * u + of_y * v
+    w = 1.0 / (1.0 + t3 * xd + t4 * yd)
+    x, y = t0 * xd * w, (t1 * xd + t2 * yd) * w
+    # slopes of the tilt, then slopes of the pixels
+    b11, b12, b21, b22 = w * (t0 - x * t3), -w * x * t4, w * (t1 - y * t3), w * (t2 - y * t4)
+    j21, j22 = b21 * a11 + b22 * a21, b21 * a12 + b22 * a22
+    j11, j12 = lens[1] * (b11 * a11 + b12 * a21) + lens[3] * j21, lens[1] * (b11 * a12 + b12 * a22) + lens[3] * j22
+    return lens[4] + lens[1] * x + lens[3] * y, lens[5] + lens[2] * y, j11, j12, lens[2] * j21, lens[2] * j22
+
+
 @outer
 def lens_jacobian(lens, u, v):
     """Return d(image px) / d(normalised) at (u, v): the four entries row by row."""
+    if lens.size > N_KERNEL_PARAMETERS:
+        return _full_image(lens, u, v)[2:]
     if is_rational(lens):
         return _slopes(lens, _rational_expansion(lens, u, v), u, v)
     return _slopes(lens, _plain_expansion(lens, u, v), u, v)
 
 
 @inner
-def image_of(lens, u, v):
-    """Return the pixel x, y of a normalised point, and d(image px) / d(normalised) there, row by row."""
-    near = _rational_expansion(lens, u, v) if is_rational(lens) else _plain_expansion(lens, u, v)
+def _rational_image(lens, u, v):
+    near = _rational_expansion(lens, u, v)
     j11, j12, j21, j22 = _slopes(lens, near, u, v)
     return near.x, near.y, j11, j12, j21, j22
+
+
+@inner
+def _plain_image(lens, u, v):
+    near = _plain_expansion(lens, u, v)
+    j11, j12, j21, j22 = _slopes(lens, near, u, v)
+    return near.x, near.y, j11, j12, j21, j22
+
+
+@inner
+def image_of(lens, u, v):
+    """Return the pixel x, y of a normalised point, and d(image px) / d(normalised) there, row by row."""
+    if lens.size > N_KERNEL_PARAMETERS:
+        return _full_image(lens, u, v)
+    return _rational_image(lens, u, v) if is_rational(lens) else _plain_image(lens, u, v)
 
 
 @inner
@@ -155,8 +197,8 @@ def _radially_undistorted(lens, xd, yd):
     return xd * factor, yd * factor
 
 
-def _make_newton(expansion: Any, made_for: str) -> Any:
-    """Compile Newton's method for an expansion's lenses."""
+def _make_newton(image: Any, made_for: str) -> Any:
+    """Compile Newton's method for the lenses of one kind of image."""
 
     @kernel(made_for)
     def newton(lens, x, y, u, v):
@@ -167,9 +209,8 @@ def _make_newton(expansion: Any, made_for: str) -> Any:
                 shrink = 0.999 * math.sqrt(lens[11] / (u * u + v * v))
                 u *= shrink
                 v *= shrink
-            near = expansion(lens, u, v)
-            j11, j12, j21, j22 = _slopes(lens, near, u, v)
-            ex, ey = near.x - x, near.y - y
+            x_now, y_now, j11, j12, j21, j22 = image(lens, u, v)
+            ex, ey = x_now - x, y_now - y
             error = max(abs(ex), abs(ey))
             det = j11 * j22 - j12 * j21
             du = (j22 * ex - j12 * ey) / det
@@ -185,8 +226,9 @@ def _make_newton(expansion: Any, made_for: str) -> Any:
     return newton
 
 
-_plain_newton = _make_newton(_plain_expansion, "plain")
-_rational_newton = _make_newton(_rational_expansion, "rational")
+_plain_newton = _make_newton(_plain_image, "plain")
+_rational_newton = _make_newton(_rational_image, "rational")
+_full_newton = _make_newton(_full_image, "full")
 
 
 @inner
@@ -198,9 +240,20 @@ def undistort(lens, x, y):
         q = 1.0 - 4.0 * lens[6] * (xd * xd + yd * yd)
         factor = 2.0 / (1.0 + math.sqrt(q)) if q > 0.0 else np.nan
         return xd * factor, yd * factor
+    full = lens.size > N_KERNEL_PARAMETERS
+    if full:  # back from the tilted sensor
+        xd /= lens[19]
+        yd = (yd - lens[20] * xd) / lens[21]
+        left = 1.0 - lens[22] * xd - lens[23] * yd
+        if not left > 0.0:
+            return np.nan, np.nan
+        xd, yd = xd / left, yd / left
     if is_rational(lens):  # it may level off or rise to a pole, where Newton's method from afar would leave the branch
-        u, v = _radially_undistorted(lens, xd, yd)
-        return _rational_newton(lens, x, y, u, v)
+        xd, yd = _radially_undistorted(lens, xd, yd)
+        if not full:
+            return _rational_newton(lens, x, y, xd, yd)
+    if full:
+        return _full_newton(lens, x, y, xd, yd)
     return _plain_newton(lens, x, y, xd, yd)
 
 
@@ -289,7 +342,7 @@ def _make_node_rays(rational: bool) -> Any:
 
 
 def _make_set_up_nodes(rational: bool) -> Any:
-    """Compile the nodes' set-up; apart for rational lenses, so that the others do not divide or round otherwise."""
+    """Compile the nodes' set-up, separately for rational lenses: the others need no division and round as before."""
     expansion, node_rays = _rational_expansion if rational else _plain_expansion, _make_node_rays(rational)
 
     @kernel("rational" if rational else "plain")
@@ -314,6 +367,25 @@ def _make_set_up_nodes(rational: bool) -> Any:
     return set_up
 
 
+@inner
+def _set_up_full_nodes(lens, dx, dy, half, xc, yc, q, powers):
+    """Compute the rays of a lens with a thin prism or a tilted sensor, node by node."""
+    x0, y0, j11, j12, j21, j22 = _full_image(lens, xc, yc)
+    det = j11 * j22 - j12 * j21
+    q[16], q[17], q[18], q[19] = j22 / det, -j12 / det, -j21 / det, j11 / det
+    for n in range(N_NODES):
+        x, y = dx + half * NODES[0, n], dy + half * NODES[1, n]
+        u, v = _full_newton(lens, x0 + x, y0 + y, xc + q[16] * x + q[17] * y, yc + q[18] * x + q[19] * y)
+        if math.isnan(u):
+            return False
+        u -= xc
+        v -= yc
+        powers[0, n], powers[1, n], powers[2, n] = 1.0, u, v
+        if powers.shape[0] == 6:
+            powers[3, n], powers[4, n], powers[5, n] = u * u, u * v, v * v
+    return True
+
+
 _set_up_plain_nodes, _set_up_rational_nodes = _make_set_up_nodes(False), _make_set_up_nodes(True)
 
 
@@ -332,7 +404,7 @@ def set_up_nodes(lens, dx, dy, half, xc, yc, q, powers):
     xc, yc
         The point's ray.
     q
-        (25,) work space.
+        (25,) work space; 16 to 19 out: the inverse Jacobian at the point, row by row.
     powers
         (M, 16) out: the monomials of the rays.
 
@@ -341,6 +413,8 @@ def set_up_nodes(lens, dx, dy, half, xc, yc, q, powers):
     bool
         False if the subset leaves the lens model's domain.
     """
+    if lens.size > N_KERNEL_PARAMETERS:
+        return _set_up_full_nodes(lens, dx, dy, half, xc, yc, q, powers)
     if is_rational(lens):
         return _set_up_rational_nodes(lens, dx, dy, half, xc, yc, q, powers)
     return _set_up_plain_nodes(lens, dx, dy, half, xc, yc, q, powers)
@@ -366,6 +440,7 @@ def _polynomials(_typingctx: Any, lens: Any, m: Any, powers: Any, out: Any) -> A
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         lens, matrix, powers, out = (data(context, builder, sig, args, i) for i in range(4))
+        size = builder.extract_value(context.make_array(sig.args[0])(context, builder, args[0]).shape, 0)
         columns = context.make_array(sig.args[1])(context, builder, args[1])
         n_columns = builder.extract_value(columns.shape, 1)
 
@@ -405,6 +480,14 @@ def _polynomials(_typingctx: Any, lens: Any, m: Any, powers: Any, out: Any) -> A
         p1, p2 = if_seidel(0.0, a[8]), if_seidel(0.0, a[9])
         xd = u * radial + 2.0 * p1 * uv + p2 * (3.0 * uu + vv)
         yd = v * radial + 2.0 * p2 * uv + p1 * (uu + 3.0 * vv)
+        on_sensor = [cgutils.alloca_once_value(builder, one.value) for one in (xd, yd)]
+        with builder.if_then(builder.icmp_signed(">", size, size.type(N_KERNEL_PARAMETERS))):
+            s1, s2, s3, s4, t0, t1, t2, t3, t4 = (number(lens, LONG(i)) for i in range(15, 24))
+            xf, yf = xd + r2 * (s1 + r2 * s2), yd + r2 * (s3 + r2 * s4)
+            w = 1.0 / (1.0 + t3 * xf + t4 * yf)
+            for one, value in zip(on_sensor, (t0 * xf * w, (t1 * xf + t2 * yf) * w), strict=True):
+                builder.store(value.value, one)
+        xd, yd = (Vec(builder, builder.load(one)) for one in on_sensor)
         for row, position in enumerate((a[4] + a[1] * xd + a[3] * yd, a[5] + a[2] * yd)):
             total = None
             for n in range(N_NODES):

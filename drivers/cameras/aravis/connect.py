@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
-from core.errors import CameraError
-from drivers.cameras.aravis.device import Device
-from drivers.cameras.aravis.discovery import find
-from drivers.cameras.aravis.gvcp import ControlState, control_state, longest_packet
-from drivers.cameras.aravis.library import aravis
-from drivers.cameras.protocol import CameraOptions
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.aravis.device import AravisDevice
+from stereorig.drivers.cameras.aravis.discovery import find
+from stereorig.drivers.cameras.aravis.library import aravis
+from stereorig.drivers.cameras.genicam.gvcp import ControlState, control_state, longest_packet
+from stereorig.drivers.cameras.protocol import CameraOptions
 
 _PACKET_SIZE = "GevSCPSPacketSize"
 _TEST_PACKET = "GevSCPSFireTestPacket"
 
 
-def connect(device: Device, options: CameraOptions, on_lost: Callable[[], None]) -> None:
+def connect(device: AravisDevice, options: CameraOptions, on_lost: Callable[[], None]) -> None:
     """Open the camera that the options name: by id, serial number, MAC or IP address.
 
     ``on_lost`` is called from a thread of Aravis when a USB3 camera is lost.
@@ -42,7 +43,19 @@ def connect(device: Device, options: CameraOptions, on_lost: Callable[[], None])
                 raise
 
 
-def _ready(device: Device, name: str) -> str:
+@contextlib.contextmanager
+def connected(name: str) -> Iterator[AravisDevice]:
+    """Connect to a camera, by id, serial number, MAC or IP address, for the length of a block; raises as `connect`."""
+    options = CameraOptions(device=name)
+    device = AravisDevice(options, lambda: None)
+    try:
+        connect(device, options, lambda: None)
+        yield device
+    finally:
+        device.drop()
+
+
+def _ready(device: AravisDevice, name: str) -> str:
     """Return the id to open; a camera that cannot be opened is refused here, since Aravis would take 2.5 s for that."""
     if _is_address(name):
         _check_control(device, control_state(name))
@@ -57,7 +70,8 @@ def _ready(device: Device, name: str) -> str:
             raise device.lost("is no camera that answers, by its id, serial number, MAC or IP address")
         state = control_state(camera.address) if camera.address else None
     _check_control(device, state)
-    return camera.id
+    # a name that is no ASCII may be written otherwise here than Aravis has it
+    return camera.id if camera.id.isascii() or not camera.address else camera.address
 
 
 def _is_address(name: str) -> bool:
@@ -68,14 +82,14 @@ def _is_address(name: str) -> bool:
     return True
 
 
-def _check_control(device: Device, state: ControlState | None) -> None:
+def _check_control(device: AravisDevice, state: ControlState | None) -> None:
     if state is ControlState.HELD:
         raise device.busy()
     if state is ControlState.SILENT:
         raise device.lost("does not answer at its address")
 
 
-def _set_packet_size(device: Device, wanted: int | None) -> None:
+def _set_packet_size(device: AravisDevice, wanted: int | None) -> None:
     """Set the size, or else the largest that passes.
 
     A camera that sends no test packets keeps its own size, as long as it fits the network's packets: of divided ones
@@ -84,12 +98,12 @@ def _set_packet_size(device: Device, wanted: int | None) -> None:
     device.ask_camera("gv_set_packet_size_adjustment", aravis().GvPacketSizeAdjustment.NEVER)
     low, high = (int(bound) for bound in device.ask_camera("get_integer_bounds", _PACKET_SIZE))
     step = int(device.ask_camera("get_integer_increment", _PACKET_SIZE))
+    # a test packet may pass in parts, which cost far more than smaller packets
+    high = min(high, longest_packet(device.address()) or high)
     if device.ask_camera("is_feature_available", _TEST_PACKET):
         high = min(high, int(device.ask_camera("gv_auto_packet_size")))
-    else:
-        high = min(high, longest_packet(device.address()) or high)
-        if wanted is None and int(device.ask_camera("gv_get_packet_size")) > high:
-            wanted = high - (high - low) % step
+    if wanted is None and int(device.ask_camera("gv_get_packet_size")) > high:
+        wanted = high - (high - low) % step
     if wanted is None:
         return
     if not low <= wanted <= high or (wanted - low) % step:

@@ -10,14 +10,16 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from core.errors import CameraError
-from drivers.cameras.aravis.library import aravis, glib_error
-from drivers.cameras.protocol import CameraOptions
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.aravis.library import aravis, glib_error, text_of
+from stereorig.drivers.cameras.genicam.errors import RECONNECT, NamedCamera
+from stereorig.drivers.cameras.protocol import CameraOptions
 
-_RECONNECT = "Check its cable and power, then reconnect."
+# errors of these kinds speak of the connection; others of a formula or a text of the camera's description
+_OF_THE_CONNECTION = ("arv-device-error-quark", "g-io-error-quark")
 
 
-class Device:
+class AravisDevice(NamedCamera):
     """A camera that is under our control.
 
     Every call that asks the camera takes about a millisecond, or 2.5 s when it does not answer.
@@ -31,8 +33,7 @@ class Device:
     """
 
     def __init__(self, options: CameraOptions, check: Callable[[], None]) -> None:
-        self.name = options.device
-        self._check = check
+        super().__init__(options.device, check)
         self._camera: Any = None
         self._handle: Any = None
         self._handler: int | None = None
@@ -54,10 +55,9 @@ class Device:
             # without control Aravis opens it all the same, for reading only; letting go of that may take 2.5 s
             threading.Thread(target=self.drop, name=f"release {self.name}", daemon=True).start()
             raise self.busy()
-        self._camera.set_range_check_policy(aravis().RangeCheckPolicy.ENABLE)
         if not self.is_gige:
-            # Of a GigE camera it would come from a thread of Aravis that the handle's end waits for: letting go of the
-            # handle during the signal would let that thread wait for itself, which ends the program.
+            # With a GigE camera the signal comes from a thread of Aravis that the handle's end waits for: releasing the
+            # handle during the signal would make that thread wait for itself, which ends the program.
             self._handler = self._handle.connect("control-lost", lambda _device: on_lost())
         self.stop()  # an acquisition left running by a program that crashed, or a connection that broke
 
@@ -67,7 +67,7 @@ class Device:
         return handle is not None and (not self.is_gige or bool(handle.is_controller()))
 
     def drop(self) -> None:
-        """Release the camera and its control; takes 2.5 s where it does not answer."""
+        """Release the camera and its control; takes 2.5 s if it does not answer."""
         if self._handle is not None and self._handler is not None:
             self._handle.disconnect(self._handler)
             self._handler = None
@@ -124,16 +124,26 @@ class Device:
             except glib_error():  # it is not there, or not under control any more
                 return
 
+    def text(self, method: str, *args: Any) -> str:
+        """Return a text from a method of the device (``ArvDevice``), in any encoding that the maker used."""
+        return text_of(lambda: self.ask(method, *args))
+
     def text_of(self, method: str) -> str:
-        """Return a text about the camera, empty where it has none."""
+        """Return a text about the camera, empty if it has none."""
         self._check()
         try:
-            return str(getattr(self._camera, method)() or "")
+            return text_of(getattr(self._camera, method))
         except glib_error() as error:
             lost = self.translated(error)
             if lost.code != "camera_lost":
                 return ""
             raise lost from None
+
+    def description(self) -> str:
+        """Return the camera's description (GenICam XML)."""
+        xml = self._handle.get_genicam_xml()
+        text = xml[0] if isinstance(xml, tuple) else xml
+        return text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text or "")
 
     def start_stream(self) -> tuple[Any, int]:
         """Return a new stream (``ArvStream``) and the size of its buffers."""
@@ -153,44 +163,23 @@ class Device:
             if error.code in (codes.OUT_OF_RANGE, codes.ENUM_ENTRY_NOT_FOUND):
                 return self.out_of_range(name, value, f"what the camera accepts: {text}")
             return self.unknown(name, f"cannot be used: {text}")
+        if error.domain not in _OF_THE_CONNECTION:
+            # a formula that divides by zero, a register without a length: the cable is not to blame
+            return self.unknown(name or "its description", f"cannot be used: {text}")
         codes = aravis().DeviceError
+        if error.domain == "arv-device-error-quark" and error.code in (
+            codes.GENICAM_NOT_FOUND,
+            codes.INVALID_PARAMETER,
+            codes.PROTOCOL_ERROR_BAD_ALIGNMENT,
+            codes.PROTOCOL_ERROR_BUSY,
+            codes.PROTOCOL_ERROR_INVALID_ADDRESS,
+            codes.PROTOCOL_ERROR_NOT_IMPLEMENTED,
+        ):
+            return self.unknown(name or "its description", f"cannot be used: {text}")
         if error.code in (codes.FEATURE_NOT_FOUND, codes.WRONG_FEATURE):
             return self.unknown(name, f"is not there: {text}")
         if error.code == codes.PROTOCOL_ERROR_ACCESS_DENIED:
             return self.busy() if name is None else self.unknown(name, f"is locked now: {text}")
         if error.code in (codes.PROTOCOL_ERROR_INVALID_PARAMETER, codes.PROTOCOL_ERROR_WRITE_PROTECT):
             return self.out_of_range(name, value, f"what the camera accepts: {text}")
-        return CameraError(f"{self.name}: {text}.", code="camera_lost", remedy=_RECONNECT, camera=self.name)
-
-    def busy(self) -> CameraError:
-        """Return the error of a camera that another program controls."""
-        return CameraError(
-            f"Another program controls {self.name}.",
-            code="camera_busy",
-            remedy="Close the other program, then reconnect; a program that crashed holds a camera for 3 s more.",
-            camera=self.name,
-        )
-
-    def lost(self, why: str) -> CameraError:
-        """Return the error of a camera that cannot be used any more."""
-        return CameraError(f"{self.name} {why}.", code="camera_lost", remedy=_RECONNECT, camera=self.name)
-
-    def out_of_range(self, name: object, value: object, allowed: str) -> CameraError:
-        """Return the error for a value that is refused, with the allowed ones."""
-        return CameraError(
-            f"{self.name} cannot set {name} to {value!r}, only {allowed}.",
-            code="out_of_range",
-            remedy="Give a value as named above.",
-            camera=self.name,
-            setting=str(name),
-        )
-
-    def unknown(self, name: object, why: str) -> CameraError:
-        """Return the error for a feature or setting that the camera does not have."""
-        return CameraError(
-            f"{self.name}: {name} {why}.",
-            code="unknown_feature",
-            remedy="Take one of the names in the camera's description (feature_names), or leave it out.",
-            camera=self.name,
-            setting=str(name),
-        )
+        return CameraError(f"{self.name}: {text}.", code="camera_lost", remedy=RECONNECT, camera=self.name)

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from core.errors import CameraError
-from drivers.cameras.aravis.gvcp import ControlState, control_state
-from drivers.cameras.aravis.library import aravis
-from drivers.cameras.protocol import FoundDevice
+from stereorig.drivers.cameras.aravis.library import aravis, text_of
+from stereorig.drivers.cameras.genicam.errors import several
+from stereorig.drivers.cameras.genicam.gvcp import ControlState, control_state
+from stereorig.drivers.cameras.protocol import FoundDevice
 
 DRIVER = "aravis"
 _GIGE = "GigEVision"
 _PROBLEMS = {
     ControlState.HELD: "Another program or the running service uses it: close that first.",
-    ControlState.SILENT: "It does not answer at its address: give it one in the network of this machine's interface.",
+    ControlState.SILENT: "It does not answer at its address: give it one by stereorig devices --set-address.",
 }
 _EXTRA = ("vendor", "protocol", "physical_id", "manufacturer_info")
 
@@ -35,7 +35,7 @@ def _listed() -> Iterator[ListedCamera]:
     for index in range(int(aravis().get_n_devices())):
 
         def of(name: str, index: int = index) -> str:
-            return str(getattr(aravis(), f"get_device_{name}")(index) or "")
+            return text_of(lambda: getattr(aravis(), f"get_device_{name}")(index))
 
         yield ListedCamera(
             of("id"),
@@ -75,7 +75,7 @@ def discover() -> list[FoundDevice]:
 
 
 def find(name: str) -> ListedCamera | None:
-    """Return the camera of this id, serial number or MAC address in Aravis' present list; None where there is none.
+    """Return the camera of this id, serial number or MAC address in Aravis' present list; None without one.
 
     Raises
     ------
@@ -87,10 +87,5 @@ def find(name: str) -> ListedCamera | None:
         one for one in cameras if name in (one.serial, one.physical_id)
     ]
     if len(found) > 1:
-        raise CameraError(
-            f"Several cameras answer to {name}: {', '.join(one.id for one in found)}.",
-            code="camera_lost",
-            remedy="Name the camera by one of these ids.",
-            camera=name,
-        )
+        raise several(name, (one.id for one in found))
     return found[0] if found else None

@@ -1,16 +1,15 @@
-"""GenICam features of one camera by name: kinds, ranges and increments, and errors in the project's words."""
+"""GenICam features of one camera through Aravis: kinds, values, ranges and increments."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from typing import Any
 
-from drivers.cameras.aravis.device import Device
-from drivers.cameras.aravis.library import aravis
-from drivers.cameras.protocol import FeatureValue
-
-Kind = Literal["command", "enumeration", "boolean", "float", "integer", "string"]
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.aravis.device import AravisDevice
+from stereorig.drivers.cameras.aravis.library import aravis
+from stereorig.drivers.cameras.genicam.features import Bounds, CameraFeatures, Kind
+from stereorig.drivers.cameras.protocol import FeatureValue
 
 # the first class of a node is its kind: an enumeration can be read as an integer as well
 _KINDS: tuple[tuple[str, Kind], ...] = (
@@ -25,16 +24,7 @@ _KINDS: tuple[tuple[str, Kind], ...] = (
 _OUTSIDE_CATEGORIES = ("Gain", "GainRaw", "GainAuto", "ExposureAuto", "BlackLevel", "BlackLevelRaw")
 
 
-@dataclass(frozen=True)
-class Bounds:
-    """Lowest and highest value of a feature and its step; ``step`` is None where any value between will do."""
-
-    low: float
-    high: float
-    step: float | None
-
-
-class Features:
+class AravisFeatures(CameraFeatures):
     """The features of an opened device.
 
     Every call may wait for the camera: about a millisecond for one that answers, 2.5 s for one that does not.
@@ -45,7 +35,8 @@ class Features:
         The camera, connected.
     """
 
-    def __init__(self, device: Device) -> None:
+    def __init__(self, device: AravisDevice) -> None:
+        super().__init__(device)
         self._device = device
         self._kinds: dict[str, Kind | None] = {}
         self.names = self._list_names()
@@ -83,10 +74,6 @@ class Features:
             return False
         return bool(self._device.ask("is_feature_available", name))
 
-    def first(self, *names: str) -> str | None:
-        """Return the first of several names that the camera has."""
-        return next((name for name in names if self.has(name)), None)
-
     def writable(self, name: str) -> bool:
         """Return True if the camera has it and it can be written at all."""
         if not self.has(name):
@@ -114,76 +101,53 @@ class Features:
         if kind == "command":
             raise self._device.unknown(name, "is a command and has no value")
         method = "string" if kind == "enumeration" else kind
-        value = self._device.ask(f"get_{method}_feature_value", name)
         if method == "string":
-            return str(value or "")
+            return self._device.text(f"get_{method}_feature_value", name)
+        value = self._device.ask(f"get_{method}_feature_value", name)
         if method == "boolean":
             return bool(value)
         return int(value) if method == "integer" else float(value)
 
-    def read_number(self, name: str) -> float:
-        """Return the value of an integer or float feature."""
-        value = self.read(name)
-        if isinstance(value, str):
-            raise self._device.unknown(name, "is no number")
-        return float(value)
-
     def entries(self, name: str) -> tuple[str, ...]:
-        """Values that an enumeration can have now."""
-        entries = self._device.ask("dup_available_enumeration_feature_values_as_strings", name)
+        """Return the values that an enumeration can have now."""
+        entries = self._if_given("dup_available_enumeration_feature_values_as_strings", name)
         return tuple(str(entry) for entry in entries or ())
 
+    def is_at(self, name: str, value: FeatureValue) -> bool:
+        """Return True if a feature has a value; two names of an enumeration's one value are the same."""
+        present = self.read(name)
+        if present == value or self.kind(name) != "enumeration":
+            return present == value
+        numbers = {str(entry.get_name()): entry.get_value() for entry in self._device.node(name).get_entries()}
+        return value in numbers and numbers.get(str(present)) == numbers[str(value)]
+
     def bounds(self, name: str) -> Bounds:
-        """Range of an integer or float feature, as the camera has it now."""
-        ask = self._device.ask
-        if self.kind(name) == "integer":
-            low, high = ask("get_integer_feature_bounds", name)
-            return Bounds(int(low), int(high), max(1, int(ask("get_integer_feature_increment", name))))
-        low, high = ask("get_float_feature_bounds", name)
-        step = float(ask("get_float_feature_increment", name))
-        # without an increment Aravis gives the smallest number there is
-        return Bounds(float(low), float(high), step if 1e-300 < step < math.inf else None)
+        """Return the range of an integer or float feature, as the camera has it now.
 
-    def check_value(self, name: str, value: FeatureValue, shown: str | None = None, scale: float = 1.0) -> FeatureValue:
-        """Return the value as the feature takes it, or raise ``out_of_range`` with the allowed values.
-
-        Parameters
-        ----------
-        name, value
-            Feature, and value in the camera's unit.
-        shown, scale
-            For the error text: the setting's name, and the number of the camera's units in one of its units.
+        Aravis takes both ends of a register through the description's formula; behind a formula that neither grows nor
+        falls both come out as the same number, which is no range unless it is the present value.
         """
-        kind = self._known(name)
-        shown = shown or name
-        if kind in ("command", "boolean"):
-            if not isinstance(value, bool):
-                raise self._device.out_of_range(shown, value, "true" if kind == "command" else "true or false")
-            return value
-        if kind == "enumeration":
-            known = self.entries(name)
-            if value not in known:
-                raise self._device.out_of_range(shown, value, "one of " + ", ".join(known))
-            return value
-        if kind == "string":
-            if not isinstance(value, str):
-                raise self._device.out_of_range(shown, value, "text")
-            return value
-        return self._check_number(name, value, shown, scale)
+        method = "integer" if self.kind(name) == "integer" else "float"
+        number = int if method == "integer" else float
+        ends = self._if_given(f"get_{method}_feature_bounds", name)
+        step = self._if_given(f"get_{method}_feature_increment", name)
+        present = self._if_given(f"get_{method}_feature_value", name)
+        low, high = (-math.inf, math.inf) if ends is None else (number(end) for end in ends)
+        if low > high or (low == high and present is not None and present != low):
+            low, high = -math.inf, math.inf
+        if method == "integer":
+            return Bounds(low, high, max(1, int(step or 1)))
+        # without an increment Aravis gives the smallest number there is
+        return Bounds(low, high, None if step is None or not 1e-300 < step < math.inf else float(step))
 
-    def _check_number(self, name: str, value: FeatureValue, shown: str, scale: float) -> FeatureValue:
-        bounds = self.bounds(name)
-        allowed = f"{bounds.low / scale:g} to {bounds.high / scale:g}"
-        if bounds.step is not None and bounds.step != 1:
-            allowed += f" in steps of {bounds.step / scale:g}"
-        given = value if scale == 1.0 or isinstance(value, bool | str) else value / scale
-        if isinstance(value, bool | str) or not bounds.low <= value <= bounds.high:  # NaN is in no range
-            raise self._device.out_of_range(shown, given, allowed)
-        if self.kind(name) == "integer":
-            if value != int(value) or (bounds.step is not None and (int(value) - int(bounds.low)) % int(bounds.step)):
-                raise self._device.out_of_range(shown, given, "whole numbers, " + allowed)
-            return int(value)
-        return float(value)
+    def _if_given(self, method: str, name: str) -> Any:
+        """Return the answer to a question; None if the camera's description does not hold it."""
+        try:
+            return self._device.ask(method, name)
+        except CameraError as error:
+            if error.code != "unknown_feature":
+                raise
+            return None
 
     def write(self, name: str, value: FeatureValue) -> None:
         """Set it; `check_value` first gives the better error texts.
@@ -202,11 +166,3 @@ class Features:
             return
         method = "string" if kind == "enumeration" else kind
         self._device.ask(f"set_{method}_feature_value", name, value)
-
-    def _known(self, name: str) -> Kind:
-        kind = self.kind(name)
-        if kind is None:
-            raise self._device.unknown(name, "is not there")
-        if not self.has(name):
-            raise self._device.unknown(name, "cannot be used now")
-        return kind

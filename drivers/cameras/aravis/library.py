@@ -7,21 +7,21 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import importlib
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import CameraError
+from stereorig.core.errors import CameraError
 
+_VERSIONS = {"Aravis": "0.8", "GLib": "2.0", "GIRepository": "2.0"}
 _INSTALL = (
-    "Install what reaches it: apt install gir1.2-aravis-0.8 libgirepository1.0-dev libcairo2-dev pkg-config gcc "
+    "Install the bindings: apt install gir1.2-aravis-0.8 libgirepository1.0-dev libcairo2-dev pkg-config gcc "
     "python3-dev, then pip install 'stereorig[aravis]'."
 )
 
 
-@functools.cache
 def aravis() -> Any:
     """Return the namespace of Aravis 0.8.
 
@@ -30,25 +30,39 @@ def aravis() -> Any:
     CameraError
         ``driver_missing`` when PyGObject or Aravis is not installed.
     """
-    return _namespace("Aravis", "0.8")
+    return repository().Aravis
 
 
-@functools.cache
 def glib_error() -> type[Exception]:
     """Return the class of the errors that Aravis raises."""
-    error: type[Exception] = _namespace("GLib", "2.0").Error
+    error: type[Exception] = repository().GLib.Error
     return error
 
 
-def _namespace(name: str, version: str) -> Any:
+def text_of(call: Callable[[], Any]) -> str:
+    """Return the text that a function of Aravis gives, empty if none; a maker may have written it in any encoding."""
     try:
-        gi = importlib.import_module("gi")
-        gi.require_version(name, version)
-        return importlib.import_module(f"gi.repository.{name}")
+        return str(call() or "")
+    except UnicodeDecodeError as error:  # GLib's texts should be UTF-8
+        return error.object.decode("latin-1")
+
+
+@functools.cache
+def repository() -> Any:
+    """Return the package of Aravis and of the libraries that it needs."""
+    try:
+        import gi
+
+        for name, version in _VERSIONS.items():
+            gi.require_version(name, version)
+        import gi.repository.Aravis
+        import gi.repository.GIRepository
+        import gi.repository.GLib
     except (ImportError, ValueError) as error:  # ValueError: PyGObject is there, the library is not
         raise CameraError(
             f"The Aravis library cannot be used: {error}.", code="driver_missing", remedy=_INSTALL
         ) from error
+    return gi.repository
 
 
 def buffer_bytes(buffer: Any) -> NDArray[np.uint8]:
@@ -64,9 +78,8 @@ def buffer_bytes(buffer: Any) -> NDArray[np.uint8]:
 @functools.cache
 def _data_of() -> Any:
     # PyGObject's own get_data() copies every frame into a bytes object first
-    aravis()
-    repository = _namespace("GIRepository", "2.0").Repository.get_default()
-    library = ctypes.CDLL(repository.get_shared_library("Aravis").split(",")[0])
+    libraries = repository().GIRepository.Repository.get_default()
+    library = ctypes.CDLL(libraries.get_shared_library("Aravis").split(",")[0])
     function = library.arv_buffer_get_data
     function.argtypes = [ctypes.c_void_p, ctypes.POINTER(ctypes.c_size_t)]
     function.restype = ctypes.c_void_p

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
-from core.errors import CameraError
-from drivers.cameras.aravis.clock import ArrivalClock
-from drivers.cameras.aravis.device import Device
-from drivers.cameras.aravis.library import aravis, buffer_bytes
-from drivers.cameras.pixels import BY_CODE, BY_NAME, PixelFormat, unpack
-from drivers.cameras.protocol import Frame, FrameStatus, Pixels
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.aravis.device import AravisDevice
+from stereorig.drivers.cameras.aravis.library import aravis, buffer_bytes
+from stereorig.drivers.cameras.genicam.errors import unreadable
+from stereorig.drivers.cameras.pixels import BY_CODE, PixelFormat, unpack
+from stereorig.drivers.cameras.protocol import Frame, FrameStatus, Pixels
 
 #: a frame that lacks packets is given up this long after its last one; so frames may come so much later
 RETENTION_S = 0.05
@@ -44,6 +44,62 @@ _INFOS = {
 _PRESENT = ("free_buffers", "waiting_frames")
 
 
+# Between two looks at the clocks (20 ms) the kernel's slewing shifts them by 10 us at most
+_STEP_NS = 2_000_000
+
+
+class ArrivalClock:
+    """Converts Aravis' arrival times, by the wall clock, into times of the monotonic clock.
+
+    The wall clock may be set while frames wait. Such a step shows as a change of the difference between both clocks;
+    frames that had come before it then get the time at which they are taken.
+
+    Parameters
+    ----------
+    wall_ns, steady_ns
+        The clocks, in ns.
+    """
+
+    def __init__(
+        self, wall_ns: Callable[[], int] = time.time_ns, steady_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self._wall_ns = wall_ns
+        self._steady_ns = steady_ns
+        self._difference = self._measure()
+        self._doubtful = 0
+        self._stepped = False
+
+    def _measure(self) -> int:
+        # the thread may be suspended between both readings: the quickest of three counts
+        readings = []
+        for _ in range(3):
+            before = self._steady_ns()
+            wall = self._wall_ns()
+            after = self._steady_ns()
+            readings.append((after - before, wall - (before + after) // 2))
+        return min(readings)[1]
+
+    def watch(self) -> None:
+        """Look at the clocks; to be called often."""
+        difference = self._measure()
+        if abs(difference - self._difference) > _STEP_NS:
+            self._stepped = True
+        self._difference = difference
+
+    def monotonic_ns(self, wall_ns: int, waiting: int) -> int:
+        """Return when a frame arrived, and expect ``waiting`` more that may have come before it was taken."""
+        self.watch()
+        now = self._steady_ns()
+        if self._stepped:
+            self._stepped = False
+            self._doubtful = waiting + 1
+        arrived = wall_ns - self._difference
+        if self._doubtful > 0:
+            self._doubtful -= 1
+            return now
+        return min(arrived, now)
+
+
 class CameraStream:
     """Frames of a camera from arming to disarming.
 
@@ -66,7 +122,7 @@ class CameraStream:
         self._changed = threading.Condition()
         self._stream: Any = None
 
-    def start(self, device: Device, buffers: int) -> None:
+    def start(self, device: AravisDevice, buffers: int) -> None:
         """Let the camera's frames come.
 
         Parameters
@@ -137,11 +193,11 @@ class CameraStream:
             if status == statuses.SUCCESS:
                 code = int(buffer.get_image_pixel_format())
                 if code not in BY_CODE:
-                    return self._unreadable(code)
+                    return unreadable(self._name, code)
                 known = BY_CODE[code]
                 pixels = _pixels(buffer, known)
             return Frame(
-                self._blank(known) if pixels is None else pixels,
+                known.blank(self._width, self._height) if pixels is None else pixels,
                 known.bit_depth,
                 int(buffer.get_frame_id()),
                 # a camera without a clock of its own gives zero
@@ -151,19 +207,6 @@ class CameraStream:
             )
         finally:
             _give_back(stream, buffer)
-
-    def _blank(self, pixel_format: PixelFormat) -> Pixels:
-        if pixel_format.bit_depth <= 8:
-            return np.zeros((self._height, self._width), np.uint8)
-        return np.zeros((self._height, self._width), np.uint16)
-
-    def _unreadable(self, code: int) -> CameraError:
-        return CameraError(
-            f"{self._name} sends pixel format 0x{code:08x}, which is none of {', '.join(BY_NAME)}.",
-            code="frame_format",
-            remedy="Choose a Mono pixel format in the camera's settings.",
-            camera=self._name,
-        )
 
     def statistics(self) -> dict[str, int | float]:
         """Return Aravis' counters; does not ask the camera."""

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import platform
 
-from core.errors import CameraError
-from drivers.cameras.protocol import CameraOptions, FoundDevice, FrameGrabber
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.protocol import CameraOptions, FoundDevice, FrameGrabber
 
 
 def make(options: CameraOptions) -> FrameGrabber:
-    """Make a camera, not yet opened; code ``driver_missing`` where there is no Linux."""
+    """Make a camera, not yet opened; code ``driver_missing`` on systems other than Linux."""
     _require_linux()
-    from drivers.cameras.v4l2.grabber import V4L2Grabber
+    from stereorig.drivers.cameras.v4l2.grabber import V4L2Grabber
 
     return V4L2Grabber(options)
 
 
 def discover() -> list[FoundDevice]:
-    """List the capture devices, also those that cannot be used; code ``driver_missing`` where there is no Linux."""
+    """List the capture devices, also those that cannot be used; code ``driver_missing`` on systems other than Linux."""
     _require_linux()
-    from drivers.cameras.v4l2 import discovery
+    from stereorig.drivers.cameras.v4l2 import discovery
 
     return discovery.discover()
 

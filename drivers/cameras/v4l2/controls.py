@@ -1,4 +1,4 @@
-"""Controls by name: those of a device, their ranges, and their values as set and read back.
+"""Controls of a device by name: their ranges, and their values as set and read back.
 
 V4L2 clamps in silence: a value out of range, off the step or no item of a menu is therefore refused here, before
 anything is written, and each control is read back after it was written.
@@ -10,10 +10,10 @@ import ctypes
 import errno
 from dataclasses import dataclass
 
-from core.errors import CameraError
-from drivers.cameras.protocol import FeatureValue
-from drivers.cameras.v4l2 import structures as v
-from drivers.cameras.v4l2.device import Device
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.protocol import FeatureValue
+from stereorig.drivers.cameras.v4l2 import structures as v
+from stereorig.drivers.cameras.v4l2.device import V4l2Device
 
 _NUMBERS = (v.CTRL_TYPE_INTEGER, v.CTRL_TYPE_INTEGER64, v.CTRL_TYPE_BITMASK)
 _MENUS = (v.CTRL_TYPE_MENU, v.CTRL_TYPE_INTEGER_MENU)
@@ -55,7 +55,7 @@ class Control:
 class Controls:
     """All controls of one device."""
 
-    def __init__(self, device: Device) -> None:
+    def __init__(self, device: V4l2Device) -> None:
         self._device = device
         self._numbers: dict[str, int] = {}
         number = 0
@@ -81,7 +81,7 @@ class Controls:
         return tuple(name for name in self._numbers if self.find(name).settable)
 
     def find(self, name: str) -> Control:
-        """Describe a control as it is now; code ``unknown_feature`` where there is none of this name."""
+        """Describe a control as it is now; code ``unknown_feature`` if there is none of this name."""
         if name not in self._numbers:
             raise CameraError(
                 f"{self._device.path} has no control {name!r}.",
@@ -96,7 +96,7 @@ class Controls:
         return found
 
     def by_number(self, number: int) -> Control | None:
-        """Describe a control by its ``V4L2_CID_`` number; ``None`` where the device has none."""
+        """Describe a control by its ``V4L2_CID_`` number; ``None`` if the device has none."""
         query = v.QueryExtCtrl(id=number)
         try:
             self._device.ioctl(v.VIDIOC_QUERY_EXT_CTRL, query)
@@ -237,7 +237,7 @@ class Controls:
             )
 
     def get(self, control: Control) -> Raw | None:
-        """Read a control's value; ``None`` where it cannot be read."""
+        """Read a control's value; ``None`` if it cannot be read."""
         if control.is_button or control.flags & v.CTRL_FLAG_WRITE_ONLY:
             return None
         try:

@@ -17,14 +17,14 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Self
 
-from core.errors import CameraError
-from drivers.cameras.v4l2 import structures as v
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.v4l2 import structures as v
 
-# The device is not there any more, or its bus says so
+# The device is not there any more, or its bus reports so
 _GONE = {errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN, errno.EIO}
 
 
-class Device:
+class V4l2Device:
     """A video device.
 
     Parameters
@@ -129,7 +129,7 @@ class Device:
             return CameraError(
                 f"There is no {self.path}.",
                 code="camera_lost",
-                remedy="Plug the camera in; `stereorig devices` lists what is there and its stable names.",
+                remedy="Plug the camera in; `stereorig devices` lists the devices and their stable names.",
                 device=self.path,
             )
         return self.fault(error, "be opened")

@@ -6,12 +6,12 @@ import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from core.errors import CameraError
-from drivers.cameras.protocol import FoundDevice
-from drivers.cameras.v4l2 import structures as v
-from drivers.cameras.v4l2.device import Device
-from drivers.cameras.v4l2.picture import Picture
-from drivers.cameras.v4l2.stream import probe_flags
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.protocol import FoundDevice
+from stereorig.drivers.cameras.v4l2 import structures as v
+from stereorig.drivers.cameras.v4l2.device import V4l2Device
+from stereorig.drivers.cameras.v4l2.picture import PictureFormat
+from stereorig.drivers.cameras.v4l2.stream import probe_flags
 
 _SYS = Path("/sys/class/video4linux")
 _LINKS = (Path("/dev/v4l/by-id"), Path("/dev/v4l/by-path"))
@@ -19,7 +19,7 @@ _LINKS = (Path("/dev/v4l/by-id"), Path("/dev/v4l/by-path"))
 
 @dataclass(frozen=True)
 class Identity:
-    """Identity of a device. ``serial`` is the maker's where the bus has it, else the position on the bus."""
+    """Identity of a device. ``serial`` is the maker's if the bus has it, else the position on the bus."""
 
     model: str
     serial: str
@@ -71,7 +71,7 @@ def discover() -> list[FoundDevice]:
 
 def _examined(node: Path) -> FoundDevice | None:
     try:
-        device = Device(str(node)).open()
+        device = V4l2Device(str(node)).open()
     except CameraError as error:
         if error.code == "not_a_camera":
             return None
@@ -98,11 +98,11 @@ def _examined(node: Path) -> FoundDevice | None:
         device.close()
 
 
-def _problem(device: Device) -> str | None:
+def _problem(device: V4l2Device) -> str | None:
     try:
         if not device.capabilities & v.CAP_STREAMING:
             return "It cannot stream into mapped buffers, and this driver reads in no other way. Use another camera."
-        picture = Picture(device)
+        picture = PictureFormat(device)
         if not picture.gray_formats:
             names = ", ".join(name.strip() for name in picture.other_formats()) or "none at all"
             return f"It sends only formats without plain brightness ({names}). Use a camera with a gray or YUV format."

@@ -1,7 +1,7 @@
 """Pixel formats that carry brightness, and their conversion to right-aligned gray values.
 
-Byte layouts are those of the kernel's documentation (luma-only formats, packed and semi-planar YUV). Colour patterns
-(Bayer), RGB and compressed formats are left out on purpose: they do not deliver the measured brightness.
+Byte layouts follow the kernel's documentation (luma-only formats, packed and semi-planar YUV). Colour patterns (Bayer),
+RGB and compressed formats are left out on purpose: they do not deliver the measured brightness.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.cameras.protocol import Pixels
+from stereorig.drivers.cameras.protocol import Pixels
 
 Bytes = NDArray[np.uint8]
 
@@ -35,7 +35,7 @@ class GrayFormat:
     more_rows
         Lines of colour behind the brightness in the same memory, as a part of its own.
     colour
-        True where the sensor's pixels or the device's conversion also carry colour.
+        True if the sensor's pixels or the device's conversion also carry colour.
     """
 
     code: int
@@ -77,7 +77,7 @@ def _fourcc(name: str, *, big_endian: bool = False) -> int:
 
 
 def fourcc_name(code: int) -> str:
-    """Four characters of a format's number, with ``-BE`` where it is marked big-endian."""
+    """Four characters of a format's number, with ``-BE`` if it is marked big-endian."""
     text = (code & 0x7FFF_FFFF).to_bytes(4, "little").decode("ascii", "replace")
     return text + ("-BE" if code >> 31 else "")
 
@@ -175,7 +175,7 @@ def _ipu3_10(lines: Bytes) -> Pixels:
     return out.reshape(rows, -1)
 
 
-#: from the plainest to what must be unpacked or carries colour: the first that fits is taken
+#: from the plainest to those that must be unpacked or carry colour: the first that fits is taken
 GRAY_FORMATS: tuple[GrayFormat, ...] = (
     GrayFormat(_fourcc("GREY"), 8, 1, 1, _bytes),
     GrayFormat(_fourcc("Y10 "), 10, 1, 2, _words),

@@ -1,4 +1,4 @@
-"""The V4L2 camera: `drivers.cameras.protocol.FrameGrabber` over the kernel's own interface."""
+"""The V4L2 camera: `stereorig.drivers.cameras.protocol.FrameGrabber` over the kernel's own interface."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 
-from core.errors import CameraError
-from drivers.cameras.protocol import CameraDescription, CameraOptions, CameraSettings, Frame
-from drivers.cameras.v4l2 import structures as v
-from drivers.cameras.v4l2.controls import Controls
-from drivers.cameras.v4l2.device import Device, closed, not_a_camera
-from drivers.cameras.v4l2.discovery import identity
-from drivers.cameras.v4l2.picture import Picture
-from drivers.cameras.v4l2.settings import Setup
-from drivers.cameras.v4l2.stream import Counts, Stream, clock_of, probe_flags, stamped_at
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.protocol import CameraDescription, CameraOptions, CameraSettings, Frame
+from stereorig.drivers.cameras.v4l2 import structures as v
+from stereorig.drivers.cameras.v4l2.controls import Controls
+from stereorig.drivers.cameras.v4l2.device import V4l2Device, closed, not_a_camera
+from stereorig.drivers.cameras.v4l2.discovery import identity
+from stereorig.drivers.cameras.v4l2.picture import PictureFormat
+from stereorig.drivers.cameras.v4l2.settings import Setup
+from stereorig.drivers.cameras.v4l2.stream import Counts, Stream, clock_of, probe_flags, stamp_error_ms, stamped_at
 
 _COUNTER = (0, 2**32 - 1)
 _PATIENCE_S = 0.5
 
 
 class V4L2Grabber:
-    """One V4L2 camera; see `drivers.cameras.protocol.FrameGrabber`.
+    """One V4L2 camera; see `stereorig.drivers.cameras.protocol.FrameGrabber`.
 
-    Trigger modes: ``free`` always; ``hardware`` and ``software`` only where ``options.trigger_features`` names the
-    controls that bring the device there, since V4L2 has no standard way. Of the features of ``software``, the one
-    button among them is what `trigger` presses; the others are set.
+    Trigger modes: ``free`` always; ``hardware`` and ``software`` only if ``options.trigger_features`` names the
+    controls that bring the device there, since V4L2 has no standard way. The one button among the features of
+    ``software`` is pressed by `trigger`; the others are set.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class V4L2Grabber:
 
     def __init__(self, options: CameraOptions) -> None:
         self._options = options
-        self._device: Device | None = None
+        self._device: V4l2Device | None = None
         self._setup: Setup | None = None
         self._stream: Stream | None = None
         self._counts = Counts()
@@ -56,12 +56,12 @@ class V4L2Grabber:
         """
         if self._device is not None:
             return
-        device = Device(self._options.device).open()
+        device = V4l2Device(self._options.device).open()
         try:
             wanted = v.CAP_VIDEO_CAPTURE | v.CAP_VIDEO_CAPTURE_MPLANE
             if not device.capabilities & wanted or not device.capabilities & v.CAP_STREAMING:
                 raise not_a_camera(device.path, "this node streams no pictures (a camera may have several nodes)")
-            picture = Picture(device)
+            picture = PictureFormat(device)
             if not picture.gray_formats:
                 picture.require_readable(picture.layout())
             self._flags = probe_flags(device, picture)
@@ -73,7 +73,7 @@ class V4L2Grabber:
         self._device = device
 
     @contextmanager
-    def _opened(self) -> Iterator[tuple[Device, Setup]]:
+    def _opened(self) -> Iterator[tuple[V4l2Device, Setup]]:
         device, setup = self._device, self._setup
         if device is None or setup is None:
             raise closed(self._options.device)
@@ -96,6 +96,7 @@ class V4L2Grabber:
                 driver="v4l2",
                 firmware=known.firmware,
                 clock=clock_of(self._flags),
+                clock_error_ms=stamp_error_ms(self._flags),
                 counter_range=_COUNTER,
                 pixel_formats=tuple(one.name for one in setup.picture.gray_formats),
                 feature_names=setup.controls.settable_names,
@@ -103,7 +104,7 @@ class V4L2Grabber:
             )
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
-        """Set what is not ``None`` and read everything back.
+        """Set the values that are not ``None`` and read everything back.
 
         Raises
         ------
@@ -180,7 +181,7 @@ class V4L2Grabber:
             ending.join(_PATIENCE_S)
 
 
-def _end(device: Device, stream: Stream | None) -> None:
+def _end(device: V4l2Device, stream: Stream | None) -> None:
     if stream is not None:
         with suppress(CameraError), device.use():
             stream.stop()

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import TypeVar
 
-from core.errors import CameraError
-from drivers.cameras.v4l2 import structures as v
-from drivers.cameras.v4l2.device import Device
-from drivers.cameras.v4l2.formats import BY_CODE, GRAY_FORMATS, GrayFormat, fourcc_name
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.v4l2 import structures as v
+from stereorig.drivers.cameras.v4l2.device import V4l2Device
+from stereorig.drivers.cameras.v4l2.formats import BY_CODE, GRAY_FORMATS, GrayFormat, fourcc_name
 
 Region = tuple[int, int, int, int]
 _Entry = TypeVar("_Entry", v.FmtDesc, v.FrmSizeEnum, v.FrmIvalEnum)
@@ -29,7 +29,7 @@ _RATE_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True)
-class Layout:
+class FrameLayout:
     """Layout of one frame in memory."""
 
     code: int
@@ -55,14 +55,14 @@ class Rates:
     single: tuple[Fraction, ...] = ()
 
     def holds(self, rate_hz: float) -> bool:
-        """Return True if a rate lies in the range; the device may round it inside."""
+        """Return True if a rate is in the range; the device may round it inside."""
         return self.lowest * (1 - _RATE_TOLERANCE) <= rate_hz <= self.highest * (1 + _RATE_TOLERANCE)
 
 
-class Picture:
+class PictureFormat:
     """Format, region and rate of one device."""
 
-    def __init__(self, device: Device) -> None:
+    def __init__(self, device: V4l2Device) -> None:
         self._device = device
         self._origin = (0, 0)
         self.planar = bool(device.capabilities & v.CAP_VIDEO_CAPTURE_MPLANE)
@@ -91,7 +91,7 @@ class Picture:
         """Names of the formats that cannot be read."""
         return tuple(fourcc_name(code) for code in self.codes if code not in BY_CODE)
 
-    def layout(self) -> Layout:
+    def layout(self) -> FrameLayout:
         """Read the present format."""
         return self._layout(self._format(v.VIDIOC_G_FMT, v.Format(type=self.buffer_type), "say its format"))
 
@@ -102,10 +102,10 @@ class Picture:
             raise self._device.fault(error, action) from error
         return wanted
 
-    def _layout(self, answer: v.Format) -> Layout:
+    def _layout(self, answer: v.Format) -> FrameLayout:
         if self.planar:
             many = answer.fmt.pix_mp
-            return Layout(
+            return FrameLayout(
                 code=many.pixelformat,
                 width=many.width,
                 height=many.height,
@@ -115,7 +115,7 @@ class Picture:
                 quantization=many.quantization,
             )
         one = answer.fmt.pix
-        return Layout(
+        return FrameLayout(
             code=one.pixelformat,
             width=one.width,
             height=one.height,
@@ -135,16 +135,16 @@ class Picture:
             one.pixelformat, one.width, one.height, one.field = code, width, height, v.FIELD_NONE
         return wanted
 
-    def tried(self, code: int, width: int, height: int) -> Layout:
+    def tried(self, code: int, width: int, height: int) -> FrameLayout:
         """Return the format that the device would take, without setting it."""
         return self._layout(self._format(v.VIDIOC_TRY_FMT, self._asking(code, width, height), "try a format"))
 
-    def set(self, code: int, width: int, height: int) -> Layout:
+    def set(self, code: int, width: int, height: int) -> FrameLayout:
         """Set a format and return the one that the device took."""
         return self._layout(self._format(v.VIDIOC_S_FMT, self._asking(code, width, height), "set its format"))
 
     def sizes(self, code: int) -> str:
-        """Sizes that a format comes in, as a text; empty where the device does not list them."""
+        """Sizes that a format comes in, as a text; empty if the device does not list them."""
         found: list[str] = []
         for entry in self._list(v.VIDIOC_ENUM_FRAMESIZES, v.FrmSizeEnum(pixel_format=code)):
             if entry.type == v.FRMSIZE_TYPE_DISCRETE:
@@ -156,7 +156,7 @@ class Picture:
         return ", ".join(found)
 
     def rates(self, code: int, width: int, height: int) -> Rates | None:
-        """Frame rates of a format and size; ``None`` where the device does not list them."""
+        """Frame rates of a format and size; ``None`` if the device does not list them."""
         single: list[Fraction] = []
         for entry in self._list(
             v.VIDIOC_ENUM_FRAMEINTERVALS, v.FrmIvalEnum(pixel_format=code, width=width, height=height)
@@ -172,7 +172,7 @@ class Picture:
         return Rates(float(1 / single[-1]), float(1 / single[0]), tuple(single)) if single else None
 
     def period(self) -> Fraction | None:
-        """Time from frame to frame in s; ``None`` where the device does not report it or has no such setting."""
+        """Time from frame to frame in s; ``None`` if the device does not report it or has no such setting."""
         parm = self._parm()
         if parm is None:
             return None
@@ -206,7 +206,7 @@ class Picture:
             raise self._device.fault(error, f"run at {rate_hz:g} Hz") from error
 
     def bounds(self) -> tuple[int, int] | None:
-        """Width and height that a region may be cut out of; ``None`` where the device cannot cut one."""
+        """Width and height that a region may be cut out of; ``None`` if the device cannot cut one."""
         present = self._selection(v.SEL_TGT_CROP)
         bounds = self._selection(v.SEL_TGT_CROP_BOUNDS)
         if present is None or bounds is None or min(bounds[2:]) < 1:
@@ -217,7 +217,7 @@ class Picture:
         except OSError as error:
             if error.errno != errno.EBUSY:
                 return None
-        if self.layout() != before:  # some choose their format anew with each rectangle
+        if self.layout() != before:  # some change their format with each rectangle
             self.set(before.code, before.width, before.height)
         self._origin = bounds[0], bounds[1]
         return bounds[2], bounds[3]
@@ -259,7 +259,7 @@ class Picture:
         with suppress(OSError):
             self._device.ioctl(v.VIDIOC_REQBUFS, v.RequestBuffers(0, self.buffer_type, v.MEMORY_MMAP))
 
-    def require_readable(self, layout: Layout) -> GrayFormat:
+    def require_readable(self, layout: FrameLayout) -> GrayFormat:
         """Return the reader of a format; code ``frame_format`` when there is none."""
         path = self._device.path
         gray = layout.gray

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from core.errors import CameraError
-from drivers.cameras.protocol import CameraOptions, CameraSettings, FeatureValue
-from drivers.cameras.v4l2 import structures as v
-from drivers.cameras.v4l2.controls import Control, Controls, Raw
-from drivers.cameras.v4l2.device import Device
-from drivers.cameras.v4l2.formats import GrayFormat, find_format
-from drivers.cameras.v4l2.picture import Layout, Picture, Rates, Region
-from drivers.cameras.v4l2.triggers import Triggers
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.protocol import CameraOptions, CameraSettings, FeatureValue
+from stereorig.drivers.cameras.v4l2 import structures as v
+from stereorig.drivers.cameras.v4l2.controls import Control, Controls, Raw
+from stereorig.drivers.cameras.v4l2.device import V4l2Device
+from stereorig.drivers.cameras.v4l2.formats import GrayFormat, find_format
+from stereorig.drivers.cameras.v4l2.picture import FrameLayout, PictureFormat, Rates, Region
+from stereorig.drivers.cameras.v4l2.triggers import Triggers
 
 # V4L2_CID_EXPOSURE_ABSOLUTE counts in 100 us
 _EXPOSURES_PER_MS = 10
@@ -23,7 +23,7 @@ _MANUAL = (v.EXPOSURE_MANUAL, v.EXPOSURE_SHUTTER_PRIORITY)
 
 @dataclass(frozen=True)
 class _Shape:
-    """Format, size and region to come."""
+    """Format, size and region that are to be set."""
 
     gray: GrayFormat
     width: int
@@ -34,7 +34,7 @@ class _Shape:
 class Setup:
     """Settings of one device."""
 
-    def __init__(self, device: Device, picture: Picture, controls: Controls, options: CameraOptions) -> None:
+    def __init__(self, device: V4l2Device, picture: PictureFormat, controls: Controls, options: CameraOptions) -> None:
         self.picture = picture
         self.controls = controls
         self.triggers = Triggers(controls, options)
@@ -44,14 +44,14 @@ class Setup:
         self._armed = False
 
     def image_size(self) -> tuple[int, int]:
-        """Return the whole image: the bounds of a region, or where none can be set, the present format's image."""
+        """Return the whole image: the bounds of a region, or if none can be set, the present format's image."""
         if self._bounds is not None:
             return self._bounds
         layout = self.picture.layout()
         return layout.width, layout.height
 
     def exposure_range(self) -> tuple[float, float] | None:
-        """In ms; ``None`` where the device has no exposure in units of time."""
+        """In ms; ``None`` if the device has no exposure in units of time."""
         control = self._exposure()
         if control is None:
             return None
@@ -164,7 +164,7 @@ class Setup:
             raise self._out_of_range("region_px", settings.region_px, f"inside {columns} x {rows} px")
         return _Shape(gray, width, height, (x0, y0, width, height))
 
-    def _checked_format(self, settings: CameraSettings, layout: Layout) -> GrayFormat:
+    def _checked_format(self, settings: CameraSettings, layout: FrameLayout) -> GrayFormat:
         here = self.picture.gray_formats
         if settings.pixel_format is not None:
             gray = find_format(settings.pixel_format, here)
@@ -187,7 +187,7 @@ class Setup:
         depths = ", ".join(str(depth) for depth in sorted({one.bit_depth for one in here}))
         raise self._out_of_range("bit_depth", settings.bit_depth, depths)
 
-    def _tried_size(self, gray: GrayFormat, width: int, height: int, layout: Layout) -> tuple[int, int]:
+    def _tried_size(self, gray: GrayFormat, width: int, height: int, layout: FrameLayout) -> tuple[int, int]:
         if (gray.code, width, height) == (layout.code, layout.width, layout.height):
             return width, height
         if self._armed:  # even to try a format is a request that a streaming camera may take amiss
@@ -197,7 +197,7 @@ class Setup:
             raise self._out_of_range("pixel_format", gray.name.strip(), "another one: the device does not take it now")
         return tried.width, tried.height
 
-    def _checked_size(self, gray: GrayFormat, width: int, height: int, layout: Layout) -> None:
+    def _checked_size(self, gray: GrayFormat, width: int, height: int, layout: FrameLayout) -> None:
         if self._tried_size(gray, width, height, layout) != (width, height):
             raise self._out_of_range(
                 "pixel_format",
@@ -244,7 +244,7 @@ class Setup:
 
     # -- setting and reading back --------------------------------------------------------------------------------------
 
-    def _has(self, layout: Layout, shape: _Shape) -> bool:
+    def _has(self, layout: FrameLayout, shape: _Shape) -> bool:
         same = (layout.code, layout.width, layout.height) == (shape.gray.code, shape.width, shape.height)
         return same and (shape.region is None or self.picture.crop() == shape.region)
 
@@ -297,7 +297,7 @@ class Setup:
         raw = self.controls.get(control)
         return None if raw is None else int(raw) / _EXPOSURES_PER_MS
 
-    def _region_now(self, layout: Layout) -> Region | None:
+    def _region_now(self, layout: FrameLayout) -> Region | None:
         if self._bounds is None:
             return 0, 0, layout.width, layout.height
         crop = self.picture.crop()

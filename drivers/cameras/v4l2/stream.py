@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.errors import CameraError
-from drivers.cameras.protocol import Frame, FrameStatus
-from drivers.cameras.v4l2 import structures as v
-from drivers.cameras.v4l2.device import Device
-from drivers.cameras.v4l2.picture import Layout, Picture
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.protocol import Frame, FrameStatus
+from stereorig.drivers.cameras.v4l2 import structures as v
+from stereorig.drivers.cameras.v4l2.device import V4l2Device
+from stereorig.drivers.cameras.v4l2.picture import FrameLayout, PictureFormat
 
-# A stamp of the monotonic clock that lies further from the frame's arrival than this is wrong
+# A stamp of the monotonic clock that differs from the frame's arrival by more than this is wrong
 _ODD_STAMP_NS = 1_000_000_000
 _BUSY_S = 0.2
 
@@ -35,7 +35,7 @@ class Counts:
     odd_stamps: int = 0  # more than a second from their arrival
 
 
-def _new_buffer(picture: Picture, index: int) -> v.Buffer:
+def _new_buffer(picture: PictureFormat, index: int) -> v.Buffer:
     buffer = v.Buffer(index=index, type=picture.buffer_type, memory=v.MEMORY_MMAP)
     if picture.planar:
         planes = (v.Plane * v.VIDEO_MAX_PLANES)()
@@ -44,7 +44,7 @@ def _new_buffer(picture: Picture, index: int) -> v.Buffer:
     return buffer
 
 
-def _request(device: Device, picture: Picture, count: int) -> int:
+def _request(device: V4l2Device, picture: PictureFormat, count: int) -> int:
     """Ask for buffers and return their number; waits a moment for a short user of the device, such as `discover`."""
     end = time.monotonic() + _BUSY_S
     while True:
@@ -59,7 +59,7 @@ def _request(device: Device, picture: Picture, count: int) -> int:
             return request.count
 
 
-def probe_flags(device: Device, picture: Picture) -> int:
+def probe_flags(device: V4l2Device, picture: PictureFormat) -> int:
     """Ask for a buffer and give it back; return the clock of the frames' stamps, or raise if another program streams.
 
     Raises
@@ -91,10 +91,17 @@ def stamped_at(flags: int) -> str:
     return "start of exposure" if flags & v.BUF_FLAG_TSTAMP_SRC_MASK == v.BUF_FLAG_TSTAMP_SRC_SOE else "end of frame"
 
 
+def stamp_error_ms(flags: int) -> float:
+    """Largest error of such a stamp: an interrupt's delay; at the end of a frame, the steps of USB's frames too."""
+    return 0.1 if flags & v.BUF_FLAG_TSTAMP_SRC_MASK == v.BUF_FLAG_TSTAMP_SRC_SOE else 1.0
+
+
 class Stream:
     """A running stream of one layout; `stop` may come while another thread is in `take`."""
 
-    def __init__(self, device: Device, picture: Picture, layout: Layout, buffers: int, counts: Counts) -> None:
+    def __init__(
+        self, device: V4l2Device, picture: PictureFormat, layout: FrameLayout, buffers: int, counts: Counts
+    ) -> None:
         self._device = device
         self._picture = picture
         self._layout = layout
@@ -180,7 +187,7 @@ class Stream:
 
     def _broken(self, error: OSError) -> CameraError:
         fault = self._device.fault(error, "deliver frames")
-        if fault.code == "camera_fault":  # in any case, no frame will come of this stream any more
+        if fault.code == "camera_fault":  # in any case, no frame will come from this stream any more
             fault.code = "camera_lost"
         return fault
 
@@ -201,13 +208,13 @@ class Stream:
             counts.short += 1
             status = FrameStatus.INCOMPLETE
         stamp_ns = buffer.timestamp.tv_sec * 1_000_000_000 + buffer.timestamp.tv_usec * 1000
-        if clock_of(buffer.flags) and abs(host_ns - stamp_ns) > _ODD_STAMP_NS:
+        if stamp_ns and clock_of(buffer.flags) and abs(host_ns - stamp_ns) > _ODD_STAMP_NS:
             counts.odd_stamps += 1
         if memory.size < needed:
             memory = np.zeros(needed, np.uint8)
         pixels = gray.pixels(memory, layout.width, layout.height, self._stride)
         if status is not FrameStatus.OK:
-            # missing lines still show those of an older frame
+            # missing lines still show an older frame
             pixels[max(used, 0) // self._stride :] = 0
         elif pixels.dtype == np.uint16 and gray.bit_depth < 16 and int(pixels.max()) >= 1 << gray.bit_depth:
             raise CameraError(

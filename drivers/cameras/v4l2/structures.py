@@ -1,7 +1,7 @@
 """The kernel's V4L2 structures and request numbers, as ``linux/videodev2.h`` lays them out.
 
-Only what the driver uses. Names are the header's, in Python's spelling; their meanings are in the header's comments and
-the kernel's documentation. Sizes and offsets are checked against the header by a C program in the tests.
+Only the parts that the driver uses. Names are the header's, in Python's spelling; their meanings are in the header's
+comments and the kernel's documentation. Sizes and offsets are checked against the header by a C program in the tests.
 """
 
 from __future__ import annotations

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from core.errors import CameraError
-from drivers.cameras.protocol import CameraOptions, FeatureValue, TriggerMode
-from drivers.cameras.v4l2.controls import Control, Controls, Raw
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.protocol import CameraOptions, FeatureValue, TriggerMode
+from stereorig.drivers.cameras.v4l2.controls import Control, Controls, Raw
 
 
 class Triggers:
     """Trigger modes of one device.
 
-    Of the features of ``software``, the one button among them is what `press` presses; the others are set.
+    The one button among the features of ``software`` is pressed by `press`; the others are set.
     """
 
     def __init__(self, controls: Controls, options: CameraOptions) -> None:

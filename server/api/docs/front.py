@@ -1,4 +1,4 @@
-"""The page: files of `server/static`, as they lie there."""
+"""The page: the files of `server/static`, unchanged."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class _Files(StaticFiles):
 
 
 def install(app: FastAPI) -> None:
-    """Serve the page at ``/`` and what it loads below ``/static``."""
+    """Serve the page at ``/`` and its files below ``/static``."""
 
     def index() -> FileResponse:
         return FileResponse(STATIC / "index.html", headers={"Cache-Control": "no-cache"})

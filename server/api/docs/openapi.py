@@ -9,12 +9,12 @@ from typing import Any, TypedDict
 from fastapi.routing import APIRoute
 from pydantic.json_schema import JsonSchemaValue
 
-from server.api.protocol import problems
+from stereorig.server.api.protocol import problems
 
 #: Version of the API, and of the program (pyproject.toml): one number. While it begins with 0, the second number grows
-#: with what breaks clients; what they need not heed is free until the next release
+#: with each change that breaks clients; additions that clients may ignore are free until the next release
 #: (docs/explanation/decisions/0019-api-description.md).
-API_VERSION = "0.2.0"
+API_VERSION = "0.3.0"
 
 _BODY_METHODS = ("post", "put", "patch")
 _BOUNDS = {"ge": "minimum", "le": "maximum", "gt": "exclusiveMinimum", "lt": "exclusiveMaximum"}
@@ -26,7 +26,7 @@ _TAGS = {
     "stage": "Positions of the axes, moves, homing, stop.",
     "noise": "The cameras' noise, measured.",
     "calibrations": "Calibrations: made on the rig, or imported.",
-    "live": "Measurement while a test runs: newest values, streams, channels beside it.",
+    "live": "Measurement while a test runs: newest values, streams, channels.",
     "tests": "Tests and their load steps.",
     "analyses": "Shape and displacement, computed over a test's steps.",
     "certificates": "Verification certificates of the measuring system.",
@@ -36,12 +36,12 @@ _TAGS = {
     "previews": "Previews: 8-bit pictures, and maps over an image; nothing is measured in them.",
 }
 
-#: what a small simulated rig was asked and answered (tests/bench/documents/api_examples.py)
+#: requests and event streams as examples, kept by hand; examples of other answers come from the fields of their models
 EXAMPLES = Path(__file__).with_name("examples.json")
 _BYTES = {"type": "string", "format": "binary"}
 
 _JOB = {"job_id": "$response.body#/job/id"}
-#: where an answer holds what another operation's path asks for
+#: fields of an answer that fill parameters of another operation's path
 _LINKS = {
     "create_test": {"test_id": "$response.body#/id"},
     "list_tests": {"test_id": "$response.body#/tests/0/id"},
@@ -86,7 +86,7 @@ def _without_titles(node: Any) -> Any:
     if not isinstance(node, dict):
         return node
     if node.get("type") in ("integer", "number"):
-        # bounds that stand around a validator come by pydantic's names, which JSON Schema lacks
+        # next to a validator pydantic writes bounds by its own names, which JSON Schema lacks
         node = {_BOUNDS.get(name, name): value for name, value in node.items()}
     return {
         name: value if name in ("example", "examples", "default") else _without_titles(value)
@@ -96,12 +96,12 @@ def _without_titles(node: Any) -> Any:
 
 
 def describe(schema: Part) -> Part:
-    """Complete FastAPI's description: problems in place of its own errors, what the door answers, keys, tags.
+    """Complete FastAPI's description: problems in place of its own errors, the middleware's answers, keys, tags.
 
     Parameters
     ----------
     schema
-        What FastAPI made of the routes.
+        FastAPI's description of the routes.
     """
     schema = dict(_without_titles(schema))
     components = schema.setdefault("components", {})
@@ -113,10 +113,10 @@ def describe(schema: Part) -> Part:
         "key": {"type": "http", "scheme": "bearer", "description": "A key made by `stereorig keys add`."},
         "cookie": {"type": "apiKey", "in": "cookie", "name": "stereorig_session", "description": "See POST /session."},
     }
-    # where none is asked for (loopback), none is needed
+    # {}: without a key, on loopback if the rig file requires none
     schema["security"] = [{}, {"key": []}, {"cookie": []}]
     used = set()
-    examples = json.loads(EXAMPLES.read_text(encoding="utf-8")) if EXAMPLES.exists() else {}
+    examples = json.loads(EXAMPLES.read_text(encoding="utf-8"))
     for path in schema["paths"].values():
         for method, operation in path.items():
             used |= set(operation.get("tags", ()))
@@ -159,7 +159,7 @@ def _sendable(schema: JsonSchemaValue) -> JsonSchemaValue:
 
 
 def _exemplify(operation: Part, examples: Examples) -> None:
-    """Show what was sent and answered; say of other forms that they are text or bytes."""
+    """Add the recorded requests and answers; declare other media types as text or bytes."""
     for media, values in examples.get("requests", {}).items():
         shown = {f"{k}": {"summary": text, "value": value} for k, (text, value) in enumerate(values.items(), 1)}
         operation["requestBody"]["content"][media]["examples"] = shown

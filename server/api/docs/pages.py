@@ -8,7 +8,7 @@ from fastapi import APIRouter
 from fastapi.responses import HTMLResponse
 from starlette.requests import Request
 
-from server.api.docs.shell import page
+from stereorig.server.api.docs.shell import page
 
 router = APIRouter(include_in_schema=False)
 _SWAGGER = """

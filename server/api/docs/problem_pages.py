@@ -12,14 +12,14 @@ from fastapi import APIRouter
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 from starlette.requests import Request
 
-from server.api.docs.shell import page
-from server.base.errors import NotFoundError
+from stereorig.server.api.docs.shell import page
+from stereorig.server.base.errors import NotFoundError
 
 router = APIRouter(include_in_schema=False)
 _LIST = Path(__file__).resolve().parents[2] / "static" / "problems.json"
 _INTRODUCTION = (
     "<p>Every error is <code>problem+json</code> (RFC 9457): the <code>code</code> is stable, <code>detail</code> is "
-    "the cause with the values that disagree, <code>remedy</code> is what can be done. Words in braces stand for "
+    "the cause with the values that disagree, <code>remedy</code> is the advice. Words in braces stand for "
     "values. The command line prints the same codes. The same list as <a href='/problems.json'>JSON</a>.</p>"
 )
 
@@ -63,7 +63,7 @@ def problems_json() -> Response:
 
 @router.get("/problems/{code}")
 def one_problem(request: Request, code: str) -> Response:
-    """Return what a problem's ``type`` points to."""
+    """Return the description of a problem, to which its ``type`` points."""
     problem = known_problems().get(code)
     if problem is None:
         raise NotFoundError(f"There is no problem {code[:60]!r}.", kind="problem", remedy="See /problems.")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 
-from server.formats.version import software_version
+from stereorig.server.formats.version import software_version
 
 _HEAD = (
     "<!doctype html><html lang='en'><meta charset='utf-8'><meta name='viewport' content='width=device-width'>"

@@ -1,7 +1,7 @@
-"""Wire models: what goes over HTTP, apart from what the code works with inside."""
+"""Wire models: the bodies of requests and answers, separate from the program's own types."""
 
-from core.names import CameraName
-from server.api.models.analyses import (
+from stereorig.core.names import CameraName
+from stereorig.server.api.models.analyses import (
     AnalysisAccepted,
     AnalysisList,
     AnalysisReply,
@@ -16,7 +16,7 @@ from server.api.models.analyses import (
     Region,
     StrainRequest,
 )
-from server.api.models.calibrations import (
+from stereorig.server.api.models.calibrations import (
     CalibrationAccepted,
     CalibrationList,
     CalibrationReply,
@@ -26,9 +26,9 @@ from server.api.models.calibrations import (
     ResidualsReply,
     ViewList,
 )
-from server.api.models.jobs import Accepted, JobList, JobProblem, JobReply, JobStepList, Progress
-from server.api.models.noise import NoiseAccepted, NoiseList, NoiseModelReply, NoiseReply, NoiseRequest
-from server.api.models.rig import (
+from stereorig.server.api.models.jobs import Accepted, JobList, JobProblem, JobReply, JobStepList, Progress
+from stereorig.server.api.models.noise import NoiseAccepted, NoiseList, NoiseModelReply, NoiseReply, NoiseRequest
+from stereorig.server.api.models.rig import (
     AxesRequest,
     CameraSet,
     CamerasReply,
@@ -45,10 +45,12 @@ from server.api.models.rig import (
     StageMessages,
     StopReply,
 )
-from server.api.models.tests import (
+from stereorig.server.api.models.tests import (
     BurstAccepted,
     ReadingReply,
     ReadingRequest,
+    RecordAccepted,
+    RecordRequest,
     StepList,
     StepPatch,
     StepReply,
@@ -57,11 +59,10 @@ from server.api.models.tests import (
     TestPatch,
     TestReply,
     TestRequest,
-    WatchReply,
     WatchRequest,
 )
-from server.base.models import Channels, JobState, Label, Number, Reply, Request, Timestamp, utc_text
-from server.rig.description import CameraReply, DynamicsReply, RigReply, SceneReply, StageMessage, StageReply
+from stereorig.server.base.models import Channels, JobState, Label, Number, Reply, Request, Timestamp, utc_text
+from stereorig.server.rig.description import CameraReply, DynamicsReply, RigReply, SceneReply, StageMessage, StageReply
 
 __all__ = [
     "Accepted",
@@ -112,6 +113,8 @@ __all__ = [
     "Progress",
     "ReadingReply",
     "ReadingRequest",
+    "RecordAccepted",
+    "RecordRequest",
     "Region",
     "RepairRequest",
     "Reply",
@@ -136,7 +139,6 @@ __all__ = [
     "TestRequest",
     "Timestamp",
     "ViewList",
-    "WatchReply",
     "WatchRequest",
     "utc_text",
 ]

@@ -9,16 +9,17 @@ from pydantic import ConfigDict, Field, StringConstraints, field_validator, mode
 from pydantic.config import JsonDict
 from pydantic_core import PydanticKnownError
 
-from core import settings
-from core.settings import StoredSettings, disagreement
-from server.api.models.cameras_moved import CameraMotion
-from server.api.models.jobs import Accepted, JobProblem
-from server.api.models.systematic import SystematicTerms
-from server.api.models.tests import AnalysisEntry
-from server.api.models.warnings import AnalysisWarning
-from server.base.json_values import Nested
-from server.base.models import JobState, Label, Listing, Reply, Request, StepNumber, Switch, any_of, given
-from server.formats.gauges.readings import (
+from stereorig.core import settings
+from stereorig.core.settings import StoredSettings, disagreement
+from stereorig.server.api.models.jobs import Accepted, JobProblem
+from stereorig.server.api.models.systematic import SystematicTerms
+from stereorig.server.api.models.tests import AnalysisEntry
+from stereorig.server.api.models.warnings import AnalysisWarning
+from stereorig.server.base.json_values import Nested
+from stereorig.server.base.models import JobState, Label, Listing, Reply, Request, StepNumber, Switch, any_of, given
+from stereorig.server.documents.results import FieldVariable, Probe, Uncertainty
+from stereorig.server.documents.tests import CameraMotion
+from stereorig.server.formats.gauges.readings import (
     AreaReading,
     DifferenceReading,
     ExtensometerReading,
@@ -27,7 +28,7 @@ from server.formats.gauges.readings import (
     PointReading,
     RigidMotionReading,
 )
-from server.results.gauges.request import GaugeRequest
+from stereorig.server.results.gauges.request import GaugeRequest
 
 _FORMS: list[JsonDict] = [given("rectangle"), given("polygon"), given("outlines")]
 
@@ -46,7 +47,7 @@ class Region(settings.Region):
     )
 
     mask_png_base64: Annotated[str, StringConstraints(max_length=20_000_000)] | None = Field(
-        None, description="Image of camera 1's size, white where points may lie."
+        None, description="Image of camera 1's size, white where points are allowed."
     )
 
     @model_validator(mode="after")
@@ -73,14 +74,14 @@ class StrainRequest(settings.StrainSettings):
 
 
 class AnalysisRequest(settings.AnalysisSettings):
-    """Analysis over a test's steps; what it leaves out, a recipe that it names gives."""
+    """Analysis over a test's steps; a named recipe gives the settings that the request leaves out."""
 
     model_config = ConfigDict(json_schema_extra=any_of("region", "recipe"))
 
     recipe: Annotated[str, StringConstraints(min_length=1, max_length=120)] | None = Field(
         None,
-        description="Id or name of a kept recipe, or `workspace`: what is drawn and set for the test. It gives what "
-        "this request leaves out.",
+        description="Id or name of a kept recipe, or `workspace`: the test's drawing and settings. It gives the "
+        "fields that this request leaves out.",
         examples=["r000001-5d0a3f"],
     )
     kind: Literal["profile", "displacement"] = Field(
@@ -92,7 +93,7 @@ class AnalysisRequest(settings.AnalysisSettings):
     calibration_id: Annotated[str, StringConstraints(max_length=40)] | None = Field(
         None,
         description="Calibration to measure with, of which the test keeps a copy; `latest`: the newest one accepted; "
-        "left out: that of the test.",
+        "left out: the test's.",
     )
     noise_id: Annotated[str, StringConstraints(max_length=40)] | None = Field(
         None, description="Noise measurement that weighs the pixels; without it, residuals give the noise."
@@ -105,7 +106,7 @@ class AnalysisRequest(settings.AnalysisSettings):
         default_factory=lambda: StrainRequest.model_validate({}), description="Strain of a displacement; null: none."
     )
     follow: Switch = Field(
-        False, description="Go on with each step of the test as it lands, until the analysis is finished or cancelled."
+        False, description="Measure also each new step of the test, until the analysis is finished or cancelled."
     )
     label: Label = Field("", description="Free text.")
 
@@ -148,7 +149,7 @@ class ContinueRequest(Request):
     """Continuation of an analysis."""
 
     other_version: Switch = Field(
-        False, description="Go on although another version of the program began it: its steps might not agree."
+        False, description="Continue although another version of the program began it: its steps might not agree."
     )
 
 
@@ -180,10 +181,10 @@ class StepFigures(Reply):
     valid_fraction: float | None = Field(None, description="Their share.")
     status: dict[str, int] | None = Field(None, description="Points by status.")
     camera_motion: CameraMotion | None = Field(
-        None, description="Whether a camera moved, by the epipolar offset; null: too few points to tell."
+        None, description="Motion of a camera, by the epipolar offset; null: too few points."
     )
     systematic: SystematicTerms | None = Field(
-        None, description="What no standard uncertainty holds; null: not estimated, by an earlier version."
+        None, description="Errors that no standard uncertainty holds; null: not estimated."
     )
     dense: DenseFigures | None = Field(None, description="Its dense field; null: none was asked for.")
     wall_s: float | None = Field(None, description="Seconds that the step took.")
@@ -200,14 +201,14 @@ class AnalysisSummary(Reply):
 
 
 class AnalysisReply(Reply):
-    """An analysis: its settings, and what is finished."""
+    """An analysis: its settings and its progress."""
 
     id: str = Field(description="Id.")
     test_id: str = Field(description="Its test.")
     kind: Literal["profile", "displacement"] = Field(description="Kind of computation.")
     state: JobState = Field(description="State of its job.")
-    job_id: str | None = Field(None, description="Its job; the last one, where it was continued.")
-    follow: bool = Field(False, description="True if it goes on with each step that lands.")
+    job_id: str | None = Field(None, description="Its job; the last one, if it was continued.")
+    follow: bool = Field(False, description="True if it measures also each new step.")
     n_steps: int = Field(0, description="Number of the steps that it measures.")
     n_finished: int = Field(0, description="Number of the steps whose results can be read now.")
     n_failed: int = Field(0, description="Number of the steps that could not be measured.")
@@ -230,8 +231,7 @@ class AnalysisReply(Reply):
     )
     stale_reasons: list[str] = Field(default_factory=list, description="Inputs that are gone or were replaced.")
     warnings: list[AnalysisWarning] = Field(
-        default_factory=list,
-        description="What must be known before the results are used: failed checks first, each with its remedy.",
+        default_factory=list, description="Warnings about the results: failed checks first, each with its remedy."
     )
 
 
@@ -262,34 +262,6 @@ class AnalysisList(Listing):
     analyses: list[AnalysisEntry] = Field(description="Short entry of each.")
 
 
-class Uncertainty(Reply):
-    """What the uncertainties of an answer are, and what they include."""
-
-    k: float = Field(description="Coverage factor of `expanded`; `sigma` is one standard uncertainty.", examples=[1.0])
-    coverage: float = Field(description="Share of the distribution within k standard uncertainties.", examples=[0.6827])
-    distribution: str = Field(description="The distribution, and the number of degrees of freedom.")
-    includes: list[str] = Field(description="Causes that are included.", examples=[["matching", "calibration"]])
-    not_included: list[str] = Field(
-        description="What is not: `calibration` where its covariance is not known; systematic terms."
-    )
-    text: str = Field(
-        description="The same in one line; `calibration not included` where that is so.",
-        examples=["u (k = 1) includes matching, calibration"],
-    )
-
-
-class FieldVariable(Reply):
-    """A variable of a result."""
-
-    name: str = Field(description="Name.", examples=["w_mm"])
-    units: str = Field(description="Unit.", examples=["mm"])
-    long_name: str = Field(description="Meaning.")
-    dimensions: list[str] = Field(description="Names of its dimensions.", examples=[["row", "col"]])
-    shape: list[int] = Field(description="Length of each dimension.", examples=[[4, 6]])
-    flags: dict[str, str] | None = Field(None, description="Of a status: what each value means.")
-    comparisons: list[str] | None = Field(None, description="Of a correlation: which images its last axis compares.")
-
-
 class FieldList(Reply):
     """The variables of a step's result."""
 
@@ -297,7 +269,7 @@ class FieldList(Reply):
     cuts_px: list[tuple[float, float, float, float]] = Field(
         description="Straight pieces x0, y0, x1, y1 of the cuts, px of camera 1's reference image; empty: none."
     )
-    uncertainty: Uncertainty = Field(description="What the step's uncertainties include.")
+    uncertainty: Uncertainty = Field(description="Terms that the step's uncertainties include.")
     frame: str = Field("", description="Frame of positions, displacements and strain.")
 
 
@@ -310,33 +282,14 @@ class FieldReply(Reply):
     shape: list[int] = Field(description="Rows and columns (and further axes).")
     rows: str = Field("", description="Rows of the grid, start:stop:step.")
     cols: str = Field("", description="Columns of the grid, start:stop:step.")
-    values: Nested = Field(description="Nested rows; null where the point failed.")
-    uncertainty: Uncertainty | None = Field(None, description="What the step's uncertainties include.")
+    values: Nested = Field(description="Nested rows; null if the point failed.")
+    uncertainty: Uncertainty | None = Field(None, description="Terms that the step's uncertainties include.")
 
 
-class ProbeValue(Reply):
-    """A number, or several, of a point."""
-
-    value: float | int | Nested | None = Field(description="The value; null where the point failed.")
-    units: str = Field(description="Its unit; `1` of what has none.", examples=["mm"])
-    sigma: float | None = Field(None, description="Standard uncertainty; null where it is not known.")
-    expanded: float | None = Field(None, description="k times it, where another k than 1 was asked for.")
-    budget: dict[str, float | None] | None = Field(
-        None, description="Standard uncertainty by cause; their squares add up to that of sigma. Null: not known."
-    )
-    not_included: str = Field("", description="`calibration not included` where that is so.")
-
-
-class ProbeReply(Reply):
+class ProbeReply(Probe):
     """Everything known about the measurement point nearest to a pixel."""
 
-    row: int = Field(description="Row of the point.")
-    col: int = Field(description="Column of the point.")
     step: int = Field(description="Step.")
-    distance_px: float = Field(description="Distance of the pixel asked for from the point.")
-    status: str = Field(description="Status of the point.")
-    values: dict[str, ProbeValue] = Field(description="Its numbers, by variable.")
-    uncertainty: Uncertainty = Field(description="What the uncertainties are, and what they include.")
 
 
 class GaugeStep(Reply):
@@ -348,6 +301,9 @@ class GaugeStep(Reply):
     load_n: float | None = Field(None, description="The step's load in newton.")
     time_s: float | None = Field(None, description="Seconds since the reference; null where a time is not known.")
     channels: dict[str, float] = Field(default_factory=dict, description="The step's channels, by name.")
+    channel_u: dict[str, float] = Field(
+        default_factory=dict, description="Standard uncertainty of those that the rig file names."
+    )
     rigid_motion: RigidMotionReading | None = Field(
         None, description="The motion that was taken out, with its covariance."
     )
@@ -356,7 +312,7 @@ class GaugeStep(Reply):
     lines: list[LineReading] = Field(default_factory=list, description="Values along lines; null where missing.")
     areas: list[AreaReading] = Field(default_factory=list, description="Statistics, with the mean's uncertainty.")
     not_told: list[str] = Field(
-        default_factory=list, description="What the budgets do not tell apart, and what they do not include."
+        default_factory=list, description="Causes that the budgets do not separate, and terms that they do not include."
     )
     differences: list[DifferenceReading] = Field(
         default_factory=list, description="From the step of `difference_from`; empty in that step itself."
@@ -383,8 +339,12 @@ class GaugesReply(Reply):
     frame: str = Field(description="Frame of all positions and displacements.")
     subset_px: float = Field(description="Subset of the measurement; determines which pixels neighbours share.")
     smoothing_window: int | None = Field(None, description="Points over which displacements were smoothed.")
-    alignment: FrameReading | None = Field(None, description="The frame that was laid, and its uncertainty.")
-    uncertainty: Uncertainty = Field(description="What the uncertainties are, and what they include in all steps.")
-    channel_units: dict[str, str] = Field(default_factory=dict, description="Unit of each channel, from its name.")
+    alignment: FrameReading | None = Field(None, description="The frame, and its uncertainty.")
+    uncertainty: Uncertainty = Field(
+        description="Meaning of the uncertainties, and the terms that they include in all steps."
+    )
+    channel_units: dict[str, str] = Field(
+        default_factory=dict, description="Unit of each channel: stated by a record, else as its name ends."
+    )
     steps: list[GaugeStep] = Field(description="Readings of each step of the page.")
     next_cursor: str | None = Field(None, description="Send it as `cursor` for the next page; null: that was all.")

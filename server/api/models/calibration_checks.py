@@ -6,11 +6,11 @@ from typing import Annotated, Self
 
 from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
-from core.calibration.checks.distance import MARK_SIGMA_PX
-from core.names import CameraName
-from core.settings import Pixel, Real
-from server.base.models import Reply, Request, StepNumber, one_of
-from server.results.certificate.plan import StatedTarget
+from stereorig.core.calibration.checks.distance import MARK_SIGMA_PX
+from stereorig.core.names import CameraName
+from stereorig.core.settings import Pixel, Real
+from stereorig.server.base.models import Reply, Request, StepNumber, one_of
+from stereorig.server.results.certificate.plan import StatedTarget
 
 Mark = tuple[Pixel, Pixel]
 Positive = Annotated[Real, Field(gt=0.0, le=1e9, allow_inf_nan=False)]
@@ -55,7 +55,7 @@ class DistanceRequest(Request):
 class DistanceReply(Reply):
     """A measured against a known distance; kept with the calibration."""
 
-    measured_mm: float = Field(description="Measured distance; of a target, that of its two outermost points.")
+    measured_mm: float = Field(description="Measured distance; for a target, between its two outermost points.")
     known_mm: float = Field(description="Known distance.")
     ratio: float = Field(description="Measured over known.", examples=[1.00012])
     sigma_mm: float = Field(description="Standard uncertainty of the difference.")
@@ -79,13 +79,13 @@ class DifferenceReply(Reply):
 class ChangeReply(Reply):
     """A difference of the cameras."""
 
-    name: str = Field(description="What it is, its unit at the end.", examples=["relative_orientation_deg"])
+    name: str = Field(description="Name, with its unit at the end.", examples=["relative_orientation_deg"])
     value: float = Field(description="B minus A.")
     sigma: float | None = Field(description="Its standard deviation; null: not known.")
 
 
 class ExplanationReply(Reply):
-    """A cause, and what it leaves unexplained."""
+    """A possible cause, and the disagreement that it leaves unexplained."""
 
     cause: str = Field(
         description="`scale`, `camera_moved`, `focal_length`, `image_centre`, `distortion` or `lens`.",
@@ -115,10 +115,14 @@ class ComparisonReply(Reply):
     scale: DifferenceReply = Field(description="Relative difference of size.")
     epipolar_rms_px: DifferenceReply = Field(description="Rms distance from the other's epipolar lines, camera 2.")
     epipolar_max_px: DifferenceReply = Field(description="Largest of these distances.")
-    chi_square: float | None = Field(description="Of all differences in units of both covariances; null: not known.")
+    chi_square: float | None = Field(description="Chi-square of all differences by both covariances; null: not known.")
     degrees: int | None = Field(description="Its degrees of freedom: the parameters less the frame.")
     probability: float | None = Field(description="Probability of so much by chance.")
     unexplained_px: float = Field(description="Rms image difference that no parameter makes, as of two lens models.")
+    shared: list[str] = Field(
+        description="`target`, `stage`, `aspect`: parts that both declare alike and that are taken for the same; their "
+        "errors cancel."
+    )
     agrees: bool | None = Field(description="Verdict; null where a covariance is not known.")
     changes: ChangesReply = Field(description="What changed.")
     text: str = Field(description="The finding in a sentence.")
@@ -130,7 +134,7 @@ class AspectReply(Reply):
     aspect: float = Field(description="Rows' scale over columns' scale.", examples=[0.9617])
     sigma: float = Field(description="Its standard deviation.")
     images: int = Field(description="Images used.")
-    tilt_rad: float = Field(description="Largest tilt of the grid; an upper bound where the stand-off is not given.")
+    tilt_rad: float = Field(description="Largest tilt of the grid; an upper bound without the stand-off.")
     tilt_sigma_rad: float = Field(description="Its standard deviation.")
     tilt_effect: float = Field(description="The most by which the tilts change the aspect ratio.")
     standoff_known: bool = Field(description="True if the tilt is an angle and no bound.")
@@ -162,7 +166,7 @@ class GeometryReply(Reply):
 
 
 class KeptCheck(Reply):
-    """A check made of a calibration after it was made; its numbers are beside these."""
+    """A check made of a calibration after it was made; the check's own numbers are added to these."""
 
     agrees: bool = Field(description="Its finding.")
     text: str = Field(description="The same in a sentence.")

@@ -7,18 +7,20 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, Field, StringConstraints, with_config
 from typing_extensions import TypedDict
 
-from core.plan.settings import PlannedMeasurement, PlannedRig
-from core.settings import SUBSET_PX, Real, SpacingPx, SubsetPx, Whole
-from server.api.models.analyses import Region
-from server.api.models.calibration_checks import KeptCheck
-from server.api.models.jobs import Accepted, JobProblem
-from server.base.json_values import Nested
-from server.base.models import Label, Listing, Number, Reply, Request, StepNumber
-from server.store.documents import MadeState
+from stereorig.core.plan.settings import PlannedMeasurement, PlannedRig
+from stereorig.core.settings import SUBSET_PX, Real, SpacingPx, SubsetPx, Whole
+from stereorig.drivers.acquisition.simultaneity import SKEW_SOURCES, SkewSource
+from stereorig.drivers.cameras.protocol import CameraIdentity
+from stereorig.server.api.models.analyses import Region
+from stereorig.server.api.models.calibration_checks import KeptCheck
+from stereorig.server.api.models.jobs import Accepted, JobProblem
+from stereorig.server.base.models import Label, Listing, Number, Reply, Request, StepNumber
+from stereorig.server.documents.made import MadeState, Review
+from stereorig.server.documents.results import ViewResiduals
 
 
 class CalibrationRequest(Request):
-    """Plan of a calibration; what is left out comes from the rig file."""
+    """Plan of a calibration; the rig file gives the parts left out."""
 
     positions_mm: list[Number] | None = Field(
         None, description="dZ of the positions that are fitted.", min_length=1, max_length=100
@@ -32,7 +34,7 @@ class CalibrationRequest(Request):
 
 
 class RepairRequest(Request):
-    """Steps from whose speckle the cameras' relative orientation is estimated anew."""
+    """Steps from whose speckle the cameras' relative orientation is estimated again."""
 
     test_id: Annotated[str, StringConstraints(max_length=40)] = Field(
         description="Test that has the steps.", examples=["t000001-0c9f1e"]
@@ -40,9 +42,9 @@ class RepairRequest(Request):
     steps: Annotated[list[StepNumber], Field(min_length=1, max_length=20)] = Field(
         description="Steps taken after the bump; several, at other depths and tilts, make it surer.", examples=[[0, 1]]
     )
-    region: Region | None = Field(None, description="Where points lie in camera 1's images; null: all of them.")
+    region: Region | None = Field(None, description="Region of the points in camera 1's images; null: all.")
     subset_px: SubsetPx = SUBSET_PX.default
-    spacing_px: SpacingPx | None = Field(None, description="Distance of the points; null: as many as tell more.")
+    spacing_px: SpacingPx | None = Field(None, description="Distance of the points; null: as many as add information.")
     max_turn_deg: Annotated[Real, Field(gt=0.0, le=20.0)] = Field(
         5.0, description="A larger turn of one camera against the other is refused."
     )
@@ -59,7 +61,7 @@ class CalibrationAccepted(Accepted):
 
 
 class ExpectRequest(Request):
-    """Plan of a calibration that is only thought about; what is left out comes from the rig file."""
+    """Plan of a calibration that is only predicted; the rig file gives the parts left out."""
 
     positions_mm: list[Number] | None = Field(
         None, description="dZ of the positions that are fitted.", min_length=1, max_length=100, examples=[[0.0, 5.0]]
@@ -75,7 +77,7 @@ class ExpectRequest(Request):
         0.0, description="Turn of the grid in the images; matters where its corners leave them."
     )
     rig: PlannedRig | None = Field(
-        None, description="What differs from the rig file, of a rig that is not there yet; the stage is not asked then."
+        None, description="Differences from the rig file, for a planned rig; the stage is not asked then."
     )
     measurement: PlannedMeasurement | None = Field(
         None, description="The measurement that is planned; null: the defaults of each of its fields."
@@ -133,16 +135,16 @@ class PlannedQuantityReply(Reply):
         description="A point in the middle of the target, a length, the mean over a square, a strain gauge."
     )
     unit: Literal["mm", "1"] = Field(description="Unit of its uncertainty.")
-    size_mm: float | None = Field(description="Of the length, square or gauge; null: a point.")
+    size_mm: float | None = Field(description="Size of the length, square or gauge; null: a point.")
     translation_mm: tuple[float, float, float] | None = Field(
-        description="Of the body since the reference; null: a quantity of its shape."
+        description="Translation of the body since the reference; null: a quantity of its shape."
     )
-    sigma: float | None = Field(description="Standard uncertainty; null where it cannot be told.", examples=[0.0012])
+    sigma: float | None = Field(description="Standard uncertainty; null if it is not known.", examples=[0.0012])
     budget: dict[str, float] = Field(
         description="The same by cause: `matching` (new at each step), `reference` (noise of the reference pair, "
-        "common to all steps), `calibration`, `stage`, `target`; their squares add up. Empty where it cannot be told."
+        "common to all steps), `calibration`, `stage`, `target`; their squares add up. Empty if it is not known."
     )
-    missing: str = Field(description="Why it cannot be told.", examples=[""])
+    missing: str = Field(description="Reason why it is not known.", examples=[""])
 
 
 class ExpectReply(Reply):
@@ -171,22 +173,6 @@ class ReviewRequest(Request):
     note: Label = Field("", description="Reason.")
 
 
-class Review(Reply):
-    """An operator's decision on a calibration."""
-
-    decision: Literal["accepted", "discarded"] = Field(description="The decision.")
-    note: str = Field("", description="Reason.")
-    by: str = Field("", description="Name of the key, or `local`.")
-    decided_utc: str = Field(description="Time of the decision.")
-
-
-class CameraIdentity(Reply):
-    """Which camera took an image."""
-
-    model: str = Field(description="Model.")
-    serial: str = Field(description="Serial number.")
-
-
 class ViewReply(Reply):
     """One view of the target by one camera."""
 
@@ -207,6 +193,8 @@ class ViewReply(Reply):
     frames: int | None = Field(None, description="Frames averaged.")
     full_scale: float | None = Field(None, description="Largest grey level that the image can hold.")
     skew_ms: float | None = Field(None, description="Difference of both cameras' exposures.")
+    skew_uncertainty_ms: float | None = Field(None, description="Largest error of the skew.")
+    skew_source: SkewSource | None = Field(None, description=SKEW_SOURCES)
     file: str = Field(description="Its file in the calibration's folder.", examples=["views/000_cam1.tif"])
     sha256: str = Field(description="Checksum of that file.")
 
@@ -215,23 +203,6 @@ class ViewList(Reply):
     """The views of a calibration."""
 
     views: list[ViewReply] = Field(description="In the order that they were taken; empty until all are.")
-
-
-class ViewResiduals(Reply):
-    """Residuals of one view."""
-
-    name: str = Field(description="Name of the view.", examples=["cam1 dZ 5.000 mm"])
-    camera: int | str = Field(description="Which camera.")
-    dz_mm: float | None = Field(None, description="Travel; null for a free pose.")
-    frame: int | None = Field(None, description="Number of the free pose; null at a stage position.")
-    held_out: bool = Field(description="True if it was kept for the check.")
-    rbe_px: float | None = Field(description="Rms residual.")
-    raz_mm: float | None = Field(description="Rms error in space.")
-    nsce: float | None = Field(description="Normalised stereo calibration error.")
-    found_px: Nested = Field(
-        description="Column and row where each intersection was found: rows of lines of pairs; null: not seen."
-    )
-    residual_px: Nested = Field(description="Measured minus projected position, in the same order.")
 
 
 class ResidualsReply(Reply):
@@ -270,7 +241,7 @@ def _own_verdict(value: object) -> object:
 
 
 class CalibrationReply(Reply):
-    """A calibration: its plan, and once complete everything in calibration.json; what a verdict refused, too."""
+    """A calibration: its plan, and once complete everything in calibration.json; also if a verdict refused it."""
 
     id: str = Field(description="Id.")
     state: MadeState = Field(description="Only `complete` ones can be measured with.")
@@ -287,7 +258,7 @@ class CalibrationReply(Reply):
 
 
 class CalibrationFile(Reply):
-    """calibration.json, which `stereorig measure` reads; its statistics are beside these."""
+    """calibration.json, which `stereorig measure` reads; its statistics are added to these."""
 
     cam1: dict[str, float] | None = Field(None, description="Camera 1: its parameters by name, the unit in the name.")
     cam2: dict[str, float] | None = Field(None, description="Camera 2.")
@@ -321,12 +292,12 @@ class ConversionReply(Reply):
     software: str = Field(description="This program and its version.")
     source: str = Field(description="Format that it was read as.", examples=["calibration_json"])
     source_sha256: str = Field(description="Checksum of calibration.json.")
-    units: str = Field(description="Of the numbers.")
+    units: str = Field(description="Unit of the numbers.")
     frame: Literal["target", "camera 1"] = Field(description="System frame of the file.")
     image_size_px: list[list[int]] | None = Field(description="Width and height of both images; null: not known.")
     exact: bool = Field(description="True if both lenses were carried over to the last digits.")
     lens: dict[str, dict[str, float]] = Field(
-        description="By camera, what is left between both lens models over the image.",
+        description="By camera, the difference of both lens models over the image.",
         examples=[{"cam1": {"rms_px": 0.016, "max_px": 0.065}, "cam2": {"rms_px": 0.013, "max_px": 0.051}}],
     )
     read_back: dict[str, float | int | None] = Field(

@@ -6,9 +6,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from core.settings import Real, Whole
-from server.api.models.jobs import JobProblem
-from server.base.models import Label, Reply, Request, Switch
+from stereorig.core.settings import Real, Whole
+from stereorig.server.api.models.jobs import JobProblem
+from stereorig.server.base.models import Label, Reply, Request, Switch
 
 
 class GuideRequest(Request):
@@ -45,13 +45,13 @@ class SeenTarget(Reply):
 
 
 class LiveLook(Reply):
-    """What the newest live pair shows."""
+    """Findings of the newest live pair."""
 
     cameras: dict[str, SeenTarget] = Field(description="By camera.")
-    seen: bool = Field(description="True where both cameras show the target.")
-    still: bool = Field(description="True where it has not moved since the pair before.")
+    seen: bool = Field(description="True if both cameras show the target.")
+    still: bool = Field(description="True if it has not moved since the pair before.")
     moved_px: float | None = Field(description="Median move of its points since then; null: not known.")
-    new: bool = Field(description="True where its pose differs enough from every view taken.")
+    new: bool = Field(description="True if its pose differs enough from every view taken.")
     like_view: int | None = Field(description="The view that it is most like; null: none.")
     difference: float | None = Field(description="Difference from that view; 1 and more is new.")
 
@@ -81,7 +81,7 @@ class GuideProposal(Reply):
 
 
 class GuideCoverage(Reply):
-    """What the views taken cover."""
+    """Cover of the image and of poses by the views taken."""
 
     cells: dict[str, list[list[int]]] = Field(description="By camera, points seen in each of 6 rows of 8 cells.")
     share: dict[str, float] = Field(description="By camera, share of the cells with points.")
@@ -99,19 +99,19 @@ class LeftOut(Reply):
 
 
 class GuidanceReply(Reply):
-    """What the views taken say."""
+    """Findings from the views taken."""
 
     taken: int = Field(description="Views on disk.")
     used: int = Field(description="Of these, with the target found by both cameras and fitting the others.")
     left_out: list[LeftOut] = Field(description="The others.")
-    coverage: GuideCoverage = Field(description="What they cover.")
+    coverage: GuideCoverage = Field(description="Cover of images and poses.")
     adjusted: bool = Field(description="False while they are too few: uncertainties then come from nominal lenses.")
     reason: str = Field(description="Why there is no adjustment.")
     lens: str = Field(description="Lens model so far.", examples=["paper"])
     uncertainty: GuideUncertainty | None = Field(description="By the views taken; null: not determined.")
     reached: bool = Field(description="True once the goal is met.")
     text: str = Field(
-        description="What to do next, in a sentence.",
+        description="Next thing to do, in a sentence.",
         examples=["Hold it nearer, tilted to the left: the uncertainty of Z at your specimen goes from 2.1 to 1.4 um."],
     )
     proposal: GuideProposal | None = Field(description="The next view; null: none would be seen whole.")
@@ -130,5 +130,5 @@ class GuideReply(Reply):
     automatic: bool = Field(description="True if views are taken by themselves.")
     rate_hz: float | None = Field(description="Live pairs looked at in a second; null: none yet.")
     looks: int = Field(description="Live pairs looked at.")
-    live: LiveLook | None = Field(description="The newest one; null where the acquisition has ended or just begins.")
-    guidance: GuidanceReply | None = Field(description="What the views say; null until it is known first.")
+    live: LiveLook | None = Field(description="The newest one; null if the acquisition has ended or just begins.")
+    guidance: GuidanceReply | None = Field(description="Findings from the views; null until they are known first.")

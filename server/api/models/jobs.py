@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from server.base.models import Listing, Reply
-from server.base.problem import JobProblem
-from server.store.documents import JobRecord, Progress
+from stereorig.server.base.models import Listing, Reply
+from stereorig.server.base.problem import JobProblem
+from stereorig.server.documents.jobs import JobRecord, Progress
 
 __all__ = ["Accepted", "JobList", "JobProblem", "JobReply", "Progress"]
 

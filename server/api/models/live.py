@@ -6,20 +6,21 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints
 
-from server.api.models.jobs import JobProblem
-from server.base.models import Channels, Number, Reply, Request, Switch
-from server.results.gauges.request import Name, Variable
+from stereorig.drivers.acquisition.simultaneity import SKEW_SOURCES, SkewSource
+from stereorig.server.api.models.jobs import JobProblem
+from stereorig.server.base.models import Channels, Number, Reply, Request, Switch
+from stereorig.server.results.gauges.request import Name, Variable
 
 
 class LiveNumber(Reply):
     """A number with its standard uncertainty."""
 
     value: float = Field(description="The value.")
-    u: float | None = Field(description="Standard uncertainty (k = 1); null where it is not known.")
+    u: float | None = Field(description="Standard uncertainty (k = 1); null if it is not known.")
     u_calibration: float | None = Field(description="The calibration's part of it; null: not known, and not included.")
     budget: dict[str, float] = Field(
         default_factory=dict,
-        description="`u` by where it comes from; the squares add up. `matching` holds the reference's noise too.",
+        description="`u` by cause; the squares add up. `matching` holds the reference's noise too.",
     )
     units: str = Field(description="Unit; `1` of a number without one.")
 
@@ -27,27 +28,29 @@ class LiveNumber(Reply):
 class LiveGaugeReply(Reply):
     """A gauge in one frame."""
 
-    kind: Literal["point", "extensometer", "area"] = Field(description="What it is.")
-    valid: bool = Field(description="False where it has no values that hold.")
+    kind: Literal["point", "extensometer", "area"] = Field(description="Kind of gauge.")
+    valid: bool = Field(description="False if it has no valid values.")
     reason: str = Field(
         description="Why: the status of a point that it needs, `cut`, `occluded`, `silence`, a camera's or frame's "
-        "error code; empty where it is valid."
+        "error code; empty if it is valid."
     )
-    values: dict[str, LiveNumber] = Field(description="By quantity; empty where it is not valid.")
+    values: dict[str, LiveNumber] = Field(description="By quantity; empty if it is not valid.")
 
 
 class LiveValues(Reply):
     """The values of one frame."""
 
     number: int = Field(description="Number of the measured frame, from 1; 0 before the first.")
-    valid: bool = Field(description="False where the newest frame, or its absence, leaves no values that hold.")
-    reason: str = Field(description="Why; empty where they are valid.")
+    valid: bool = Field(description="False if the newest frame, or its absence, leaves no valid values.")
+    reason: str = Field(description="Reason; empty if they are valid.")
     time_s: float | None = Field(
         None, description="Beginning of camera 1's exposure on the host's monotonic clock, which channels refer to."
     )
     device_time_s: float | None = Field(None, description="The same on camera 1's own clock.")
     exposed_utc: str | None = Field(None, description="The same in UTC.")
-    skew_ms: float | None = Field(None, description="Beginning of camera 2's exposure minus that of camera 1.")
+    skew_ms: float | None = Field(None, description="Beginning of camera 2's exposure minus camera 1's.")
+    skew_uncertainty_ms: float | None = Field(None, description="Largest error of the skew.")
+    skew_source: SkewSource | None = Field(None, description=SKEW_SOURCES)
     how: Literal["followed", "step"] | None = Field(
         None, description="`followed` from the frames before, or measured as a `step` is, with all its checks."
     )
@@ -85,19 +88,22 @@ class LiveLine(Reply):
     values: int = Field(description="Lines that had a value.")
     unreadable: int = Field(description="Lines that had none.")
     losses: int = Field(description="Times that the open line was lost.")
-    reason: str = Field(description="Why it is not `reading`; empty where it is.")
+    reason: str = Field(description="Reason why it is not `reading`; empty if it is.")
 
 
 class LiveChannel(Reply):
     """A channel whose readings were sent, or are read from a line."""
 
-    unit: str = Field("", description="Its unit, where the rig file has one.")
-    line: LiveLine | None = Field(None, description="Of a channel that the rig file names; null of one that is posted.")
+    unit: str = Field("", description="Its unit, if the rig file has one.")
+    line: LiveLine | None = Field(None, description="Line of a channel that the rig file names; null for a posted one.")
     readings: int = Field(0, description="Readings that are kept.")
     last_time_s: float | None = Field(
-        None, description="Time of the last one, by the channel's clock: of a line, that of its arrival here."
+        None, description="Time of the last one, by the channel's clock; for a line the time of its arrival."
     )
     last_value: float | None = Field(None, description="Its value.")
+    fault: str = Field(
+        "", description="Why its readings cannot be believed: stuck, or another channel's; mostly empty."
+    )
     offset_s: float = Field(0.0, description="Added to the channel's times; 0 before it was aligned.")
     offset_u_s: float | None = Field(None, description="Standard uncertainty of that; null before it was aligned.")
 
@@ -114,7 +120,7 @@ class LiveReply(Reply):
     problem: JobProblem | None = Field(None, description="Why it failed.")
     reference_points: int | None = Field(None, description="Points that the reference has; null before it is measured.")
     values: LiveValues = Field(description="The newest values.")
-    account: LiveAccount = Field(description="What became of the frames.")
+    account: LiveAccount = Field(description="Counters of the frames by their fate.")
     channels: dict[str, LiveChannel] = Field(description="Channels by name.")
     tcp_port: int | None = Field(None, description="Port of the line protocol; null while it is off.")
 
@@ -158,13 +164,15 @@ class LiveReading(Request):
 
 
 class LiveReadings(Request):
-    """Readings of channels beside a live measurement."""
+    """Readings of channels for a live measurement."""
 
-    readings: list[LiveReading] = Field(description="In the order of their times.", min_length=1, max_length=5000)
+    readings: list[LiveReading] = Field(
+        description="In the order of their times.", min_length=1, max_length=5000, fail_fast=True
+    )
 
 
 class LiveReadingsReply(Reply):
-    """What came of readings."""
+    """Number of readings that were taken."""
 
     taken: int = Field(description="Values that were taken.")
 

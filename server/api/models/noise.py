@@ -7,16 +7,21 @@ from typing import Annotated
 from pydantic import Field, with_config
 from typing_extensions import TypedDict
 
-from core.settings import Whole
-from server.api.models.jobs import Accepted, JobProblem
-from server.base.models import Label, Listing, Reply, Request
-from server.store.documents import MadeState
+from stereorig.core.settings import Whole
+from stereorig.server.api.models.jobs import Accepted, JobProblem
+from stereorig.server.base.models import Label, Listing, Reply, Request
+from stereorig.server.documents.made import MadeState
 
 
 class NoiseRequest(Request):
     """Measurement of the cameras' noise."""
 
     frames: Annotated[Whole, Field(ge=2, le=200)] = Field(16, description="Pairs of frames; the scene must be at rest.")
+    even: bool = Field(
+        False,
+        description="The cameras see an even field (a diffuser, far out of focus): a map of each sensor's fixed "
+        "pattern and defective pixels is measured too, and taken off images that are measured with this `noise_id`.",
+    )
     label: Label = Field("", description="Free text.")
 
 
@@ -24,6 +29,13 @@ class NoiseAccepted(Accepted):
     """A noise measurement was begun."""
 
     noise_id: str = Field(description="Id of the noise measurement.", examples=["n000001-5b1c22"])
+
+
+class SensorReply(Reply):
+    """The map of a sensor in two numbers; noise.json has all of it."""
+
+    pattern_sd_grey: float = Field(description="Standard deviation of its fixed pattern, grey levels.")
+    defective_pixels: int = Field(description="Number of its defective pixels.")
 
 
 class NoiseModelReply(Reply):
@@ -36,6 +48,7 @@ class NoiseModelReply(Reply):
     misfit: float = Field(description="Scatter of the bins about it, in their own sd; 1 is chance.")
     drift: float = Field(description="Largest relative change of brightness between frames; taken out.")
     shift_px: float = Field(description="Largest motion of the image between frames; taken out.")
+    sensor: SensorReply | None = Field(None, description="Its fixed pattern; null: not measured.")
 
 
 class NoiseFile(Reply):

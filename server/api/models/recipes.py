@@ -1,4 +1,4 @@
-"""Recipes: what is drawn and set for a test, as one document that any other test can take.
+"""Recipes: drawing and settings of a test, as one document that any other test can take.
 
 The same document is a test's workspace, a kept template, and the file of ``stereorig measure --recipe``.
 """
@@ -11,18 +11,18 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, JsonValue, StringConstraints, ValidationError, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
-from core import settings
-from core.errors import InputError, RegionError
-from core.settings import Whole
-from server.api.models.analyses import Region, StrainRequest
-from server.base.models import ON_ONE_LINE, Label, Listing, Number, Reply, Request, Switch
-from server.results.gauges.request import GaugeRequest
-from server.wording import problems_in
+from stereorig.core import settings
+from stereorig.core.errors import InputError, RegionError
+from stereorig.core.settings import Whole
+from stereorig.server.api.models.analyses import Region, StrainRequest
+from stereorig.server.base.models import ON_ONE_LINE, Label, Listing, Number, Reply, Request, Switch
+from stereorig.server.results.gauges.request import GaugeRequest
+from stereorig.server.wording import problems_in
 
 #: version of the document; a step means that earlier programs cannot read it
 RECIPE_VERSION = 1
 RECIPE_FORMAT: Literal["stereorig recipe"] = "stereorig recipe"
-#: in place of a recipe's name: what is drawn for the test itself
+#: in place of a recipe's name: the test's own drawing and settings
 WORKSPACE = "workspace"
 Side = Annotated[Whole, Field(ge=1, le=65_536)]
 Percent = Annotated[Number, Field(ge=0.0, le=100.0)]
@@ -45,7 +45,7 @@ class RecipeSettings(settings.AnalysisSettings):
 
 
 class Display(Request):
-    """How fields are shown."""
+    """Settings of the display of fields."""
 
     field: Annotated[str, StringConstraints(max_length=80)] | None = Field(None, description="The field.")
     colours: Annotated[str, StringConstraints(max_length=40, pattern=r"^[a-z_]+$")] = Field(
@@ -63,13 +63,13 @@ class Display(Request):
 
 
 class Recipe(Request):
-    """What is drawn and set: region, settings, gauges, display; each part may be left out."""
+    """Drawing and settings: region, settings, gauges, display; each part may be left out."""
 
-    format: Literal["stereorig recipe"] = Field(RECIPE_FORMAT, description="What the document is.")
+    format: Literal["stereorig recipe"] = Field(RECIPE_FORMAT, description="Kind of the document.")
     version: Annotated[Whole, Field(ge=1)] = Field(
         RECIPE_VERSION,
         description="Version of the document; a later one is refused.",
-        # said in the validator's place, with what helps
+        # checked by a validator instead, whose error has a remedy
         json_schema_extra={"maximum": RECIPE_VERSION},
     )
     image_size_px: tuple[Side, Side] | None = Field(
@@ -85,7 +85,7 @@ class Recipe(Request):
     gauges: GaugeRequest | None = Field(None, description="Gauges; a report shows their histories.")
     display: Display | None = Field(None, description="Field, limits and colours.")
     drawing: dict[str, JsonValue] | None = Field(
-        None, description="The page's own record of what is drawn, unfinished shapes too; it may be left out."
+        None, description="The page's own record of the drawing, unfinished shapes too; it may be left out."
     )
     note: Label = Field("", description="Free text.")
 
@@ -100,7 +100,7 @@ class Recipe(Request):
         return given
 
     def document(self) -> dict[str, object]:
-        """Return what was stated, as plain values; with the format and its version."""
+        """Return the stated values as plain ones; with the format and its version."""
         return {
             "format": RECIPE_FORMAT,
             "version": RECIPE_VERSION,
@@ -133,7 +133,7 @@ class Recipe(Request):
                 f"The recipe was drawn over an image of {drawn[0]} x {drawn[1]} px, camera 1's is {width} x {height} "
                 "px.",
                 code="recipe_other_size",
-                remedy="Draw the region anew; to take the numbers as they are, leave out image_size_px.",
+                remedy="Draw the region again; to take the numbers as they are, leave out image_size_px.",
             )
         for name, (x, y) in self._positions():
             if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
@@ -167,7 +167,7 @@ def recipe_in(document: object, *, name: str) -> Recipe:
     try:
         return Recipe.model_validate(document)
     except ValidationError as error:
-        first = problems_in(error, Recipe)[0]
+        first = problems_in(error)[0]
         where = f"{first.field}: " if first.field else ""
         raise InputError(
             f"{name}: {where}{first.problem}.",
@@ -177,7 +177,7 @@ def recipe_in(document: object, *, name: str) -> Recipe:
 
 
 class Workspace(Recipe):
-    """What is drawn and set for a test, kept as it is drawn."""
+    """Drawing and settings of a test, stored as they are drawn."""
 
 
 class RecipeRequest(Request):

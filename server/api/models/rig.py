@@ -1,4 +1,4 @@
-"""Cameras, stage and scene, as they travel; what they say of themselves is in :mod:`server.rig.description`."""
+"""Bodies about cameras, stage and scene; :mod:`stereorig.server.rig.description` has the devices' own descriptions."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
-from core.names import CameraName
-from core.settings import Real, Whole
-from drivers.acquisition.pairing import PairingAccount
-from drivers.cameras.protocol import FrameCounters
-from server.base.models import AxisValues, Number, Reply, Reported, Request, any_of, one_of
-from server.rig.description import CameraReply, CameraSettingsReply, StageMessage
-from server.workflows.exposure import LEVEL, LEVEL_HIGH, LEVEL_LOW
+from stereorig.core.names import CameraName
+from stereorig.core.settings import Real, Whole
+from stereorig.drivers.acquisition.pairing import PairingAccount
+from stereorig.drivers.cameras.protocol import FrameCounters
+from stereorig.server.base.models import AxisValues, Number, Reply, Reported, Request, any_of, one_of
+from stereorig.server.rig.description import CameraReply, CameraSettingsReply, StageMessage
+from stereorig.server.workflows.exposure import LEVEL, LEVEL_HIGH, LEVEL_LOW
 
 
 class SettingsPatch(Request):
-    """Camera settings to change; what is left out stays."""
+    """Camera settings to change; settings left out keep their values."""
 
     exposure_ms: Annotated[Real, Field(gt=0.0, le=60000.0)] | None = Field(None, description="Exposure time.")
     gain_db: Annotated[Real, Field(ge=-100.0, le=100.0)] | None = Field(None, description="Gain.")
@@ -51,7 +51,7 @@ class ExposureRequest(Request):
 class ExposureFound(Reply):
     """An exposure that was searched for and set."""
 
-    name: CameraName = Field(description="Which camera.")
+    name: CameraName = Field(description="Name of the camera.")
     settings: CameraSettingsReply = Field(description="Every setting, as read back.")
     level: float = Field(description="Level of the brightest parts of the picture with it, over full scale.")
     saturated_share: float = Field(description="Share of pixels at full scale with it.")
@@ -79,7 +79,7 @@ class MoveRequest(Request):
 
 
 class HomeRequest(Request):
-    """Which axes to home."""
+    """Axes to home."""
 
     axes: list[Annotated[Whole, Field(ge=1, le=31)]] | None = Field(
         None, description="Axis numbers; all that the cameras use if left out.", min_length=1, max_length=6
@@ -87,7 +87,7 @@ class HomeRequest(Request):
 
 
 class AxesRequest(Request):
-    """Which axes."""
+    """Axes of the request."""
 
     axes: list[Annotated[Whole, Field(ge=1, le=31)]] | None = Field(
         None, description="Axis numbers; all that the cameras use if left out.", min_length=1, max_length=6
@@ -95,7 +95,7 @@ class AxesRequest(Request):
 
 
 class DynamicsPatch(Request):
-    """Velocity and acceleration of an axis; what is left out stays."""
+    """Velocity and acceleration of an axis; a value left out is kept."""
 
     model_config = ConfigDict(json_schema_extra=any_of("velocity_mm_s", "acceleration_mm_s2"))
 
@@ -114,10 +114,10 @@ class DynamicsPatch(Request):
 
 
 class FlashConsent(Request):
-    """Consent to what cannot be taken back."""
+    """Consent to a change that cannot be undone."""
 
     write_flash: Literal[True] = Field(
-        description="Must be true: leaving writes the controller's flash memory, which bears about a hundred writes."
+        description="Must be true: leaving writes the controller's flash memory, which endures about a hundred writes."
     )
 
     @field_validator("write_flash", mode="before")
@@ -176,7 +176,7 @@ class CamerasReply(Reply):
 class CameraSet(Reply):
     """Settings that a camera accepted."""
 
-    name: CameraName = Field(description="Which camera.")
+    name: CameraName = Field(description="Name of the camera.")
     settings: CameraSettingsReply = Field(description="Every setting, as read back.")
 
 
@@ -205,9 +205,9 @@ class FrameQuality(Reply):
 
 
 class CameraStats(Reply):
-    """Counters of a camera's frames, and the newest one's quality."""
+    """Counters of a camera's frames, and the quality of the newest frame."""
 
-    name: CameraName = Field(description="Which camera.")
+    name: CameraName = Field(description="Name of the camera.")
     frames: FrameCounts = Field(description="Its frames since it was opened.")
     driver: dict[str, int | float] = Field(description="The driver's own counts, by its own names.")
     pairs: PairCounts = Field(description="Both cameras' triggers.")
@@ -224,9 +224,9 @@ class LiveCheckReply(Reply):
         description="`ok`, `warning` or `failed` as of a measured field (`epipolar_check`). Not checked: `no_texture`, "
         "`off_zero` (a stage is off the calibrated place) and `busy` (a job runs)."
     )
-    offset_px: float | None = Field(description="How far points lie off their epipolar lines; null: not checked.")
+    offset_px: float | None = Field(description="Distance of points from their epipolar lines; null: not checked.")
     own_px: float | None = Field(description="The calibration's own offset at most; null: not known.")
-    points: int = Field(description="Points that were matched; 0 where the offset is that of features, or none.")
+    points: int = Field(description="Points that were matched; 0 if the offset is from features, or not checked.")
     text: str = Field(description="The finding in a sentence.")
     checked_utc: str = Field(description="Time of the check.")
 

@@ -6,18 +6,20 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StringConstraints
 
-from core.settings import Real, Whole
-from server.api.models.jobs import Accepted
-from server.api.models.warnings import AnalysisWarning
-from server.base.models import ON_ONE_LINE, Channels, Label, Listing, Notes, Number, Reply, Request, Timestamp
+from stereorig.core.names import CameraName
+from stereorig.core.settings import Real, Whole
+from stereorig.drivers.acquisition.simultaneity import SKEW_SOURCES, SkewSource
+from stereorig.server.api.models.jobs import Accepted
+from stereorig.server.api.models.warnings import AnalysisWarning
+from stereorig.server.base.models import ON_ONE_LINE, Channels, Label, Listing, Notes, Number, Reply, Request, Timestamp
+from stereorig.server.documents.steps import BurstIndex, StepQuality
+from stereorig.server.workflows.recording import RecordPlan
 
 TestName = Annotated[str, StringConstraints(min_length=1, max_length=300), ON_ONE_LINE]
 
 
 class TestRequest(Request):
     """A new test."""
-
-    __test__ = False
 
     name: TestName = Field(description="Name, in any script; on one line, without control characters.")
     calibration_id: str | None = Field(
@@ -31,8 +33,6 @@ class TestRequest(Request):
 
 class TestPatch(Request):
     """Fields of a test to change."""
-
-    __test__ = False
 
     name: Annotated[str, StringConstraints(min_length=1, max_length=300), ON_ONE_LINE] | None = Field(
         None, description="Name."
@@ -48,8 +48,6 @@ class TestPatch(Request):
 
 class TestEntry(Reply):
     """Entry of a test in a list."""
-
-    __test__ = False
 
     id: str = Field(description="Id.", examples=["t000001-0c9f1e"])
     name: str = Field(description="Name.")
@@ -85,14 +83,12 @@ class AnalysisEntry(Reply):
     job_id: str | None = Field(None, description="Its job.")
     steps_failed: list[int] = Field(default_factory=list, description="Steps that could not be measured.")
     warnings: list[AnalysisWarning] = Field(
-        default_factory=list, description="What must be known before its results are used, failed checks first."
+        default_factory=list, description="Warnings about its results, failed checks first."
     )
 
 
 class TestReply(Reply):
     """A test."""
-
-    __test__ = False
 
     id: str = Field(description="Id.", examples=["t000001-0c9f1e"])
     name: str = Field(description="Name.")
@@ -108,7 +104,7 @@ class TestReply(Reply):
     n_steps: int = Field(0, description="Number of its complete steps.")
     steps: list[StepEntry] = Field(
         default_factory=list,
-        description="Its complete steps, in order; the first 100 where there are more, see `steps_next_cursor`.",
+        description="Its complete steps, in order; the first 100 if there are more, see `steps_next_cursor`.",
     )
     steps_next_cursor: str | None = Field(
         None, description="Of GET /tests/{id}/steps for the steps after these; null: these are all."
@@ -120,8 +116,6 @@ class TestReply(Reply):
 
 class TestList(Listing):
     """Tests, oldest first."""
-
-    __test__ = False
 
     tests: list[TestEntry] = Field(description="Short entry of each.")
 
@@ -145,7 +139,7 @@ class StepRequest(Request):
     load_n: Number | None = Field(None, description="Load in newton.")
     timestamp_utc: Timestamp | None = Field(
         None,
-        description="The client's own time of this load step, with its time zone; kept beside the service's "
+        description="The client's own time of this load step, with its time zone; stored with the service's "
         "`captured_utc`, and never used for order.",
     )
     channels: Channels = Field(
@@ -160,84 +154,55 @@ class StepRequest(Request):
         1, description="Steps to take. More than one make a burst: the answer is 202 and a job."
     )
     interval_ms: Annotated[Real, Field(allow_inf_nan=False, ge=0.0, le=86_400_000.0)] = Field(
-        0.0, description="From the beginning of one step of a burst to that of the next; 0: as fast as it goes."
+        0.0, description="From the beginning of one step of a burst to the next; 0: as fast as possible."
     )
-
-
-class CameraQuality(Reply):
-    """Quality of one camera's image."""
-
-    code: str = Field(description="`ok`, `saturated`, `dark`, `blank`, `low_texture` or `blurred`.", examples=["ok"])
-    mean_grey: float = Field(description="Mean grey level, counts.", examples=[118.4])
-    mean_share: float | None = Field(None, description="Mean grey level over full scale.", examples=[0.464])
-    saturated_share: float = Field(description="Share of pixels at full scale.", examples=[0.0])
-    contrast_grey: float = Field(description="Standard deviation of the grey levels, counts.", examples=[41.0])
-    texture_grey_per_px: float = Field(
-        description="Median over tiles of the rms gradient, counts per pixel.", examples=[12.7]
-    )
-    focus: float | None = Field(
-        None,
-        description="Share of the gradient that remains at the scale of a pixel, noise taken out; below 0.12 "
-        "blurred; null where little but noise is seen.",
-        examples=[0.31],
-    )
-    exposure_ms: float | None = Field(None, description="Exposure as read back; null for files.", examples=[10.0])
-    gain_db: float | None = Field(None, description="Gain as read back; null where there is none.", examples=[0.0])
-    frames: dict[str, int] | None = Field(
-        None,
-        description="Counters of the camera's frames during the capture: delivered, dropped, incomplete ...",
-        examples=[{"delivered": 1, "overrun": 0, "dropped": 0, "incomplete": 0, "duplicates": 0, "out_of_order": 0}],
-    )
-
-
-class StepQuality(Reply):
-    """Quality of a pair."""
-
-    code: str | None = Field(
-        None, description="`ok`, or the first thing that is wrong; `cameras_off_zero` off their calibrated position."
-    )
-    skew_ms: float | None = Field(None, description="Difference of the exposures' beginnings.", examples=[0.02])
-    max_skew_ms: float | None = Field(None, description="Largest skew that the rig allows, ms.", examples=[1.0])
-    pairs: dict[str, int] | None = Field(
-        None,
-        description="Counters of the triggers during the capture: triggered = paired + unpaired + incomplete + "
-        "dropped.",
-        examples=[{"triggered": 1, "paired": 1, "unpaired": 0, "incomplete": 0, "dropped": 0, "refused": 0, "late": 0}],
-    )
-    cam1: CameraQuality | None = Field(None, description="Camera 1's image.")
-    cam2: CameraQuality | None = Field(None, description="Camera 2's image.")
-
-
-class BurstIndex(Reply):
-    """Index of a step in its burst."""
-
-    job_id: str = Field(description="Job of the burst.")
-    index: int = Field(description="Number in the burst, from 0.")
-    count: int = Field(description="Steps that were asked for.")
-    interval_ms: float = Field(description="Interval that was asked for.")
-    since_first_ms: float = Field(description="Exposure's beginning after that of the burst's first step.")
 
 
 class StepReply(Reply):
     """A step: durable on disk when this is sent."""
 
     warnings: list[str] = Field(
-        default_factory=list, description="What should be put right before this step is measured; mostly empty."
+        default_factory=list, description="Faults to put right before this step is measured; mostly empty."
     )
     n: int = Field(description="Number; 0 is the reference.")
     test_id: str = Field(description="Its test.")
     label: str = Field(description="Free text.")
     load_n: float | None = Field(None, description="Load in newton.")
     timestamp_utc: str | None = Field(None, description="The client's own time, if it gave one.")
-    channels: dict[str, float] = Field(default_factory=dict, description="Scalar readings, as sent.")
+    channels: dict[str, float] = Field(
+        default_factory=dict,
+        description="Scalar readings, as sent, and the rig file's channels at the exposure, between the "
+        "readings around it.",
+    )
+    channel_units: dict[str, str] = Field(
+        default_factory=dict,
+        description="Unit of each channel that a load frame's record gave, as the file states it, or that the rig file "
+        "names.",
+    )
+    channel_u: dict[str, float] = Field(
+        default_factory=dict,
+        description="Standard uncertainty of each channel of the rig file at the exposure: noise, change between the "
+        "readings around it, resolution, latency of the line.",
+    )
     source: Literal["capture", "import"] = Field(description="Source of the images.")
     captured_utc: str = Field(description="Time of the capture or import, by the service's clock.")
     skew_ms: float | None = Field(None, description="Difference of the two exposures' beginnings.")
-    quality: StepQuality = Field(description="`code` (`ok` or what is wrong), and figures of each camera.")
+    dz_mm: dict[CameraName, float | None] | None = Field(
+        None,
+        description="Travel of each camera's axis as the pair was taken; null where the stage did not answer, and its "
+        "position is unknown. Null as a whole without a stage.",
+        examples=[{"cam1": 0.0, "cam2": 0.0}],
+    )
+    simulated: list[Literal["cam1", "cam2", "stage"]] | None = Field(
+        None, description="Devices that were simulated; null for files that were imported."
+    )
+    skew_uncertainty_ms: float | None = Field(None, description="Largest error of the skew.")
+    skew_source: SkewSource | None = Field(None, description=SKEW_SOURCES)
+    quality: StepQuality = Field(description="`code` (`ok` or the fault), and figures of each camera.")
     sha256: dict[str, str] = Field(description="Checksums of both image files.")
     grey_from: dict[str, str] | None = Field(
         None,
-        description="By camera, what the grey levels of a colour image were made from.",
+        description="By camera, the origin of a colour image's grey levels.",
         examples=[{"cam1": "luminance, 0.299 R + 0.587 G + 0.114 B"}],
     )
     burst: BurstIndex | None = Field(None, description="Its index in its burst, if it is of one.")
@@ -247,32 +212,29 @@ class BurstAccepted(Accepted):
     """A burst was begun; its job's `result` lists each step that is durable, and each that failed."""
 
 
+class RecordRequest(RecordPlan):
+    """Record both cameras, and keep steps by a trigger."""
+
+    label: Label = Field("", description="Label of the steps.")
+
+
+class RecordAccepted(Accepted):
+    """A recording was begun; its job's `result` lists each step that is durable, and accounts for every pair."""
+
+
 class WatchRequest(Request):
-    """Which channel is watched, and what makes a step."""
+    """Channel to watch, and the change that takes a step."""
 
     channel: Annotated[str, StringConstraints(min_length=1, max_length=100), ON_ONE_LINE] = Field(
         description="Name of a channel of the readings; `load_n` for the load.", examples=["load_n"]
     )
     threshold: Annotated[Number, Field(ge=0.0)] = Field(
-        description="A step is taken when the channel differs by this or more from the newest step that bears it; 0: "
+        description="A step is taken when the channel differs by this or more from the newest step that has it; 0: "
         "at any difference.",
         examples=[500.0],
     )
     frames: Annotated[Whole, Field(ge=1, le=256)] = Field(1, description="Frames averaged in each step.")
     label: Label = Field("", description="Label of steps whose reading brings none.")
-
-
-class WatchReply(Reply):
-    """Watch on a channel."""
-
-    active: bool = Field(description="True if readings take steps.")
-    channel: str = Field(description="The channel.")
-    threshold: float = Field(description="Difference that makes a step.")
-    frames: int = Field(description="Frames averaged in each step.")
-    label: str = Field(description="Label of steps whose reading brings none.")
-    since_utc: str = Field(description="Time at which the watch began.")
-    last_value: float | None = Field(None, description="Value that the next reading is compared with; null: none yet.")
-    last_step: int | None = Field(None, description="Step that it is from.")
 
 
 class ReadingRequest(Request):
@@ -295,6 +257,6 @@ class ReadingReply(Reply):
     reason: Literal["first", "changed", "below_threshold", "channel_absent"] = Field(
         description="Reason why a step was or was not taken."
     )
-    value: float | None = Field(None, description="Value of the watched channel; null where it was absent.")
+    value: float | None = Field(None, description="Value of the watched channel; null if it was absent.")
     last_value: float | None = Field(None, description="Value that it was compared with; null: there was none.")
     step: StepReply | None = Field(None, description="The step, durable on disk.")

@@ -6,9 +6,9 @@ from typing import Annotated
 
 from pydantic import Field
 
-from core.settings import Whole
-from server.base.models import Listing, Reply, Request
-from server.store.documents import TrashEntry
+from stereorig.core.settings import Whole
+from stereorig.server.base.models import Listing, Reply, Request
+from stereorig.server.documents.made import TrashEntry
 
 
 class TrashList(Listing):
@@ -35,4 +35,4 @@ class ExportedReply(Reply):
     by: str = Field(description="Whose key it was.")
     steps: int = Field(description="Number of complete steps.")
     results: int = Field(description="Number of result files.")
-    sha256: str = Field(description="Of the checksums of all of them.")
+    sha256: str = Field(description="Checksum of the checksums of all of them.")

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from server.base.models import Reply
+from stereorig.server.base.models import Reply
 
 
 class AnalysisWarning(Reply):
@@ -24,4 +24,4 @@ class AnalysisWarning(Reply):
     steps: list[int] = Field(
         default_factory=list, description="Steps that it holds for, 100 at most; empty: all of it."
     )
-    n_steps: int | None = Field(None, description="Number of those steps, where there are more than 100.")
+    n_steps: int | None = Field(None, description="Number of the steps, if there are more than 100.")

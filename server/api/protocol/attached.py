@@ -9,10 +9,10 @@ from typing import Annotated
 
 from fastapi import Query, Request
 
-from core.errors import StateError
-from server.api.protocol.paging import WHOLE
-from server.jobs.job import FINAL
-from server.workflows.service import Service
+from stereorig.core.errors import StateError
+from stereorig.server.api.protocol.paging import WHOLE
+from stereorig.server.jobs.job import FINAL
+from stereorig.server.workflows.service import Service
 
 Attached = Annotated[
     bool,
@@ -29,7 +29,7 @@ Wait = Annotated[
         ge=0,
         le=MAX_WAIT_S,
         allow_inf_nan=False,
-        description="Seconds to wait, at most, for the job's end; the answer shows the job as it is then. It goes on "
+        description="Seconds to wait, at most, for the job's end; the answer shows the job as it is then. It continues "
         "whether the client stays or not.",
     ),
 ]

@@ -1,30 +1,24 @@
 """A number for each request, headers that browsers heed, and a line for each request that changes something.
 
-The audit log lies in the data folder as JSON lines: who did what, from where, when, and how it ended.
+A line of the audit log has the person, the address, the request, its time and its status.
 """
 
 from __future__ import annotations
 
-import json
 import logging
-import logging.handlers
 import re
 import secrets
 import time
-from pathlib import Path
 
 from starlette.datastructures import MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from server.base.logs import about
-from server.base.metrics import Metrics
-from server.store.folder import now_utc
+from stereorig.server.base.logs import about
+from stereorig.server.base.metrics import Metrics
+from stereorig.server.store.audit_log import AuditLog
 
 _log = logging.getLogger("stereorig.http")
 
-AUDIT_FILE = "audit.log"
-_FILE_BYTES = 10 * 2**20
-_FILES = 10
 _ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 # the client went before it was answered; no such status is ever sent
 _LEFT = 499
@@ -42,24 +36,6 @@ SECURITY_HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; "
     "frame-ancestors 'none'; base-uri 'none'; form-action 'self'",
 }
-
-
-class AuditLog:
-    """Appends to ``audit.log`` of a data folder; older ones are kept as ``audit.log.1`` and so on."""
-
-    def __init__(self, data: Path) -> None:
-        self._handler = logging.handlers.RotatingFileHandler(
-            data / AUDIT_FILE, maxBytes=_FILE_BYTES, backupCount=_FILES, encoding="utf-8", delay=True
-        )
-
-    def write(self, **entries: object) -> None:
-        """Write one line."""
-        text = json.dumps({"utc": now_utc(), **entries}, ensure_ascii=False)
-        self._handler.emit(logging.LogRecord("audit", logging.INFO, "", 0, text, None, None))
-
-    def close(self) -> None:
-        """Close the file."""
-        self._handler.close()
 
 
 class Recorder:
@@ -102,7 +78,7 @@ class Recorder:
         finally:
             took_s = (ended or time.monotonic()) - began
             self._record(scope, status, took_s, number)
-            if scope["method"] not in _SAFE:
+            if scope["method"] not in _SAFE and not scope["state"].get("unrecorded"):
                 person = scope["state"].get("person")
                 self._log.write(
                     who=None if person is None else person.name,
@@ -116,7 +92,7 @@ class Recorder:
 
     def _record(self, scope: Scope, status: int, took_s: float, number: str) -> None:
         """Count and time a request, and write its line into the log."""
-        # what a client made up is no label: each would be kept for ever
+        # an unknown method is no label: each would be kept for ever
         method = scope["method"] if scope["method"] in _METHODS else "other"
         route = _route(scope)
         self._metrics.requests.labels(method, route, str(status)).inc()
@@ -137,10 +113,10 @@ class Recorder:
 
 
 def _route(scope: Scope) -> str:
-    """Return the path's template; ``none`` where no operation was met."""
+    """Return the path's template; ``none`` if no operation matches."""
     template: str | None = getattr(scope.get("route"), "path", None)
     if template is None:
         return "none"
-    template = re.sub(r":\w+\}", "}", template)  # without what a parameter may hold
+    template = re.sub(r":\w+\}", "}", template)  # without the parameters' converters
     prefix = "/api/v1"
     return template if template.startswith(prefix) or not scope["path"].startswith(prefix) else prefix + template

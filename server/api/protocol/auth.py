@@ -1,66 +1,34 @@
 """Authentication and rights: bearer keys for scripts, a cookie for the page, limits on the rate.
 
-On loopback no key is required unless the rig file demands one; what is presented there is checked all the same.
+On loopback no key is required unless the rig file demands one; a key that is sent is checked all the same.
 """
 
 from __future__ import annotations
 
+import asyncio
 import math
-import secrets
 import time
 from collections import OrderedDict
-from dataclasses import dataclass
-from http.cookies import CookieError, SimpleCookie
+from dataclasses import dataclass, field
 
 from starlette.responses import Response
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from core.errors import StereorigError
-from server.api.protocol.guard import refuse_socket
-from server.api.protocol.problems import problem_response
-from server.http.access import KeyFile, Person, Role
+from stereorig.core.errors import StereorigError
+from stereorig.server.api.protocol.guard import POLICY_VIOLATION, refuse_socket
+from stereorig.server.api.protocol.problems import problem_response
+from stereorig.server.http.rights import ABORT, COOKIE, LOCAL, STOP, Caller, Callers, by_name, role_for
+from stereorig.server.http.shutout import ShutOut
 
-COOKIE = "stereorig_session"
-SESSION_S = 12 * 3600.0
-LOCAL = Person("local", "admin")
-
-#: readable without a key: whether the service runs, and the page, which holds nothing of its own
-_OPEN = frozenset({"/", "/docs", "/healthz", "/readyz", "/api/v1/healthz", "/api/v1/readyz", "/api/v1/session"})
-# the page's own files and what is public in the program's source; without them no operator could log in
+#: readable without a key, and while an address is shut out: whether the service runs, and the page, which holds nothing
+_OPEN = frozenset({"/", "/docs", "/healthz", "/readyz", "/api/v1/healthz", "/api/v1/readyz"})
+# the page's own files and public parts of the program's source; without them no operator could log in
 _PAGES = ("/static/", "/docs/", "/problems")
-_SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
-_STOP = "/api/v1/stage:stop"
-# stopping must never fail for a right that is lacking; every client may log in and out
-_FOR_EVERYBODY = frozenset({_STOP, "/api/v1/session"})
-_HALTS = frozenset({_STOP, "/api/v1/stage:abort"})
+_SESSION = "/api/v1/session"
+_HALTS = frozenset({STOP, ABORT})
+_STREAMS = (b"text/event-stream", b"multipart/x-mixed-replace")
 _MAX_CLIENTS = 10_000
-
-
-class Sessions:
-    """Sessions of the page's cookies; in memory, so that a restart ends them all."""
-
-    def __init__(self) -> None:
-        self._known: OrderedDict[str, tuple[Person, float]] = OrderedDict()
-
-    def begin(self, person: Person) -> str:
-        """Return a new cookie's value."""
-        token = secrets.token_urlsafe(32)
-        self._known[token] = person, time.monotonic() + SESSION_S
-        while len(self._known) > _MAX_CLIENTS:
-            self._known.popitem(last=False)
-        return token
-
-    def who(self, token: str) -> Person | None:
-        """Return whose cookie it is; None when it has ended."""
-        person, until = self._known.get(token, (None, 0.0))
-        if person is not None and time.monotonic() > until:
-            self.end(token)
-            return None
-        return person
-
-    def end(self, token: str) -> None:
-        """Let it mean nothing from now on."""
-        self._known.pop(token, None)
+_LOOK_S = 0.4
 
 
 class RateLimit:
@@ -69,7 +37,7 @@ class RateLimit:
     Parameters
     ----------
     per_s
-        Rate that may go on for ever.
+        Lasting rate of calls.
     burst
         Calls that may come at once.
     """
@@ -98,34 +66,40 @@ class AccessRules:
 
     Parameters
     ----------
-    keys
-        The keys there are.
+    callers
+        The keys and sessions there are.
     required
         True if a key is asked for.
     requests_per_s
-        Of one client, for ever; ten times as many at once.
+        Lasting rate of one client; ten times as many at once.
+    shut_out
+        Addresses that are shut out.
     """
 
-    keys: KeyFile
+    callers: Callers
     required: bool
     requests_per_s: float = 500.0
+    shut_out: ShutOut = field(default_factory=ShutOut)
 
 
-def role_for(method: str, path: str) -> Role:
-    """Return the lowest role that may do this."""
-    if method in _SAFE or path in _FOR_EVERYBODY:
-        return "viewer"
-    return "admin" if method == "DELETE" else "operator"
+@dataclass(eq=False)
+class _Stream:
+    """An open stream: its task, and the caller whose right it is."""
+
+    task: asyncio.Task[object]
+    caller: Caller
+    ended: bool = False
 
 
 class Door:
     """Lets requests through with their person in ``scope["state"]``, or answers with the reason."""
 
-    def __init__(self, app: ASGIApp, rules: AccessRules, sessions: Sessions) -> None:
+    def __init__(self, app: ASGIApp, rules: AccessRules) -> None:
         self._app = app
         self._rules = rules
-        self._sessions = sessions
         self._calls = RateLimit(rules.requests_per_s, 10.0 * rules.requests_per_s)
+        self._streams: set[_Stream] = set()
+        self._looking: asyncio.Task[None] | None = None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Check, then pass on."""
@@ -135,29 +109,79 @@ class Door:
         refusal = self._refuse(scope)
         if refusal is not None and scope["type"] == "websocket":
             await refuse_socket(refusal, scope, send)
+        elif refusal is not None:
+            await refusal(scope, receive, send)
+        else:
+            await self._while_permitted(scope, receive, send)
+
+    async def _while_permitted(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on, and end its stream once the caller's key or session is gone."""
+        caller: Caller = scope["state"]["caller"]
+        task = asyncio.current_task()
+        if caller.key is None or task is None:
+            await self._app(scope, receive, send)
             return
-        await (self._app if refusal is None else refusal)(scope, receive, send)
+        stream = _Stream(task, caller)
+
+        async def noted(message: Message) -> None:
+            if _begins_a_stream(message):
+                self._streams.add(stream)
+                if self._looking is None or self._looking.done():
+                    self._looking = asyncio.create_task(self._look())
+            await send(message)
+
+        try:
+            await self._app(scope, receive, noted)
+        except asyncio.CancelledError:
+            if not stream.ended:
+                raise
+            task.uncancel()
+            socket = scope["type"] == "websocket"
+            last = {"type": "websocket.close", "code": POLICY_VIOLATION} if socket else {"type": "http.response.body"}
+            await send(last)
+        finally:
+            self._streams.discard(stream)
+
+    async def _look(self) -> None:
+        """End the streams of callers whose key or session is gone, until no stream is open."""
+        while self._streams:
+            await asyncio.sleep(_LOOK_S)
+            for stream in list(self._streams):
+                try:
+                    held = self._rules.callers.hold(stream.caller)
+                except StereorigError:
+                    held = False
+                if not held and not stream.ended:
+                    stream.ended = True
+                    stream.task.cancel()
 
     def _refuse(self, scope: Scope) -> Response | None:
         # a WebSocket begins as a reading, and only hands out
         path, method = scope["path"], scope.get("method", "GET")
         client = (scope.get("client") or ("unknown", 0))[0]
-        if scope.get("state", {}).get("crowded") and path not in _HALTS:
-            return _crowded()
-        # keys have 256 bits and cannot be found by trying, so wrong ones are not counted separately
-        wait = 0.0 if path == _STOP else self._calls.wait_s(client)
+        state = scope.setdefault("state", {})
+        state["caller"], state["person"] = Caller(), None
+        is_open = path in _OPEN or path.startswith(_PAGES)
+        shut_s = 0.0 if path in _HALTS else self._rules.shut_out.left_s(client)
+        if shut_s > 0.0 and not is_open:
+            state["unrecorded"] = True  # one line at the begin and one at the end are in the audit log
+            return _shut_out(shut_s)
+        wait = 0.0 if path == STOP else self._calls.wait_s(client)
         if wait > 0.0:
             return _too_many(wait)
-        headers = {k.lower(): v.decode("latin-1") for k, v in scope["headers"]}
         try:
-            person = self._who(headers)
+            caller = Caller() if shut_s > 0.0 else self._rules.callers.of(by_name(scope["headers"]))
         except StereorigError as error:
             return problem_response(503, error.code, error.cause, error.remedy)
-        if person is None and b"authorization" in headers:
+        if caller.wrong in ("key_wrong", "cookie_unknown"):
+            self._rules.shut_out.wrong(client, caller.presented if caller.wrong == "cookie_unknown" else "")
+        if caller.wrong == "key_wrong":
             return _unknown("key_wrong", "No user has this key.")
-        if person is None and self._rules.required and path not in _OPEN and not path.startswith(_PAGES):
+        if caller.wrong == "session_ended" and not is_open and (method, path) != ("DELETE", _SESSION):
+            return _session_ended()
+        if caller.person is None and self._rules.required and not is_open and path != _SESSION:
             return _unknown("key_missing", "This service asks for a key.")
-        person = person or (LOCAL if not self._rules.required else None)
+        person = caller.person or (LOCAL if not self._rules.required else None)
         if person is not None and not person.may(role_for(method, path)):
             needed = role_for(method, path)
             return problem_response(
@@ -166,20 +190,15 @@ class Door:
                 f"{person.name} is {person.role}; {method} {path} needs {needed}.",
                 f"Use a key of the role {needed}.",
             )
-        scope.setdefault("state", {})["person"] = person
+        state["caller"], state["person"] = caller, person
         return None
 
-    def _who(self, headers: dict[bytes, str]) -> Person | None:
-        scheme, _, key = headers.get(b"authorization", "").partition(" ")
-        if scheme.lower() == "bearer" and key.strip():
-            return self._rules.keys.who(key.strip())
-        if b"authorization" not in headers and b"cookie" in headers:
-            try:
-                cookie = SimpleCookie(headers[b"cookie"]).get(COOKIE)
-            except CookieError:
-                return None
-            return None if cookie is None else self._sessions.who(cookie.value)
-        return None
+
+def _begins_a_stream(message: Message) -> bool:
+    if message["type"] == "http.response.start":
+        kinds = [value for name, value in message.get("headers", ()) if name.lower() == b"content-type"]
+        return any(kind.startswith(_STREAMS) for kind in kinds)
+    return bool(message["type"] == "websocket.accept")
 
 
 def _unknown(code: str, cause: str) -> Response:
@@ -198,11 +217,23 @@ def _too_many(wait_s: float) -> Response:
     )
 
 
-def _crowded() -> Response:
+def _shut_out(left_s: float) -> Response:
     return problem_response(
-        503,
-        "too_many_connections",
-        "There are too many connections.",
-        "Close some, or wait for the time in Retry-After.",
-        headers={"Retry-After": "5", "Connection": "close"},
+        429,
+        "shut_out",
+        "Too many wrong keys or words came from this address.",
+        "Wait for the time in Retry-After, then use a right key; the stage can be stopped all the same.",
+        headers={"Retry-After": str(math.ceil(left_s))},
+    )
+
+
+def _session_ended() -> Response:
+    # the browser forgets the cookie, so that its next request is one without a session
+    gone = f"{COOKIE}=; Max-Age=0; Path=/; HttpOnly; SameSite=strict"
+    return problem_response(
+        401,
+        "session_ended",
+        "This session has ended: its key was removed or changed.",
+        "Log in again with a key.",
+        headers={"WWW-Authenticate": "Bearer", "Set-Cookie": gone},
     )

@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar
 from fastapi import Header, Response
 from pydantic import BaseModel
 
-from core.errors import StateError
+from stereorig.core.errors import StateError
 
 IfMatch = Annotated[
     str | None,
@@ -32,7 +32,7 @@ class PreconditionRequiredError(StateError):
     """A change must say which state it was meant for."""
 
     code = "precondition_required"
-    remedy = "Send If-Match with the ETag that reading it gave, or `If-Match: *` to change whatever is there."
+    remedy = "Send If-Match with the ETag that reading it gave, or `If-Match: *` to change any state."
 
 
 def etag_of(document: Any) -> str:
@@ -63,7 +63,7 @@ def require_match(header: str | None, etag: str, subject: str, *, required: bool
     Raises
     ------
     PreconditionRequiredError
-        ``precondition_required`` if nothing was said and it must be.
+        ``precondition_required`` if the header is missing and required.
     PreconditionFailedError
         ``precondition_failed``.
     """

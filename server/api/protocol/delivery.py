@@ -12,7 +12,7 @@ import anyio
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from server.api.protocol.conditional import tags_in
+from stereorig.server.api.protocol.conditional import tags_in
 
 _MIN_BYTES = 1024
 _IN_THREAD = 64 * 1024  # more than this takes longer than the event loop may be held up
@@ -23,13 +23,13 @@ _SUFFIX = "-gzip"
 
 
 class Delivery:
-    """Gives answers to GET an ETag and answers 304, answers HEAD, compresses what gets smaller by it."""
+    """Gives answers to GET an ETag and answers 304, answers HEAD, compresses answers that become smaller."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass on, and deliver what comes back."""
+        """Pass the request on, and deliver its answer."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -50,7 +50,7 @@ class Delivery:
 
 
 def _plain(headers: list[tuple[bytes, bytes]]) -> list[tuple[bytes, bytes]]:
-    """Return a request's headers with the tags of compressed answers as those of the things themselves."""
+    """Return a request's headers with the ETags of compressed answers replaced by the uncompressed ones."""
     conditional = (b"if-match", b"if-none-match")
     return [(k, v.replace(f'{_SUFFIX}"'.encode(), b'"') if k.lower() in conditional else v) for k, v in headers]
 
@@ -76,7 +76,7 @@ class _Answer:
         self.endless = False
 
     async def head(self, app: ASGIApp) -> None:
-        """Let the GET be answered, send its headers alone, and end what would go on."""
+        """Let the GET be answered, send its headers alone, and end an endless answer."""
         work = asyncio.ensure_future(app(self.scope, self._receive, self.forward))
         waiting = asyncio.ensure_future(self._ended.wait())
         try:

@@ -9,11 +9,11 @@ from fastapi import Depends, Header, Path, Query, Request
 from pydantic import BaseModel
 from starlette.convertors import StringConvertor, register_url_convertor
 
-from core.names import CameraName
-from core.settings import MAX_COVERAGE, MAX_COVERAGE_FACTOR, Coverage, CoverageFields
-from server.formats.results.uncertainty import coverage_of
-from server.jobs.idempotency import RequestMark
-from server.workflows.service import Service
+from stereorig.core.names import CameraName
+from stereorig.core.settings import MAX_COVERAGE, MAX_COVERAGE_FACTOR, Coverage, CoverageFields
+from stereorig.server.formats.results.uncertainty import coverage_of
+from stereorig.server.jobs.idempotency import RequestMark
+from stereorig.server.workflows.service import Service
 
 
 class _NoAction(StringConvertor):
@@ -81,7 +81,7 @@ CoverageDep = Annotated[Coverage, Depends(get_coverage)]
 
 
 def mark(scope: str, key: str | None, body: BaseModel | None, *parts: bytes) -> RequestMark:
-    """Make the mark of a request, of what the client said and nothing else: defaults may change some day."""
+    """Return a request's mark: the hash of the stated values only, since defaults may change some day."""
     digest = hashlib.sha256(b"" if body is None else body.model_dump_json(exclude_unset=True).encode())
     for part in parts:
         digest.update(hashlib.sha256(part).digest())
@@ -89,6 +89,6 @@ def mark(scope: str, key: str | None, body: BaseModel | None, *parts: bytes) -> 
 
 
 def person_name(request: Request) -> str:
-    """Return who asks, for what is kept with their name; ``local`` where no key is asked for."""
+    """Return the caller's name, to be stored with a change; ``local`` if no key is required."""
     person = getattr(request.state, "person", None)
     return "local" if person is None else str(person.name)

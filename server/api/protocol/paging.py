@@ -1,4 +1,4 @@
-"""Lists a page at a time: a cursor names the last thing seen, so that what is made meanwhile moves nothing."""
+"""Lists a page at a time: a cursor names the last entry seen, so that new entries in between move nothing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request, Response
 
-from core.errors import InputError
+from stereorig.core.errors import InputError
 
 MAX_LIMIT = 1000
 #: a document holds so many steps itself; further ones come page by page
@@ -24,7 +24,7 @@ def cursor_of(key: str) -> str:
 
 
 class Page:
-    """Which part of a list is asked for.
+    """The requested part of a list.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class Page:
         return self.cut(rest, key)
 
     def cut(self, rest: Sequence[Any], key: Callable[[Any], str]) -> list[Any]:
-        """Return the page at the beginning of what is left."""
+        """Return the first page of the rest of a list."""
         page = list(rest[: self.limit])
         if len(rest) > len(page):
             cursor = cursor_of(key(page[-1]))
@@ -77,7 +77,7 @@ def _position(cursor: str | None) -> str | None:
         raise InputError(
             "The cursor is none that this service gave.",
             code="cursor_invalid",
-            remedy="Send next_cursor as it came, or leave it out to begin anew.",
+            remedy="Send next_cursor as it came, or leave it out to begin at the start.",
         ) from error
 
 
@@ -86,7 +86,7 @@ Cursor = Annotated[
     str | None,
     Query(
         max_length=200,
-        description="`next_cursor` of the page before; the list goes on after it, whatever was made or deleted "
+        description="`next_cursor` of the page before; the list continues after it, whatever was made or deleted "
         "meanwhile.",
     ),
 ]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Sequence
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException
 from starlette.routing import compile_path
 
-from core.errors import (
+from stereorig.core.errors import (
     CalibrationError,
     DeviceError,
     InputError,
@@ -25,14 +24,16 @@ from core.errors import (
     StereorigError,
     StorageError,
 )
-from server.base.errors import NotFoundError, QueueFullError, TooLargeError
-from server.base.problem import problem_of
-from server.wording import FieldProblem, in_words
+from stereorig.server.base.errors import NotFoundError, QueueFullError, TooLargeError
+from stereorig.server.base.problem import problem_of, without_paths
+from stereorig.server.wording import field_problem
 
 _log = logging.getLogger("stereorig.api")
-_PARAMETER = re.compile(r"\{[^}]*\}")
+_PARAMETER = re.compile(r"\{[^{}]*\}")
 
 MEDIA_TYPE = "application/problem+json"
+#: wrong values of a request that an answer lists
+_FIRST = 20
 RETRY_AFTER_S = 5
 
 #: device errors that are the caller's doing, not the device's
@@ -50,6 +51,8 @@ _BY_CODE = {
     "skew_too_large": 409,
     "shutting_down": 503,
     "checksum_mismatch": 409,
+    "file_missing": 409,
+    "folder_copied": 409,
     "image_too_large": 413,
     "unknown_feature": 422,
     "wrong_camera": 409,
@@ -108,15 +111,16 @@ def problem_response(
         "type": f"/problems/{code}",
         "title": HTTPStatus(status).phrase,
         "status": status,
-        "detail": detail,
+        "detail": without_paths(detail),
         "code": code,
-        "remedy": remedy,
+        "remedy": without_paths(remedy),
         **more,
     }
     return JSONResponse(body, status_code=status, media_type=MEDIA_TYPE, headers=headers)
 
 
-def _response_of(error: StereorigError) -> JSONResponse:
+def response_of(error: StereorigError) -> JSONResponse:
+    """Return the problem of an error of the project's tree."""
     status = status_of(error)
     described = problem_of(error)
     headers = {"Retry-After": str(RETRY_AFTER_S)} if status == 503 else None
@@ -128,16 +132,23 @@ def install(app: FastAPI) -> None:
     """Make ``app`` answer every error as a problem."""
 
     @app.exception_handler(StereorigError)
-    async def _known(_request: Request, error: StereorigError) -> JSONResponse:
-        return _response_of(error)
+    async def _known(request: Request, error: StereorigError) -> JSONResponse:
+        if isinstance(error, NotFoundError | StorageError) or error.code in ("file_missing", "file_unreadable"):
+            folder = _folder_problem(request)
+            if folder is not None and (folder.code == "data_folder_gone" or isinstance(error, StorageError)):
+                return response_of(folder)
+        return response_of(error)
 
     @app.exception_handler(RequestValidationError)
-    async def _invalid(request: Request, error: RequestValidationError) -> JSONResponse:
-        found = _field_problems(request, error.errors())
+    async def _invalid(_: Request, error: RequestValidationError) -> JSONResponse:
+        every = error.errors()
+        found = [(str(one["loc"][0]), field_problem(one, skip=1)) for one in every[:_FIRST]]
         fields = [{"field": one.field or where, "in": where, "problem": one.problem} for where, one in found]
         wrong = " ".join(str(one) for _, one in found[:3])
         more = f" {len(found) - 3} more values are wrong; `fields` has them." if len(found) > 3 else ""
-        if all(item["type"] == "values_disagree" for item in error.errors()):
+        if len(every) > _FIRST:
+            more = f" These are of the first {_FIRST} of {len(every)} values that are wrong."
+        if all(item["type"] == "values_disagree" for item in every):
             return problem_response(
                 422,
                 "values_disagree",
@@ -164,9 +175,11 @@ def install(app: FastAPI) -> None:
         )
 
     @app.exception_handler(FileNotFoundError)
-    async def _gone(_request: Request, error: FileNotFoundError) -> JSONResponse:
+    async def _gone(request: Request, error: FileNotFoundError) -> JSONResponse:
+        if (folder := _folder_problem(request)) is not None:
+            return response_of(folder)
         cause = f"{Path(error.filename or 'A file').name} was deleted while it was being read."
-        return problem_response(404, "not_found", cause, "List what there is, and use one of those ids.")
+        return problem_response(404, "not_found", cause, "List the entries, and use one of their ids.")
 
     @app.exception_handler(Exception)
     async def _unknown(_request: Request, error: Exception) -> JSONResponse:
@@ -175,18 +188,15 @@ def install(app: FastAPI) -> None:
         return problem_response(500, "internal_error", cause, "Report this with the service's log.")
 
 
-def _field_problems(request: Request, errors: Sequence[Any]) -> list[tuple[str, FieldProblem]]:
-    """Return what is wrong in a request, with the part of it (``body``, ``query`` ...), as its sender would say it."""
-    field = getattr(request.scope.get("route"), "body_field", None)
-    body = None if field is None else field.field_info.annotation
-    parts = list(dict.fromkeys(str(error["loc"][0]) for error in errors))
-    return [
-        (part, problem)
-        for part in parts
-        for problem in in_words(
-            [e for e in errors if str(e["loc"][0]) == part], body if part == "body" else None, skip=1
-        )
-    ][:20]
+def _folder_problem(request: Request) -> StorageError | None:
+    """Return the error of a data folder that is gone or read-only; None if it is there."""
+    service = getattr(request.app.state, "service", None)
+    try:
+        if service is not None:
+            service.folder.require_there()
+    except StorageError as error:
+        return error
+    return None
 
 
 def _methods_of(app: FastAPI, path: str) -> list[str]:
@@ -207,7 +217,7 @@ def errors(*statuses: int) -> dict[int | str, dict[str, Any]]:
         429: "Too many requests",
         404: "No such thing",
         409: "Wrong moment: busy hardware or wrong state",
-        412: "It was changed meanwhile: If-Match names another state",
+        412: "It was changed since: If-Match names another state",
         413: "Body or image too large",
         415: "Not a form this operation reads",
         422: "Invalid input",

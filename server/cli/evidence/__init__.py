@@ -1,1 +1,1 @@
-"""Commands that show others what a result is worth: certificate, repetition, bundle, comparison with a model."""
+"""Commands that prove a result to others: certificate, repetition, bundle, comparison with a model."""

@@ -6,10 +6,10 @@ import argparse
 import json
 from pathlib import Path
 
-from core.errors import InputError
-from server.store.bundle.pack import pack
-from server.store.bundle.unpack import unpack
-from server.store.verify import require_data_folder
+from stereorig.core.errors import InputError
+from stereorig.server.store.bundle.pack import pack
+from stereorig.server.store.bundle.unpack import unpack
+from stereorig.server.store.verify import require_data_folder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "Pack a test into one ZIP file with all that is needed to measure it again: images, settings, calibrations, "
         "analyses, the SHA-256 of every file, the environment, and RO-Crate metadata, by which repositories show it; a "
         "service may run on the data folder. 'bundle --open FILE' brings such a file into a data folder on which no "
-        "service runs, and makes the folder where there is none: the whole test, or nothing."
+        "service runs, and makes the folder if it is missing: the whole test, or nothing."
     )
     parser.add_argument("test", nargs="?", metavar="TEST", help="id of the test to pack")
     parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="file to write (default: TEST.zip)")

@@ -8,17 +8,17 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from core.errors import InputError
-from server.exports.vtu import write_vtu
-from server.formats.files import make_folder, write_bytes
-from server.formats.models.read import UNITS
-from server.formats.results.folder import first_results
-from server.formats.results.summary import to_json
-from server.results.models.compare import compare_files
-from server.results.models.document import ComparisonReply, FieldVerdict
-from server.results.models.request import CompareRequest, placement_in
-from server.results.steps import Source, read_step
-from server.wording import problems_in
+from stereorig.core.errors import InputError
+from stereorig.server.exports.vtu import write_vtu
+from stereorig.server.formats.files import make_folder, write_bytes
+from stereorig.server.formats.models.read import UNITS
+from stereorig.server.formats.results.folder import first_results
+from stereorig.server.formats.results.summary import to_json
+from stereorig.server.results.models.compare import compare_files
+from stereorig.server.results.models.document import FieldVerdict, ModelComparisonReply
+from stereorig.server.results.models.request import CompareRequest, placement_in
+from stereorig.server.results.steps import ExportSource, read_step
+from stereorig.server.wording import problems_in
 
 _SHOWN = 12  # refuted regions
 _MICRO = 1e6
@@ -34,16 +34,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add = parser.add_argument
     add("folder", metavar="FOLDER", type=Path, help="results of stereorig measure, or of an analysis: step_0000.nc ...")
-    add("--model", metavar="FILE", type=Path, required=True, help="VTU, XDMF (its HDF5 beside it), or CSV")
-    add("--unit", choices=UNITS, help="unit of length of the file, where it states none")
-    add("--displacement", metavar="NAME", help="array of the nodes' displacement, or three: ux,uy,uz")
+    add("--model", metavar="FILE", type=Path, required=True, help="VTU, XDMF (its HDF5 in the same folder), or CSV")
+    add("--unit", choices=UNITS, help="unit of length of the file, if it states none")
+    add(
+        "--displacement",
+        metavar="NAME",
+        help="the nodes' displacement: an array, a table's vector, or scalars: ux,uy,uz (two of a plane model)",
+    )
     add("--time", type=float, metavar="T", help="time of the state to take from a series (the last)")
     add("--step", type=int, metavar="N", help="step to compare (the last)")
     add(
         "--align",
         default="given",
         metavar="given|3-2-1:X,Y,...|markers|best-fit|JSON",
-        help="where the model lies: in the system frame; by six positions in px, three on its plane Z = 0, two on its "
+        help="placement: in the system frame; by six positions in px, three on its plane Z = 0, two on its "
         "X axis, one at X = 0; by --marker; by the shape, from the markers or the system frame; or as the API's align",
     )
     add(
@@ -71,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
         make_folder(args.out)
         write_bytes(args.out / "comparison.json", to_json(document.model_dump(mode="json")))
         path = next(f for f in files if f.name in document.inputs_sha256)
-        source = Source(files, "comparison", about={"model": document.model.model_dump(mode="json")})
+        source = ExportSource(files, "comparison", about={"model": document.model.model_dump(mode="json")})
         write_vtu(args.out / "comparison.vtu", found.added_to(read_step(path)), source)
     if args.json:
         print(to_json(document.model_dump(mode="json")).decode())
@@ -89,7 +93,7 @@ def _request(args: argparse.Namespace) -> CompareRequest:
         return CompareRequest.model_validate({**body, "remove_rigid": args.remove_rigid, "align": _align(args)})
     except ValidationError as error:
         raise InputError(
-            f"{problems_in(error, CompareRequest)[0]}", code="wrong_usage", remedy="See stereorig compare-model --help."
+            f"{problems_in(error)[0]}", code="wrong_usage", remedy="See stereorig compare-model --help."
         ) from error
 
 
@@ -133,7 +137,7 @@ def _numbers(option: str, text: str, count: int) -> list[float]:
     return numbers
 
 
-def report(found: ComparisonReply) -> list[str]:
+def report(found: ModelComparisonReply) -> list[str]:
     """Return the comparison in lines of text."""
     model, place, factor = found.model, found.align, found.factor
     through = f", {place.points} points, residual {1e3 * place.residual_rms_mm:.2f} um" if place.points else ""
@@ -149,6 +153,13 @@ def report(found: ComparisonReply) -> list[str]:
     lines += _quantity("displacement", found.displacement, 1e3, "um")
     if found.strain is not None:
         lines += _quantity("strain", found.strain, _MICRO, "microstrain")
+    if model.corners_only:
+        lines.append(f"of {model.corners_only} cells of a higher order only the corners were taken")
+    if found.left_out is not None:
+        left = found.left_out.removesuffix("_mm")
+        lines.append(
+            f"plane model: {left} is left out of difference, chi-square and verdict; the others are in its plane"
+        )
     if found.not_included:
         lines.append(f"uncertainties: {found.not_included}")
     for k in found.refuted[:_SHOWN]:

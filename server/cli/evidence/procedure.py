@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from core.errors import InputError, StateError
-from server.api.models.evidence.procedure import ProcedureReply, ProcedureStepReply
-from server.cli.terminal import ProgressLine
-from server.demo.client import ServiceClient
-from server.results.certificate.plan import CertificatePlan
+from stereorig.core.errors import InputError, StateError
+from stereorig.server.api.models.evidence.procedure import ProcedureReply, ProcedureStepReply
+from stereorig.server.cli.terminal import ProgressLine
+from stereorig.server.demo.client import ServiceClient
+from stereorig.server.results.certificate.plan import CertificatePlan
 
 if TYPE_CHECKING:
-    from server.api.models.recipes import Recipe
+    from stereorig.server.api.models.recipes import Recipe
 
 
 @dataclass(frozen=True)
@@ -39,23 +39,23 @@ def carry_out(
     Parameters
     ----------
     plan
-        What is carried out.
+        The plan to carry out.
     test_id
-        A test that is there, whose procedure goes on; None: a new one with the newest accepted calibration.
+        A test whose procedure is to be continued; None: a new one with the newest accepted calibration.
     frames
-        Averaged at each step.
+        Frames averaged at each step.
     url, key
-        Of the service.
+        Address of the service, and a key for it.
     recipe
-        Region and settings of the analysis; None: what is drawn in the test. Where no region is drawn, the specimen as
-        it is found.
+        Region and settings of the analysis; None: the test's drawing. Without a region in either, the specimen is
+        searched for.
     on
-        Where progress and what was done are said.
+        Prints the progress and the finished steps.
 
     Raises
     ------
     InputError
-        ``certificate_plan_invalid``, ``procedure_order``; ``procedure_by_hand`` where nobody can be asked.
+        ``certificate_plan_invalid``, ``procedure_order``; ``procedure_by_hand`` without a terminal to ask.
     StateError
         The service's refusal; ``not_calibrated`` before any step is taken.
     MeasurementError
@@ -89,7 +89,7 @@ def _document(plan: CertificatePlan) -> dict[str, Any]:
 
 
 def _test(client: ServiceClient, test_id: str | None, plan: CertificatePlan, on: ProgressLine) -> str:
-    """Return the test that the steps are taken in; refuse one without calibration before anybody moves a body."""
+    """Return the test that the steps are taken in; refuse one without calibration before a body is moved by hand."""
     if test_id is None:
         body = {"name": plan.title or "verification", "calibration_id": "latest"}
         test_id = str(client.call("POST", "/tests", json=body).json()["id"])
@@ -106,7 +106,7 @@ def _test(client: ServiceClient, test_id: str | None, plan: CertificatePlan, on:
 def _taken(
     client: ServiceClient, test_id: str, plan: CertificatePlan, frames: int, on: ProgressLine
 ) -> list[ProcedureStepReply]:
-    """Plan the procedure, take what is not taken yet; return the steps that are there."""
+    """Plan the procedure, take the steps that are not taken yet; return the steps that are taken."""
     path = f"/tests/{test_id}/certificate-plan"
     sent = {"plan": _document(plan), "frames": frames}
     now = ProcedureReply.model_validate(client.call("PUT", path, json=sent).json())
@@ -122,24 +122,24 @@ def _taken(
 
 
 def _confirmed(step: ProcedureStepReply) -> None:
-    """Wait until a person has done what a step asks for."""
+    """Wait until a person has done the action of a step."""
     if step.by != "hand" and step.n > 0:
         return
     try:
         input("  Press Enter when it is done. ")
     except EOFError as error:
         raise InputError(
-            f"Step {step.n} is taken by hand, and nobody can be asked here. {step.what}",
+            f"Step {step.n} is taken by hand, and there is no terminal to ask in. {step.what}",
             code="procedure_by_hand",
             remedy="Run the command in a terminal; steps that are taken stay taken.",
         ) from error
 
 
 def _asked_of(client: ServiceClient, test_id: str, recipe: Recipe | None, on: ProgressLine) -> dict[str, Any]:
-    """Return the analysis that is asked for: region and settings of the recipe, else of what is drawn in the test."""
-    from server.api.models.recipes import recipe_in
+    """Return the analysis to make: region and settings of the recipe, else of the test's drawing."""
+    from stereorig.server.api.models.recipes import recipe_in
 
-    drawn = recipe or recipe_in(client.get(f"/tests/{test_id}/workspace"), name="what is drawn in the test")
+    drawn = recipe or recipe_in(client.get(f"/tests/{test_id}/workspace"), name="the test's drawing")
     body = drawn.analysis()
     if "region" not in body:
         subset = {name: body[name] for name in ("subset_px",) if name in body}

@@ -9,13 +9,13 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from core.errors import InputError
-from server.cli.terminal import ProgressLine
-from server.store.folder import DataFolder
-from server.store.tests.tests import TestStore
-from server.store.verify import require_data_folder
-from server.worker.tasks import measure_step
-from server.workflows.repetition.repeat import Repetition, repeat
+from stereorig.core.errors import InputError
+from stereorig.server.cli.terminal import ProgressLine
+from stereorig.server.compute.functions import measure_step
+from stereorig.server.store.folder import DataFolder
+from stereorig.server.store.tests.tests import TestStore
+from stereorig.server.store.verify import require_data_folder
+from stereorig.server.workflows.repetition.repeat import Repetition, repeat
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Measure an analysis again from the stored images, settings and calibration, and compare it with its results: "
         "equal to the last bit; within, the same points and every difference at most a tenth of its standard "
-        "uncertainty; or differs, with what changed in version, libraries and processor. The data folder is only read; "
+        "uncertainty; or differs, with the changes in version, libraries and processor. The data folder is only read; "
         "a service may run on it. Ends with 1 when something differs."
     )
     parser.add_argument("analysis", metavar="TEST/ANALYSIS", help="ids; TEST alone: all its analyses")

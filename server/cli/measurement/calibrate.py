@@ -3,27 +3,36 @@
 from __future__ import annotations
 
 import argparse
-import re
 from math import isfinite
 from pathlib import Path
 
-from core.calibration import CalibrationResult, Measures
-from core.errors import InputError
-from core.names import CAMERAS
-from server.cli.terminal import ProgressLine
-from server.formats.calibrations.from_folder import calibrate_folder
+from stereorig.core.calibration import CalibrationResult, Measures
+from stereorig.core.errors import InputError
+from stereorig.core.names import CAMERAS
+from stereorig.server.cli.measurement.image_lists import expand, pair_up
+from stereorig.server.cli.terminal import ProgressLine
+from stereorig.server.formats.calibrations.from_folder import calibrate_folder
+from stereorig.server.formats.views import ViewFile, views_of_pairs
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    # "-2,4" after --hold-out is a list of numbers, not an option
-    parser._negative_number_matcher = re.compile(r"^-[\d.][\d.,+\- ]*$")
     parser.add_argument(
         "views",
+        nargs="?",
         metavar="VIEWS",
         type=Path,
         help="folder with cam1_+0.000mm.tif, cam2_+5.000mm.tif and so on (dZ in the name); of free poses cam1_000.tif, "
         "cam2_000.tif and so on; of both for mixtures",
+    )
+    parser.add_argument(
+        "--cam1",
+        nargs="+",
+        metavar="GLOB",
+        help="instead of VIEWS: camera 1's images of free poses, a quoted pattern or several paths",
+    )
+    parser.add_argument(
+        "--cam2", nargs="+", metavar="GLOB", help="camera 2's; files are paired in sorted order and numbered from 0"
     )
     parser.add_argument(
         "--target",
@@ -38,13 +47,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="RIG.toml",
         type=Path,
         help="[cam1] and [cam2]: image_size_px, phd_px, standoff_mm, angle_deg, aspect; [calibration]: moves (cameras, "
-        "both_cameras, target, free), lens (auto, paper, opencv5, opencv8)",
+        "both_cameras, target, free), lens (auto, paper, opencv5, opencv8, opencv12, opencv14)",
     )
     parser.add_argument(
         "--hold-out",
         default="",
         metavar="2,4",
-        help="positions in mm, or numbers of free poses, to leave out of the fit and check with",
+        help="positions in mm, or numbers of free poses, to leave out of the fit and check with; left out: each "
+        "position but the first and the last in turn, or a fifth of the free poses at a time",
     )
     parser.add_argument(
         "--localiser",
@@ -58,12 +68,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Calibrate; print a table; write the file unless the verdict is failed."""
     held_out = parse_hold_out(args.hold_out)
+    views = args.views if args.cam1 is None and args.cam2 is None else _paired(args)
+    if views is None:
+        raise InputError(
+            "No views were given.", code="views_missing", remedy="Give the folder of views, or --cam1 and --cam2."
+        )
     if args.out.is_dir():
         raise InputError(f"The output {args.out} is a folder.", code="output_unusable", remedy="Give a file's name.")
     line = ProgressLine()
     try:
         found = calibrate_folder(
-            args.views,
+            views,
             args.target,
             args.rig,
             hold_out=held_out,
@@ -76,6 +91,24 @@ def run(args: argparse.Namespace) -> int:
     found.write(args.out)
     print(f"written: {args.out}")
     return 0
+
+
+def _paired(args: argparse.Namespace) -> list[ViewFile]:
+    """Return the views that --cam1 and --cam2 name, paired as ``measure`` pairs its images."""
+    if args.cam1 is None or args.cam2 is None or args.views is not None:
+        raise InputError(
+            "Views come from one folder, or from --cam1 and --cam2 together.",
+            code="views_missing",
+            remedy="Give the folder of views alone, or both options without it.",
+        )
+    lists = []
+    for option, items in (("--cam1", args.cam1), ("--cam2", args.cam2)):
+        files, note = expand(option, items)
+        if note is not None:
+            print(f"note: {note}")
+        lists.append(files)
+    pairs = pair_up(*lists)
+    return views_of_pairs([p.cam1 for p in pairs], [p.cam2 for p in pairs])
 
 
 def parse_hold_out(text: str) -> tuple[float, ...]:

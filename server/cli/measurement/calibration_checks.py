@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from core.arrays import Float
-from core.calibration.checks.compare import CalibrationComparison, Difference
-from core.calibration.checks.distance import MARK_SIGMA_PX
-from core.errors import InputError
-from core.names import CAMERAS
-from server.formats.calibrations.kept_checks import keep_check
-from server.formats.calibrations.recognise import load_calibration
-from server.formats.calibrations.target_toml import read_rig, read_target
-from server.formats.files import write_bytes
-from server.formats.images import read_image
-from server.results.calibration_checks import (
+from stereorig.core.arrays import Float
+from stereorig.core.calibration.checks.compare import CalibrationComparison, Difference
+from stereorig.core.calibration.checks.distance import MARK_SIGMA_PX
+from stereorig.core.errors import InputError
+from stereorig.core.names import CAMERAS
+from stereorig.server.formats.calibrations.kept_checks import keep_check
+from stereorig.server.formats.calibrations.recognise import load_calibration
+from stereorig.server.formats.calibrations.target_toml import read_rig, read_target
+from stereorig.server.formats.files import write_bytes
+from stereorig.server.formats.images import read_image
+from stereorig.server.results.calibration_checks import (
     KNOWN_DISTANCE,
     NamedImage,
     aspect_of_images,
@@ -38,7 +38,7 @@ ACTIONS = ("distance", "compare", "aspect")
 def add_check_actions(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the actions' arguments."""
     distance = actions.add_parser("distance", help="measure a known distance: the only check that shows a wrong pitch")
-    distance.add_argument("file", metavar="FILE", type=Path, help="calibration; the finding is kept beside it")
+    distance.add_argument("file", metavar="FILE", type=Path, help="calibration; the finding is stored in its folder")
     distance.add_argument(
         "--points", nargs=2, metavar="X1,Y1,X2,Y2", help="both marks' positions in camera 1's image, then in camera 2's"
     )
@@ -62,6 +62,9 @@ def add_check_actions(actions: argparse._SubParsersAction[argparse.ArgumentParse
     compare = actions.add_parser("compare", help="compare two calibrations of one rig in space")
     compare.add_argument("file", metavar="A", type=Path, help="a calibration")
     compare.add_argument("other", metavar="B", type=Path, help="a second one of the same rig")
+    compare.add_argument(
+        "--independent", action="store_true", help="other targets, stages and cameras, also where declared alike"
+    )
     compare.add_argument("--out", metavar="FILE.json", type=Path, help="write all numbers")
     aspect = actions.add_parser("aspect", help="measure the aspect ratio from images of a line grid at 45 degrees")
     aspect.add_argument("images", nargs="+", metavar="IMAGE", type=Path, help="cam1_*.tif, cam2_*.tif; else one camera")
@@ -71,7 +74,7 @@ def add_check_actions(actions: argparse._SubParsersAction[argparse.ArgumentParse
 
 
 def run_check(args: argparse.Namespace) -> int:
-    """Run one of the actions; print what was found."""
+    """Run one of the actions; print its findings."""
     if args.action == "distance":
         _distance(args)
     elif args.action == "compare":
@@ -115,7 +118,7 @@ def _distance(args: argparse.Namespace) -> None:
         how = {"images": [str(path) for path in args.images], "target": str(args.target)}
     print(found.text)
     if found.residual_mm is not None:
-        print(f"the points lie {1e3 * found.residual_mm:.3g} um rms off the target's description")
+        print(f"the points are {1e3 * found.residual_mm:.3g} um rms off the target's description")
     kept = keep_check(args.file, loaded.sha256, KNOWN_DISTANCE, kept_distance(found, how))
     print(f"known_distance: {'agrees' if found.agrees else 'DOES NOT AGREE'}; kept in {kept}")
 
@@ -135,7 +138,7 @@ def _marks(text: str) -> Float:
 
 
 def _compare(args: argparse.Namespace) -> None:
-    found = compare_loaded(load_calibration(args.file), load_calibration(args.other))
+    found = compare_loaded(load_calibration(args.file), load_calibration(args.other), independent=args.independent)
     print("\n".join(comparison_lines(found)))
     if args.out is not None:
         write_bytes(args.out, (json.dumps(plain(found), indent=1, allow_nan=False) + "\n").encode())

@@ -7,19 +7,23 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-from core.errors import InputError
-from server.cli.measurement import calibration_repair
-from server.cli.measurement.calibration_checks import ACTIONS, add_check_actions, run_check
-from server.formats.calibrations.export import FORMS, ConversionReport, convert_calibration
-from server.formats.calibrations.in_test import calibration_in
-from server.formats.calibrations.kept_checks import read_checks
-from server.formats.calibrations.programs.plausibility import CalibrationCheck, Residual, check_calibration
-from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
-from server.formats.files import make_folder, write_bytes
-from server.formats.images import read_file
-from server.formats.results.folder import first_results
-from server.formats.results.reading import read_head
-from server.results.epipolar_check import EpipolarComparison, check_against
+from stereorig.core.errors import InputError
+from stereorig.server.cli.measurement import calibration_repair
+from stereorig.server.cli.measurement.calibration_checks import ACTIONS, add_check_actions, run_check
+from stereorig.server.formats.calibrations.export import FORMS, ConversionReport, convert_calibration
+from stereorig.server.formats.calibrations.in_test import calibration_in
+from stereorig.server.formats.calibrations.kept_checks import read_checks
+from stereorig.server.formats.calibrations.programs.plausibility import CalibrationCheck, Residual, check_calibration
+from stereorig.server.formats.calibrations.recognise import (
+    UNIT_HELP,
+    LoadedCalibration,
+    calibration_bytes,
+    load_calibration,
+)
+from stereorig.server.formats.files import make_folder, write_bytes
+from stereorig.server.formats.results.folder import first_results
+from stereorig.server.formats.results.reading import read_head
+from stereorig.server.results.epipolar_check import EpipolarComparison, check_against
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     known = "calibration.json, DICe XML or text, OpenCV YAML, MatchID caldat, VIC-3D XML or pyvale text"
     convert = actions.add_parser("convert", help="write a calibration in another form")
     convert.add_argument("file", metavar="IN", type=Path, help=known)
-    convert.add_argument("out", metavar="OUT", type=Path, help="file to write; OUT.report.json goes beside it")
+    convert.add_argument("out", metavar="OUT", type=Path, help="file to write; OUT.report.json is written too")
     convert.add_argument(
         "--to",
         required=True,
@@ -39,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     check = actions.add_parser("check", help="epipolar residuals: over the volume, and over measured points")
     check.add_argument("file", metavar="FILE", type=Path, help=known)
     calibration_repair.add_arguments(
-        actions.add_parser("repair", help="estimate the cameras' orientation anew after a bump, from speckle images")
+        actions.add_parser("repair", help="estimate the cameras' orientation again after a bump, from speckle images")
     )
     for action in (convert, check):
         action.add_argument(
@@ -49,25 +53,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             help="results of stereorig measure or of an analysis: their points are checked too",
         )
         action.add_argument(
-            "--measured-with", metavar="FILE", type=Path, help="the calibration of those results (that of their test)"
+            "--measured-with", metavar="FILE", type=Path, help="the calibration of those results (their test's)"
         )
+        action.add_argument("--unit", metavar="UNIT", help=UNIT_HELP)
     add_check_actions(actions)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Convert, check or repair; print what was found."""
+    """Convert, check or repair; print the findings."""
     if args.action in ACTIONS:
         return run_check(args)
     if args.action == "repair":
         return calibration_repair.run(args)
-    loaded = load_calibration(args.file)
+    loaded = load_calibration(args.file, unit=args.unit)
     checked, points = check_calibration(loaded), None
     if args.points is not None:
         points = _against(loaded, args.points, args.measured_with)
     elif args.measured_with is not None:
         raise InputError("--measured-with is given without --points.", code="option_conflict", remedy="Give both.")
     if args.action == "convert":
-        made = convert_calibration(loaded, args.to, read_file(args.file))
+        made = convert_calibration(loaded, args.to, calibration_bytes(args.file))
         make_folder(args.out.absolute().parent)
         write_bytes(args.out, made.data)
         check = asdict(checked) | ({} if points is None else {"points": asdict(points)})

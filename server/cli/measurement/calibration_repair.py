@@ -1,4 +1,4 @@
-"""``stereorig calibration repair``: the cameras' relative orientation anew from speckle images, after a bump."""
+"""``stereorig calibration repair``: the cameras' relative orientation again from speckle images, after a bump."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from core.errors import InputError
-from core.orientation import RepairLimits
-from core.settings import SPACING_PX, SUBSET_PX, Region
-from server.cli.measurement.image_lists import ImagePair, pairs_of_test_folder
-from server.cli.measurement.image_pairs import check_cameras, check_pair, checked_shapes
-from server.cli.measurement.region import check_whole, parse_rectangle
-from server.cli.terminal import ProgressLine
-from server.compute.orientation_repair import repair_from_files
-from server.formats.calibrations.recognise import load_calibration
-from server.formats.files import make_folder, write_bytes
-from server.formats.images import read_mask
-from server.formats.results.summary import to_json
-from server.worker.tasks import StepImages
+from stereorig.core.errors import InputError
+from stereorig.core.orientation import RepairLimits
+from stereorig.core.settings import SPACING_PX, SUBSET_PX, Region
+from stereorig.server.cli.measurement.image_lists import ImagePair, pairs_of_test_folder
+from stereorig.server.cli.measurement.image_pairs import check_cameras, check_pair, checked_shapes
+from stereorig.server.cli.measurement.region import check_whole, parse_rectangle
+from stereorig.server.cli.terminal import ProgressLine
+from stereorig.server.compute.orientation_repair import repair_from_files
+from stereorig.server.compute.tasks import StepImages
+from stereorig.server.formats.calibrations.recognise import load_calibration
+from stereorig.server.formats.files import make_folder, write_bytes
+from stereorig.server.formats.images import read_mask
+from stereorig.server.formats.results.summary import to_json
 
 _LIMITS = RepairLimits()
 _AXES = ("x", "y", "z (optical axis)")
@@ -38,10 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--test", metavar="FOLDER", type=Path, help="a test's folder, in place of --images")
     add("--steps", nargs="+", type=int, metavar="N", help="steps of that test, all taken after the bump (all)")
-    add("--roi", metavar="X0,Y0,X1,Y1", help="points lie there in camera 1's images (all of them)")
-    add("--mask", metavar="PNG", type=Path, help="image of camera 1's size, white where points may lie")
+    add("--roi", metavar="X0,Y0,X1,Y1", help="region of the points in camera 1's images (all of them)")
+    add("--mask", metavar="PNG", type=Path, help="image of camera 1's size, white where points are allowed")
     add("--subset", default=str(SUBSET_PX.default), metavar="PX", help=f"subset width, odd ({SUBSET_PX.default})")
-    add("--step", "--spacing", metavar="PX", help="distance of the points (as many as tell more)")
+    add("--step", "--spacing", metavar="PX", help="distance of the points (as many as add information)")
     add(
         "--max-turn",
         type=float,
@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Repair; print what moved; write the new file."""
+    """Repair; print the change; write the new file."""
     steps = _steps(args)
     if args.out.exists() and args.out.samefile(args.file):
         raise InputError(

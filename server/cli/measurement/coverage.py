@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from core.settings import Coverage
-from server.formats.results.uncertainty import coverage_of
+from stereorig.core.settings import Coverage
+from stereorig.server.formats.results.uncertainty import coverage_of
 
 
 def add_coverage(parser: argparse.ArgumentParser) -> None:

@@ -8,16 +8,16 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-from core.errors import InputError
-from server.cli.measurement.coverage import add_coverage, coverage_from
-from server.exports.request import FORMATS, ExportRequest, steps_in
-from server.exports.run import export
-from server.exports.source import find_source
-from server.formats.figures.options import COLOURS, MAX_LEVELS, FigureStyle
-from server.formats.files import make_folder
-from server.results.gauges import FRAME_HELP
-from server.results.gauges.framed import asked_at, in_frame
-from server.results.gauges.frames import part_of
+from stereorig.core.errors import InputError
+from stereorig.server.cli.measurement.coverage import add_coverage, coverage_from
+from stereorig.server.exports.request import FORMATS, ExportRequest, steps_in
+from stereorig.server.exports.run import export
+from stereorig.server.exports.source import find_source
+from stereorig.server.formats.figures.options import COLOURS, MAX_LEVELS, FigureStyle
+from stereorig.server.formats.files import make_folder
+from stereorig.server.formats.results.variables import described
+from stereorig.server.results.gauges import FRAME_HELP
+from stereorig.server.results.gauges.framed import asked_at, in_frame
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,10 +52,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--colours", choices=COLOURS, default="viridis", help="colour map (viridis)")
     add("--levels", type=int, default=0, metavar="N", help=f"bands of one colour, up to {MAX_LEVELS} (0: smooth)")
     add("--reverse", action="store_true", help="the colour map from its other end")
-    add("--opacity", type=float, default=0.75, metavar="N", help="of the map over the image, up to 1 (0.75)")
+    add("--opacity", type=float, default=0.75, metavar="N", help="opacity of the map over the image, up to 1 (0.75)")
     add("--width", type=int, default=900, metavar="PX", help="of figures and films (900)")
     add("--over-image", action="store_true", help="draw over camera 1's reference image")
-    add("--image", type=Path, metavar="FILE", help="camera 1's reference image, where it lies elsewhere now")
+    add("--image", type=Path, metavar="FILE", help="camera 1's reference image, if it was moved")
     add("--fps", type=float, default=2.0, metavar="N", help="steps a second in a film (2)")
     add_coverage(parser)
 
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory() as folder:
         files = [Path(path) for path in source.files]
         drawn = request.drawn_variables
-        strain = drawn is None or any(part_of(name) == "strain" for name in drawn)
+        strain = drawn is None or any(described(name).part == "strain" for name in drawn)
         framed = in_frame(files, asked_at(args.frame, files[0]), Path(folder) / "frame", strain=strain)
         for path in export(replace(source, files=framed), request, args.out):
             print(path)

@@ -9,20 +9,20 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from core.errors import InputError
-from server.cli.measurement.coverage import add_coverage, coverage_from
-from server.formats.files import make_folder, write_bytes
-from server.formats.gauges.matlab import gauges_mat
-from server.formats.gauges.readings import GaugeReadings, LineReading, Number, StepReadings
-from server.formats.gauges.table import gauges_csv
-from server.formats.results.folder import first_results
-from server.formats.results.summary import to_json
-from server.results.gauges import FRAME_HELP
-from server.results.gauges.fields import FieldWriter
-from server.results.gauges.framed import asked_at
-from server.results.gauges.readings import read_gauges
-from server.results.gauges.request import Alignment, GaugeRequest
-from server.wording import problems_in
+from stereorig.core.errors import InputError
+from stereorig.server.cli.measurement.coverage import add_coverage, coverage_from
+from stereorig.server.formats.files import make_folder, write_bytes
+from stereorig.server.formats.gauges.matlab import gauges_mat
+from stereorig.server.formats.gauges.readings import GaugeReadings, LineReading, Number, StepReadings
+from stereorig.server.formats.gauges.table import gauges_csv
+from stereorig.server.formats.results.folder import first_results
+from stereorig.server.formats.results.summary import to_json
+from stereorig.server.results.gauges import FRAME_HELP
+from stereorig.server.results.gauges.fields import FieldWriter
+from stereorig.server.results.gauges.framed import asked_at
+from stereorig.server.results.gauges.readings import read_gauges
+from stereorig.server.results.gauges.request import Alignment, GaugeRequest
+from stereorig.server.wording import problems_in
 
 _FORMS = {".csv": gauges_csv, ".json": lambda readings: to_json(readings.document()), ".mat": gauges_mat}
 
@@ -94,7 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         const="all",
         metavar="X0,Y0,X1,Y1",
-        help="take out the rigid motion of the whole field, or that of a rectangle or polygon",
+        help="take out the rigid motion of the whole field, or of a rectangle or polygon",
     )
     add("--robust", action="store_true", help="let no outlier draw the rigid motion")
     add("--step", action="append", default=[], type=int, metavar="N", help="read this step only; repeatable (all)")
@@ -102,7 +102,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--difference-from",
         type=int,
         metavar="N",
-        help="also take the readings of step N from those of each step: what both share of the uncertainty cancels",
+        help="also subtract the readings of step N from each step's: the uncertainty that both share cancels",
     )
     add_coverage(parser)
     add(
@@ -174,7 +174,7 @@ def _request(args: argparse.Namespace, frame: Alignment | None) -> GaugeRequest:
     try:
         return GaugeRequest.model_validate(body)
     except ValidationError as error:
-        first = problems_in(error, GaugeRequest)[0]
+        first = problems_in(error)[0]
         raise InputError(f"{first}", code="gauge_unusable", remedy="See stereorig gauge --help.") from error
 
 
@@ -250,7 +250,7 @@ def report(readings: GaugeReadings) -> list[str]:
             f"  from {frame.points} points, residual {1e3 * frame.residual_rms_mm:.2f} um rms; "
             f"sd of its turns about X, Y, Z {turns} urad"
         )
-    lines += [f"step {s.n}: {s.problem.code}: {s.problem.cause}" for s in readings.steps if s.problem is not None]
+    lines += [f"step {s.n}: {s.problem.code}: {s.problem.detail}" for s in readings.steps if s.problem is not None]
     steps = readings.read
     moved = [(s, s.rigid_motion.values, "") for s in steps if s.rigid_motion is not None]
     if moved:
@@ -303,7 +303,7 @@ def _table(rows: Sequence[tuple[StepReadings, Mapping[str, Number], str]]) -> li
 
 
 def _shown(number: Number | None) -> str:
-    """A number to the second digit of its uncertainty: the expanded one where that was asked for."""
+    """A number to the second digit of its uncertainty: of the expanded one if asked for."""
     if number is None or number.value is None:
         return "-"
     value, sigma = number.value, number.sigma if number.expanded is None else number.expanded

@@ -1,4 +1,4 @@
-"""Which image files make which step: patterns expanded, files paired in sorted order."""
+"""Lists of image files as steps: patterns expanded, files paired in sorted order."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from core.errors import FileFormatError, ImageError, InputError
-from core.names import CAMERAS
-from server.worker.tasks import averages_of, grey_from_of
+from stereorig.core.errors import FileFormatError, ImageError, InputError
+from stereorig.core.names import CAMERAS
+from stereorig.server.compute.tasks import averages_of, grey_from_of
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,9 @@ class ImagePair:
 
 
 def _natural(path: str) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path)]
+    return [
+        (int(part), "") if part.isascii() and part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", path)
+    ]
 
 
 def expand(option: str, items: Sequence[str]) -> tuple[list[Path], str | None]:
@@ -122,7 +124,7 @@ def pairs_of_test_folder(folder: Path) -> list[ImagePair]:
             record = json.loads(mark.read_text())
         except (ValueError, OSError) as error:
             raise FileFormatError(f"{mark} cannot be read as a step's record ({error}).") from error
-        number = int(mark.parent.name) if mark.parent.name.isdigit() else None
+        number = int(mark.parent.name) if _is_number(mark.parent) else None
         known = record if isinstance(record, dict) else {}
         images = mark.parent / "cam1.tif", mark.parent / "cam2.tif"
         pairs.append(ImagePair(*images, number, *_hashes(record), averages_of(known), grey_from_of(known)))
@@ -135,9 +137,13 @@ def pairs_of_test_folder(folder: Path) -> list[ImagePair]:
     return pairs
 
 
+def _is_number(folder: Path) -> bool:
+    return folder.name.isascii() and folder.name.isdigit()
+
+
 def _check_steps(folder: Path) -> None:
     """Refuse a test whose steps do not begin with the reference or have a gap; an incomplete step keeps its folder."""
-    complete = [int(mark.parent.name) for mark in folder.glob("steps/*/step.json") if mark.parent.name.isdigit()]
+    complete = [int(mark.parent.name) for mark in folder.glob("steps/*/step.json") if _is_number(mark.parent)]
     if not complete:
         return
     remedy = "Restore it from a backup, or give the images that are left with --cam1 and --cam2."
@@ -145,7 +151,7 @@ def _check_steps(folder: Path) -> None:
         raise InputError(
             f"The reference, step 0, of {folder} is missing or incomplete.", code="reference_missing", remedy=remedy
         )
-    known = {int(path.name) for path in folder.glob("steps/*") if path.name.isdigit()}
+    known = {int(path.name) for path in folder.glob("steps/*") if _is_number(path)}
     gone = [n for n in range(max(complete)) if n not in known]
     if gone:
         raise InputError(

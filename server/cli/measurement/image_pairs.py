@@ -7,20 +7,21 @@ import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
-from core.errors import FileFormatError, ImageError, InputError, StereorigError
-from core.field.points.images import check_calibrated_size
-from server.cli.measurement.image_lists import ImagePair
-from server.formats.calibrations.recognise import LoadedCalibration
-from server.formats.images import decode, decode_image, read_file
-from server.store.durable import read_json
-from server.worker.tasks import StepImages
-from server.workflows.camera_identity import check_same_cameras
+from stereorig.core.errors import FileFormatError, ImageError, InputError, StereorigError
+from stereorig.core.field.points.images import check_calibrated_size
+from stereorig.server.cli.measurement.image_lists import ImagePair
+from stereorig.server.compute.tasks import StepImages
+from stereorig.server.formats.calibrations.recognise import LoadedCalibration
+from stereorig.server.formats.images import decode, decode_image, read_file
+from stereorig.server.results.images.quality import saturated_share
+from stereorig.server.store.durable import read_json
+from stereorig.server.workflows.camera_identity import check_same_cameras
 
 
 def checked_pairs(
     files: Sequence[ImagePair], shapes: tuple[tuple[int, int], tuple[int, int]], *, alone: bool
 ) -> tuple[list[StepImages], dict[int, StereorigError]]:
-    """Check every pair; return those that can be measured, and the error of each other one, by its number.
+    """Check every pair; return the ones that can be measured, and the errors of the others, by number.
 
     Parameters
     ----------
@@ -61,7 +62,7 @@ def check_cameras(pair: ImagePair, calibration_file: Path) -> None:
 
 
 def checked_shapes(first: ImagePair, calibration: LoadedCalibration) -> tuple[tuple[int, int], tuple[int, int]]:
-    """(rows, cols) of both cameras' images, which the calibration must agree with where it states a size."""
+    """(rows, cols) of both cameras' images; the calibration's sizes, if it states them, must agree."""
     shapes = []
     for path, size in ((first.cam1, calibration.image_size1_px), (first.cam2, calibration.image_size2_px)):
         rows, cols = decode_image(read_file(path), name=str(path)).shape
@@ -72,7 +73,7 @@ def checked_shapes(first: ImagePair, calibration: LoadedCalibration) -> tuple[tu
 
 def check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[int, int]]) -> StepImages:
     """Read both images of a step once, so that a bad one is found before hours of work on the others."""
-    hashes, greys = [], []
+    hashes, greys, saturated = [], [], []
     for path, recorded, shape in ((pair.cam1, pair.sha256_1, shapes[0]), (pair.cam2, pair.sha256_2, shapes[1])):
         data = read_file(path)
         hashes.append(hashlib.sha256(data).hexdigest())
@@ -98,6 +99,7 @@ def check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[
                 remedy="Check exposure, lens cap and trigger, then take the step again.",
             )
         greys.append(decoded.grey_from)
+        saturated.append(saturated_share(image, decoded.bit_depth))
     if hashes[0] == hashes[1]:
         raise InputError(
             f"{pair.cam1} and {pair.cam2} (step {step}) hold the same image.",
@@ -110,4 +112,5 @@ def check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[
         sha256=(hashes[0], hashes[1]),
         averages=pair.averages,
         grey_from=(greys[0] or pair.grey_from[0], greys[1] or pair.grey_from[1]),
+        saturated=(saturated[0], saturated[1]),
     )

@@ -7,14 +7,13 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from core.errors import FileFormatError, InputError, RegionError
-from core.field.prefilter import check_prefilter
-from core.settings import (
+from stereorig.core.errors import FileFormatError, InputError, RegionError
+from stereorig.core.field.prefilter import check_prefilter
+from stereorig.core.settings import (
     DEFAULT_INTERPOLATION,
     DEFAULT_MAX_SIGMA_PX,
     DEFAULT_PATCH,
     DEFAULT_REFERENCE_UPDATE,
-    DEFAULT_SPLIT_STEP,
     DENSE_STEP_PX,
     INTERPOLATIONS,
     MAX_SIGMA_PX,
@@ -22,38 +21,47 @@ from core.settings import (
     REFERENCE_UPDATES,
     SMOOTHING_WINDOW,
     SPACING_PX,
-    SPLIT_STEP_FROM,
-    SPLIT_STEPS,
     STRAIN_ORDERS,
     STRAIN_TENSORS,
     STRAIN_WINDOW,
     SUBSET_PX,
     Outline,
     StoredSettings,
-    patch_name,
 )
-from server.cli.measurement.image_lists import ImagePair, expand, pair_up, pairs_of_test_folder
-from server.cli.measurement.image_pairs import check_cameras, checked_pairs, checked_shapes, first_readable
-from server.cli.measurement.region import check_region, check_whole, parse_outline
-from server.cli.measurement.sequence import MeasureJob, measure_sequence
-from server.cli.measurement.specimen import SPECIMEN_FILE, found_specimen
-from server.cli.recipe import mask_of, notes_on, with_recipe
-from server.cli.terminal import ProgressLine
-from server.compute.seeds import check_positions
-from server.formats.calibrations.in_test import calibration_in
-from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
-from server.formats.files import write_bytes
-from server.formats.images import read_mask
-from server.formats.noise_json import load_noise
-from server.formats.object_storage import copied
-from server.formats.results.reading import read_head
-from server.formats.results.summary import to_json
-from server.results.gauges import FRAME_HELP
-from server.results.images.projected_pattern import check_settings
-from server.store.durable import known_json
+from stereorig.server.cli.measurement.image_lists import ImagePair, expand, pair_up, pairs_of_test_folder
+from stereorig.server.cli.measurement.image_pairs import check_cameras, checked_pairs, checked_shapes, first_readable
+from stereorig.server.cli.measurement.region import check_region, check_whole, parse_outline
+from stereorig.server.cli.measurement.sequence import MeasureJob, measure_sequence
+from stereorig.server.cli.measurement.specimen import SPECIMEN_FILE, found_specimen
+from stereorig.server.cli.recipe import mask_of, notes_on, with_recipe
+from stereorig.server.cli.terminal import ProgressLine
+from stereorig.server.compute.seeds import check_positions
+from stereorig.server.formats.calibrations.in_test import calibration_in
+from stereorig.server.formats.calibrations.programs.plausibility import length_warning
+from stereorig.server.formats.calibrations.recognise import (
+    UNIT_HELP,
+    LoadedCalibration,
+    calibration_bytes,
+    imported_content,
+    load_calibration,
+    parse_calibration,
+)
+from stereorig.server.formats.files import write_bytes
+from stereorig.server.formats.images import read_mask
+from stereorig.server.formats.noise_json import load_noise
+from stereorig.server.formats.object_storage import copied
+from stereorig.server.formats.results.reading import read_head
+from stereorig.server.formats.results.summary import to_json
+from stereorig.server.results.gauges import FRAME_HELP
+from stereorig.server.results.images.projected_pattern import check_settings
+from stereorig.server.store.durable import known_json
 
 if TYPE_CHECKING:
-    from server.results.gauges.request import Alignment
+    from stereorig.server.results.gauges.request import Alignment
+
+
+#: a calibration with additions that its own file lacks, in the folder of the results
+CARRIED_FILE = "calibration_used.json"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -67,20 +75,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="calibration.json, or another program's: see stereorig calibration convert",
     )
+    add("--unit", metavar="UNIT", help=UNIT_HELP)
     add(
         "--roi",
         action="append",
         metavar="X0,Y0,X1,Y1|circle:X,Y,RADIUS|polygon:X0,Y0,...|auto",
-        help="points lie at X0 + i step, Y0 + j step up to X1, Y1, or likewise in a circle or a polygon; given several "
+        help="points at X0 + i step, Y0 + j step up to X1, Y1, or likewise in a circle or a polygon; given several "
         "times, in any of them; auto: on the specimen, found by its texture and shown in specimen.png (auto, without a "
         "mask)",
     )
     add(
         "--recipe",
         metavar="FILE",
-        help="recipe of the page or the API: region and settings, where no option here gives another",
+        help="recipe of the page or the API: region and settings, unless an option here gives another",
     )
-    add("--mask", metavar="PNG", help="image of camera 1's size, white where points may lie")
+    add("--mask", metavar="PNG", help="image of camera 1's size, white where points are allowed")
     add(
         "--crack",
         action="append",
@@ -99,10 +108,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--step", "--spacing", metavar="PX", help=f"distance of the points ({SPACING_PX.default})")
     add(
         "--patch",
-        type=patch_name,
         choices=PATCH_SETTINGS,
         help="affine, rigid: plane patches; quadratic: second-order shape and motion, about twice the noise; auto: "
-        f"affine or quadratic, whichever has the smaller total error, with the reason ({DEFAULT_PATCH})",
+        f"affine or quadratic, the one with the smaller total error, with the reason ({DEFAULT_PATCH})",
     )
     add("--interpolation", choices=INTERPOLATIONS, help=f"spline between the pixels ({DEFAULT_INTERPOLATION})")
     add(
@@ -116,7 +124,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PX",
         help=f"reject points whose match, in depth too, has a larger standard deviation ({DEFAULT_MAX_SIGMA_PX:g})",
     )
-    add("--keep-rejected", action="store_true", help="keep what was measured at rejected points, apart: rejected_*")
+    add(
+        "--keep-rejected",
+        action="store_true",
+        help="keep the values of rejected points, in variables of their own: rejected_*",
+    )
     add(
         "--seed",
         action="append",
@@ -151,15 +163,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--reference-update",
         choices=REFERENCE_UPDATES,
         help="never: match every step against the first (total); always: against the step before (incremental); auto: "
-        "against the first, or a later reference where that fails, with a note; displacements are totals in any case "
+        "against the first, or a later reference if that fails, with a note; displacements are totals in any case "
         f"({DEFAULT_REFERENCE_UPDATE})",
-    )
-    add(
-        "--split-step",
-        choices=SPLIT_STEPS,
-        help=f"auto: fields of {SPLIT_STEP_FROM['auto']:,.0f} usable points and more grow over a coarse part of them "
-        "first; always: all fields; never: every field grows in one piece. A service's workers share the rest of such "
-        f"a step ({DEFAULT_SPLIT_STEP})",
     )
     add(
         "--projected",
@@ -197,14 +202,14 @@ def _frame(args: argparse.Namespace) -> Alignment | None:
     """Return the frame that is asked for; None: the system frame."""
     if args.frame is None:
         return None
-    from server.results.gauges.frames import frame_asked, frame_of_test  # gauges are slow to load
+    from stereorig.server.results.gauges.frames import frame_asked, frame_of_test  # gauges are slow to load
 
     kept = None if args.folder is None else known_json(Path(args.folder) / "test.json").get("frame")
     return frame_asked(args.frame, frame_of_test(kept if isinstance(kept, dict) else None))
 
 
 def _put_into(asked: Alignment, files: list[Path]) -> str:
-    from server.results.gauges.framed import put_into_frame
+    from stereorig.server.results.gauges.framed import put_into_frame
 
     return put_into_frame(files, asked)
 
@@ -243,7 +248,7 @@ def _max_sigma_px(args: argparse.Namespace) -> float:
     value = DEFAULT_MAX_SIGMA_PX if args.max_sigma is None else float(args.max_sigma)
     if not 0.0 < value <= MAX_SIGMA_PX:
         raise InputError(
-            f"--max-sigma {value:g} must lie above 0 and be at most {MAX_SIGMA_PX:g}.", code="option_out_of_range"
+            f"--max-sigma {value:g} must be above 0 and at most {MAX_SIGMA_PX:g}.", code="option_out_of_range"
         )
     return value
 
@@ -297,12 +302,19 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
     files = _pairs(args, progress)
     folder = None if args.folder is None else Path(args.folder)
     calibration_file = Path(args.calibration) if args.calibration or folder is None else calibration_in(folder)
-    calibration = load_calibration(calibration_file)
+    calibration = load_calibration(calibration_file, unit=args.unit)
     if folder is not None and not args.calibration:
         _check_calibration(folder, calibration)
     for pair in files:
         check_cameras(pair, calibration_file)
+    doubt = length_warning(calibration)
+    if doubt is not None:
+        progress.note(f"warning: {doubt}")
     out = Path(args.out) if args.out or folder is None else folder / "exports" / "measure"
+    carried = _carried(calibration, calibration_file, args.unit)
+    if carried is not None:
+        calibration_file = out / CARRIED_FILE
+        calibration = parse_calibration(carried, name=str(calibration_file))
     first = first_readable(files) if args.projected else files[0]
     shapes = checked_shapes(first, calibration)
     if recipe is not None:
@@ -346,7 +358,6 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
             "dense_step_px": _dense_step_px(args, step),
             "pattern": "projected" if args.projected else "surface",
             "reference_update": args.reference_update or ("never" if args.projected else DEFAULT_REFERENCE_UPDATE),
-            "split_step": args.split_step or DEFAULT_SPLIT_STEP,
             "strain": strain,
             "reference": steps[0].n,
             "noise": None if noise is None else noise.record(),
@@ -364,7 +375,16 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         failed=failed,
         specimen=specimen,
         gauges=None if recipe is None else recipe.gauges,
+        carried=carried,
     )
+
+
+def _carried(calibration: LoadedCalibration, file: Path, unit: str | None) -> bytes | None:
+    """Return a calibration.json with additions that the file lacks: its unit, or its other half; else None."""
+    data = calibration_bytes(file)
+    if not calibration.imported or (unit is None and data == file.read_bytes()):
+        return None
+    return to_json(imported_content(data, name=str(file), unit=unit))
 
 
 def _check_calibration(folder: Path, calibration: LoadedCalibration) -> None:

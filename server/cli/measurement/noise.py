@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from core.errors import InputError
-from core.names import CAMERAS
-from core.noise import NoiseModel, measure_noise
-from server.cli.measurement.image_lists import expand
-from server.formats.files import make_folder, sha256_of
-from server.formats.noise_frames import read_frames
-from server.formats.noise_json import noise_content, write_noise
+from stereorig.core.errors import InputError
+from stereorig.core.names import CAMERAS
+from stereorig.core.noise import NoiseModel, measure_noise, measure_pattern
+from stereorig.server.cli.measurement.image_lists import expand
+from stereorig.server.formats.files import make_folder, sha256_of
+from stereorig.server.formats.noise_json import noise_content, read_frames, stated_full_scale, write_noise
 
 SHOWN_LEVELS = 5
 
@@ -25,15 +26,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "frames",
         nargs="*",
         metavar="FRAMES",
-        help="frames of one camera, which then stand for both: two of one make with the same setting",
+        help="frames of one camera, used for both: two of one make with the same setting",
     )
     add("--cam1", nargs="+", metavar="GLOB", help="camera 1's frames: a quoted pattern or several paths")
     add("--cam2", nargs="+", metavar="GLOB", help="camera 2's frames")
     add(
+        "--even1",
+        nargs="+",
+        metavar="GLOB",
+        help="camera 1's frames of an even field (a diffuser, far out of focus): a map of its fixed pattern and "
+        "defective pixels goes into the file, and is taken off images that are measured with it",
+    )
+    add("--even2", nargs="+", metavar="GLOB", help="camera 2's frames of an even field")
+    add(
         "--full-scale",
         type=float,
         metavar="GREY",
-        help="grey level at which the converter ends, as 4095 for 12 bits in 16 (found from the frames)",
+        help="grey level at which the converter ends, as 4095 for 12 bits in 16 (the files' own, or found from them)",
     )
     add("-o", "--out", required=True, metavar="noise.json", type=Path, help="file to write")
 
@@ -50,22 +59,43 @@ def run(args: argparse.Namespace) -> int:
     if args.out.is_dir():
         raise InputError(f"The output {args.out} is a folder.", code="output_unusable", remedy="Give a file's name.")
     models: dict[str, NoiseModel] = {}
-    sources = {}
+    sources: dict[str, Any] = {}
     for option, items in wanted.items():
         if not items:
             continue
         files, note = expand(option if option == "FRAMES" else f"--{option}", items)
         if note:
             print(f"note: {note}")
-        model = measure_noise(read_frames(files), full_scale=args.full_scale)
+        model = measure_noise(read_frames(files), full_scale=args.full_scale or stated_full_scale(files[0]))
         source = [{"file": str(file), "sha256": sha256_of(file)} for file in files]
         for cam in CAMERAS if option == "FRAMES" else (option,):
             models[cam], sources[cam] = model, source
         print(report("both cameras" if option == "FRAMES" else option, model))
+    for cam, items in zip(CAMERAS, (args.even1, args.even2), strict=True):
+        if items:
+            even(cam, items, models, sources)
     make_folder(args.out.absolute().parent)
     write_noise(args.out, noise_content(models, sources=sources))
     print(f"written: {args.out}")
     return 0
+
+
+def even(cam: str, items: list[str], models: dict[str, NoiseModel], sources: dict[str, Any]) -> None:
+    """Add the map of a camera's sensor to its model."""
+    option = f"--even{cam[-1]}"
+    if cam not in models:
+        raise InputError(
+            f"{option} is given without frames of {cam}'s noise.",
+            code="option_missing",
+            remedy=f"Give --{cam} too: frames of the specimen at rest.",
+        )
+    files, note = expand(option, items)
+    if note:
+        print(f"note: {note}")
+    sensor = measure_pattern(read_frames(files, whole=True))
+    models[cam] = replace(models[cam], sensor=sensor)
+    sources[cam] = [*sources[cam], *({"file": str(file), "sha256": sha256_of(file), "even": True} for file in files)]
+    print(f"{cam}: fixed pattern {sensor.pattern.std():.2f} grey levels (sd), {len(sensor.defects)} defective pixels")
 
 
 def report(name: str, model: NoiseModel) -> str:

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import InputError, RegionError
-from core.field.region.lay_points import lay_points
-from core.field.region.outlines import corners_px
-from core.field.region.region import check_region as check_points
-from core.field.seeding.seeds import Seed
-from core.settings import Outline, Range, StoredRegion
-from server.formats.images import read_mask
+from stereorig.core.errors import InputError, RegionError
+from stereorig.core.field.region.lay_points import lay_points
+from stereorig.core.field.region.outlines import corners_px
+from stereorig.core.field.region.region import check_region as check_points
+from stereorig.core.field.seeding.seeds import Seed
+from stereorig.core.settings import Outline, Range, StoredRegion
+from stereorig.server.formats.images import read_mask
 
 Rectangle = tuple[float, float, float, float]
 Line = list[list[float]]
@@ -154,9 +154,9 @@ def check_region(
     Parameters
     ----------
     outlines, mask_path
-        One of them, or both; points lie in any of the outlines.
+        One of them, or both; points are inside any of the outlines.
     mask
-        The mask, where its file is still to be written.
+        The mask, if its file is still to be written.
 
     Raises
     ------
@@ -200,11 +200,11 @@ def _seeds(texts: Sequence[str], rectangle: Rectangle, mask: NDArray[np.bool_] |
         count = 4 if text.count(",") == 3 else 2
         x, y, *other = _numbers("--seed", text, count, "X,Y or X,Y,X2,Y2")
         if not (x0 <= x <= x1 and y0 <= y <= y1):
-            cause = f"--seed {text} lies outside the region {x0:g},{y0:g},{x1:g},{y1:g}."
+            cause = f"--seed {text} is outside the region {x0:g},{y0:g},{x1:g},{y1:g}."
             raise RegionError(cause, code="seed_outside", remedy="Give a seed inside the region, in camera 1's image.")
         if mask is not None and not mask[min(round(y), mask.shape[0] - 1), min(round(x), mask.shape[1] - 1)]:
             raise RegionError(
-                f"--seed {text} lies where the mask is black.",
+                f"--seed {text} is at a black pixel of the mask.",
                 code="seed_outside",
                 remedy="Give a seed where the mask is white.",
             )

@@ -6,12 +6,12 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from core.errors import InputError
-from server.cli.measurement.coverage import add_coverage, coverage_from
-from server.formats.files import make_folder, write_bytes
-from server.results.gauges import FRAME_HELP
-from server.results.gauges.framed import asked_at, in_frame
-from server.results.metadata import load_metadata
+from stereorig.core.errors import InputError
+from stereorig.server.cli.measurement.coverage import add_coverage, coverage_from
+from stereorig.server.formats.files import make_folder, write_bytes
+from stereorig.server.results.gauges import FRAME_HELP
+from stereorig.server.results.gauges.framed import asked_at, in_frame
+from stereorig.server.results.metadata import load_metadata
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,17 +21,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "folder",
         metavar="DATA_OR_RESULTS",
         type=Path,
-        help="a data folder, a test's, an analysis', or what stereorig measure --out wrote",
+        help="a data folder, a test's, an analysis', or an output of stereorig measure --out",
     )
     add("--test", metavar="ID", help="which test of a data folder (its only one)")
-    add("--analysis", metavar="ID", help="which analysis of a test (the newest with results)")
-    add("--calibration", metavar="FILE", type=Path, help="the calibration, where it is not beside the results")
+    add("--analysis", metavar="ID", help="analysis of a test (the newest with results)")
+    add("--calibration", metavar="FILE", type=Path, help="the calibration, if it is not in the results' folder")
     add(
         "--metadata",
         "--facts",
         metavar="TOML",
         type=Path,
-        help="lenses, light, pattern, specimen, static steps ...; what is kept with the test if left out",
+        help="lenses, light, pattern, specimen, static steps ...; the test's own if left out",
     )
     add("--frame", metavar="FRAME", help=FRAME_HELP)
     add("--out", metavar="FILE", type=Path, default=Path("report.html"), help="the report (report.html)")
@@ -39,10 +39,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make the report; print what is not stated."""
+    """Make the report; print the items that are not stated."""
     # the drawing library takes a second to load
-    from server.report.build import make_report
-    from server.report.source import find_source
+    from stereorig.server.report.build import make_report
+    from stereorig.server.report.source import find_source
 
     if args.out.suffix.lower() not in (".html", ".htm"):
         raise InputError(

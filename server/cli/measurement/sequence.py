@@ -17,37 +17,39 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from core.compiling import COMPILING, report_compiling
-from core.errors import Cancelled, StereorigError, StorageError
-from core.field.points.result import Field
-from core.settings import StoredSettings
-from server.base.problem import problem_of
-from server.cli.terminal import ProgressLine, duration
-from server.compute.background_compilation import BackgroundCompilation
-from server.compute.overlap import ReadAhead, WriteBehind
-from server.compute.strain import smoothing_note
-from server.formats.calibrations.recognise import LoadedCalibration
-from server.formats.files import make_folder, sha256_of, write_bytes
-from server.formats.images import encode_png, read_mask
-from server.formats.noise_json import LoadedNoise
-from server.formats.results.folder import DENSE, results_in
-from server.formats.results.summary import SequenceSummary, region_found, to_json
-from server.formats.results.uncertainty import NOT_INCLUDED
-from server.formats.version import software_version
-from server.worker.tasks import StepImages
+from stereorig.core.compiling import COMPILING, report_compiling
+from stereorig.core.errors import Cancelled, StereorigError, StorageError
+from stereorig.core.field.points.result import Field
+from stereorig.core.names import CAMERAS
+from stereorig.core.settings import StoredSettings
+from stereorig.server.base.problem import problem_of
+from stereorig.server.cli.terminal import ProgressLine, duration
+from stereorig.server.compute.background_compilation import BackgroundCompilation
+from stereorig.server.compute.overlap import ReadAhead, WriteBehind
+from stereorig.server.compute.strain import smoothing_note
+from stereorig.server.compute.tasks import StepImages
+from stereorig.server.formats.calibrations.recognise import LoadedCalibration
+from stereorig.server.formats.files import make_folder, sha256_of, write_bytes
+from stereorig.server.formats.images import encode_png, read_mask
+from stereorig.server.formats.noise_json import LoadedNoise
+from stereorig.server.formats.results.folder import DENSE, results_in
+from stereorig.server.formats.results.summary import SequenceSummary, region_found, to_json
+from stereorig.server.formats.results.uncertainty import NOT_INCLUDED
+from stereorig.server.formats.version import software_version
+from stereorig.server.results.images.quality import SATURATED_SHARE, saturation_text
 
 if TYPE_CHECKING:
-    from core.field.seeding.specimen import Specimen
-    from server.compute.sequence import Pair, SequenceMeasurement
-    from server.results.gauges.request import GaugeRequest
+    from stereorig.core.field.seeding.specimen import Specimen
+    from stereorig.server.compute.sequence import Pair, SequenceMeasurement
+    from stereorig.server.results.gauges.request import GaugeRequest
 
-_MIN_OF_STATED, _MAX_OF_STATED = 0.75, 1.5  # residuals hold interpolation error besides noise, never less
+_MIN_OF_STATED, _MAX_OF_STATED = 0.75, 1.5  # residuals hold noise and interpolation error, never less than noise
 _SEEDS_SHARE = 0.15  # of a step's time, as a rule
-_RESULT = re.compile(r"step_\d{4}\.nc")
+_RESULT = re.compile(r"step_[0-9]{4}\.nc")
 
 
 def _camera_offset(motion: dict[str, Any] | None) -> str:
-    """Return what the step's epipolar offset says about the cameras, for its line."""
+    """Return the finding about the cameras from the step's epipolar offset, for its line."""
     found = None if motion is None else motion["reference"] or motion["calibration"]
     if found is None:
         return ""
@@ -82,9 +84,10 @@ def _uncertainty(summary: Mapping[str, Any]) -> str:
 class MeasureJob:
     """Everything that ``stereorig measure`` was asked to do, checked.
 
-    ``steps`` are those that can be measured, the reference first; ``failed`` has the error of each other one.
-    ``specimen`` is what was found where no region was given; its mask is then to be written to ``mask_file``.
-    ``gauges`` are the recipe's: they are kept beside the results, and the report reads them.
+    ``steps`` are the measurable ones, the reference first; ``failed`` has the errors of the others.
+    ``specimen`` was found if no region was given; its mask is then to be written to ``mask_file``.
+    ``gauges`` are the recipe's: they are stored with the results, and the report reads them. ``carried`` is the
+    calibration to be written to ``calibration_file``, if its own file does not hold all of it.
     """
 
     calibration: LoadedCalibration
@@ -97,6 +100,7 @@ class MeasureJob:
     failed: Mapping[int, StereorigError] = field(default_factory=dict)
     specimen: Specimen | None = None
     gauges: GaugeRequest | None = None
+    carried: bytes | None = None
 
     @property
     def last(self) -> int:
@@ -113,9 +117,9 @@ def measure_sequence(job: MeasureJob, progress: ProgressLine) -> dict[str, Any]:
     Raises
     ------
     StereorigError
-        The reference's, and then nothing is written; what no step can be measured after, such as a full disk; and the
-        first step's where none but the reference could be measured. Results of finished steps stay, and the summary
-        says what stopped the others.
+        The reference's, and then nothing is written; one that ends the whole measurement, such as a full disk; and the
+        first step's if none but the reference could be measured. Results of finished steps stay, and the summary
+        has the error that stopped the others.
     """
     started = time.monotonic()
 
@@ -170,7 +174,7 @@ def _measure_all(runner: _Runner, job: MeasureJob, compilation: BackgroundCompil
 
 
 def _write_summary(runner: _Runner, seconds: float, error: BaseException | None) -> dict[str, Any]:
-    """Write ``summary.json`` of what was measured and what was not."""
+    """Write ``summary.json`` with the measured and the failed steps."""
     job = runner.job
     summary = SequenceSummary(
         state=_state_after(error),
@@ -236,10 +240,11 @@ class _Runner:
         self._chosen: tuple[str, bool] | None = None
         self._checked = "ok"
         self._moved: bool | None = False
+        self._clipped: set[str] = set()
         self._smoothing_noted = False
         self._done = 0.0
         for n in sorted(self.failed):
-            self._note_failure(n)
+            self._record_failure(n)
 
     def begin(self, reference: StepImages) -> None:
         """Begin a sequence at a reference."""
@@ -247,7 +252,7 @@ class _Runner:
 
     def _sequence(self, reference: StepImages) -> SequenceMeasurement:
         # the kernels' modules take seconds to load: after the input was checked is early enough
-        from server.compute.sequence import SequenceMeasurement
+        from stereorig.server.compute.sequence import SequenceMeasurement
 
         job = self.job
         mask, inputs = None, {}
@@ -268,8 +273,8 @@ class _Runner:
     def measure(self, step: StepImages, images: Iterator[Pair] | None) -> None:
         """Measure a step, the reference's shape first (no images), and have its file written.
 
-        Under a projected pattern every step is its own reference. An error of the step's own is kept; one of the
-        reference, and what is not the step's doing, is raised.
+        Under a projected pattern every step is its own reference. An error of the step's own is kept; an error of the
+        reference, or one that ends the whole measurement, is raised.
         """
         started = time.monotonic()
         alone = self.job.settings.pattern == "projected"
@@ -284,13 +289,15 @@ class _Runner:
                 raise
             error.context |= dict(zip(("cam1", "cam2"), map(str, step.files), strict=True))
             self.failed[step.n] = error
-            self._note_failure(step.n)
+            self._record_failure(step.n)
             return
         compute_s = round(time.monotonic() - started, 3)
         if not self.begun:
             self._remove_older()
             if self.job.specimen is not None and self.job.mask_file is not None:
                 write_bytes(self.job.mask_file, encode_png(self.job.specimen.mask))
+            if self.job.carried is not None:
+                write_bytes(self.job.calibration_file, self.job.carried)
             self._doubt_noise(result)
             self.begun = True
         elif not alone:
@@ -304,7 +311,7 @@ class _Runner:
             return None
         return self.failed[min(self.failed)]
 
-    def _note_failure(self, n: int) -> None:
+    def _record_failure(self, n: int) -> None:
         self._progress.note(f"step {n} of {self.job.last}: failed: {self.failed[n]}")
 
     def _write(
@@ -325,12 +332,20 @@ class _Runner:
             "wall_s": seconds,
             "seconds": seconds,
         }
+        shares = dict(zip(CAMERAS, step.saturated or (0.0, 0.0), strict=True))
+        clipped = {cam: share for cam, share in shares.items() if share > SATURATED_SHARE}
+        if clipped:
+            of_each = {cam: {"saturated_share": round(share, 5)} for cam, share in shares.items()}
+            summary["quality"] = {"code": "saturated", **of_each}
         rms = summary["epipolar_residual_rms_px"]
         residual = "" if rms is None else f"epipolar residual {rms:.3f} px, "
         self._progress.note(
             f"step {k} of {self.job.last}: {summary['valid']} of {summary['points']} points, "
             f"{residual}{_camera_offset(summary['camera_motion'])}{_strain_noise(summary['strain'])}{duration(seconds)}"
         )
+        for cam in clipped.keys() - self._clipped:
+            self._progress.note(f"warning: step {k}: {cam}: {saturation_text(clipped[cam])}.")
+        self._clipped = set(clipped)
         self._note_dense(k, summary.get("dense"))
         self._note_patch(k, finished.field)
         self._note_reference(k, finished.field)
@@ -347,7 +362,7 @@ class _Runner:
         return summary
 
     def _note_smoothing(self, result: Field, strain: dict[str, Any] | None) -> None:
-        """Print once what smoothing leaves distinguishable."""
+        """Print once the smallest detail that smoothing leaves distinguishable."""
         if result.smoothing is None or self._smoothing_noted:
             return
         self._smoothing_noted = True
@@ -367,7 +382,7 @@ class _Runner:
         )
 
     def _note_patch(self, n: int, result: Field) -> None:
-        """Print the reason for the patch: of the shape, of the first step, and where it changes."""
+        """Print the reason for the patch: for the shape, for the first step, and at each change."""
         choice = result.patch
         if choice is None:
             return
@@ -410,7 +425,7 @@ class _Runner:
             )
 
     def _remove_older(self) -> None:
-        """Remove an earlier run's results: more steps than now, or its summary, would pass for this one's."""
+        """Remove an earlier run's results: a surplus step or its summary would be taken for the present run's."""
         for path in (*self.job.out.iterdir(), *results_in(self.job.out / DENSE)):
             if path.name == "summary.json" or _RESULT.fullmatch(path.name):
                 path.unlink()

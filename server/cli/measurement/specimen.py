@@ -1,4 +1,4 @@
-"""The region of ``stereorig measure`` where none is given: the specimen, found in the first pair of images."""
+"""The default region of ``stereorig measure``: the specimen, found in the first pair of images."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import RegionError
-from server.cli.measurement.image_lists import ImagePair
-from server.formats.calibrations.recognise import LoadedCalibration
-from server.formats.images import read_image
+from stereorig.core.errors import RegionError
+from stereorig.server.cli.measurement.image_lists import ImagePair
+from stereorig.server.formats.calibrations.recognise import LoadedCalibration
+from stereorig.server.formats.images import read_image
 
 if TYPE_CHECKING:
-    from core.field.seeding.specimen import Specimen
+    from stereorig.core.field.seeding.specimen import Specimen
 
 SPECIMEN_FILE = "specimen.png"
 """The mask in the output folder, white on the specimen: to be looked at, and to be corrected for ``--mask``."""
@@ -30,11 +30,11 @@ def found_specimen(
     RegionError
         ``region_not_found``; ``mask_size`` for a mask of another size.
     ImageError, SeedError
-        The images cannot be used; ``not_seeded`` where they have no matches.
+        The images cannot be used; ``not_seeded`` if they have no matches.
     """
-    # the kernels' modules take seconds to load: only where they are needed
-    from core.field.points.images import MeasureImage
-    from core.field.seeding.specimen import find_specimen
+    # the kernels' modules take seconds to load: only if they are needed
+    from stereorig.core.field.points.images import MeasureImage
+    from stereorig.core.field.seeding.specimen import find_specimen
 
     one, two = (MeasureImage(read_image(path), str(path)) for path in (pair.cam1, pair.cam2))
     if mask is not None and mask.shape != one.shape:
@@ -49,7 +49,7 @@ def found_specimen(
     both = specimen.mask & mask
     if not both.any():
         raise RegionError(
-            "The specimen that was found lies where the mask is black.",
+            "The specimen that was found is where the mask is black.",
             code="region_not_found",
             remedy="Leave out --roi auto or the mask.",
         )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib
 import signal
 import sys
 import time
@@ -14,20 +13,20 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from core.errors import FileFormatError
-from server.cli.terminal import ProgressLine, duration
-from server.demo.client import ServiceClient
-from server.demo.process import running_service
-from server.demo.session import Check, Outcome, Session
-from server.formats.files import make_folder, write_bytes
-from server.formats.results.summary import to_json
-from server.formats.version import software_version
+from stereorig.core.errors import FileFormatError
+from stereorig.server.cli.terminal import ProgressLine, duration
+from stereorig.server.demo.client import ServiceClient
+from stereorig.server.demo.process import running_service
+from stereorig.server.demo.session import DemoCheck, DemoRun, Outcome
+from stereorig.server.formats.files import make_folder, write_bytes
+from stereorig.server.formats.results.summary import to_json
+from stereorig.server.formats.version import software_version
 
-# experiment -> (module, rig file, what it is)
+# experiment -> (rig file, description)
 EXPERIMENTS = {
-    "plate": ("server.demo.experiments.plate", "sim_paper.toml", "clamped circular plate under ten pressures"),
-    "steel": ("server.demo.experiments.steel", "sim_paper.toml", "profile of a ground steel plate"),
-    "panel": ("server.demo.experiments.panel", "sim_panel.toml", "centre-cracked panel in tension"),
+    "plate": ("sim_paper.toml", "clamped circular plate under ten pressures"),
+    "steel": ("sim_paper.toml", "profile of a ground steel plate"),
+    "panel": ("sim_panel.toml", "centre-cracked panel in tension"),
 }
 
 
@@ -39,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run one experiment; 1 if a figure misses its limit."""
-    module, config_name, title = EXPERIMENTS[args.experiment]
+    config_name, title = EXPERIMENTS[args.experiment]
     config = find_config(config_name)
     out = Path(args.out or f"demo_{args.experiment}").absolute()
     make_folder(out)
@@ -54,20 +53,21 @@ def run(args: argparse.Namespace) -> int:
         with running_service(config, out / "data", log) as url:
             note(f"service: {url}, log: {log}")
             with ServiceClient(url, on_progress=note.progress) as client:
-                outcome = _experiment(Session(client, _true_rig(config), config, out, note), module)
+                outcome = _experiment(DemoRun(client, _true_rig(config), config, out, note), args.experiment)
     seconds = time.monotonic() - started
     return _finish(out, args.experiment, title, outcome, seconds)
 
 
 def _true_rig(config: Path) -> Any:
-    from sim.rig import SimRig
+    from stereorig.sim.rig import SimRig
 
     return SimRig.from_toml(config)
 
 
-def _experiment(session: Session, module: str) -> Outcome:
-    from server.demo import calibration
-    from server.demo.drawing import fields
+def _experiment(session: DemoRun, name: str) -> Outcome:
+    from stereorig.server.demo import calibration
+    from stereorig.server.demo.drawing import fields
+    from stereorig.server.demo.experiments import panel, plate, steel
 
     session.note("calibrating: both stages move, the grid is imaged ...")
     made = session.calibrate()
@@ -75,7 +75,7 @@ def _experiment(session: Session, module: str) -> Outcome:
     for line in report.lines:
         session.note(line)
     session.note("")
-    outcome: Outcome = importlib.import_module(module).run(session, made.id)
+    outcome: Outcome = {"plate": plate, "steel": steel, "panel": panel}[name].run(session, made.id)
     outcome.checks = report.checks + outcome.checks
     outcome.pictures = fields.calibration(session.out, report.views) | outcome.pictures
     outcome.data["calibration"] = {"id": made.id, "checks": made.checks, "verdict": made.verdict}
@@ -116,7 +116,7 @@ def _finish(out: Path, experiment: str, title: str, outcome: Outcome, seconds: f
     return 1 if missed else 0
 
 
-def _as_dict(check: Check) -> dict[str, object]:
+def _as_dict(check: DemoCheck) -> dict[str, object]:
     return asdict(check) | {"error_unit": check.error_unit or check.unit, "passed": check.passed}
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from core.errors import InputError
-from server.cli.operation.serve import DEFAULT_PORT, check_record, default_config
-from server.doctor import Check, examine
-from server.doctor.report import line_of
+from stereorig.core.errors import InputError
+from stereorig.server.cli.operation.serve import DEFAULT_PORT, check_record, default_config
+from stereorig.server.doctor import Check, examine
+from stereorig.server.doctor.report import line_of
 
 LONGEST_S = 3600.0
 
@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Check the whole bench that a rig file names: software, machine, cameras (identity, settings, rates, losses, "
         "skew, images), stage (state, limits, answers, stop) and disk. Each line has the measured value and its limit; "
-        "the exit status is 0 if nothing failed and 1 otherwise. No service may hold the devices meanwhile."
+        "the exit status is 0 if nothing failed and 1 otherwise. No service may hold the devices at that time."
     )
     add = parser.add_argument
     add("--config", type=Path, help="rig file (default: the simulated paper rig)")

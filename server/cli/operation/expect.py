@@ -1,4 +1,4 @@
-"""``stereorig expect``: what a rig, a calibration and a measurement will leave uncertain, before anything moves."""
+"""``stereorig expect``: the uncertainties to expect from a rig, a calibration and a measurement."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from core.errors import InputError
-from core.names import BUDGET
-from core.plan.settings import PlannedMeasurement, PlannedRig
+from stereorig.core.errors import InputError
+from stereorig.core.names import BUDGET
+from stereorig.core.plan.settings import PlannedMeasurement, PlannedRig
 
 #: options that other commands have by these names
 _NAMES = {"subset_px": "--subset", "spacing_px": "--step", "strain_window": "--strain"}
@@ -24,10 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.description = (
         "Predict the standard uncertainties of a measurement, with their budget by cause, from nominal values alone: "
-        "of a rig file, or of a rig that is only thought about."
+        "of a rig file, or of a planned rig."
     )
-    # "-2,4" after --positions is a list of numbers, not an option
-    parser._negative_number_matcher = re.compile(r"^-[\d.][\d.,+\- ]*$")
     parser.add_argument(
         "--rig", metavar="RIG.toml", type=Path, help="rig file; without one the options below state all"
     )
@@ -39,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--roll-deg", type=float, default=0.0, metavar="DEG", help="turn of the target in the images")
     parser.add_argument("--json", action="store_true", help="print the whole document in place of a table")
-    for title, model in (("the rig, where it differs from the file", PlannedRig), ("measurement", PlannedMeasurement)):
+    for title, model in (("the rig, if it differs from the file", PlannedRig), ("measurement", PlannedMeasurement)):
         group = parser.add_argument_group(title)
         for name, field in model.model_fields.items():
             default = "" if field.default is None else f" (default: {_shown(field.default)})"
@@ -49,9 +47,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Predict and print; 1 where such a calibration would be refused."""
-    from server.compute.calibration.expectation import PlannedCalibration, expectation_document, rig_as_planned
-    from server.formats.results.summary import to_json
-    from server.workflows.calibration.sequence import CalibrationPlan, check_plan
+    from stereorig.server.compute.calibration.expectation import (
+        PlannedCalibration,
+        expectation_document,
+        rig_as_planned,
+    )
+    from stereorig.server.formats.results.summary import to_json
+    from stereorig.server.workflows.calibration.sequence import CalibrationPlan, check_plan
 
     planned = _model(PlannedRig, args)
     measured = _model(PlannedMeasurement, args)
@@ -98,10 +100,10 @@ def table(document: Mapping[str, Any]) -> str:
 
 
 def _base(path: Path | None, planned: PlannedRig) -> tuple[dict[str, Any], tuple[float, ...], Any]:
-    """Rig, positions and localiser of the rig file; without one those that everything must be stated beside."""
+    """Rig, positions and localiser of the rig file; without one, of the options, all of which are then required."""
     if path is not None:
-        from server.config.rig_file import load_config
-        from server.workflows.calibration.sequence import rig_metadata
+        from stereorig.server.config.rig_file import load_config
+        from stereorig.server.workflows.calibration.sequence import rig_metadata
 
         config = load_config(path)
         return rig_metadata(config), tuple(config.calibration.positions_mm), config.calibration.localiser
@@ -131,7 +133,7 @@ def _model(model: type[_M], args: argparse.Namespace) -> _M:
     Raises
     ------
     InputError
-        Where one is no number of its range, or two disagree.
+        If a value is no number of its range, or two disagree.
     """
     given: dict[str, Any] = {}
     for name in model.model_fields:

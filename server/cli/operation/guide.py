@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from core.errors import InputError, MeasurementError, StateError
-from server.cli.terminal import ProgressLine
-from server.demo.client import ServiceClient
-from server.formats.files import write_bytes
+from stereorig.core.errors import InputError, MeasurementError, StateError
+from stereorig.server.cli.terminal import ProgressLine
+from stereorig.server.demo.client import ServiceClient
+from stereorig.server.formats.files import write_bytes
 
 _POLL_S = 0.2
 _MOST_GOAL_UM = 1e6
@@ -22,12 +22,12 @@ _MOST_GOAL_UM = 1e6
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.description = (
-        "Take views of the target held by hand, each when it stands still in a new pose, and fit both cameras. Printed "
-        "are what the views cover, and the next most useful one. Hold the target first where the specimen will be. "
+        "Take views of the target held by hand, each when it is at rest in a new pose, and fit both cameras. Printed "
+        "are the cover by the views, and the next most useful one. Hold the target first where the specimen will be. "
         "Ctrl-C ends without a fit; the views are kept."
     )
     parser.add_argument("--url", default="http://127.0.0.1:8000", help="address of the service (default: %(default)s)")
-    parser.add_argument("--key", metavar="KEY", help="key of the service, where it asks for one")
+    parser.add_argument("--key", metavar="KEY", help="key of the service, if it requires one")
     parser.add_argument("--goal-um", type=float, metavar="UM", help="stop below this uncertainty, micrometres")
     parser.add_argument(
         "--quantity", choices=("z", "shape"), default="z", help="uncertainty that the goal is about (default: z)"
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
 
 @dataclass(eq=False)
 class _Hand:
-    """The hand before a simulated rig: it does as it is told."""
+    """A simulated hand before a simulated rig: it takes the poses that the guide asks for."""
 
     client: ServiceClient
     rig: Mapping[str, Any]

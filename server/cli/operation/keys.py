@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from core.errors import InputError
-from server.http.access import ROLES, KeyFile
+from stereorig.core.errors import InputError
+from stereorig.server.http.access import ROLES, KeyFile
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "viewer may read and stop the stage, an operator may also move, capture and measure, an admin may also delete."
     )
     parser.add_argument("action", choices=["add", "list", "remove"])
-    parser.add_argument("name", nargs="?", metavar="NAME", help="of the key: who or what uses it")
+    parser.add_argument("name", nargs="?", metavar="NAME", help="name of the key: its user or program")
     parser.add_argument("--role", choices=ROLES, help="of a new key")
     parser.add_argument("--data", type=Path, default=Path("data"), help="data folder (default: ./data)")
 

@@ -8,8 +8,8 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from core.errors import InputError
-from server.demo.client import ServiceClient
+from stereorig.core.errors import InputError
+from stereorig.server.demo.client import ServiceClient
 
 _WAIT_S = 0.2
 
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_service(parser: argparse.ArgumentParser) -> None:
     """Declare how the service is reached."""
     parser.add_argument("--url", default="http://127.0.0.1:8000", help="address of the service (default: %(default)s)")
-    parser.add_argument("--key", metavar="KEY", help="key of the service, where it asks for one")
+    parser.add_argument("--key", metavar="KEY", help="key of the service, if it requires one")
 
 
 def client_of(args: argparse.Namespace) -> ServiceClient:

@@ -6,14 +6,14 @@ import argparse
 import json
 from pathlib import Path
 
-from server.cli.operation.verify import record, report
-from server.store.repair import repair
+from stereorig.server.cli.operation.verify import record, report
+from stereorig.server.store.repair import repair
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.description = (
-        "Quarantine steps without their commit mark, remove what was half written, make the catalogue anew from the "
+        "Quarantine steps without their commit mark, remove half-written files, rebuild the catalogue from the "
         "folders, and list everything that was done. Damaged files are listed and left alone. Ends with 1 when there "
         "are any."
     )

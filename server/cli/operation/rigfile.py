@@ -1,4 +1,4 @@
-"""``stereorig rigfile``: check rig files, and print what one may hold."""
+"""``stereorig rigfile``: check rig files, and print their possible entries."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from core.errors import StereorigError
+from stereorig.core.errors import StereorigError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -18,9 +18,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check or print."""
-    from server.config.reference import json_schema, markdown
-    from server.config.rig_file import load_config
-    from server.rig.build import check_config
+    from stereorig.server.config.reference import json_schema, markdown
+    from stereorig.server.config.rig_file import load_config
+    from stereorig.server.rig.build import check_config
 
     if args.schema:
         print(json.dumps(json_schema(), indent=1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
 import contextlib
 import ipaddress
 import logging
@@ -11,10 +12,11 @@ import ssl
 import sys
 from pathlib import Path
 
-from core.errors import FileFormatError, InputError
-from server.base import logs
-from server.cli.ports import port_unusable
-from server.http.access import KeyFile
+from stereorig.core.errors import FileFormatError, InputError
+from stereorig.server.base import logs
+from stereorig.server.base.memory import settle
+from stereorig.server.cli.ports import port_unusable
+from stereorig.server.http.access import KeyFile
 
 DEFAULT_CONFIG = "sim_paper.toml"
 DEFAULT_PORT = 8000
@@ -173,44 +175,41 @@ def run(args: argparse.Namespace) -> int:
     keys = KeyFile(args.data)
     check_host(args.host, keys)
     check_tls(args.tls_cert, args.tls_key)
-    logs.configure(args.log_level, args.log_format)
-    from server.base.memory import hurry, settle
-    from server.base.priority import raise_file_limit, raise_service
-    from server.config.rig_file import load_config
-    from server.http.systemd import Notifier
-    from server.worker.embedded import start_worker
+    logs.configure(args.log_level, args.log_format, lines_per_s=20)
+    from stereorig.server.base.priority import raise_file_limit, raise_service
+    from stereorig.server.http.supervisor import ServePlan, Supervisor
+    from stereorig.server.http.systemd import Notifier
 
-    hurry()
-    config = load_config(args.config or default_config())
     if args.record is not None:
         check_record(args.record)
     listener = _listen(args.host, args.port)
-    # the worker's modules and the service's take about as long: they are loaded side by side
-    worker = start_worker(config.service.kernel_threads)
-    try:
-        from server.api.app import create_app
-        from server.api.protocol.guard import LOOPBACK_NAMES
-        from server.http.server import OrderlyServer
-        from server.workflows.service import Service
-
-        service = Service(config, args.data, record=args.record, worker=worker).start()
-    except BaseException:
-        worker.shutdown()
-        listener.close()
-        raise
     raise_file_limit()
+    raise_service()
     if tls_is_missing(args.host, args.tls_cert):
         _log.warning("%s", _PLAIN)
-    required = not is_loopback(args.host) or config.service.require_key
-    app = create_app(service, hosts=LOOPBACK_NAMES | names_of(args.host), keys_required=required)
-    name = f"[{args.host}]" if ":" in args.host else args.host
-    url = f"{'http' if args.tls_cert is None else 'https'}://{name}:{listener.getsockname()[1]}"
+    scheme, tls = "http", None
+    if args.tls_cert is not None:
+        scheme, tls = "https", ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        tls.load_cert_chain(args.tls_cert, args.tls_key)
+    host = f"[{args.host}]" if ":" in args.host else args.host
+    url = f"{scheme}://{host}:{listener.getsockname()[1]}"
+    plan = ServePlan(
+        data=args.data,
+        web={
+            "config": None if args.config is None else str(args.config),
+            "data": str(args.data),
+            "record": None if args.record is None else str(args.record),
+            "host": args.host,
+            "log_level": args.log_level,
+            "log_format": args.log_format,
+        },
+        log_level=args.log_level,
+        log_format=args.log_format,
+        scheme=scheme,
+    )
 
-    def announce() -> None:
+    def announce(name: str, data: str) -> None:
         settle()
-        print(f"stereorig serves the {config.rig.name} on {url} (data in {service.folder.root})", flush=True)
+        print(f"stereorig serves the {name} on {url} (data in {data})", flush=True)
 
-    raise_service()
-    tls = None if args.tls_cert is None else (args.tls_cert, args.tls_key)
-    OrderlyServer(app, service, notifier=Notifier(), announce=announce, tls=tls).run(sockets=[listener])
-    return 0
+    return asyncio.run(Supervisor(plan, listener, tls=tls, notifier=Notifier(), announce=announce).run())

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 import threading
 
-from server.cli.operation.live import add_service, client_of
-from server.cli.ports import check_port, port_unusable
-from sim.load_frame import LoadFrame
+from stereorig.server.cli.operation.live import add_service, client_of
+from stereorig.server.cli.ports import check_port, port_unusable
+from stereorig.sim.load_frame import LoadFrame
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

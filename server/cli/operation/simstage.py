@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import threading
 
-from core.errors import InputError
-from server.cli.ports import check_port, port_unusable
-from sim.controllers.registry import make_controller
-from sim.controllers.server import ControllerServer
+from stereorig.core.errors import InputError
+from stereorig.server.cli.ports import check_port, port_unusable
+from stereorig.sim.controllers.registry import make_controller
+from stereorig.sim.controllers.server import ControllerServer
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--axes {args.axes} are not all from 1 to {highest}.")
     check_port(args)
     if not args.travel[0] < 0.0 < args.travel[1]:
-        raise InputError(f"--travel {args.travel} does not lie on both sides of home, 0.")
+        raise InputError(f"--travel {args.travel} does not extend to both sides of home, 0.")
     controller = make_controller(args.driver, args.axes, travel_mm=tuple(args.travel))
     try:
         server = ControllerServer(controller, "pty" if args.pty else "socket", port=args.port).start()

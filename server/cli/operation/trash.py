@@ -1,4 +1,4 @@
-"""``stereorig trash``: what was deleted, bring it back, remove it for good."""
+"""``stereorig trash``: list deleted data, restore them, remove them for good."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import json
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from core.errors import InputError
-from server.store.documents import TrashEntry
-from server.store.folder import DataFolder
-from server.store.indexing.build import reindex
-from server.store.trash import Trash
-from server.store.verify import require_data_folder
+from stereorig.core.errors import InputError
+from stereorig.server.documents.made import TrashEntry
+from stereorig.server.store.folder import DataFolder
+from stereorig.server.store.indexing.build import reindex
+from stereorig.server.store.trash import Trash
+from stereorig.server.store.verify import require_data_folder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("action", choices=["list", "restore", "empty"])
     parser.add_argument("ids", nargs="*", metavar="ID", help="as 'list' shows them")
-    parser.add_argument("--older-than", type=float, metavar="DAYS", help="empty: only what was deleted before that")
+    parser.add_argument("--older-than", type=float, metavar="DAYS", help="empty: only entries deleted before that")
     parser.add_argument("--data", type=Path, default=Path("data"), help="data folder (default: ./data)")
     parser.add_argument("--json", action="store_true", help="list: print JSON")
 

@@ -7,7 +7,7 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-from server.store.verify import Verification, verify
+from stereorig.server.store.verify import Verification, verify
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""What a plan of a calibration and of a measurement will leave uncertain, as the API and the command line state it."""
+"""Expected uncertainties of a planned calibration and measurement, as the API and the command line state them."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Any, Literal
 
 import numpy as np
 
-from core.boards import BoardTarget
-from core.calibration.expect import Expectation, LineModel, expect
-from core.calibration.inputs import AnyTarget
-from core.calibration.prepare import EXPECTED_NOISE_PX
-from core.common.factor import ParameterCovariance
-from core.errors import CalibrationError, CalibrationInputError
-from core.names import CAMERAS
-from core.plan.quantities import planned_quantities
-from core.plan.settings import PlannedMeasurement, PlannedRig
-from core.plan.texture import correlation_px, match_variance_px2
-from server.compute.calibration.inputs import nominals_of, options_of, target_of
+from stereorig.core.boards import BoardTarget
+from stereorig.core.calibration.expect import Expectation, LineModel, expect
+from stereorig.core.calibration.inputs import AnyTarget
+from stereorig.core.calibration.prepare import EXPECTED_NOISE_PX
+from stereorig.core.common.factor import ParameterCovariance
+from stereorig.core.errors import CalibrationError, CalibrationInputError
+from stereorig.core.names import CAMERAS
+from stereorig.core.plan.quantities import planned_quantities
+from stereorig.core.plan.settings import PlannedMeasurement, PlannedRig
+from stereorig.core.plan.texture import correlation_px, match_variance_px2
+from stereorig.server.compute.calibration.inputs import nominals_of, options_of, target_of
 
 Localiser = Literal["profile", "paper"]
 _CORNERS = tuple(f"{z} {y} {x}" for z in ("back", "front") for y in ("-Y", "+Y") for x in ("-X", "+X"))
@@ -35,14 +35,14 @@ class PlannedCalibration:
 
 
 def rig_as_planned(rig: dict[str, Any], planned: PlannedRig) -> dict[str, Any]:
-    """Return a rig's entries with what a plan says otherwise.
+    """Return a rig's entries with a plan's differences.
 
     Parameters
     ----------
     rig
-        As :func:`server.workflows.calibration.sequence.rig_metadata` gives them.
+        As :func:`stereorig.server.workflows.calibration.sequence.rig_metadata` gives them.
     planned
-        What differs.
+        Values that differ from the rig's; None: as in the rig.
     """
     stage = planned.model_dump(include={"stage_step_sigma_mm", "stage_scale_sigma", "axis_tilt_sigma_rad"})
     target = planned.model_dump(include={"pitch_mm", "node_tolerance_mm", "pitch_scale_sigma"})
@@ -63,7 +63,7 @@ def _stated(values: dict[str, object]) -> dict[str, object]:
 def expectation_document(
     rig: dict[str, Any], plan: PlannedCalibration, measured: PlannedMeasurement
 ) -> dict[str, object]:
-    """Return what a plan may be expected to leave uncertain.
+    """Return the uncertainties to expect from a plan.
 
     Parameters
     ----------
@@ -83,9 +83,9 @@ def expectation_document(
     nominals, options = nominals_of(rig), options_of(rig)
     if options.moves == "free":
         raise CalibrationInputError(
-            'The rig file declares moves = "free": no stage position tells where the target is.',
+            'The rig file declares moves = "free": no stage position gives the position of the target.',
             code="moves_undeclared",
-            remedy="Declare what the stage moves; of free poses the guided acquisition tells the uncertainty.",
+            remedy="Declare the part that the stage moves; for free poses use the guided acquisition.",
         )
     model = _line_model(target, plan.localiser)
     noise = EXPECTED_NOISE_PX if plan.noise_px is None else plan.noise_px
@@ -99,7 +99,7 @@ def expectation_document(
             quantities = planned_quantities(found.pair, sizes, source, measured)
     except (ArithmeticError, np.linalg.LinAlgError) as error:
         raise CalibrationError(
-            f"The planned rig has no numbers that a calculation could go on with ({error}).",
+            f"The planned rig's numbers cannot be calculated with ({error}).",
             code="calibration_singular",
             remedy="Plan cameras at an angle, a stand-off and a target that a rig can have.",
         ) from error
@@ -126,7 +126,7 @@ def _line_model(target: AnyTarget, localiser: Localiser) -> LineModel:
     if isinstance(target, BoardTarget):
         return "local"  # points are found one by one
     if localiser == "profile":
-        # as core.calibration.from_images chooses
+        # as stereorig.core.calibration.from_images chooses
         return "local" if target.node_tolerance_mm > 0.0 else "straight"
     return "parabola"
 
@@ -156,6 +156,6 @@ def _measured_text(measured: PlannedMeasurement) -> str:
         f"A flat surface in the target's plane, seen to {1e3 * (2.0 * match_variance_px2(measured)) ** 0.5:.2g} "
         f"thousandths of a pixel a comparison: subset {measured.subset_px} px, gradient {slope:.3g} grey levels a "
         f"pixel (rms, one direction), noise {measured.image_noise_grey:g} grey levels, plane patches. Standard "
-        "uncertainties (k = 1). Not included: interpolation's bias, bias of patches and windows on what bends, a lens "
+        "uncertainties (k = 1). Not included: interpolation's bias, bias of patches and windows on bends, a lens "
         "beyond the model."
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,22 +11,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.boards import BoardView, detect_target
-from core.calibration import CalibrationResult
-from core.calibration.from_images import ImageOfTarget, calibrate_views
-from core.errors import CalibrationError, CalibrationInputError
-from core.grid import GridOptions, GridView
-from core.names import CAMERAS
-from server.compute.calibration.inputs import nominals_of, options_of, target_of
-from server.compute.grid_kernels import await_grid_kernels
-from server.formats.calibrations.native import calibration_content, view_record
-from server.formats.images import GrayImage, read_image
-from server.formats.results.netcdf import written_dataset
-from server.formats.version import software_version
-from server.store.calibrations import REJECTED
-from server.store.durable import write_json
-from server.worker.process import current_task
-from server.worker.tasks import FitTask
+from stereorig.core.boards import BoardView, detect_target
+from stereorig.core.calibration import CalibrationResult
+from stereorig.core.calibration.from_images import ImageOfTarget, calibrate_views
+from stereorig.core.errors import CalibrationError, CalibrationInputError
+from stereorig.core.grid import GridOptions, GridView
+from stereorig.core.names import CAMERAS
+from stereorig.server.compute.calibration.inputs import nominals_of, options_of, target_of
+from stereorig.server.compute.grid_kernels import await_grid_kernels
+from stereorig.server.compute.tasks import FitTask
+from stereorig.server.formats.calibrations.native import calibration_content, view_record
+from stereorig.server.formats.images import GrayImage, read_image
+from stereorig.server.formats.results.netcdf import written_dataset
+from stereorig.server.formats.version import software_version
+from stereorig.server.store.calibrations import REJECTED
+from stereorig.server.store.durable import write_json
+from stereorig.server.worker.process import current_task
 
 TargetView = GridView | BoardView
 
@@ -90,7 +90,7 @@ def fit_calibration(task: FitTask) -> dict[str, Any]:
     drift = _drift(
         folder, task.views, known, lambda image: detect_target(image, target, localiser=plan["localiser"], options=like)
     )
-    provenance = {
+    provenance: dict[str, Any] = {
         "software_version": software_version(),
         "rig": rig["name"],
         "localiser": plan["localiser"],
@@ -99,14 +99,15 @@ def fit_calibration(task: FitTask) -> dict[str, Any]:
         "views_sha256": {Path(v["file"]).name: v["sha256"] for v in task.views},
         "cameras": {view["camera"]: view["device"] for view in task.views if "device" in view},
     }
+    if "simulated" in rig:
+        provenance["simulated"] = rig["simulated"]
     content = calibration_content(found.result, target, provenance=provenance)
     _check_drift(content, drift)
+    _check_positions(content, provenance.get("simulated", []), moves=plan.get("moves") or rig.get("moves"))
     _write_residuals(folder / "residuals.nc", found.result, {Path(f).name: grid for f, grid in known.items()})
     if content["verdict"]["level"] == "failed":
         write_json(folder / REJECTED, content)
-        raise CalibrationError(
-            f"The calibration is not usable: {' '.join(content['verdict']['reasons'])}", code="calibration_rejected"
-        )
+        found.result.verdict.check()
     write_json(folder / "calibration.json", content, checksum=True)
     return {
         "verdict": content["verdict"],
@@ -143,10 +144,10 @@ def _check_drift(content: dict[str, Any], drift: dict[str, float]) -> None:
     if not drift:
         return
     worst = max(drift, key=lambda cam: drift[cam])
-    text = f"back at zero, the grid lies {drift[worst]:.4f} px from where {worst} first saw it"
+    text = f"Back at zero, the grid is {drift[worst]:.4f} px from where {worst} first saw it."
     if drift[worst] > MAX_DRIFT_PX:
         raise CalibrationError(
-            f"The grid or a camera moved while the views were taken: {text}.",
+            f"The grid or a camera moved while the views were taken. {text}",
             code="grid_moved",
             remedy="Fix grid and cameras, let them come to the room's temperature, then calibrate again.",
             drift_px=drift,
@@ -154,9 +155,19 @@ def _check_drift(content: dict[str, Any], drift: dict[str, float]) -> None:
     content["checks"]["drift_px"] = drift
     content["checks"]["made"].append({"name": "drift", "made": True, "text": text})
     if drift[worst] > DRIFT_WARNING_PX:
-        verdict = content["verdict"]
-        verdict["level"] = "warning" if verdict["level"] == "good" else verdict["level"]
-        verdict["reasons"] = [*verdict["reasons"], f"{text}: something moved"]
+        _warn(content, f"{text} At most {DRIFT_WARNING_PX:g} px are good: the grid or a camera moved.")
+
+
+def _check_positions(content: dict[str, Any], simulated: Sequence[str], *, moves: str | None) -> None:
+    """Add a warning if real cameras were calibrated by positions of a simulated stage, at which nothing was."""
+    if "stage" in simulated and not set(CAMERAS) <= set(simulated) and moves != "free":
+        _warn(content, "The stage is simulated, the cameras are real: nothing moved to the positions that were fitted.")
+
+
+def _warn(content: dict[str, Any], reason: str) -> None:
+    verdict = content["verdict"]
+    verdict["level"] = "warning" if verdict["level"] == "good" else verdict["level"]
+    verdict["reasons"] = [*verdict["reasons"], reason]
 
 
 def _three(check: dict[str, Any] | None) -> dict[str, Any] | None:
@@ -164,7 +175,7 @@ def _three(check: dict[str, Any] | None) -> dict[str, Any] | None:
 
 
 def _write_residuals(path: Path, result: CalibrationResult, grids: dict[str, TargetView]) -> None:
-    """Write each point's position and its residual, (view, i, j, xy), NaN where it was not found."""
+    """Write each point's position and its residual, (view, i, j, xy), NaN if it was not found."""
     residuals = np.stack([view.residual_px for view in result.views])
     found = np.stack([grids[view.name].xy_px for view in result.views])
     view_records = [view_record(v) for v in result.views]

@@ -1,6 +1,6 @@
-"""A guided acquisition in its own process: the target in live pairs, and what the views taken say.
+"""A guided acquisition in its own process: the target in live pairs, and the guidance from the views taken.
 
-The process keeps the points and the estimate between calls; one that was started anew finds them in the views on disk.
+The process keeps the points and the estimate between calls; a new process finds them in the views on disk.
 """
 
 from __future__ import annotations
@@ -13,31 +13,31 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from core.arrays import Float
-from core.boards import BoardTarget, BoardView, detect_target, find_target
-from core.calibration import CalibrationOptions, CalibrationView, NominalCamera
-from core.calibration.from_images import ImageOfTarget, grid_options_for, view_of
-from core.calibration.guide import Guidance, GuideOptions, Proposal, at_rest, guide, most_alike
-from core.calibration.inputs import nodes_of
-from core.errors import StereorigError, TargetError
-from core.grid import GridOptions, Localiser
-from core.names import CAMERAS
-from core.target import GridTarget
-from server.base.json_values import without_nan
-from server.base.problem import problem_of
-from server.compute.calibration.inputs import nominals_of, options_of, target_of
-from server.compute.grid_kernels import await_grid_kernels
-from server.formats.images import GrayImage, read_image
-from server.worker.tasks import GuideTask, LookTask
+from stereorig.core.arrays import Float
+from stereorig.core.boards import BoardTarget, BoardView, detect_target, find_target
+from stereorig.core.calibration import CalibrationOptions, CalibrationView, NominalValues
+from stereorig.core.calibration.from_images import ImageOfTarget, grid_options_for, view_of
+from stereorig.core.calibration.guide import Guidance, GuideOptions, Proposal, at_rest, guide, most_alike
+from stereorig.core.calibration.inputs import nodes_of
+from stereorig.core.errors import StereorigError, TargetError
+from stereorig.core.grid import GridOptions, Localiser
+from stereorig.core.names import CAMERAS
+from stereorig.core.target import GridTarget
+from stereorig.server.base.json_values import without_nan
+from stereorig.server.base.problem import problem_of
+from stereorig.server.compute.calibration.inputs import nominals_of, options_of, target_of
+from stereorig.server.compute.grid_kernels import await_grid_kernels
+from stereorig.server.compute.tasks import GuideTask, LookTask
+from stereorig.server.formats.images import GrayImage, read_image
 
 
 @dataclass
 class _Session:
-    """What the process knows of an acquisition."""
+    """State of an acquisition in the process."""
 
     folder: str
     target: GridTarget | BoardTarget
-    nominals: tuple[NominalCamera, NominalCamera]
+    nominals: tuple[NominalValues, NominalValues]
     options: CalibrationOptions
     goal: GuideOptions
     localiser: Localiser
@@ -53,7 +53,7 @@ _pool: Final = ThreadPoolExecutor(max_workers=2)
 
 
 def find_in_pair(task: LookTask) -> dict[str, int]:
-    """Find the target in both images, as the fit will.
+    """Find the target in both images, by the method of the fit.
 
     Raises
     ------
@@ -127,7 +127,7 @@ def look_at_pair(task: GuideTask, pixels: dict[str, GrayImage], serial: int) -> 
 
 
 def guide_views(task: GuideTask, views: list[dict[str, Any]]) -> dict[str, Any]:
-    """Locate the target's points in the views that are new, and say what all cover and which view comes next."""
+    """Locate the target's points in new views, and return the cover by all of them and the next view to take."""
     session = _session(task)
     numbers = sorted({int(v["index"]) for v in views})
     for k in numbers:
@@ -166,7 +166,7 @@ def _coarse(image: GrayImage, target: GridTarget | BoardTarget) -> Float | Stere
 
 
 def _add(session: _Session, number: int, views: list[dict[str, Any]]) -> None:
-    """Locate the points of one pose; where one image does not show the target, the pose does not count."""
+    """Locate the points of one pose; if one image does not show the target, the pose does not count."""
 
     def located(view: dict[str, Any]) -> CalibrationView:
         given = GridOptions(saturation=float(view["full_scale"]))
@@ -190,7 +190,7 @@ def _add(session: _Session, number: int, views: list[dict[str, Any]]) -> None:
 def _plain(session: _Session, found: Guidance, numbers: list[int]) -> dict[str, Any]:
     estimate, cover = found.estimate, found.coverage
     dropped = [{"view": d.frame, "camera": d.camera, "reason": d.reason} for d in estimate.dropped]
-    dropped += [{"view": k, "camera": p["camera"], "reason": p["cause"]} for k, p in session.failed.items()]
+    dropped += [{"view": k, "camera": p["camera"], "reason": p["detail"]} for k, p in session.failed.items()]
     spread = found.spread
     return dict(
         without_nan(

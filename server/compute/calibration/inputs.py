@@ -1,21 +1,23 @@
-"""What a kept plan says of target, cameras and settings, as the numerical modules take it."""
+"""Target, cameras and settings of a stored plan, as the numerical modules take them."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from core.boards import BoardTarget
-from core.calibration import CalibrationOptions, NominalCamera
-from core.calibration.inputs import Moves
-from core.names import CAMERAS
-from core.target import GridTarget
+from stereorig.core.boards import BoardTarget
+from stereorig.core.calibration import CalibrationOptions, NominalValues
+from stereorig.core.calibration.inputs import Moves
+from stereorig.core.names import CAMERAS
+from stereorig.core.target import GridTarget
 
 _DEFAULTS = CalibrationOptions()
 
 
 def target_of(table: dict[str, Any]) -> GridTarget | BoardTarget:
-    """Return the target of a rig file's table, see :meth:`server.config.rig_file.TargetSection.plain`."""
-    fields: dict[str, Any] = {k: tuple(value) if k in ("lines", "size") else value for k, value in table.items()}
+    """Return the target of a rig file's table, see :meth:`stereorig.server.config.rig_file.TargetSection.plain`."""
+    fields: dict[str, Any] = {
+        k: tuple(value) if k in ("lines", "size", "missing_lines") else value for k, value in table.items()
+    }
     return BoardTarget(**fields) if fields.get("kind", "line_grid") != "line_grid" else _grid(fields)
 
 
@@ -23,10 +25,10 @@ def _grid(fields: dict[str, Any]) -> GridTarget:
     return GridTarget(**{name: value for name, value in fields.items() if name != "kind"})
 
 
-def nominals_of(rig: dict[str, Any]) -> tuple[NominalCamera, NominalCamera]:
+def nominals_of(rig: dict[str, Any]) -> tuple[NominalValues, NominalValues]:
     """Return the nominal cameras of a plan's rig."""
     one, two = (
-        NominalCamera(
+        NominalValues(
             image_size_px=tuple(rig[cam]["image_size_px"]),
             phd_px=rig[cam]["phd_px"],
             standoff_mm=rig[cam]["standoff_mm"],
@@ -47,6 +49,7 @@ def options_of(
         lens=rig.get("lens", _DEFAULTS.lens),
         held_out_mm=held_out_mm,
         axis_tilt_sigma_rad=rig["axis_tilt_sigma_rad"],
-        stage_scale_sigma=rig.get("stage_scale_sigma", 0.0),
+        stage_scale_sigma=rig.get("stage_scale_sigma", _DEFAULTS.stage_scale_sigma),
         stage_step_sigma_mm=rig.get("stage_step_sigma_mm", 0.0),
+        aspect_sigma=rig.get("aspect_sigma"),
     )

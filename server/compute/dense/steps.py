@@ -1,4 +1,4 @@
-"""The dense fields of a sequence's steps: measured beside the ordinary ones, from the same images."""
+"""The dense fields of a sequence's steps: measured in addition to the ordinary ones, from the same images."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from core.cameras.stereo import StereoPair
-from core.errors import InputError
-from core.field.points.dense_record import METHOD
-from core.field.points.images import MeasureImage
-from core.field.points.result import Field
-from core.field.region.region import PointGrid
-from core.field.settings import MeasureOptions
-from server.formats.results.layout import COVARIANCE_NAMES
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import InputError
+from stereorig.core.field.points.dense_record import METHOD
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.field.settings import MeasureOptions
+from stereorig.server.formats.results.layout import COVARIANCE_NAMES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,11 +26,11 @@ class DenseStep:
     Attributes
     ----------
     field
-        None where there is none.
+        None if there is none.
     reason
-        Why there is none.
+        Reason why there is none.
     seconds
-        That it took.
+        Duration of its measurement.
     """
 
     field: Field | None
@@ -67,7 +67,7 @@ class DenseSteps:
     pair, options
         As the ordinary fields are measured.
     step_px
-        Distance of vectors; None where no dense field is wanted.
+        Distance of vectors; None: no dense field.
     """
 
     pair: StereoPair
@@ -107,7 +107,7 @@ class DenseSteps:
         self._done[n] = DenseStep(field=found, reason=reason, seconds=round(time.perf_counter() - began, 3))
 
     def _of(self, shape: Field, result: Field, images: Sequence[MeasureImage], grid: PointGrid) -> Field:
-        from core.dense.field import dense_motion, dense_shape  # slow to load, and few measurements need it
+        from stereorig.core.dense.field import dense_motion, dense_shape  # slow to load, and few measurements need it
 
         assert self.step_px is not None
         if self._shape is None or self._shape[0] is not shape:
@@ -117,5 +117,5 @@ class DenseSteps:
         return dense_motion(self.pair, images, shape, result, self._shape[1], grid, self.options, step_px=self.step_px)
 
     def take(self, n: int) -> DenseStep | None:
-        """Return the dense field of a step, once; None where none was measured."""
+        """Return the dense field of a step, once; None if none was measured."""
         return self._done.pop(n, None)

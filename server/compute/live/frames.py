@@ -6,23 +6,23 @@ from typing import Any
 
 import numpy as np
 
-from core.arrays import Float
-from core.errors import StateError
-from core.field.points.images import MeasureImage, check_calibrated_size
-from core.field.region.lay_points import make_grid
-from core.field.region.outlines import points_inside
-from core.field.settings import MeasureOptions
-from core.live.gauges import LiveGauge, status_counts
-from core.live.measurement import LiveFrame, LiveMeasurement, LiveOptions
-from core.measure import ReferencePair
-from core.names import CAMERAS
-from core.settings import Outline
-from server.base.memory import settle
-from server.formats.calibrations.recognise import load_calibration
-from server.formats.calibrations.volume import parameter_covariance, volume_of
-from server.formats.images import read_image
-from server.formats.noise_json import load_noise
-from server.worker.tasks import LiveTask, Plain
+from stereorig.core.arrays import Float
+from stereorig.core.errors import StateError
+from stereorig.core.field.points.images import MeasureImage, check_calibrated_size
+from stereorig.core.field.region.lay_points import make_grid
+from stereorig.core.field.region.outlines import points_inside
+from stereorig.core.field.settings import MeasureOptions
+from stereorig.core.live.gauges import LiveGauge, status_counts
+from stereorig.core.live.measurement import LiveFrame, LiveMeasurement, LiveOptions
+from stereorig.core.measure import ReferencePair
+from stereorig.core.names import CAMERAS
+from stereorig.core.settings import Outline
+from stereorig.server.base.memory import settle
+from stereorig.server.compute.tasks import LiveTask, Plain
+from stereorig.server.formats.calibrations.recognise import load_calibration
+from stereorig.server.formats.calibrations.volume import parameter_covariance, volume_of
+from stereorig.server.formats.images import read_image
+from stereorig.server.formats.noise_json import load_noise
 
 _running: LiveMeasurement | None = None
 _whole = False
@@ -109,7 +109,7 @@ def _plain(frame: LiveFrame) -> Plain:
         "gauges": gauges,
     }
     if _whole and frame.field.uvw_mm is not None:
-        # five digits and more are kept of what a picture shows in some hundred colours
+        # float32 keeps five digits and more, and a picture shows some hundred colours
         found["field"] = frame.field.uvw_mm.astype(np.float32)
     return found
 

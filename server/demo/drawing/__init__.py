@@ -1,1 +1,1 @@
-"""Pictures of what the demo found."""
+"""Pictures of the demo's findings."""

@@ -1,4 +1,4 @@
-"""Pictures of what the demo found, beside what is true."""
+"""Pictures of the demo's measured and true fields."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.field.points.result import Field
-from server.demo.calibration import ViewResiduals
-from server.demo.compare import MotionComparison
-from server.exports.mesh import triangles_of
-from sim.plate import CircularPlate
+from stereorig.core.arrays import Float
+from stereorig.core.field.points.result import Field
+from stereorig.server.demo.calibration import ViewIntersections
+from stereorig.server.demo.compare import MotionComparison
+from stereorig.server.exports.mesh import triangles_of
+from stereorig.sim.plate import CircularPlate
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
@@ -48,13 +48,13 @@ def save(figure: Any, path: Path) -> None:
 
 
 def colour_limit(values: Float) -> float:
-    """Symmetric colour limit that one outlier does not spoil."""
+    """Symmetric colour limit, the 99th percentile of the sizes, which single outliers do not change."""
     finite = np.abs(values[np.isfinite(values)])
     return float(np.percentile(finite, 99)) if finite.size else 1.0
 
 
 def draw_map(axis: Any, result: Field, values: Float, title: str, unit: str, **options: Any) -> None:
-    """Draw values (r, c) where the points lie in camera 1's image."""
+    """Draw values (r, c) at their points' positions in camera 1's image."""
     half_x = 0.5 * (result.x_px[0, 1] - result.x_px[0, 0])
     half_y = 0.5 * (result.y_px[1, 0] - result.y_px[0, 0])
     extent = (
@@ -104,7 +104,7 @@ def region(out: Path, image: NDArray[Any], roi_px: Sequence[float], result: Fiel
     return {"region.png": "camera 1's reference image with the region and its points"}
 
 
-def calibration(out: Path, views: Sequence[ViewResiduals]) -> dict[str, str]:
+def calibration(out: Path, views: Sequence[ViewIntersections]) -> dict[str, str]:
     """Draw the residuals of every view as arrows.
 
     Parameters
@@ -112,7 +112,7 @@ def calibration(out: Path, views: Sequence[ViewResiduals]) -> dict[str, str]:
     out
         Folder.
     views
-        What each found.
+        The residuals of each view.
     """
     if not views:
         return {}
@@ -145,7 +145,7 @@ def calibration(out: Path, views: Sequence[ViewResiduals]) -> dict[str, str]:
         figure.tight_layout()
         axes[0, 0].quiverkey(arrows, 0.85, 0.975, scale, f"{scale:.3f} px", coordinates="figure", labelpos="E")
         save(figure, out / "calibration_residuals.png")
-    return {"calibration_residuals.png": "what the calibration leaves unexplained at every grid intersection"}
+    return {"calibration_residuals.png": "residuals of the calibration at every grid intersection"}
 
 
 def plate(
@@ -212,7 +212,7 @@ def plate(
         save(figure, out / "plate_w.png")
     return found | {
         "plate_profiles.png": "deflection over the radius at every pressure, with Eq. (18)",
-        "plate_maps.png": "u, v, w at the highest pressure, and what they differ from the truth",
+        "plate_maps.png": "u, v, w at the highest pressure, and their errors",
         "plate_w.png": "out-of-plane displacement at every pressure",
     }
 

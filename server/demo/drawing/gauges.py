@@ -1,4 +1,4 @@
-"""Pictures of what gauges read: the crack's opening, the buckle's shape, strain about the crack, a rigid motion."""
+"""Pictures of gauges' readings: the crack's opening, the buckle's shape, strain about the crack, a rigid motion."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from matplotlib import pyplot as plt
 
-from core.arrays import Float
-from core.field.points.result import Field
-from core.strain import StrainField
-from server.demo.drawing.fields import HEIGHT, STYLE, colour_limit, draw_difference, draw_map, save
-from server.demo.experiments.panel_gauges import ENDS_PX, Opening, Slice
-from server.demo.experiments.panel_strain import PanelStrain
-from server.demo.experiments.steel_motion import Moved
-from server.demo.strain import MICRO
+from stereorig.core.arrays import Float
+from stereorig.core.field.points.result import Field
+from stereorig.core.strain import StrainField
+from stereorig.server.demo.drawing.fields import HEIGHT, STYLE, colour_limit, draw_difference, draw_map, save
+from stereorig.server.demo.experiments.panel_gauges import ENDS_PX, Opening, Slice
+from stereorig.server.demo.experiments.panel_strain import PanelStrain
+from stereorig.server.demo.experiments.steel_motion import Moved
+from stereorig.server.demo.strain import MICRO
 
 _DOTS: Any = {"fmt": ".", "markersize": 5, "elinewidth": 0.8}
 
@@ -58,7 +58,7 @@ def opening(out: Path, found: Opening, loads_kn: Sequence[float], half_crack_mm:
         axes[1].set_title("The same over the load steps (lines: true)")
         axes[1].legend(frameon=False, fontsize=7)
         save(figure, out / "panel_opening.png")
-    return {"panel_opening.png": "opening of the crack along it and over the load, beside the true one"}
+    return {"panel_opening.png": "opening of the crack along it and over the load, with the true one"}
 
 
 def _true(axis: Any, x: Float, y: Float, half_crack_mm: float) -> None:
@@ -69,7 +69,7 @@ def _true(axis: Any, x: Float, y: Float, half_crack_mm: float) -> None:
 
 
 def buckle(out: Path, up: Slice, across: Slice, loads_kn: Sequence[float]) -> dict[str, str]:
-    """Draw w along two lines through the buckle at every load, and what it is off by."""
+    """Draw w along two lines through the buckle at every load, and its error."""
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(
             2, 2, figsize=(10.4, 6.2), height_ratios=(2.0, 1.0), sharex="col", layout="constrained"
@@ -97,7 +97,7 @@ def buckle(out: Path, up: Slice, across: Slice, loads_kn: Sequence[float]) -> di
         axes[1, 1].legend(frameon=False, fontsize=7)
         save(figure, out / "panel_buckle.png")
     return {
-        "panel_buckle.png": "shape of the buckle along two lines beside the true one; plane patches flatten its crests"
+        "panel_buckle.png": "shape of the buckle along two lines with the true one; plane patches flatten its crests"
     }
 
 

@@ -11,12 +11,12 @@ from matplotlib import pyplot as plt
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from core.field.points.result import Field
-from core.strain import StrainField
-from server.demo.drawing.fields import HEIGHT, STYLE, draw_difference, draw_map, save
-from server.demo.experiments.plate_strain import PlateStrain
-from server.demo.strain import MICRO
-from sim.plate import CircularPlate
+from stereorig.core.field.points.result import Field
+from stereorig.core.strain import StrainField
+from stereorig.server.demo.drawing.fields import HEIGHT, STYLE, draw_difference, draw_map, save
+from stereorig.server.demo.experiments.plate_strain import PlateStrain
+from stereorig.server.demo.strain import MICRO
+from stereorig.sim.plate import CircularPlate
 
 _SHOWN = 5  # pressures in the profiles
 
@@ -29,7 +29,7 @@ def plate(
     pressures_kpa: Sequence[float],
     theory: CircularPlate,
 ) -> dict[str, str]:
-    """Draw radial and hoop strain over the radius beside theory, and maps at the highest pressure."""
+    """Draw measured and theoretical radial and hoop strain over the radius, and maps at the highest pressure."""
     names = ("radial", "hoop")
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(1, 2, figsize=(10.6, 4.6), sharey=True, layout="constrained")
@@ -84,7 +84,7 @@ def plate(
         save(figure, out / "plate_strain_maps.png")
     return {
         "plate_strain.png": "radial and hoop strain over the radius, with plate theory",
-        "plate_strain_maps.png": "radial and hoop strain at the highest pressure beside theory",
+        "plate_strain_maps.png": "radial and hoop strain at the highest pressure, with theory",
     }
 
 

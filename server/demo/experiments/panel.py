@@ -5,23 +5,23 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.field.points.result import Field
-from server.demo.client import AnalysisHandle
-from server.demo.compare import MotionComparison, compare_motion, compare_shape
-from server.demo.drawing import fields as pictures
-from server.demo.drawing import gauges
-from server.demo.experiments import panel_gauges, panel_strain
-from server.demo.session import Check, Outcome, Session, table
-from server.demo.strain import fetched_strain
-from server.formats.calibrations.recognise import load_calibration
-from sim.panel import PAPER_LOADS_KN, CrackedPanel
+from stereorig.core.field.points.result import Field
+from stereorig.server.demo.client import AnalysisHandle
+from stereorig.server.demo.compare import MotionComparison, compare_motion, compare_shape
+from stereorig.server.demo.drawing import fields as pictures
+from stereorig.server.demo.drawing import gauges
+from stereorig.server.demo.experiments import panel_gauges, panel_strain
+from stereorig.server.demo.session import DemoCheck, DemoRun, Outcome, table
+from stereorig.server.demo.strain import fetched_strain
+from stereorig.server.formats.calibrations.recognise import load_calibration
+from stereorig.sim.panel import PAPER_LOADS_KN, CrackedPanel
 
 SUBSET_PX, SPACING_PX = 21, 10
 MARGIN_PX = 30
 LIMIT_MM = 0.05  # the dimensional accuracy that the paper states for this set-up
 
 
-def _crack_px(session: Session, panel: CrackedPanel) -> NDArray[np.float64]:
+def _crack_px(session: DemoRun, panel: CrackedPanel) -> NDArray[np.float64]:
     """Crack in the image of the calibrated camera 1: a user would click its ends."""
     s = np.linspace(-panel.half_crack_mm, panel.half_crack_mm, 101)
     half = np.sqrt(0.5)  # the panel hangs upright, the grid's lines at 45 degrees
@@ -30,7 +30,7 @@ def _crack_px(session: Session, panel: CrackedPanel) -> NDArray[np.float64]:
     return np.asarray(pair.cam1.project(line).xy)
 
 
-def run(session: Session, calibration_id: str) -> Outcome:
+def run(session: DemoRun, calibration_id: str) -> Outcome:
     """Capture the panel without load and at the paper's four loads, measure, compare."""
     panel, loads = CrackedPanel(), list(PAPER_LOADS_KN)
     client = session.client
@@ -56,7 +56,7 @@ def run(session: Session, calibration_id: str) -> Outcome:
 
 def _gauge(
     outcome: Outcome,
-    session: Session,
+    session: DemoRun,
     analysis: AnalysisHandle,
     fields: list[Field],
     comparisons: list[MotionComparison],
@@ -86,7 +86,7 @@ def _gauge(
 
 
 def _outcome(
-    shape: Field, fields: list[Field], comparisons: list[MotionComparison], loads: list[float], session: Session
+    shape: Field, fields: list[Field], comparisons: list[MotionComparison], loads: list[float], session: DemoRun
 ) -> Outcome:
     outcome = Outcome()
     rows = []
@@ -97,7 +97,9 @@ def _outcome(
         found, true = -result.uvw_mm[use, 2], -comparison.truth.uvw_mm[use, 2]
         worst = float(np.max(np.abs(comparison.error_mm[use, 2])))
         outcome.checks.append(
-            Check(f"w at {load:g} kN, largest error", "mm", float(np.ptp(found)), float(np.ptp(true)), worst, LIMIT_MM)
+            DemoCheck(
+                f"w at {load:g} kN, largest error", "mm", float(np.ptp(found)), float(np.ptp(true)), worst, LIMIT_MM
+            )
         )
         rms = 1e3 * comparison.rms_mm
         rows.append(
@@ -114,7 +116,7 @@ def _outcome(
             ]
         )
     wrong = sum(int(c.wrong.sum()) for c in comparisons) + int(compare_shape(shape, session.rig, "panel").sum())
-    outcome.checks.append(Check("wrong points among the valid", "points", wrong, None, wrong, 0))
+    outcome.checks.append(DemoCheck("wrong points among the valid", "points", wrong, None, wrong, 0))
     outcome.lines = table(
         ["kN", "w found mm", "w true mm", "max error um", "rms u um", "v", "w", "valid", "wrong"], rows
     )

@@ -1,4 +1,4 @@
-"""Gauges on the cracked panel: how far the crack opens, and the shape of the buckle, beside the scene's truth."""
+"""Gauges on the cracked panel: the crack's opening and the buckle's shape, measured and true."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.camera import Camera
-from server.demo.client import AnalysisHandle
-from server.demo.session import Check, Outcome, Session, table
-from server.demo.strain import SAFE
-from sim.catalog import make_scene
-from sim.panel import CrackedPanel
-from sim.rig import SimRig
-from sim.truth import Truth, truth_at
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import Camera
+from stereorig.server.demo.client import AnalysisHandle
+from stereorig.server.demo.session import DemoCheck, DemoRun, Outcome, table
+from stereorig.server.demo.strain import SAFE
+from stereorig.sim.catalog import make_scene
+from stereorig.sim.panel import CrackedPanel
+from stereorig.sim.rig import SimRig
+from stereorig.sim.truth import Truth, truth_at
 
 ACROSS = tuple(round(0.15 * k, 2) for k in range(-6, 7))  # of the half crack: positions of the extensometers
 BEYOND = (-1.35, 1.35)  # the same, ahead of the tips: nothing opens there
@@ -34,7 +34,7 @@ class Opening:
     position
         (n,) along the crack, of its half length; beyond +-1 ahead of the tips.
     found, sigma
-        (steps, n) elongation, mm; NaN where it is missing.
+        (steps, n) elongation, mm; NaN for missing readings.
     true
         (steps, n) of the same ends.
     lips
@@ -60,9 +60,9 @@ class Slice:
     Attributes
     ----------
     xy_px, at_mm
-        (m, 2) its positions, (m,) where they lie along the load or along the crack, true.
+        (m, 2) its positions, px; (m,) their true coordinate along the load or along the crack, mm.
     found, sigma, true
-        (steps, m) mm; the first two NaN where it is missing.
+        (steps, m) mm; the first two NaN for missing readings.
     """
 
     xy_px: Float
@@ -81,9 +81,9 @@ class Crest:
 
 
 def read_opening(
-    session: Session, analysis: AnalysisHandle, crack_px: Float, panel: CrackedPanel, loads_kn: Sequence[float]
+    session: DemoRun, analysis: AnalysisHandle, crack_px: Float, panel: CrackedPanel, loads_kn: Sequence[float]
 ) -> Opening:
-    """Lay extensometers across the crack and read them over HTTP."""
+    """Put extensometers across the crack and read them over HTTP."""
     position = np.array([BEYOND[0], *ACROSS, BEYOND[1]])
     middle, half = 0.5 * (crack_px[0] + crack_px[-1]), 0.5 * (crack_px[-1] - crack_px[0])
     on = middle + position[:, None] * half
@@ -115,7 +115,7 @@ def read_opening(
 
 
 def read_slice(
-    session: Session, analysis: AnalysisHandle, ends_px: Float, loads_kn: Sequence[float], axis: int
+    session: DemoRun, analysis: AnalysisHandle, ends_px: Float, loads_kn: Sequence[float], axis: int
 ) -> Slice:
     """Read w along a line over HTTP; ``axis`` 0: given along the crack, 1: along the load."""
     line = {"vertices_px": np.asarray(ends_px).tolist()}
@@ -205,12 +205,12 @@ def add_checks(
             )
             if k == len(loads_kn) - 1:
                 name = f"{side} crest of the buckle at {load:g} kN"
-                outcome.checks.append(Check(name, "mm", f.height_mm, t.height_mm, off_mm, limit))
+                outcome.checks.append(DemoCheck(name, "mm", f.height_mm, t.height_mm, off_mm, limit))
     inside, last = np.abs(opening.position) < 1.0, loads_kn[-1]
     worst = np.nanmax(np.abs(opening.found - opening.true)[-1]) if np.isfinite(opening.found).all() else np.nan
     sigma = float(np.max(opening.sigma[-1]))
     outcome.checks += [
-        Check(
+        DemoCheck(
             f"crack opening in the middle at {last:g} kN",
             "mm",
             float(opening.found[-1, middle]),
@@ -218,7 +218,7 @@ def add_checks(
             float((opening.found - opening.true)[-1, middle]),
             SAFE * float(opening.sigma[-1, middle]),
         ),
-        Check(
+        DemoCheck(
             f"crack opening at {last:g} kN, worst of {inside.sum()} positions and of 2 ahead of the tips",
             "mm",
             float(worst),
@@ -259,5 +259,5 @@ def _elongation(truth: Truth) -> Float:
 
 
 def _numbers(values: Sequence[Sequence[float | None]]) -> Float:
-    """Lists of numbers, None where one is missing."""
+    """Return lists of numbers as an array, NaN for missing ones."""
     return np.array(values, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Strain of the cracked panel along the load: beside the crack, where a gauge may not reach over it, and elsewhere."""
+"""Strain of the cracked panel along the load: at the crack, which a gauge may not reach over, and elsewhere."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.field.points.result import Field
-from core.strain import StrainField
-from server.demo.compare import MotionComparison
-from server.demo.session import Check, Outcome, table
-from server.demo.strain import MICRO, Difference, along, as_read, chi_limit, difference
-from sim.panel import CrackedPanel
+from stereorig.core.arrays import Float
+from stereorig.core.field.points.result import Field
+from stereorig.core.strain import StrainField
+from stereorig.server.demo.compare import MotionComparison
+from stereorig.server.demo.session import DemoCheck, Outcome, table
+from stereorig.server.demo.strain import MICRO, StrainDifference, along, as_read, chi_limit, difference
+from stereorig.sim.panel import CrackedPanel
 
 LOAD_SYS = (1.0, 1.0)  # the panel hangs upright, the grid's lines at 45 degrees
 _BESIDE = 0.6  # of the half crack: beyond, the tips' strain varies within a gauge
-SHARE_OVER = 0.1  # of what a gauge over the crack would read
+SHARE_OVER = 0.1  # of the reading of a gauge over the crack
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,11 +30,11 @@ class PanelStrain:
     found, sigma, true, read
         Measured, its standard deviation, true at the point, true as the gauge reads it.
     beside
-        Points whose window the crack cuts, the tips' surroundings left out.
+        Points whose window the crack cuts, except those near its tips.
     at_points, all_read, beside_read, beside_points
-        Against the truth at the points and as the gauge reads it; everywhere and beside the crack.
+        Differences from the truth at the points and from the gauge's reading of it; everywhere, and at `beside`.
     over
-        What a gauge that reached over the crack's middle would read too much: the opening over its width.
+        Excess reading of a gauge that reached over the crack's middle: the opening over the gauge's width.
     """
 
     found: Float
@@ -42,10 +42,10 @@ class PanelStrain:
     true: Float
     read: Float
     beside: NDArray[np.bool_]
-    at_points: Difference
-    all_read: Difference
-    beside_read: Difference
-    beside_points: Difference
+    at_points: StrainDifference
+    all_read: StrainDifference
+    beside_read: StrainDifference
+    beside_points: StrainDifference
     over: float
 
 
@@ -91,7 +91,7 @@ def add_checks(outcome: Outcome, found: Sequence[PanelStrain], strain: StrainFie
     last, load = found[-1], loads_kn[-1]
     chi, beside = last.all_read.chi, last.beside_points.rms
     outcome.checks += [
-        Check(
+        DemoCheck(
             f"strain along the load at {load:g} kN, its chi with the gauge's width known",
             "",
             chi,
@@ -99,7 +99,7 @@ def add_checks(outcome: Outcome, found: Sequence[PanelStrain], strain: StrainFie
             chi,
             chi_limit(strain),
         ),
-        Check(
+        DemoCheck(
             f"strain beside the crack at {load:g} kN, rms off the truth at the points",
             "microstrain",
             beside,

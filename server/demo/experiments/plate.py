@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from core.arrays import Float
-from core.field.points.result import Field
-from server.demo.client import AnalysisHandle
-from server.demo.compare import MotionComparison, compare_motion, compare_shape
-from server.demo.drawing import fields as pictures
-from server.demo.drawing import strain as strain_pictures
-from server.demo.experiments import plate_strain
-from server.demo.session import Check, Outcome, Session, table
-from server.demo.strain import fetched_strain
-from sim.plate import PAPER_PRESSURES_KPA, CircularPlate
+from stereorig.core.arrays import Float
+from stereorig.core.field.points.result import Field
+from stereorig.server.demo.client import AnalysisHandle
+from stereorig.server.demo.compare import MotionComparison, compare_motion, compare_shape
+from stereorig.server.demo.drawing import fields as pictures
+from stereorig.server.demo.drawing import strain as strain_pictures
+from stereorig.server.demo.experiments import plate_strain
+from stereorig.server.demo.session import DemoCheck, DemoRun, Outcome, table
+from stereorig.server.demo.strain import fetched_strain
+from stereorig.sim.plate import PAPER_PRESSURES_KPA, CircularPlate
 
 ROI_PX = (86.0, 70.0, 426.0, 410.0)  # 341 x 341 px, as in the paper
 SUBSET_PX, SPACING_PX = 21, 10
@@ -27,7 +27,7 @@ _CENTRE_REACH_MM = 5.0  # an even polynomial of degree four is Eq. (18) itself
 
 @dataclass(frozen=True)
 class PlateFit:
-    """Eq. (18) fitted to all pressures at once: the radius and where the centre lies."""
+    """Eq. (18) fitted to all pressures at once: radius and centre of the plate, mm."""
 
     radius_mm: float
     centre_mm: tuple[float, float]
@@ -36,8 +36,8 @@ class PlateFit:
 def fit_plate(fields: list[Field], pressures_kpa: list[float], plate: CircularPlate) -> PlateFit:
     """Fit radius and centre of Eq. (18) to the out-of-plane displacements of all pressures, as in the paper.
 
-    Stiffness, thickness and pressure are taken as known. Where the plate carries load as a membrane too, the centre's
-    deflection is that of the large-deflection formula.
+    Stiffness, thickness and pressure are taken as known. If the plate carries load as a membrane too, the centre's
+    deflection is taken from the large-deflection formula.
     """
     x, y, w, q = [], [], [], []
     for result, pressure in zip(fields, pressures_kpa, strict=True):
@@ -81,7 +81,7 @@ def centre_deflection_um(result: Field, centre_mm: tuple[float, float]) -> float
     return float(-1e3 * np.linalg.lstsq(design, result.uvw_mm[use, 2], rcond=None)[0][0])
 
 
-def run(session: Session, calibration_id: str) -> Outcome:
+def run(session: DemoRun, calibration_id: str) -> Outcome:
     """Capture the plate at rest and at ten pressures, measure, compare."""
     plate, pressures = CircularPlate(), list(PAPER_PRESSURES_KPA)
     client = session.client
@@ -109,7 +109,7 @@ def run(session: Session, calibration_id: str) -> Outcome:
     return outcome
 
 
-def _strain_in_the_centre(session: Session, analysis: AnalysisHandle, fit: PlateFit) -> list[tuple[float, float]]:
+def _strain_in_the_centre(session: DemoRun, analysis: AnalysisHandle, fit: PlateFit) -> list[tuple[float, float]]:
     """Read the mean of both normal strains in the plate's centre in every step, with its standard deviation."""
     centre = {"name": "centre", "xy_mm": list(fit.centre_mm)}
     steps = session.client.gauges(analysis, points=[centre], variables=["exx", "eyy"])[1:]
@@ -131,14 +131,14 @@ def _outcome(
     pressures: list[float],
     plate: CircularPlate,
     fit: PlateFit,
-    session: Session,
+    session: DemoRun,
 ) -> Outcome:
     outcome = Outcome()
     rows = []
     for result, comparison, pressure in zip(fields, comparisons, pressures, strict=True):
         found = centre_deflection_um(result, fit.centre_mm)
         true = 1e3 * plate.centre_deflection_mm(pressure)
-        check = Check(f"centre deflection at {pressure:g} kPa", "um", found, true, found - true, CENTRE_LIMIT_UM)
+        check = DemoCheck(f"centre deflection at {pressure:g} kPa", "um", found, true, found - true, CENTRE_LIMIT_UM)
         outcome.checks.append(check)
         u, v, w = 1e3 * comparison.rms_mm
         rows.append(
@@ -156,11 +156,11 @@ def _outcome(
         )
     percent = 100.0 * (fit.radius_mm / plate.radius_mm - 1.0)
     outcome.checks.append(
-        Check("radius fitted to Eq. (18)", "mm", fit.radius_mm, plate.radius_mm, percent, RADIUS_LIMIT_PERCENT, "%")
+        DemoCheck("radius fitted to Eq. (18)", "mm", fit.radius_mm, plate.radius_mm, percent, RADIUS_LIMIT_PERCENT, "%")
     )
     wrong = sum(int(c.wrong.sum()) for c in comparisons) + int(compare_shape(shape, session.rig, "plate").sum())
     valid = int(shape.valid.sum()) + sum(int(f.valid.sum()) for f in fields)
-    outcome.checks.append(Check("wrong points among the valid", "points", wrong, None, wrong, 0))
+    outcome.checks.append(DemoCheck("wrong points among the valid", "points", wrong, None, wrong, 0))
     outcome.lines += table(["kPa", "centre um", "true um", "error", "rms u um", "v", "w", "valid", "wrong"], rows)
     outcome.lines += [
         "",

@@ -13,18 +13,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.field.points.result import Field
-from core.strain import StrainField
-from server.demo.compare import MotionComparison
-from server.demo.session import Check, Outcome, table
-from server.demo.strain import MICRO, Difference, along, as_read, chi_limit, difference, whole_gauges
-from sim.plate import CircularPlate
+from stereorig.core.arrays import Float
+from stereorig.core.field.points.result import Field
+from stereorig.core.strain import StrainField
+from stereorig.server.demo.compare import MotionComparison
+from stereorig.server.demo.session import DemoCheck, Outcome, table
+from stereorig.server.demo.strain import MICRO, StrainDifference, along, as_read, chi_limit, difference, whole_gauges
+from stereorig.sim.plate import CircularPlate
 
 
 @dataclass(frozen=True, eq=False)
 class PlateStrain:
-    """One pressure: strain in radial and hoop direction at (r, c) points, and how far off it is.
+    """One pressure: strain in radial and hoop direction at (r, c) points, and its error.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class PlateStrain:
     whole
         (r, c) points whose window no edge cuts.
     off_theory, off_read
-        Radial and hoop over whole windows, against theory and against what the gauge reads of it.
+        Radial and hoop over whole windows, against theory and against the gauge's reading of it.
     all_off_theory
         Radial and hoop over all points.
     """
@@ -46,9 +46,9 @@ class PlateStrain:
     theory: Float
     read: Float
     whole: NDArray[np.bool_]
-    off_theory: tuple[Difference, Difference]
-    off_read: tuple[Difference, Difference]
-    all_off_theory: tuple[Difference, Difference]
+    off_theory: tuple[StrainDifference, StrainDifference]
+    off_read: tuple[StrainDifference, StrainDifference]
+    all_off_theory: tuple[StrainDifference, StrainDifference]
 
 
 def plate_strain(
@@ -69,7 +69,7 @@ def plate_strain(
     theory = np.stack(plate.face_strain(r, pressure_kpa))
     whole = whole_gauges(strain)
 
-    def off(other: Float, use: NDArray[np.bool_]) -> tuple[Difference, Difference]:
+    def off(other: Float, use: NDArray[np.bool_]) -> tuple[StrainDifference, StrainDifference]:
         radial, hoop = (difference(found[k], other[k], sigma[k], use) for k in range(2))
         return radial, hoop
 
@@ -130,8 +130,10 @@ def add_checks(
         off, read = found[-1].off_theory[k], found[-1].off_read[k]
         limit = float(np.hypot(chance * off.reported, effect))
         outcome.checks += [
-            Check(f"{name} strain at {q:g} kPa, rms off plate theory", "microstrain", off.rms, None, off.rms, limit),
-            Check(
+            DemoCheck(
+                f"{name} strain at {q:g} kPa, rms off plate theory", "microstrain", off.rms, None, off.rms, limit
+            ),
+            DemoCheck(
                 f"{name} strain at {q:g} kPa, its chi with the gauge's width known",
                 "",
                 read.chi,
@@ -142,7 +144,7 @@ def add_checks(
         ]
     (centre, sigma), true = at_centre[-1], float(plate.face_strain(0.0, q)[0])
     outcome.checks.append(
-        Check(
+        DemoCheck(
             f"strain in the centre at {q:g} kPa",
             "microstrain",
             MICRO * centre,

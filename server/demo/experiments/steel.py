@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from server.demo.compare import compare_shape, heights_mm
-from server.demo.drawing import fields as pictures
-from server.demo.drawing import gauges
-from server.demo.experiments import steel_motion
-from server.demo.session import Check, Outcome, Session, pixels_of, table
-from sim.catalog import make_scene
-from sim.truth import subset_planes
+from stereorig.server.demo.compare import compare_shape, heights_mm
+from stereorig.server.demo.drawing import fields as pictures
+from stereorig.server.demo.drawing import gauges
+from stereorig.server.demo.experiments import steel_motion
+from stereorig.server.demo.session import DemoCheck, DemoRun, Outcome, pixels_of, table
+from stereorig.sim.catalog import make_scene
+from stereorig.sim.truth import subset_planes
 
 ROI_PX = (56.0, 85.0, 456.0, 395.0)  # 400 x 310 px, as in the paper
 SUBSET_PX, SPACING_PX = 21, 15  # 27 x 21 = 567 points; the paper has 566
@@ -19,7 +19,7 @@ CAPTURES = 5  # one is the measurement, all of them determine its noise
 LIMIT_PERCENT = 3.0
 
 
-def run(session: Session, calibration_id: str) -> Outcome:
+def run(session: DemoRun, calibration_id: str) -> Outcome:
     """Capture the steel plate, measure its profile, take out the noise floor, compare."""
     client = session.client
     client.set_scene("steel")
@@ -58,10 +58,10 @@ def run(session: Session, calibration_id: str) -> Outcome:
 
     outcome = Outcome()
     outcome.checks = [
-        Check(
+        DemoCheck(
             "mean deviation from the best plane, noise taken out", "um", clean_um, truth_um, percent, LIMIT_PERCENT, "%"
         ),
-        Check("wrong points among the valid", "points", wrong, None, wrong, 0),
+        DemoCheck("wrong points among the valid", "points", wrong, None, wrong, 0),
     ]
     rows = [
         ["mean deviation, one pair", f"{mean_um:.3f}", ""],

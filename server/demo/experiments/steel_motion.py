@@ -1,4 +1,4 @@
-"""The ground plate moved as a rigid body: what gauges and strain make of a motion without deformation."""
+"""The ground plate moved as a rigid body: readings of gauges and strain in a motion without deformation."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Float
-from core.field.points.result import Field
-from core.strain import StrainField
-from server.demo.session import Check, Outcome, Session, table
-from server.demo.strain import MICRO, chi_limit, fetched_strain
-from server.formats.gauges.readings import AreaStatistics, StepReadings
+from stereorig.core.arrays import Float
+from stereorig.core.field.points.result import Field
+from stereorig.core.strain import StrainField
+from stereorig.server.demo.session import DemoCheck, DemoRun, Outcome, table
+from stereorig.server.demo.strain import MICRO, chi_limit, fetched_strain
+from stereorig.server.formats.gauges.readings import AreaStatistics, StepReadings
 
 # name, translation (mm) and rotation (degrees about X_sys, Y_sys, Z_sys) of the plate, about the system's origin
 MOTIONS = (
@@ -23,8 +23,8 @@ MOTIONS = (
     ("turned and shifted", (-0.20, 0.10, 1.00), (0.5, 0.5, 2.0)),
 )
 STRAINS = ("exx", "eyy", "exy")
-FALSE_LIMIT = 20.0  # microstrain, mean of the worst component: what the project asks of itself
-FEW = 20  # every 20th point is enough to see what the calibration does
+FALSE_LIMIT = 20.0  # microstrain, mean of the worst component: the project's own limit
+FEW = 20  # every 20th point is enough to show the calibration's effect
 OF_MANY = 4.0  # standard deviations that chance is given in the worst of many
 
 
@@ -35,13 +35,13 @@ class Moved:
     Attributes
     ----------
     name
-        Of the motion.
+        Name of the motion.
     found, sigma, true
         (6,) rotation vector in rad and translation of the points' middle in mm.
     sigma_calibration
         (6,) the calibration's part of sigma.
     noise_ratio
-        What is left after the motion, in units of its noise.
+        Residual motion of the points, in units of its noise.
     elongation_mm, elongation_sigma_mm
         (n,) of extensometers over the plate.
     false_mean, false_mean_sigma, false_mean_calibration
@@ -72,7 +72,7 @@ class Moved:
     left: Mapping[str, AreaStatistics]
 
 
-def capture(session: Session, test: str) -> None:
+def capture(session: DemoRun, test: str) -> None:
     """Capture the moved plate, one step a motion."""
     for name, shift, degrees in MOTIONS:
         turn = np.radians(degrees).tolist()
@@ -81,7 +81,7 @@ def capture(session: Session, test: str) -> None:
 
 
 def measure(
-    session: Session, test: str, first: int, region: Mapping[str, Sequence[float]], folder: str, **settings: Any
+    session: DemoRun, test: str, first: int, region: Mapping[str, Sequence[float]], folder: str, **settings: Any
 ) -> tuple[list[Moved], list[Field], list[StrainField]]:
     """Measure the motions of the steps from ``first`` on, and read the gauges over HTTP.
 
@@ -237,13 +237,13 @@ def add_checks(outcome: Outcome, moved: list[Moved], strains: list[StrainField])
     ]
 
 
-def _checks(one: Moved, strain: StrainField) -> list[Check]:
+def _checks(one: Moved, strain: StrainField) -> list[DemoCheck]:
     checks = []
     for part, quantity, unit, scale in ((slice(0, 3), "rotation", "urad", 1e6), (slice(3, 6), "shift", "um", 1e3)):
         found, true = (scale * float(np.linalg.norm(v[part])) for v in (one.found, one.true))
         off = scale * float(np.max(np.abs(one.found - one.true)[part]))
         limit = OF_MANY * scale * float(np.max(one.sigma[part]))
-        checks.append(Check(f"the plate {one.name}: {quantity}, worst component", unit, found, true, off, limit))
+        checks.append(DemoCheck(f"the plate {one.name}: {quantity}, worst component", unit, found, true, off, limit))
     change = np.abs(one.elongation_mm) / one.elongation_sigma_mm
     k = int(np.argmax(change))
     elongation, worst = 1e3 * float(one.elongation_mm[k]), int(np.argmax(np.abs(one.false_mean)))
@@ -251,7 +251,7 @@ def _checks(one: Moved, strain: StrainField) -> list[Check]:
     sigma = float(one.false_mean_sigma[worst])
     return [
         *checks,
-        Check(
+        DemoCheck(
             f"the plate {one.name}: an extensometer that must not change",
             "um",
             elongation,
@@ -259,7 +259,7 @@ def _checks(one: Moved, strain: StrainField) -> list[Check]:
             elongation,
             OF_MANY * 1e3 * float(one.elongation_sigma_mm[k]),
         ),
-        Check(
+        DemoCheck(
             f"the plate {one.name}: false strain, mean of the worst component",
             "microstrain",
             mean,
@@ -267,5 +267,5 @@ def _checks(one: Moved, strain: StrainField) -> list[Check]:
             mean,
             min(FALSE_LIMIT, OF_MANY * sigma),
         ),
-        Check(f"the plate {one.name}: chi of the false strain", "", one.chi, None, one.chi, chi_limit(strain)),
+        DemoCheck(f"the plate {one.name}: chi of the false strain", "", one.chi, None, one.chi, chi_limit(strain)),
     ]

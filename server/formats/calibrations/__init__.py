@@ -1,1 +1,1 @@
-"""Calibration files: our own and those of other programs."""
+"""Calibration files: this program's own format and the formats of other programs."""

@@ -9,25 +9,26 @@ from typing import Literal, get_args
 import cv2
 import numpy as np
 
-from core.cameras.camera import Camera, RigidTransform
-from core.cameras.conversion import LensFit, fit_opencv, fit_seidel
-from core.cameras.lens import OpenCVLens
-from core.cameras.stereo import StereoPair
-from core.errors import CalibrationError
-from core.names import CAMERAS
-from server.formats.calibrations.programs.dice_xml import dice_text
-from server.formats.calibrations.programs.matchid_caldat import caldat_text
-from server.formats.calibrations.programs.opencv_yaml import opencv_text
-from server.formats.calibrations.programs.plausibility import (
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.core.cameras.conversion import LensFit, fit_opencv, fit_seidel
+from stereorig.core.cameras.lens import OpenCVLens
+from stereorig.core.cameras.opencv_full import OpenCVFullLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import CalibrationError
+from stereorig.core.names import CAMERAS
+from stereorig.server.formats.calibrations.programs.dice_xml import dice_text
+from stereorig.server.formats.calibrations.programs.matchid_caldat import caldat_text
+from stereorig.server.formats.calibrations.programs.opencv_yaml import opencv_text
+from stereorig.server.formats.calibrations.programs.plausibility import (
     Residual,
     image_sizes,
     independent_projection,
     middle_depth_mm,
     shared_points,
 )
-from server.formats.calibrations.programs.vic3d_xml import vic3d_text
-from server.formats.calibrations.recognise import LoadedCalibration, imported_content, parse_calibration
-from server.formats.version import software_version
+from stereorig.server.formats.calibrations.programs.vic3d_xml import vic3d_text
+from stereorig.server.formats.calibrations.recognise import LoadedCalibration, imported_content, parse_calibration
+from stereorig.server.formats.version import software_version
 
 CalibrationForm = Literal["json", "paper", "opencv", "dice", "matchid", "vic3d"]
 FORMS: tuple[CalibrationForm, ...] = get_args(CalibrationForm)
@@ -91,7 +92,7 @@ class ConversionReport:
     source, source_sha256
         The calibration that was read.
     units, frame, image_size_px
-        Of the written file.
+        Units of length, system frame and image size (width, height) of both cameras in the written file.
     exact
         True if both lenses are the same but for rounding.
     lens
@@ -139,9 +140,9 @@ def convert_calibration(loaded: LoadedCalibration, form: CalibrationForm, origin
     Raises
     ------
     CalibrationError
-        ``lens_unfittable``.
+        ``lens_unfittable``; ``lens_not_held`` where the form has no thin prism or tilted sensor.
     FileFormatError
-        If what was written does not read back.
+        If the written file cannot be read back.
     """
     try:
         with np.errstate(all="ignore"):  # a file may hold numbers of any size
@@ -155,8 +156,16 @@ def convert_calibration(loaded: LoadedCalibration, form: CalibrationForm, origin
 def _convert(loaded: LoadedCalibration, form: CalibrationForm, original: bytes) -> ConvertedCalibration:
     size1, size2, known = image_sizes(loaded)
     cameras, sizes = (loaded.pair.cam1, loaded.pair.cam2), (size1, size2)
+    for name, camera in zip(CAMERAS, cameras, strict=True):
+        if isinstance(camera.lens, OpenCVFullLens) and form not in ("json", "opencv"):
+            terms = ", ".join(f"{key} = {value:.3g}" for key, value in camera.lens.prism.items() if value)
+            raise CalibrationError(
+                f"The form {form} has no thin prism and no tilted sensor; {name} has {terms}.",
+                code="lens_not_held",
+                remedy="Write the form json or opencv, which hold them, or calibrate with a lens without these terms.",
+            )
     if form == "json":
-        content = imported_content(original, name="The calibration")
+        content = imported_content(original, name="The calibration", unit=loaded.unit)
         data = (json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
         fits = [LensFit(camera.lens, 0.0, 0.0, 1.0) for camera in cameras]
     elif form == "paper":
@@ -213,8 +222,7 @@ def _paper(
     pair, size = loaded.pair, sizes or image_sizes(loaded)[:2]
     to_sys = RigidTransform.identity()
     if min(camera.cam_from_sys.translation_mm[2] for camera in (pair.cam1, pair.cam2)) <= 0.0:
-        # the paper's system frame lies in front of the cameras: in the middle of their common view, with camera 1's
-        # axes
+        # the paper's system frame: its origin is in the middle of the cameras' common view, its axes are camera 1's
         depth = middle_depth_mm(pair, *size)
         if depth is None:
             raise CalibrationError(

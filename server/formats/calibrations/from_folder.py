@@ -6,20 +6,19 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from core.boards import BoardTarget
-from core.calibration import CalibrationOptions, CalibrationResult
-from core.calibration.from_images import ImageOfTarget, calibrate_views
-from core.calibration.inputs import is_held_out
-from core.errors import CalibrationError
-from core.grid import GridView, Localiser
-from core.progress import Progress, no_progress
-from core.target import GridTarget
-from server.formats.calibrations.native import calibration_content, write_calibration
-from server.formats.calibrations.target_toml import read_rig, read_target
-from server.formats.files import make_folder, sha256_of
-from server.formats.images import decode, read_file
-from server.formats.version import software_version
-from server.formats.views import ViewFile, find_views
+from stereorig.core.boards import BoardTarget
+from stereorig.core.calibration import CalibrationOptions, CalibrationResult
+from stereorig.core.calibration.from_images import ImageOfTarget, calibrate_views
+from stereorig.core.calibration.inputs import is_held_out
+from stereorig.core.grid import GridView, Localiser
+from stereorig.core.progress import Progress, no_progress
+from stereorig.core.target import GridTarget
+from stereorig.server.formats.calibrations.native import calibration_content, write_calibration
+from stereorig.server.formats.calibrations.target_toml import read_rig, read_target
+from stereorig.server.formats.files import make_folder, sha256_of
+from stereorig.server.formats.images import decode, read_file
+from stereorig.server.formats.version import software_version
+from stereorig.server.formats.views import ViewFile, find_views
 
 
 @dataclass(frozen=True)
@@ -50,15 +49,11 @@ class FolderCalibration:
 
     def check(self) -> None:
         """Raise CalibrationError ``calibration_rejected`` if the verdict is failed."""
-        if self.result.verdict.level == "failed":
-            raise CalibrationError(
-                f"The calibration is not usable, nothing was written: {' '.join(self.result.verdict.reasons)}",
-                code="calibration_rejected",
-            )
+        self.result.verdict.check()
 
 
 def calibrate_folder(
-    views: Path,
+    views: Path | Sequence[ViewFile],
     target: Path,
     rig: Path,
     *,
@@ -72,9 +67,9 @@ def calibrate_folder(
     ----------
     views
         Folder of images with camera and travel in the name, as ``cam2_+5.000mm.tif``, or with camera and number of a
-        free pose, as ``cam2_005.tif``.
+        free pose, as ``cam2_005.tif``; or the files themselves.
     target, rig
-        TOML files: the target; the nominal cameras and what moves.
+        TOML files: the target; the nominal cameras and the kind of motion between views.
     hold_out
         Positions in mm, or numbers of free poses, to leave out of the fit and check with.
     localiser
@@ -88,17 +83,19 @@ def calibrate_folder(
         Files that cannot be used, a grid that is not found, positions that do not determine the cameras.
     """
     grid, nominal = read_target(target), read_rig(rig)
-    files = find_views(views)
+    files = find_views(views) if isinstance(views, Path) else list(views)
     decoded = {f.path: decode(read_file(f.path), name=str(f.path)) for f in files}
-    images = [ImageOfTarget(f.camera, f.dz_mm, decoded[f.path].pixels, f.path.name, f.frame) for f in files]
+    unique = len({f.path.name for f in files}) == len(files)
+    names = {f.path: f.path.name if unique else str(f.path) for f in files}
+    images = [ImageOfTarget(f.camera, f.dz_mm, decoded[f.path].pixels, names[f.path], f.frame) for f in files]
     options = nominal.options(*_held_out(files, hold_out))
     found = calibrate_views(images, grid, (nominal.cam1, nominal.cam2), options, localiser=localiser, progress=progress)
     provenance: dict[str, object] = {
         "software": software_version(),
         "localiser": localiser,
         "line_model": next((g.line_model for g in found.grids if isinstance(g, GridView)), None),
-        "views_sha256": {f.path.name: sha256_of(f.path) for f in files},
-        "views_grey_from": {f.path.name: made for f in files if (made := decoded[f.path].grey_from) is not None}
+        "views_sha256": {names[f.path]: sha256_of(f.path) for f in files},
+        "views_grey_from": {names[f.path]: made for f in files if (made := decoded[f.path].grey_from) is not None}
         or None,
         "target_file": str(target),
         "rig_file": str(rig),
@@ -108,7 +105,7 @@ def calibrate_folder(
 
 
 def _held_out(files: Sequence[ViewFile], hold_out: Sequence[float]) -> tuple[tuple[float, ...], tuple[int, ...]]:
-    """Split the values given into stage positions and numbers of free poses: a position where one is near."""
+    """Split the given values into stage positions and numbers of free poses: a position if a view was taken near it."""
     frames = {f.frame for f in files if f.frame is not None}
     positions: list[float] = []
     poses: list[int] = []

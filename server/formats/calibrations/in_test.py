@@ -1,6 +1,6 @@
 """The calibrations in a test's folder: the one that it was made with, and those that it was given since.
 
-The first lies in ``calibration.json`` and stays there; each later one lies in ``calibrations/<sha256>.json``. Nothing
+The first is ``calibration.json`` and stays there; each later one is ``calibrations/<sha256>.json``. Nothing
 is ever replaced, so that an analysis keeps the one that it was measured with. ``test.json`` names the one in force.
 """
 
@@ -9,6 +9,8 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
+
+from stereorig.server.formats.manifest import checked_bytes, is_there
 
 #: folder of the later ones
 LATER = "calibrations"
@@ -27,15 +29,20 @@ def calibration_in(test: Path, sha256: str | None = None) -> Path:
     test
         The test's folder.
     sha256
-        Checksum of the calibration; left out: that of the one in force, as ``test.json`` has it.
+        Checksum of the calibration; None: the calibration in force, whose checksum ``test.json`` has.
+
+    Raises
+    ------
+    DamagedError
+        ``file_missing`` if it was there and is gone.
     """
     wanted = _in_force(test) if sha256 is None else sha256
     later = None if wanted is None else later_file(test, wanted)
-    return later if later is not None and later.is_file() else test / "calibration.json"
+    return later if later is not None and is_there(later) else test / "calibration.json"
 
 
 def calibration_id_in(test: Mapping[str, object], sha256: str | None) -> str | None:
-    """Return the id of a calibration that a test, or one of its analyses, was given; None where it is not known.
+    """Return the id of the calibration that a test or one of its analyses was given; None if it is not known.
 
     Parameters
     ----------
@@ -70,7 +77,7 @@ def _in_force(test: Path) -> str | None:
 
 def _document(path: Path) -> dict[str, object]:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(checked_bytes(path))
     except (OSError, ValueError):
         return {}  # a folder put together by hand has none
     return found if isinstance(found, dict) else {}

@@ -1,17 +1,18 @@
-"""Checks made of a calibration after it was made: ``calibration.checks.json`` beside ``calibration.json``.
+"""Checks made of a calibration after it was made: ``calibration.checks.json`` in the folder of ``calibration.json``.
 
-The calibration itself stays as it was written, with its checksum; the file beside it names the checksum that its
-findings hold for. Where another calibration has taken the file's place, they are not shown.
+The calibration itself stays as it was written, with its checksum; the file of checks names the checksum that its
+findings hold for. If another calibration has replaced it, the findings are not shown.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from server.formats.files import write_bytes
+from stereorig.server.formats.files import write_bytes
+from stereorig.server.formats.manifest import checked_bytes
 
 KEPT_CHECKS = "calibration.checks.json"
 
@@ -24,7 +25,7 @@ def checks_file(calibration: Path) -> Path:
 def read_checks(calibration: Path, sha256: str) -> dict[str, dict[str, Any]]:
     """Return the findings kept for a calibration by the checks' names; empty without any, or of another calibration."""
     try:
-        content = json.loads(checks_file(calibration).read_text(encoding="utf-8"))
+        content = json.loads(checked_bytes(checks_file(calibration)))
     except (OSError, ValueError):
         return {}
     if not isinstance(content, dict) or content.get("calibration_sha256") != sha256:
@@ -35,8 +36,15 @@ def read_checks(calibration: Path, sha256: str) -> dict[str, dict[str, Any]]:
     return {name: finding for name, finding in found.items() if isinstance(finding, dict)}
 
 
-def keep_check(calibration: Path, sha256: str, name: str, finding: Mapping[str, object]) -> Path:
-    """Keep a check's finding with a calibration; a later one of the same name replaces it.
+def keep_check(
+    calibration: Path,
+    sha256: str,
+    name: str,
+    finding: Mapping[str, object],
+    *,
+    write: Callable[[Path, bytes], object] = write_bytes,
+) -> Path:
+    """Keep a check's finding with a calibration, by ``write``; a later one of the same name replaces it.
 
     Raises
     ------
@@ -46,12 +54,12 @@ def keep_check(calibration: Path, sha256: str, name: str, finding: Mapping[str, 
     checks = {**read_checks(calibration, sha256), name: dict(finding)}
     content = {"calibration_sha256": sha256, "checks": checks}
     path = checks_file(calibration)
-    write_bytes(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+    write(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
     return path
 
 
 def with_checks(content: Mapping[str, Any], kept: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Return a calibration.json's content with the checks kept beside it, among those made where it lists them."""
+    """Return a calibration.json's content with the later checks, which also replace entries in ``checks.made``."""
     if not kept:
         return dict(content)
     out = {**content, "kept_checks": dict(kept)}

@@ -1,8 +1,8 @@
 """calibration.json: both cameras with their covariance, checks and verdict.
 
 A file that holds only ``cam1`` and ``cam2``, the eleven parameters each, is enough to measure with
-(:func:`server.formats.calibrations.recognise.load_calibration` reads any of them); the rest states its uncertainty and
-checks.
+(:func:`stereorig.server.formats.calibrations.recognise.load_calibration` reads any of them); the rest states its
+uncertainty and checks.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from core.boards import BoardTarget
-from core.calibration import COVARIANCE_NAMES, CalibrationResult, CheckMeasures, Measures, ViewResult
-from core.cameras.camera import POSE_NAMES, Camera, RigidTransform
-from core.cameras.lens import SeidelLens
-from core.cameras.stereo import StereoPair
-from core.common.factor import ParameterCovariance
-from core.errors import FileFormatError
-from core.names import CAMERAS, CAUSES, Cause
-from core.target import LINE_GRID, GridTarget
-from server.formats.files import write_bytes
+from stereorig.core.boards import BoardTarget
+from stereorig.core.calibration import COVARIANCE_NAMES, CalibrationResult, CheckMeasures, Measures, ViewResult
+from stereorig.core.cameras.camera import POSE_NAMES, Camera, RigidTransform
+from stereorig.core.cameras.lens import SeidelLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.common.factor import ParameterCovariance
+from stereorig.core.errors import FileFormatError
+from stereorig.core.names import CAMERAS, CAUSES, Cause
+from stereorig.core.target import LINE_GRID, GridTarget
+from stereorig.server.formats.files import write_bytes
 
 FORMAT_VERSION = 1
 
@@ -103,7 +103,10 @@ def calibration_content(
 def target_record(target: GridTarget | BoardTarget) -> dict[str, Any]:
     """Return a target's description as plain values, its kind among them."""
     kind = {"kind": LINE_GRID} if isinstance(target, GridTarget) else {}
-    return {**kind, **{k: list(v) if isinstance(v, tuple) else v for k, v in asdict(target).items()}}
+    fields = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(target).items()}
+    if not any(fields.get("missing_lines", ())):
+        fields.pop("missing_lines", None)
+    return {**kind, **fields}
 
 
 def view_record(view: ViewResult) -> dict[str, Any]:
@@ -176,11 +179,11 @@ def parameters_in(content: Mapping[str, object], *, name: str, pair: StereoPair)
     Parameters
     ----------
     content
-        Of the file.
+        Content of the calibration.json.
     name
-        The file's, for messages.
+        Name of the file, for messages.
     pair
-        Its cameras, whose parameters the names must be.
+        The file's cameras: the covariance's names must be names of their parameters.
 
     Raises
     ------
@@ -205,7 +208,7 @@ def parameters_in(content: Mapping[str, object], *, name: str, pair: StereoPair)
     if missing:
         raise _unusable(name, f"its names lack {', '.join(missing)}")
     known = {f"{cam}.{key}" for cam, camera in cameras.items() for key in camera.parameter_names}
-    # the usual order where it is the paper's lens, so that equal files give equal sums
+    # the usual order for the paper's lens, so that equal files give equal sums
     order = [n for n in COVARIANCE_NAMES if n in names]
     order = (
         [*order, *(n for n in names if n in known and n not in order)]
@@ -222,7 +225,7 @@ def parameters_in(content: Mapping[str, object], *, name: str, pair: StereoPair)
 def _by_cause(
     content: Mapping[str, object], names: Sequence[str], index: Sequence[int], *, name: str
 ) -> dict[Cause, NDArray[np.float64]] | None:
-    """Parts of the covariance, in its order; None in a file that does not tell them apart."""
+    """Parts of the covariance by cause, in its order; None if the file does not separate them."""
     part = content.get("covariance_by_cause")
     if part is None:
         return None

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
-from core.target import LINE_GRID
-from server.formats.records import Record
+from stereorig.core.target import LINE_GRID
+from stereorig.server.formats.records import Record
 
 
-class Measures(Record):
+class RecordedMeasures(Record):
     """Reprojection measures; ``nsce`` is a pure number."""
 
     rbe_px: float | None = None
@@ -16,10 +16,10 @@ class Measures(Record):
     nsce: float | None = None
 
 
-class CheckRecord(Measures):
+class CheckRecord(RecordedMeasures):
     """The measures of some positions of the cameras, together and by camera."""
 
-    per_camera: dict[str, Measures] = Field(default={})
+    per_camera: dict[str, RecordedMeasures] = Field(default={})
 
 
 class MadeCheck(Record):
@@ -59,7 +59,7 @@ class PoseRecord(Record):
     translation_mm: tuple[float, float, float]
 
 
-class ViewRecord(Measures):
+class ViewRecord(RecordedMeasures):
     """One image of the target, at a stage position or in a free pose."""
 
     camera: str
@@ -79,6 +79,7 @@ class TargetRecord(Record):
     line_width_mm: float | None = None
     node_tolerance_mm: float = 0.0
     dark_lines: bool = True
+    missing_lines: tuple[list[int], list[int]] = ([], [])
     marker_mm: float | None = None
     dictionary: str | None = None
 
@@ -91,13 +92,15 @@ class LensRecord(Record):
 
 
 class StageRecord(Record):
-    """What the stage moved."""
+    """The moving part of a calibration stage: the target or the cameras."""
 
     moves: str = "cameras"
 
 
-class CameraIdentity(Record):
+class RecordedCamera(Record):
     """Identity of a camera, as it reports it."""
+
+    model_config = ConfigDict(extra="allow")
 
     model: str | None = None
     serial: str | None = None
@@ -110,7 +113,7 @@ class OriginRecord(Record):
     frames: int | None = None
     rig: str | None = None
     software_version: str | None = None
-    cameras: dict[str, CameraIdentity] = Field(default={})
+    cameras: dict[str, RecordedCamera] = Field(default={})
 
 
 class SettingsRecord(Record):

@@ -1,4 +1,4 @@
-"""calibration.json of a repaired pair: camera 2's pose and what depends on it are new, everything else is kept."""
+"""calibration.json of a repaired pair: camera 2's pose and the entries that depend on it are new, all others kept."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.uncertainty import volume_uncertainty
-from core.cameras.camera import POSE_NAMES, Camera
-from core.cameras.stereo import StereoPair
-from core.names import CAMERAS
-from core.orientation import Repair, RepairLimits
-from core.orientation.change import CHANGE_NAMES
-from core.orientation.propagate import carried_parameters, pose_parameters, repaired_covariance
-from server.formats.calibrations.export import convert_calibration
-from server.formats.calibrations.recognise import LoadedCalibration, parse_calibration
-from server.formats.calibrations.record import CalibrationRecord
-from server.formats.calibrations.volume import target_of
-from server.formats.results.summary import to_json
-from server.formats.version import software_version
+from stereorig.core.calibration.uncertainty import volume_uncertainty
+from stereorig.core.cameras.camera import POSE_NAMES, Camera
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.names import CAMERAS
+from stereorig.core.orientation import RepairedPair, RepairLimits
+from stereorig.core.orientation.change import CHANGE_NAMES
+from stereorig.core.orientation.propagate import carried_parameters, pose_parameters, repaired_covariance
+from stereorig.server.formats.calibrations.export import convert_calibration
+from stereorig.server.formats.calibrations.recognise import LoadedCalibration, parse_calibration
+from stereorig.server.formats.calibrations.record import CalibrationRecord
+from stereorig.server.formats.calibrations.volume import target_of
+from stereorig.server.formats.results.summary import to_json
+from stereorig.server.formats.version import software_version
 
 _STEP = 1e-3  # of a parameter's standard uncertainty
 
@@ -38,7 +38,7 @@ def native_content(loaded: LoadedCalibration, original: bytes) -> dict[str, Any]
     if not loaded.imported:
         return copy.deepcopy(loaded.details)
     content: dict[str, Any] = json.loads(convert_calibration(loaded, "paper", original).data)
-    # in the frame of that form, which lies before the cameras, with the lenses as they were
+    # in the frame of that form, whose origin is in front of the cameras, with the lenses as they were
     framed = parse_calibration(to_json(content), name="The calibration").pair
     for cam, camera, placed in zip(
         CAMERAS, (loaded.pair.cam1, loaded.pair.cam2), (framed.cam1, framed.cam2), strict=True
@@ -50,7 +50,7 @@ def native_content(loaded: LoadedCalibration, original: bytes) -> dict[str, Any]
 def repaired_content(
     content: Mapping[str, Any],
     original_sha256: str,
-    repair: Repair,
+    repair: RepairedPair,
     images: Sequence[Mapping[str, Any]],
     limits: RepairLimits,
 ) -> dict[str, Any]:
@@ -59,15 +59,15 @@ def repaired_content(
     Parameters
     ----------
     content
-        Of the old one, :func:`native_content`.
+        Content of the old calibration.json, from :func:`native_content`.
     original_sha256
-        Of the old file's bytes.
+        SHA-256 of the old file's bytes.
     repair
         Made with the pair of ``content``.
     images
         File names and SHA-256 of the images, by camera, a step each.
     limits
-        What it was held against.
+        The limits that the repair was checked against.
     """
     out: dict[str, Any] = copy.deepcopy(dict(content))
     out["cam2"] |= dict(zip(POSE_NAMES, pose_parameters(repair.pair).tolist(), strict=True))
@@ -96,14 +96,14 @@ def repaired_content(
     return out
 
 
-def repair_section(repair: Repair, limits: RepairLimits) -> dict[str, object]:
+def repair_section(repair: RepairedPair, limits: RepairLimits) -> dict[str, object]:
     """Return the finding of a repair as plain values."""
     sigma = np.sqrt(np.diagonal(repair.estimate.covariance))
     turn = float(np.degrees(np.linalg.norm(repair.change[:3])))
     cost = repair.consequence
     return {
-        "text": f"camera 2's orientation against camera 1 was estimated anew from the speckle, {turn:.3f} degrees from "
-        f"the calibration's, with the baseline's length kept: strains of shapes are known to "
+        "text": f"camera 2's orientation against camera 1 was estimated again from the speckle, {turn:.3f} degrees "
+        f"from the calibration's, with the baseline's length kept: strains of shapes are known to "
         f"{cost.strain_sigma_microstrain:.2g} microstrain from it",
         "estimated": list(CHANGE_NAMES),
         "change_deg": np.degrees(repair.change).tolist(),
@@ -123,7 +123,7 @@ def repair_section(repair: Repair, limits: RepairLimits) -> dict[str, object]:
 
 
 def _by_cause(parts: Mapping[str, Any], matrix: NDArray[np.float64], whole: NDArray[np.float64]) -> dict[str, object]:
-    """Parts of the repaired parameters' covariance: what the estimate adds is noise, as the calibration's is."""
+    """Parts by cause of the repaired parameters' covariance: the estimate adds noise, to the part ``calibration``."""
     out = {
         cause: whole @ np.asarray(part, dtype=np.float64) @ whole.T
         for cause, part in parts.items()
@@ -134,7 +134,7 @@ def _by_cause(parts: Mapping[str, Any], matrix: NDArray[np.float64], whole: NDAr
 
 
 def _covariance(
-    content: Mapping[str, Any], repair: Repair
+    content: Mapping[str, Any], repair: RepairedPair
 ) -> tuple[list[str], NDArray[np.float64], NDArray[np.float64]] | None:
     """Names, covariance of the repaired parameters, and their slopes over the old; None where the old file has none."""
     part = content.get("covariance")
@@ -167,7 +167,7 @@ def _stepped(content: Mapping[str, Any], name: str, step: float) -> StereoPair:
 def _uncertainty(
     content: Mapping[str, Any], pair: StereoPair, names: Sequence[str], matrix: NDArray[np.float64]
 ) -> dict[str, Any]:
-    """The entry of that name; numbers that cannot be given anew are missing."""
+    """Return the new entry ``uncertainty``; numbers that cannot be computed again are None."""
     old = content.get("uncertainty") if isinstance(content.get("uncertainty"), dict) else {}
     assert isinstance(old, dict)
     out = {**old, **dict.fromkeys(("shape_rms_mm", "scale", "centre_z_mm", "corner_z_mm"))}

@@ -9,13 +9,13 @@ from math import isfinite
 from pathlib import Path
 from typing import Any, TypedDict
 
-from core.boards.board import BOARD_KINDS, DEFAULT_DICTIONARY, BoardKind, BoardTarget, dictionary_id
-from core.calibration import CalibrationOptions, NominalCamera
-from core.calibration.fit.lens_form import LENS_CHOICES, LensChoice
-from core.calibration.inputs import MOVES, Moves
-from core.errors import FileFormatError, InputError
-from core.names import CAMERAS
-from core.target import LINE_GRID, GridTarget
+from stereorig.core.boards.board import BOARD_KINDS, DEFAULT_DICTIONARY, BoardKind, BoardTarget, dictionary_id
+from stereorig.core.calibration import CalibrationOptions, NominalValues
+from stereorig.core.calibration.fit.lens_form import LENS_CHOICES, LensChoice
+from stereorig.core.calibration.inputs import MOVES, Moves, least_count_sigma_mm
+from stereorig.core.errors import FileFormatError, InputError
+from stereorig.core.names import CAMERAS
+from stereorig.core.target import LINE_GRID, GridTarget
 
 _MAX_BYTES = 1 << 20
 _MAX_SIDE_PX = 32_767
@@ -30,17 +30,18 @@ class NominalRig:
     ----------
     cam1, cam2
         Nominal cameras.
-    moves, lens, axis_tilt_sigma_rad, stage_scale_sigma, stage_step_sigma_mm
-        Of ``[calibration]``, as :class:`core.calibration.CalibrationOptions` has them.
+    moves, lens, axis_tilt_sigma_rad, stage_scale_sigma, stage_step_sigma_mm, aspect_sigma
+        Of ``[calibration]``, as :class:`stereorig.core.calibration.CalibrationOptions` has them.
     """
 
-    cam1: NominalCamera
-    cam2: NominalCamera
+    cam1: NominalValues
+    cam2: NominalValues
     moves: Moves = DEFAULTS.moves
     lens: LensChoice = DEFAULTS.lens
     axis_tilt_sigma_rad: float = DEFAULTS.axis_tilt_sigma_rad
     stage_scale_sigma: float = DEFAULTS.stage_scale_sigma
     stage_step_sigma_mm: float = DEFAULTS.stage_step_sigma_mm
+    aspect_sigma: float | None = DEFAULTS.aspect_sigma
 
     def options(self, held_out_mm: tuple[float, ...], held_out_frames: tuple[int, ...]) -> CalibrationOptions:
         """Return the settings of a calibration with these positions and poses kept for the check."""
@@ -52,6 +53,7 @@ class NominalRig:
             axis_tilt_sigma_rad=self.axis_tilt_sigma_rad,
             stage_scale_sigma=self.stage_scale_sigma,
             stage_step_sigma_mm=self.stage_step_sigma_mm,
+            aspect_sigma=self.aspect_sigma,
         )
 
 
@@ -107,7 +109,7 @@ def target_of(table: Mapping[str, Any], where: str) -> GridTarget | BoardTarget:
     common = _Common(
         pitch_mm=_number(table, "pitch_mm", where, positive=True),
         node_tolerance_mm=_number(table, "node_tolerance_mm", where, default=0.0),
-        pitch_scale_sigma=_number(table, "pitch_scale_sigma", where, default=0.0),
+        pitch_scale_sigma=_prior(table, "pitch_scale_sigma", where),
         flatness_mm=_optional(table, "flatness_mm", where),
     )
     try:
@@ -121,7 +123,7 @@ def target_of(table: Mapping[str, Any], where: str) -> GridTarget | BoardTarget:
 class _Common(TypedDict):
     pitch_mm: float
     node_tolerance_mm: float
-    pitch_scale_sigma: float
+    pitch_scale_sigma: float | None
     flatness_mm: float | None
 
 
@@ -131,7 +133,20 @@ def _grid(table: Mapping[str, object], where: str, common: _Common) -> GridTarge
     if not isinstance(dark, bool):
         raise _field(where, "dark_lines", f"is {dark!r}, neither true nor false")
     lines = _two(table, "lines", where, "[11, 11]")
-    return GridTarget(lines=lines, line_width_mm=width, dark_lines=dark, **common)
+    missing = table.get("missing_lines", [[], []])
+    if not (isinstance(missing, list) and len(missing) == 2 and all(_whole_numbers(own) for own in missing)):
+        raise _field(where, "missing_lines", f"is {missing!r}, not two lists of whole numbers such as [[4], []]")
+    return GridTarget(
+        lines=lines,
+        line_width_mm=width,
+        dark_lines=dark,
+        missing_lines=(tuple(missing[0]), tuple(missing[1])),
+        **common,
+    )
+
+
+def _whole_numbers(value: object) -> bool:
+    return isinstance(value, list) and all(type(n) is int for n in value)
 
 
 def _board(kind: BoardKind, table: Mapping[str, object], where: str, common: _Common) -> BoardTarget:
@@ -190,11 +205,20 @@ def read_rig(path: Path) -> NominalRig:
         lens=lens,
         axis_tilt_sigma_rad=_number(plan, "axis_tilt_sigma_rad", where, default=DEFAULTS.axis_tilt_sigma_rad),
         stage_scale_sigma=_number(plan, "stage_scale_sigma", where, default=DEFAULTS.stage_scale_sigma),
-        stage_step_sigma_mm=_number(plan, "stage_step_sigma_mm", where, default=DEFAULTS.stage_step_sigma_mm),
+        stage_step_sigma_mm=_number(plan, "stage_step_sigma_mm", where, default=_least_count_sigma(content, path)),
+        aspect_sigma=_prior(plan, "aspect_sigma", where),
     )
 
 
-def _camera(table: Mapping[str, object], where: str, *, free: bool) -> NominalCamera:
+def _least_count_sigma(content: Mapping[str, object], path: Path) -> float:
+    """Return the standard deviation of a position that a stage reads back to its stated resolution; 0 without one."""
+    stage = content.get("stage")
+    if not isinstance(stage, Mapping):
+        return DEFAULTS.stage_step_sigma_mm
+    return least_count_sigma_mm(_optional(stage, "resolution_mm", f"{path}, [stage]"))
+
+
+def _camera(table: Mapping[str, object], where: str, *, free: bool) -> NominalValues:
     size = table.get("image_size_px")
     if size is None:
         raise _field(where, "image_size_px", "is missing")
@@ -206,7 +230,7 @@ def _camera(table: Mapping[str, object], where: str, *, free: bool) -> NominalCa
     # stage positions need all of them; free poses show the aspect ratio too
     standoff = _optional(table, "standoff_mm", where) if free else _number(table, "standoff_mm", where, positive=True)
     aspect = _optional(table, "aspect", where) if free else _number(table, "aspect", where, positive=True)
-    return NominalCamera(
+    return NominalValues(
         image_size_px=(size[0], size[1]),
         phd_px=_number(table, "phd_px", where, positive=True),
         standoff_mm=standoff,
@@ -217,6 +241,11 @@ def _camera(table: Mapping[str, object], where: str, *, free: bool) -> NominalCa
 
 def _optional(table: Mapping[str, object], key: str, where: str) -> float | None:
     return None if table.get(key) is None else _number(table, key, where, positive=key != "flatness_mm")
+
+
+def _prior(table: Mapping[str, object], key: str, where: str) -> float | None:
+    """Return a standard deviation, None if it is not stated; 0 states that there is no uncertainty."""
+    return None if table.get(key) is None else _number(table, key, where, default=0.0)
 
 
 def _number(

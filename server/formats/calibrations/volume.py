@@ -7,17 +7,17 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Float
-from core.boards.board import BOARD_KINDS, BoardTarget
-from core.calibration.volume import CalibratedVolume, calibrated_volume, volume_of_poses
-from core.cameras.camera import RigidTransform
-from core.common.factor import ParameterCovariance
-from core.errors import TargetError
-from core.names import CAMERAS
-from core.target import LINE_GRID, GridTarget
-from server.formats.calibrations.native import parameters_in
-from server.formats.calibrations.recognise import LoadedCalibration
-from server.formats.calibrations.record import ChecksRecord, PoseRecord, TargetRecord
+from stereorig.core.arrays import Float
+from stereorig.core.boards.board import BOARD_KINDS, BoardTarget
+from stereorig.core.calibration.volume import CalibratedVolume, calibrated_volume, volume_of_poses
+from stereorig.core.cameras.camera import RigidTransform
+from stereorig.core.common.factor import ParameterCovariance
+from stereorig.core.errors import TargetError
+from stereorig.core.names import CAMERAS
+from stereorig.core.target import LINE_GRID, GridTarget
+from stereorig.server.formats.calibrations.native import parameters_in
+from stereorig.server.formats.calibrations.recognise import LoadedCalibration
+from stereorig.server.formats.calibrations.record import ChecksRecord, PoseRecord, TargetRecord
 
 
 def volume_of(calibration: LoadedCalibration) -> CalibratedVolume | None:
@@ -56,7 +56,7 @@ def parameter_covariance(calibration: LoadedCalibration) -> ParameterCovariance 
 
 
 def target_of(target: TargetRecord | None) -> GridTarget | BoardTarget | None:
-    """Return the target that a calibration's file describes; None where it does not."""
+    """Return the target that a calibration's file describes; None if it describes none."""
     if target is None:
         return None
     try:
@@ -85,7 +85,7 @@ def _transform(pose: PoseRecord) -> RigidTransform:
 
 
 def rbe_of(calibration: LoadedCalibration) -> float | None:
-    """Return the calibration's reprojection error, of held-out positions where there are any; None if not known."""
+    """Return the calibration's reprojection error in px, at held-out positions if there are any; None if not known."""
     checks = calibration.record.checks or ChecksRecord()
     for measures in (checks.held_out, checks.fitted):
         value = None if measures is None else measures.rbe_px

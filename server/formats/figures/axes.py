@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.transforms import ScaledTranslation
 
-from core.arrays import Float
+from stereorig.core.arrays import Float
 
 _LONG_PT, _MIDDLE_PT = 14.0, 27.0
 COLOURS = {"X": "#c0392b", "Y": "#1e8449", "Z": "#1f5fa8"}
@@ -17,14 +17,14 @@ Directions = tuple[tuple[float, float], tuple[float, float]]
 
 
 def directions_of(x_px: Float, y_px: Float, x_mm: Float, y_mm: Float) -> Directions | None:
-    """Return where X and Y point in the image, right and down, the longer of length 1; None where too few points tell.
+    """Return the image directions (right, down) of X and Y, the longer of length 1; None if there are too few points.
 
     Parameters
     ----------
     x_px, y_px
         (r, c) in camera 1's reference image.
     x_mm, y_mm
-        (r, c) reference positions, NaN where there are none.
+        (r, c) reference positions, NaN for missing points.
     """
     along = _px_per_mm(x_px, y_px, x_mm, y_mm)
     if along is None:
@@ -34,7 +34,7 @@ def directions_of(x_px: Float, y_px: Float, x_mm: Float, y_mm: Float) -> Directi
 
 
 def scale_of_image(x_px: Float, y_px: Float, x_mm: Float, y_mm: Float) -> float | None:
-    """Return px of the image to a millimetre of the surface, along its rows; None where too few points tell."""
+    """Return image px per millimetre of the surface, along its rows; None if there are too few points."""
     along = _px_per_mm(x_px, y_px, x_mm, y_mm)
     if along is None:
         return None
@@ -56,7 +56,7 @@ def _px_per_mm(x_px: Float, y_px: Float, x_mm: Float, y_mm: Float) -> Float | No
 
 
 def draw_axes(axis: Any, directions: Directions) -> list[Any]:
-    """Draw X, Y and Z into the lower left corner of a map whose rows run downwards; return what was drawn."""
+    """Draw X, Y and Z into the lower left corner of a map whose rows run downwards; return the artists."""
     drawn = []
     corner = {"xycoords": "axes fraction", "textcoords": "offset points"}
     (xx, xy), (yx, yy) = directions
@@ -77,7 +77,7 @@ def draw_axes(axis: Any, directions: Directions) -> list[Any]:
 
 
 def draw_scale(axis: Any, px_per_mm: float) -> list[Any]:
-    """Draw a bar of a round length into the lower right corner of a map; return what was drawn."""
+    """Draw a bar of a round length into the lower right corner of a map; return the artists."""
     left, right = sorted(axis.get_xlim())
     bottom, top = sorted(axis.get_ylim(), reverse=True)
     room_mm = 0.3 * (right - left) / px_per_mm

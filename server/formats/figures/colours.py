@@ -6,7 +6,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.colors import ListedColormap
 
-from core.arrays import Float
+from stereorig.core.arrays import Float
 
 _ENTRIES = 256
 
@@ -17,7 +17,7 @@ def colour_map(name: str, levels: int = 0, *, reverse: bool = False) -> ListedCo
     Parameters
     ----------
     name
-        One of :data:`server.formats.figures.options.COLOURS`.
+        One of :data:`stereorig.server.formats.figures.options.COLOURS`.
     levels
         Number of bands; 0 and 1: smooth.
     reverse

@@ -22,12 +22,12 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.field.region.cuts import Cuts
-from server.formats.figures.axes import Directions, draw_axes, draw_scale
-from server.formats.figures.colours import colour_map
-from server.formats.figures.options import FigureStyle
-from server.formats.figures.smooth import between_points
+from stereorig.core.arrays import Float
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.server.formats.figures.axes import Directions, draw_axes, draw_scale
+from stereorig.server.formats.figures.colours import colour_map
+from stereorig.server.formats.figures.options import FigureStyle
+from stereorig.server.formats.figures.smooth import between_points
 
 PictureForm = Literal["png", "svg"]
 
@@ -43,19 +43,19 @@ _drawing = threading.Lock()
 
 
 @dataclass(frozen=True)
-class Picture:
+class FigureData:
     """Content of a picture.
 
     Attributes
     ----------
     values
-        (r, c) float, NaN where there is nothing; or integers with ``flags``.
+        (r, c) float, NaN for missing points; or integers with ``flags``.
     x_px, y_px
-        (r, c) where the points lie in camera 1's reference image.
+        (r, c) positions of the points in camera 1's reference image.
     label
-        Of the colour bar: name and meaning; the unit is added.
+        Text of the colour bar: name and meaning; the unit is added.
     units
-        Of the values; ``1`` is a pure number.
+        Unit of the values; ``1`` is a pure number.
     title
         Test, step, load.
     notes
@@ -69,9 +69,9 @@ class Picture:
     flags
         Name of each value, for a map of states.
     axes
-        Where X and Y point in the image; drawn into a corner.
+        Directions of X and Y in the image; drawn into a corner.
     px_per_mm
-        For a bar of a round length; None: no bar.
+        Scale for a bar of a round length; None: no bar.
     strain
         True: values are drawn in um/m.
     """
@@ -94,7 +94,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Scale:
-    """Ends of a colour scale in the stored unit, and whether values lie beyond them."""
+    """Ends of a colour scale in the stored unit; True if values are below or above them."""
 
     low: float
     high: float
@@ -103,12 +103,12 @@ class Scale:
 
     @property
     def arrows(self) -> str:
-        """Where the colour bar has an arrow."""
+        """The ends of the colour bar that get an arrow, as matplotlib names them."""
         return "both" if self.below and self.above else "min" if self.below else "max" if self.above else "neither"
 
 
 def scale_of(values: NDArray[Any], style: FigureStyle) -> tuple[float, float] | None:
-    """Return the ends of the colour scale; None where there are no values and no limits."""
+    """Return the ends of the colour scale; None without values and limits."""
     if style.limits is not None:
         return style.limits
     finite = values[np.isfinite(values)]
@@ -140,7 +140,7 @@ def _pitch(along: Float, other: Float) -> float:
     return 1.0
 
 
-def draw(picture: Picture, style: FigureStyle, form: PictureForm) -> bytes:
+def draw(picture: FigureData, style: FigureStyle, form: PictureForm) -> bytes:
     """Draw a picture; return the file's bytes."""
     with _drawing, mpl.rc_context({"svg.fonttype": "none"}):
         figure = Drawing(picture, style).figure
@@ -149,25 +149,25 @@ def draw(picture: Picture, style: FigureStyle, form: PictureForm) -> bytes:
     return out.getvalue()
 
 
-def draw_pixels(picture: Picture, style: FigureStyle) -> NDArray[np.uint8]:
+def draw_pixels(picture: FigureData, style: FigureStyle) -> NDArray[np.uint8]:
     """Draw a picture; return its pixels (h, w, 3), red green blue, of even height and width."""
     return Frames(picture, style).first()
 
 
 class Frames:
-    """Pictures of one size on one scale: what they share is laid out and drawn once.
+    """Pictures of one size on one scale: their common parts are laid out and drawn once.
 
     Parameters
     ----------
     picture
-        The first one; its title and notes have no fewer lines than those of the others.
+        The first one; its title and notes have at least as many lines as the others'.
     style
-        Of all.
+        Style of all pictures.
     scale
-        Of all; None: of the first.
+        Scale of all pictures; None: the first picture's.
     """
 
-    def __init__(self, picture: Picture, style: FigureStyle, scale: Scale | None = None) -> None:
+    def __init__(self, picture: FigureData, style: FigureStyle, scale: Scale | None = None) -> None:
         self._style = style
         with _drawing:
             self._drawing = Drawing(picture, style, scale)
@@ -179,7 +179,7 @@ class Frames:
         """Return the pixels (h, w, 3) of the first picture."""
         return self._pixels()
 
-    def next(self, picture: Picture) -> NDArray[np.uint8]:
+    def next(self, picture: FigureData) -> NDArray[np.uint8]:
         """Return the pixels of another picture with the same points."""
         if picture.flags is not None:  # whose colour bar names the states that it has
             return Frames(picture, self._style).first()
@@ -202,7 +202,7 @@ class Frames:
         return np.array(pixels[:height, :width])
 
 
-def _metadata(picture: Picture, form: PictureForm) -> dict[str, str]:
+def _metadata(picture: FigureData, form: PictureForm) -> dict[str, str]:
     texts = {"Title": picture.title, **picture.metadata}
     if form == "png":
         return texts
@@ -214,7 +214,7 @@ def _metadata(picture: Picture, form: PictureForm) -> dict[str, str]:
 class Drawing:
     """A picture as matplotlib's figure, and the parts of it that differ between the frames of a film."""
 
-    def __init__(self, picture: Picture, style: FigureStyle, scale: Scale | None = None) -> None:
+    def __init__(self, picture: FigureData, style: FigureStyle, scale: Scale | None = None) -> None:
         self._style, self._beneath = style, picture.image is not None
         width = style.width_px / style.dots_per_inch
         shape: tuple[float, float]
@@ -261,7 +261,7 @@ class Drawing:
         self.moving = [self._map, self._empty, self._title, *over] + ([self._notes] if self._notes else [])
         self.change(picture)
 
-    def change(self, picture: Picture) -> None:
+    def change(self, picture: FigureData) -> None:
         """Show another picture's values, title and notes."""
         if picture.flags is None:
             self._map.set_data(np.ma.masked_invalid(self._between(picture)))
@@ -270,14 +270,14 @@ class Drawing:
         if self._notes is not None:
             self._notes.set_text("\n".join(_wrapped(line, int(1.55 * self._characters)) for line in picture.notes))
 
-    def _between(self, picture: Picture) -> Float:
+    def _between(self, picture: FigureData) -> Float:
         values = self._factor * np.asarray(picture.values, dtype=np.float64)
         if not _has_cells(picture):
             return values
         each = int(np.ceil(_SAMPLES_PER_PX * _MAP_SHARE * self._style.width_px / values.shape[1]))
         return between_points(values, picture.x_px, picture.y_px, picture.cuts, min(max(each, 1), _MAX_EACH))
 
-    def _draw_map(self, axis: Any, picture: Picture) -> tuple[Any, list[str] | None]:
+    def _draw_map(self, axis: Any, picture: FigureData) -> tuple[Any, list[str] | None]:
         opacity = self._style.opacity if self._beneath else 1.0
         smooth = picture.flags is None and _has_cells(picture)
         extent = extent_of(picture.x_px, picture.y_px, margin=not smooth)
@@ -305,12 +305,12 @@ def _canvas_of(figure: Figure) -> Any:
     return FigureCanvasAgg(figure)
 
 
-def _has_cells(picture: Picture) -> bool:
+def _has_cells(picture: FigureData) -> bool:
     return bool(min(picture.values.shape) > 1)
 
 
-def scale_to_draw(picture: Picture, style: FigureStyle) -> Scale:
-    """Return the scale of one picture, from 0 to 1 where it has no values and no limits."""
+def scale_to_draw(picture: FigureData, style: FigureStyle) -> Scale:
+    """Return the scale of one picture, from 0 to 1 if it has no values and no limits."""
     ends = None if picture.flags is not None else scale_of(picture.values, style)
     if ends is None:
         return Scale(0.0, 1.0)
@@ -318,7 +318,7 @@ def scale_to_draw(picture: Picture, style: FigureStyle) -> Scale:
     return Scale(*ends, bool((finite < ends[0]).any()), bool((finite > ends[1]).any()))
 
 
-def _shown_unit(picture: Picture, scale: Scale) -> tuple[float, str]:
+def _shown_unit(picture: FigureData, scale: Scale) -> tuple[float, str]:
     """Return the factor and the unit in which values are drawn: those that the page shows them in."""
     if picture.strain:
         return 1e6, "\u00b5m/m"
@@ -342,7 +342,7 @@ def _draw_image(axis: Any, image: NDArray[Any], style: FigureStyle) -> None:
     axis.imshow(image, cmap="gray", vmin=low, vmax=max(high, low + 1.0), extent=(-0.5, cols - 0.5, rows - 0.5, -0.5))
 
 
-def _draw_flags(show: Any, picture: Picture) -> tuple[Any, list[str]]:
+def _draw_flags(show: Any, picture: FigureData) -> tuple[Any, list[str]]:
     flags = picture.flags or {}
     present = [value for value in flags if (picture.values == value).any()]
     values = np.full(picture.values.shape, np.nan)

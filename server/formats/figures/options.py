@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.errors import InputError
+from stereorig.core.errors import InputError
 
 COLOURS = ("viridis", "cividis", "turbo", "coolwarm", "gray", "diverging", "grey")
 WIDTHS_PX = (200, 4000)
@@ -22,13 +22,13 @@ class FigureStyle:
     limits
         Ends of the colour scale in the variable's unit; None: from ``percentiles``.
     percentiles
-        Of the drawn values at which the colour scale ends; values beyond get the end's colour, and the bar an arrow.
+        Percentiles of the drawn values at which the colour scale ends; values beyond get the end's colour and an arrow.
     colours
         One of :data:`COLOURS`.
     width_px
-        Of the picture.
+        Width of the picture.
     opacity
-        Of the map over the camera's image.
+        Opacity of the map over the camera's image.
     levels
         Number of bands of one colour; 0: smooth.
     reverse

@@ -1,6 +1,6 @@
 """Values between the points of a grid, as the page draws them: never over a missing point or a cut.
 
-Four corners of a cell bilinearly; three where the fourth is missing or lies beyond a cut, inside their triangle.
+Bilinear from four corners of a cell; from three, inside their triangle, if the fourth is missing or beyond a cut.
 """
 
 from __future__ import annotations
@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Bool, Float
-from core.field.region.cuts import Cuts, crosses
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.field.region.cuts import Cuts, crosses
 
 _ACROSS, _DOWN = np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1])  # of a cell's corners
 _DOT = 0.25  # half the width of a point without neighbours, of a cell
@@ -21,7 +21,7 @@ def between_points(values: NDArray[np.floating], x_px: Float, y_px: Float, cuts:
     Parameters
     ----------
     values
-        (r, c), NaN where there is none; r and c at least 2.
+        (r, c), NaN for missing points; r and c at least 2.
     x_px, y_px
         (r, c) positions of the points on their regular grid.
     cuts
@@ -32,7 +32,7 @@ def between_points(values: NDArray[np.floating], x_px: Float, y_px: Float, cuts:
     Returns
     -------
     NDArray
-        ((r - 1) each, (c - 1) each), from the first point to the last; NaN where there is no value.
+        ((r - 1) each, (c - 1) each), from the first point to the last; NaN for missing values.
     """
     rows, cols = values.shape[0] - 1, values.shape[1] - 1
     share = (np.arange(each) + 0.5) / each

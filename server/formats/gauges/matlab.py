@@ -1,30 +1,55 @@
-"""Readings of gauges as a MATLAB file: the table's columns as one struct, one number a row."""
+"""Readings of gauges as a MATLAB file: the table's columns as one struct, one number a row; MATLAB's names."""
 
 from __future__ import annotations
 
 import io
 import json
+import re
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from server.formats.channel_units import plain_names
-from server.formats.gauges.readings import GaugeReadings
-from server.formats.gauges.table import columns, table_rows
-from server.formats.matlab_names import matlab_name
+from stereorig.server.formats.channel_units import plain_names
+from stereorig.server.formats.gauges.readings import GaugeReadings
+from stereorig.server.formats.gauges.table import columns, table_rows
 
+_MAX_NAME = 63  # namelengthmax
+_KEYWORDS = frozenset(
+    {
+        "break",
+        "case",
+        "catch",
+        "classdef",
+        "continue",
+        "else",
+        "elseif",
+        "end",
+        "for",
+        "function",
+        "global",
+        "if",
+        "otherwise",
+        "parfor",
+        "persistent",
+        "return",
+        "spmd",
+        "switch",
+        "try",
+        "while",
+    }
+)
 _TEXTS = frozenset({"label", "gauge", "kind", "quantity", "units", "missing", "not_included"})
 
 
 def gauges_mat(readings: GaugeReadings) -> bytes:
     """Return the readings as a MATLAB file of version 5.
 
-    ``gauges`` is a struct of the columns of :func:`server.formats.gauges.table.gauges_csv`: numbers as column vectors,
-    NaN where there is none, texts as cells; ``struct2table(gauges)`` makes a table of it. ``about`` holds settings,
-    inputs and version as text.
+    ``gauges`` is a struct of the columns of :func:`stereorig.server.formats.gauges.table.gauges_csv`: numbers as column
+    vectors, NaN for missing values, texts as cells; ``struct2table(gauges)`` makes a table of it. ``about`` holds
+    settings, inputs and version as text.
     """
-    from scipy.io import savemat  # loaded where it is used
+    from scipy.io import savemat  # imported late: few calls need it
 
     rows = list(table_rows(readings))
     wanted = columns(readings)
@@ -43,3 +68,11 @@ def _column(name: str, values: list[str | float | None]) -> NDArray[np.object_] 
         cells[:, 0] = ["" if v is None else str(v) for v in values]
         return cells
     return np.array([np.nan if v is None else float(v) for v in values]).reshape(-1, 1)
+
+
+def matlab_name(name: str) -> str:
+    """Return a name as MATLAB takes it for a variable or field: letters, digits, underscores, a letter first."""
+    name = re.sub(r"[^A-Za-z0-9_]", "_", name)
+    if not name or not name[0].isalpha() or name in _KEYWORDS:
+        name = f"v_{name}"
+    return name[:_MAX_NAME]

@@ -1,4 +1,4 @@
-"""The readings of a set of gauges in every step; missing values are None, with the reason beside them."""
+"""The readings of a set of gauges in every step; a missing value is None, with its reason in the same entry."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from typing import Annotated
 
 from pydantic import Field
 
-from server.formats.channel_units import unit_of
-from server.formats.results.uncertainty import Statement
+from stereorig.server.formats.channel_units import unit_of
+from stereorig.server.formats.results.uncertainty import Statement
 
-EXPANDED = "k times the standard uncertainty, where another k than 1 was asked for."
-LACKING = "`calibration not included` where that is so."
+EXPANDED = "k times the standard uncertainty, if another k than 1 was asked for."
+LACKING = "`calibration not included` if so, else empty."
 _BUDGET = (
-    "Standard uncertainties by where they come from, whose squares add up to the whole's: `matching` (noise that is "
+    "Standard uncertainties by cause, whose squares add up to the square of the whole: `matching` (noise that is "
     "new at each step), `reference` (noise of the reference pair, the same in all steps of a test), `calibration` "
-    "(noise of its views), `stage`, `target`. What is not known is not among them, see the step's `not_told`; null "
-    "without any."
+    "(noise of its views), `stage`, `target`; `sensor` (pull of camera 1's fixed pattern) if one was found. Unknown "
+    "causes are left out, see the step's `not_told`; null without any."
 )
 
 
@@ -25,11 +25,11 @@ _BUDGET = (
 class Number:
     """A number with its standard deviation."""
 
-    value: Annotated[float | None, Field(description="The value; null where it is missing.")]
-    sigma: Annotated[float | None, Field(description="Standard uncertainty; null where it is not known.")]
+    value: Annotated[float | None, Field(description="The value; null if it is missing.")]
+    sigma: Annotated[float | None, Field(description="Standard uncertainty; null if it is not known.")]
     units: Annotated[str, Field(description="Unit; `1` of a number without one.")]
     sigma_calibration: Annotated[
-        float | None, Field(description="The calibration's part of sigma; null where it is not known and not included.")
+        float | None, Field(description="The calibration's part of sigma; null if it is not known and not included.")
     ] = None
     budget: Annotated[Mapping[str, float] | None, Field(description=_BUDGET)] = None
     expanded: Annotated[float | None, Field(description=EXPANDED)] = None
@@ -61,14 +61,14 @@ class ExtensometerReading:
 class Numbers:
     """One number for each position of a line."""
 
-    value: Annotated[Sequence[float | None], Field(description="Value at each position; null where it is missing.")]
+    value: Annotated[Sequence[float | None], Field(description="Value at each position; null if it is missing.")]
     sigma: Annotated[
-        Sequence[float | None], Field(description="Standard uncertainty at each position; null where it is not known.")
+        Sequence[float | None], Field(description="Standard uncertainty at each position; null if it is not known.")
     ]
     units: Annotated[str, Field(description="Unit; `1` of numbers without one.")]
     sigma_calibration: Annotated[
         Sequence[float | None],
-        Field(description="The calibration's part of each sigma; null where it is not known and not included."),
+        Field(description="The calibration's part of each sigma; null if it is not known and not included."),
     ] = ()
     budget: Annotated[Mapping[str, Sequence[float | None]] | None, Field(description=_BUDGET)] = None
     expanded: Annotated[Sequence[float | None], Field(description=f"{EXPANDED} Empty: none was asked for.")] = ()
@@ -98,16 +98,14 @@ class AreaStatistics:
     units: Annotated[str, Field(description="Unit; `1` of a variable without one.")]
     count: Annotated[int, Field(description="Number of values.")]
     mean: Annotated[float | None, Field(description="Mean.")]
-    mean_sigma: Annotated[
-        float | None, Field(description="Standard uncertainty of the mean; null where it is not known.")
-    ]
+    mean_sigma: Annotated[float | None, Field(description="Standard uncertainty of the mean; null if it is not known.")]
     sd: Annotated[float | None, Field(description="Standard deviation over the area.")]
     rms: Annotated[float | None, Field(description="Root of the mean square.")]
     min: Annotated[float | None, Field(description="Smallest value.")]
     max: Annotated[float | None, Field(description="Largest value.")]
     mean_sigma_calibration: Annotated[
         float | None,
-        Field(description="The calibration's part of mean_sigma; null where it is not known and not included."),
+        Field(description="The calibration's part of mean_sigma; null if it is not known and not included."),
     ] = None
     mean_budget: Annotated[Mapping[str, float] | None, Field(description=_BUDGET)] = None
     mean_expanded: Annotated[float | None, Field(description=EXPANDED)] = None
@@ -140,7 +138,7 @@ class AreaReading:
 
 @dataclass(frozen=True)
 class FrameReading:
-    """The frame that was laid through the surface: X_frame = rotation (X_sys - origin)."""
+    """The frame that the surface defines: X_frame = rotation (X_sys - origin)."""
 
     rotation: Annotated[Sequence[Sequence[float]], Field(description="Rotation matrix, row by row.")]
     origin_mm: Annotated[Sequence[float], Field(description="Origin in the system frame.")]
@@ -149,7 +147,7 @@ class FrameReading:
         Sequence[float], Field(description="Standard uncertainty of the origin along each axis.")
     ]
     residual_rms_mm: Annotated[float, Field(description="Root mean square distance of the points from the fit.")]
-    points: Annotated[int, Field(description="Points that it was laid through.")]
+    points: Annotated[int, Field(description="Points that it was fitted to.")]
     budget_rad: Annotated[Sequence[Mapping[str, float]], Field(description="Budget of each rotation's sigma.")] = ()
     budget_origin_mm: Annotated[
         Sequence[Mapping[str, float]], Field(description="Budget of the origin's sigma along each axis.")
@@ -174,7 +172,7 @@ class RigidMotionReading:
 
 @dataclass(frozen=True)
 class DifferenceReading:
-    """What a gauge reads in a step less what it reads in another; what both steps share has cancelled."""
+    """A gauge's reading in a step minus its reading in another; errors that both steps share cancel."""
 
     gauge: Annotated[str | None, Field(description="Name of the gauge.")]
     kind: Annotated[str, Field(description="`point`, `extensometer` or `area`, whose means are taken.")]
@@ -182,24 +180,24 @@ class DifferenceReading:
 
 
 @dataclass(frozen=True)
-class Problem:
+class StepProblem:
     """Reason why a step has no readings."""
 
     code: str
-    cause: str
+    detail: str
     remedy: str
 
 
 @dataclass(frozen=True)
 class StepReadings:
-    """The readings of one step; none where it has a problem.
+    """The readings of one step; empty if it has a problem.
 
     Attributes
     ----------
     not_told
-        What the budgets do not tell apart, and what they do not include.
+        The causes that the budgets cannot separate, and the terms that they do not include.
     differences
-        From the step that was asked for; empty where none was, and in that step itself.
+        Differences from the step that was asked for; empty if none was asked for, and in that step itself.
     """
 
     n: int
@@ -208,7 +206,9 @@ class StepReadings:
     load_n: float | None
     time_s: float | None = None
     channels: Mapping[str, float] = field(default_factory=dict)
-    problem: Problem | None = None
+    channel_units: Mapping[str, str] = field(default_factory=dict)
+    channel_u: Mapping[str, float] = field(default_factory=dict)
+    problem: StepProblem | None = None
     rigid_motion: RigidMotionReading | None = None
     points: Sequence[PointReading] = ()
     extensometers: Sequence[ExtensometerReading] = ()
@@ -222,7 +222,8 @@ class StepReadings:
         whole = asdict(self)
         if self.problem is not None:
             return {name: whole[name] for name in ("n", "kind", "label", "load_n", "time_s", "channels", "problem")}
-        return {k: v for k, v in whole.items() if k != "problem" and (k != "rigid_motion" or v is not None)}
+        left = ("problem", "channel_units")
+        return {k: v for k, v in whole.items() if k not in left and (k != "rigid_motion" or v)}
 
 
 @dataclass(frozen=True)
@@ -234,19 +235,19 @@ class GaugeReadings:
     settings
         The request.
     calibration
-        ``id``, None where it is not known, and ``sha256`` of the calibration that was measured with.
+        ``id``, None if it is not known, and ``sha256`` of the calibration that was measured with.
     inputs_sha256
-        Of each result file, by its name.
+        SHA-256 of each result file, by its name.
     stale, stale_reasons
         Inputs or results that are gone or were replaced since.
     frame
         The frame of positions and displacements.
     smoothing_window
-        Of the displacements; None: as measured.
+        Smoothing window of the displacements, points; None: as measured.
     alignment
-        None where the frame is the system's.
+        None if the frame is the system's.
     statement
-        What the uncertainties are, and what they include in all steps.
+        The uncertainties' meaning, and the terms that they include in all steps.
     """
 
     software_version: str
@@ -265,7 +266,11 @@ class GaugeReadings:
     @property
     def channel_units(self) -> dict[str, str]:
         """The unit of each channel that any step has."""
-        return {name: unit_of(name) for name in sorted({name for step in self.steps for name in step.channels})}
+        found: dict[str, str] = {}
+        for step in self.steps:
+            for name in step.channels:
+                found.setdefault(name, step.channel_units.get(name) or unit_of(name))
+        return dict(sorted(found.items()))
 
     @property
     def read(self) -> list[StepReadings]:

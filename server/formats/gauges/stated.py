@@ -1,16 +1,16 @@
-"""What is stated beside each number of a gauge: its expanded uncertainty, and that the calibration is not included."""
+"""The statement with each number of a gauge: its expanded uncertainty, and that the calibration is not included."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
 
-from server.formats.gauges.readings import AreaStatistics, Number, Numbers, StepReadings
-from server.formats.results.uncertainty import Statement
+from stereorig.server.formats.gauges.readings import AreaStatistics, Number, Numbers, StepReadings
+from stereorig.server.formats.results.uncertainty import Statement
 
 
 def stated(step: StepReadings, statement: Statement) -> StepReadings:
-    """Return a step's readings with the interval that is asked for, and what it does not include, in every number."""
+    """Return a step's readings with the requested interval, and the terms that it does not include, in every number."""
     k = statement.k if statement.expanded else None
     lacking = statement.included.lacking
 

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from operator import attrgetter
 
-from server.formats.gauges.readings import GaugeReadings, Number, StepReadings
+from stereorig.server.formats import csv_cells
+from stereorig.server.formats.gauges.readings import GaugeReadings, Number, StepReadings
 
 _OF_AREA = ("mean", "sd", "min", "max", "rms", "count")
 
 
 @dataclass(frozen=True)
-class Row:
+class GaugeRow:
     """One number of a gauge; its fields are the table's columns."""
 
     step: int
@@ -39,54 +38,63 @@ class Row:
     u_calibration: float | None = None
     u_stage: float | None = None
     u_target: float | None = None
+    u_sensor: float | None = None
     time_s: float | None = None
     channels: Mapping[str, float] = field(default_factory=dict)
+    channel_u: Mapping[str, float] = field(default_factory=dict)
 
 
-_OWN = tuple(f.name for f in fields(Row) if f.name != "channels")
+_OWN = tuple(f.name for f in fields(GaugeRow) if f.name not in ("channels", "channel_u"))
 
 
-def columns(readings: GaugeReadings) -> dict[str, Callable[[Row], str | float | None]]:
-    """Return the table's columns by name; each channel that was recorded has one, after those of every table."""
-    found: dict[str, Callable[[Row], str | float | None]] = {name: attrgetter(name) for name in _OWN}
+def columns(readings: GaugeReadings) -> dict[str, Callable[[GaugeRow], str | float | None]]:
+    """Return the table's columns by name; each recorded channel has one, after the columns that every table has."""
+    found: dict[str, Callable[[GaugeRow], str | float | None]] = {name: attrgetter(name) for name in _OWN}
     for name in readings.channel_units:
         # a channel may have the name of another column
         found[name if name not in found else f"channel_{name}"] = lambda row, name=name: row.channels.get(name)  # type: ignore[misc]
+    for name in sorted({name for step in readings.steps for name in step.channel_u}):
+        found[f"{name}_u"] = lambda row, name=name: row.channel_u.get(name)  # type: ignore[misc]
     return found
 
 
 def gauges_csv(readings: GaugeReadings) -> bytes:
     """Return the readings as CSV, settings and inputs in comment lines (#) above the header.
 
-    Missing numbers are empty, with the reason in the column ``missing``; ``not_included`` says where the uncertainty
+    Missing numbers are empty, with the reason in the column ``missing``; ``not_included`` states that the uncertainty
     lacks the calibration, ``u_matching`` ... are its parts by cause.
     """
-    text = io.StringIO(newline="")
-    for name, value in readings.about().items():
-        text.write(f"# {name}: {json.dumps(value, ensure_ascii=False, sort_keys=True)}\n")
-    writer = csv.writer(text, lineterminator="\n")
+    lines = [
+        csv_cells.comment(f"{name}: {json.dumps(value, ensure_ascii=False, sort_keys=True)}")
+        for name, value in readings.about().items()
+    ]
     wanted = columns(readings)
-    writer.writerow(wanted)
-    for row in table_rows(readings):
-        writer.writerow(_cell(value(row)) for value in wanted.values())
-    return text.getvalue().encode()
+    lines.append(csv_cells.row(wanted))
+    # csv writes None as nothing, and a float with all of its digits
+    lines.extend(csv_cells.row(value(row) for value in wanted.values()) for row in table_rows(readings))
+    return "".join(lines).encode()
 
 
-def table_rows(readings: GaugeReadings) -> Iterator[Row]:
+def table_rows(readings: GaugeReadings) -> Iterator[GaugeRow]:
     """Yield every number of every step; differences from step n have ``:since_step_<n>`` behind the quantity."""
     since = readings.settings.get("difference_from")
     for step in readings.steps:
         yield from _of_step(step)
-        head = Row(step.n, step.label, step.load_n, time_s=step.time_s, channels=step.channels)
+        head = _head(step)
         for one in step.differences:
             values = {f"{quantity}:since_step_{since}": number for quantity, number in one.values.items()}
             yield from _rows(replace(head, gauge=one.gauge, kind=one.kind), values, "")
 
 
-def _of_step(step: StepReadings) -> Iterator[Row]:
-    head = Row(step.n, step.label, step.load_n, time_s=step.time_s, channels=step.channels)
+def _head(step: StepReadings) -> GaugeRow:
+    head = GaugeRow(step.n, step.label, step.load_n, time_s=step.time_s)
+    return replace(head, channels=step.channels, channel_u=step.channel_u)
+
+
+def _of_step(step: StepReadings) -> Iterator[GaugeRow]:
+    head = _head(step)
     if step.problem is not None:
-        yield replace(head, kind="step", missing=step.problem.cause)
+        yield replace(head, kind="step", missing=step.problem.detail)
     if step.rigid_motion is not None:
         motion = replace(head, gauge="rigid motion", kind="rigid_motion")
         yield from _rows(motion, step.rigid_motion.values, "")
@@ -122,7 +130,7 @@ def _at(budget: Mapping[str, Sequence[float | None]] | None, k: int) -> dict[str
     return {name: value for name, value in found.items() if value is not None}
 
 
-def _rows(head: Row, values: Mapping[str, Number], missing: str) -> Iterator[Row]:
+def _rows(head: GaugeRow, values: Mapping[str, Number], missing: str) -> Iterator[GaugeRow]:
     for quantity, number in values.items():
         # the position may be valid, but this variable has no value there
         why = missing or ("no value" if number.value is None else "")
@@ -142,8 +150,5 @@ def _rows(head: Row, values: Mapping[str, Number], missing: str) -> Iterator[Row
             u_calibration=budget.get("calibration"),
             u_stage=budget.get("stage"),
             u_target=budget.get("target"),
+            u_sensor=budget.get("sensor"),
         )
-
-
-def _cell(value: object) -> object:
-    return "" if value is None else repr(value) if isinstance(value, float) else value

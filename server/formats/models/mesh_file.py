@@ -1,15 +1,17 @@
-"""What a file of a finite element program holds, before it is a surface."""
+"""The content of a finite element program's file, before a surface is made of it."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.errors import FileFormatError
+from stereorig.core.arrays import Float
+from stereorig.core.errors import FileFormatError
 
 #: largest number of numbers in one array of a file
 MAX_NUMBERS = 60_000_000
@@ -29,9 +31,11 @@ class MeshFile:
     data
         Arrays (n,) or (n, c) of the nodes by name.
     units
-        What the file says of units, by array's name; that of the positions is ``""``. Empty where it says nothing.
+        Unit by array's name, as the file states it; the positions' name is ``""``. Empty if the file states none.
     time
-        Of the state that was read; None where the file has none.
+        Time of the state that was read; None if the file has none.
+    corners_only
+        Number of cells of a higher order that were reduced to their corners.
     """
 
     points: Float
@@ -39,6 +43,17 @@ class MeshFile:
     data: Mapping[str, Float]
     units: Mapping[str, str] = field(default_factory=dict)
     time: float | None = None
+    corners_only: int = 0
+
+
+#: names of displacements, the first of an array of many; others may precede the word, as in "nodal displacement"
+DISPLACEMENT = ("displacement", "displacements", "u", "disp", "depl", "displ", "deformation", "d", "depls")
+
+
+def is_displacement(name: str) -> bool:
+    """Return True for a name that means a displacement."""
+    words = [word for word in re.findall(r"[a-z]+|[0-9]+", name.lower()) if word not in ("field", "vector")]
+    return bool(words) and words[-1] in DISPLACEMENT
 
 
 def unreadable(cause: str, *, remedy: str | None = None) -> FileFormatError:
@@ -48,6 +63,36 @@ def unreadable(cause: str, *, remedy: str | None = None) -> FileFormatError:
         code="model_unreadable",
         remedy=remedy or "Export it again as VTU, XDMF or CSV, and check that it was copied whole.",
     )
+
+
+def whole_number(text: str | None, what: str) -> int:
+    """Return the whole number that a file's text states.
+
+    Raises
+    ------
+    FileFormatError
+        ``model_unreadable`` for anything but digits from 0 to 9.
+    """
+    plain = (text or "").strip()
+    if not (plain.isascii() and plain.isdigit() and len(plain) <= 18):
+        raise unreadable(f"{what} is no whole number")
+    return int(plain)
+
+
+def require_nodes(numbers: NDArray[Any], n: int) -> Index:
+    """Return the numbers of nodes that cells name, each of 0 to n - 1.
+
+    Raises
+    ------
+    FileFormatError
+        ``model_unreadable``.
+    """
+    outside = np.flatnonzero(~((numbers >= 0) & (numbers < n)))  # NaN too
+    if outside.size:
+        raise unreadable(
+            f"{outside.size} corners of its cells are none of the {n} nodes, first corner {outside[0] + 1}"
+        )
+    return numbers.astype(np.int64)
 
 
 def require_count(count: int, what: str) -> None:

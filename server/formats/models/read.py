@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from core.arrays import Float
-from core.errors import FileFormatError, InputError
-from core.model.surface import ModelSurface, surface_of_cloud
-from server.formats.models.cells import triangles_of
-from server.formats.models.mesh_file import MeshFile, unreadable
-from server.formats.models.table import read_table
-from server.formats.models.vtu import read_vtu
-from server.formats.models.xdmf import read_xdmf
+from stereorig.core.arrays import Float
+from stereorig.core.errors import FileFormatError, InputError
+from stereorig.core.model.surface import ModelSurface, surface_of_cloud
+from stereorig.server.formats.manifest import checked_bytes
+from stereorig.server.formats.models.cells import triangles_of
+from stereorig.server.formats.models.mesh_file import DISPLACEMENT, MeshFile, is_displacement, unreadable
+from stereorig.server.formats.models.table import read_table
+from stereorig.server.formats.models.vtu import read_vtu
+from stereorig.server.formats.models.xdmf import read_xdmf
 
 Unit = Literal["um", "mm", "cm", "m", "in"]
 #: units of length that a model may be in
@@ -25,8 +27,8 @@ MAX_BYTES = 1 << 30
 SUFFIXES = (".vtu", ".xdmf", ".xmf", ".csv", ".txt")
 _TO_MM: dict[str, float] = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3, "in": 25.4}
 _ALSO = {"µm": "um", "μm": "um", "micron": "um", "inch": "in", "millimeter": "mm", "millimetre": "mm", "meter": "m"}
-_DISPLACEMENT = ("displacement", "displacements", "u", "disp", "depl", "displ")
 _SCALARS = (("u_mm", "v_mm", "w_mm"), ("ux", "uy", "uz"), ("u1", "u2", "u3"), ("u", "v", "w"))
+_FLAT = 1e-6  # of a plane model's size: its nodes' heights may differ by rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,15 +38,17 @@ class ModelFile:
     Attributes
     ----------
     mesh
-        What the file holds.
+        The file's content.
     displacement_mm
-        (n, 3).
+        (n, 3), model's frame.
     nodes_mm
-        (n, 3).
+        (n, 3), model's frame.
     unit, displacement_unit
         Of positions and displacements in the file.
     displacement_name
-        Of the array or arrays that were taken.
+        Name of the array, or names of the arrays, that were read as the displacement.
+    plane
+        True of a model with two displacements: that along z is not known, and is zero here.
     """
 
     mesh: MeshFile
@@ -53,9 +57,10 @@ class ModelFile:
     unit: str
     displacement_unit: str
     displacement_name: str
+    plane: bool = False
 
     def surface(self, towards: Float) -> ModelSurface:
-        """Return the surface; that of a cloud of points as it is seen along ``towards`` (3,), model's frame.
+        """Return the surface; a cloud of points gives the surface seen along ``towards`` (3,), model's frame.
 
         Raises
         ------
@@ -63,41 +68,80 @@ class ModelFile:
             ``model_invalid``, ``model_no_surface``, ``model_not_a_surface``.
         """
         if not self.mesh.cells:
-            return surface_of_cloud(self.nodes_mm, self.displacement_mm, towards)
+            return replace(surface_of_cloud(self.nodes_mm, self.displacement_mm, towards), plane=self.plane)
         triangles, solid = triangles_of(self.mesh)
-        surface = ModelSurface(self.nodes_mm, self.displacement_mm, triangles, closed=solid)
+        surface = ModelSurface(self.nodes_mm, self.displacement_mm, triangles, closed=solid, plane=self.plane)
         return surface.facing(towards)
 
 
 def read_model(
-    path: Path, *, unit: Unit | None = None, displacement: str | None = None, time: float | None = None
+    path: Path,
+    *,
+    unit: Unit | None = None,
+    displacement: str | None = None,
+    time: float | None = None,
+    contents: Mapping[str, Any] | None = None,
 ) -> ModelFile:
-    """Read a model's file: VTU, XDMF with its HDF5 beside it, or a table (CSV).
+    """Read a model's file: VTU, XDMF with its HDF5 file from the same folder, or a table (CSV).
 
     Parameters
     ----------
     path
-        Of the file; its ending names the format.
+        The file; its ending names the format.
     unit
-        Of length, positions and displacements; None: the file states it.
+        Unit of positions and displacements; None: the file states it.
     displacement
-        Name of the nodes' displacement, or three names parted by commas; None: the one whose name says so.
+        Name of the nodes' displacement, or two or three names with commas between, each of a scalar or of one component
+        (``U:0``, ``U_x``); None: the array whose name means a displacement. Two components are a plane model's x and y.
     time
-        Of the state to take from a series; None: the last.
+        Time of the state to take from a series; None: the last.
+    contents
+        Contents of the file and contents or data sets of its companions, by name: then no file is opened.
 
     Raises
     ------
     FileFormatError
         ``file_missing``, ``model_unreadable``.
     InputError
-        ``model_unit_missing``, ``model_unit_conflict``, ``model_no_displacement``.
+        ``model_unit_missing``, ``model_unit_conflict``, ``model_no_displacement``, ``model_displacement_unclear``,
+        ``model_invalid``.
     """
-    mesh = _mesh(path, time)
+    mesh = _mesh(path, time, contents, displacement)
     name, values = _displacement(mesh, displacement)
+    plane = values.shape[1] == 2
+    if plane:
+        values = np.column_stack([values, np.zeros(len(values))])
+        z = mesh.points[:, 2]
+        if z.size and not np.ptp(z) <= _FLAT * np.ptp(mesh.points, axis=0).max():
+            raise InputError(
+                f"The model's displacement {name} has two components, but its nodes are in no plane of constant z: "
+                f"{z.min():.6g} to {z.max():.6g}.",
+                code="model_no_displacement",
+                remedy="Export all three components, or a plane model in its plane x, y.",
+            )
     own, moved = _unit(mesh, "", unit), _unit(mesh, name, unit)
     if mesh.points.size == 0:
         raise unreadable("it has no nodes")
-    return ModelFile(mesh, _TO_MM[own] * mesh.points, _TO_MM[moved] * values, own, moved, name)
+    nodes, displaced = _TO_MM[own] * mesh.points, _TO_MM[moved] * values
+    _require_sensible(nodes, "positions", 1e9)
+    corners = [cells.ravel() for _, cells in mesh.cells]
+    used = np.zeros(len(nodes), dtype=np.bool_) if corners else np.ones(len(nodes), dtype=np.bool_)
+    used[np.concatenate(corners) if corners else []] = True
+    # a node of no cell, as in the middle of a hole, may have any displacement
+    _require_sensible(np.where(used[:, None], displaced, 0.0), "displacements", 1e18)
+    return ModelFile(mesh, nodes, displaced, own, moved, name, plane)
+
+
+def _require_sensible(values: Float, what: str, most_mm: float) -> None:
+    """Refuse nodes whose positions or displacements are no length of a thing that was measured."""
+    odd = np.flatnonzero(~(np.abs(values) <= most_mm).all(axis=1))  # NaN too
+    if odd.size:
+        raise InputError(
+            f"{odd.size} of {len(values)} nodes have {what} that are not finite or beyond {most_mm:g} mm, "
+            f"first node {odd[0] + 1}.",
+            code="model_invalid",
+            remedy="Export the measured surface with the displacement of its nodes; check the unit.",
+        )
 
 
 def ending_of(head: bytes) -> str:
@@ -107,64 +151,85 @@ def ending_of(head: bytes) -> str:
     return ".xdmf" if b"<Xdmf" in head else ".csv"
 
 
-def _mesh(path: Path, time: float | None) -> MeshFile:
+def _mesh(path: Path, time: float | None, contents: Mapping[str, Any] | None, displacement: str | None) -> MeshFile:
     ending = path.suffix.lower()
     if ending not in SUFFIXES:
         raise unreadable(f"{path.name} ends in none of {', '.join(SUFFIXES)}")
     try:
-        if path.stat().st_size > MAX_BYTES:
+        if (path.stat().st_size if contents is None else len(contents[path.name])) > MAX_BYTES:
             raise unreadable(f"{path.name} has more than {MAX_BYTES >> 20} MiB")
-        content = path.read_bytes()
+        content = checked_bytes(path) if contents is None else contents[path.name]
     except OSError as error:
         raise FileFormatError(
-            f"{path} cannot be read: {error.strerror}.", code="file_missing", remedy="Check the path."
+            f"{path.name} cannot be read: {error.strerror}.", code="file_missing", remedy="Check the path."
         ) from error
     if ending == ".vtu":
         return read_vtu(content)
     if ending in (".xdmf", ".xmf"):
-        return read_xdmf(content, lambda name: _beside(path, name), time=time)
-    return read_table(content)
+        return read_xdmf(content, lambda name: _beside(path, name, contents), time=time)
+    return read_table(content, displacement)
 
 
-def _beside(path: Path, name: str) -> Path:
-    """Return the file of heavy data, which lies beside the light one and nowhere else."""
+def _beside(path: Path, name: str, contents: Mapping[str, Any] | None) -> tuple[Path, Any]:
+    """Return the file of heavy data, which must be in the folder of the light one."""
     plain = name.strip()
     found = path.parent / Path(plain).name
     if Path(plain).name in ("", ".", "..") or Path(plain).parent != Path():
-        raise unreadable(f"it names its heavy data {plain[:100]!r}: only files beside it are read")
-    if not found.is_file():
+        raise unreadable(f"it names its heavy data {plain[:100]!r}: only files in the same folder are read")
+    if not (found.is_file() if contents is None else found.name in contents):
         raise unreadable(
-            f"its heavy data {plain} are not beside it", remedy=f"Give {plain} too, in the same folder or upload."
+            f"its heavy data {plain} are not in its folder", remedy=f"Give {plain} too, in the same folder or upload."
         )
-    return found
+    return found, None if contents is None else contents[found.name]
 
 
 def _displacement(mesh: MeshFile, wanted: str | None) -> tuple[str, Float]:
+    """Return name and (n, 2) or (n, 3) values of the requested displacement, or of one recognised by its name."""
     by_name = {name.lower(): name for name in mesh.data}
     if wanted is not None:
-        choices = [tuple(part.strip() for part in wanted.split(","))]
+        choices = [[tuple(part.strip() for part in wanted.split(","))]]
     else:
-        choices = [(name,) for name in _DISPLACEMENT] + list(_SCALARS)
-    for names in choices:
-        held = [mesh.data[by_name[n.lower()]] for n in names if n.lower() in by_name]
-        if len(held) != len(names):
-            continue
-        values = held[0] if len(held) == 1 else np.column_stack(held)
-        if values.ndim == 2 and values.shape[1] == 3:
-            return by_name[names[0].lower()], np.asarray(values, dtype=np.float64)
+        whole = [*((name,) for name in DISPLACEMENT if name in by_name), *_SCALARS]
+        choices = [whole, [names[:2] for names in _SCALARS], [(n,) for n in by_name if is_displacement(n)]]
+    for likely in choices:
+        found: dict[str, Float] = {}
+        for names in likely:
+            held = [_column(mesh, by_name, n.lower(), whole=len(names) == 1) for n in names]
+            if all(values is not None for values in held):
+                values = np.column_stack([np.asarray(one, dtype=np.float64) for one in held])
+                if values.shape[1] in (2, 3):
+                    found[by_name.get(names[0].lower(), names[0])] = values
+        first = next(iter(found), None)
+        if first is not None:
+            if any(not np.array_equal(one, found[first], equal_nan=True) for one in found.values()):
+                raise InputError(
+                    f"The model has several arrays that may be its displacement: {', '.join(found)}.",
+                    code="model_displacement_unclear",
+                    remedy="Name the one that is meant (--displacement, displacement).",
+                )
+            return first, found[first]
     shown = ", ".join(f"{n} ({1 if v.ndim == 1 else v.shape[1]})" for n, v in list(mesh.data.items())[:20]) or "none"
-    asked = (
-        "no displacement of three components" if wanted is None else f"no displacement {wanted!r} of three components"
-    )
+    asked = "no displacement" if wanted is None else f"no displacement {wanted!r}"
     raise InputError(
-        f"The model has {asked} at its nodes; it has (with components): {shown}.",
+        f"The model has {asked} of two or three components at its nodes; it has (with components): {shown}.",
         code="model_no_displacement",
-        remedy="Name the array of displacements, or three scalars as in 'ux,uy,uz'; export displacements at nodes.",
+        remedy="Name the array of displacements, or its scalars as in 'ux,uy,uz' (two of a plane model); export "
+        "displacements at nodes.",
     )
+
+
+def _column(mesh: MeshFile, by_name: Mapping[str, str], name: str, *, whole: bool) -> Float | None:
+    """Return an array (n, ...) by its name, or a scalar (n,) or component, as ``u:0`` or ``u_x``; None without."""
+    if name in by_name:
+        values = mesh.data[by_name[name]]
+        return values if whole or values.ndim == 1 else None
+    stem, part = name[:-1].rstrip(":_. "), "xyz".find(name[-1:]) if name[-1:] in "xyz" else "012".find(name[-1:])
+    held = mesh.data.get(by_name.get(stem, ""))
+    return held[:, part] if not whole and held is not None and held.ndim == 2 and 0 <= part < held.shape[1] else None
 
 
 def _unit(mesh: MeshFile, name: str, asked: Unit | None) -> str:
-    """Unit of an array: the file's own; for one without, the user's, else that of the positions."""
+    """Unit of an array: the file's own; if it states none, the user's, else the unit of the positions."""
     stated = mesh.units.get(name, "") or ("" if asked else mesh.units.get("", ""))
     what = "displacements" if name else "positions"
     if not stated:

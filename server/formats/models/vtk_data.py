@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from server.formats.models.mesh_file import require_count, unreadable
+from stereorig.server.formats.models.mesh_file import require_count, unreadable, whole_number
 
 _TYPES = {
     "Int8": "i1",
@@ -26,12 +26,13 @@ _TYPES = {
     "Float32": "f4",
     "Float64": "f8",
 }
+_MAX_LZMA_BYTES = 128 << 20  # memory of a decoder; the highest preset needs half of it
 _COMPRESSORS = ("", "vtkZLibDataCompressor", "vtkLZMADataCompressor")
 
 
 @dataclass(frozen=True)
 class Decoder:
-    """How a file's numbers are written.
+    """Encoding of a file's numbers.
 
     Attributes
     ----------
@@ -42,7 +43,7 @@ class Decoder:
     compressor
         Name of the compressor; empty for none.
     appended
-        What follows the underscore of the appended data.
+        The bytes after the underscore of the appended data.
     appended_base64
         True if that is text.
     """
@@ -95,7 +96,7 @@ class Decoder:
         if form == "binary":
             content, text = b"".join((element.text or "").encode().split()), True
         elif form == "appended":
-            offset = _whole(element.get("offset"))
+            offset = whole_number(element.get("offset"), f"the offset of the array {name}")
             if not 0 <= offset < len(self.appended):
                 raise unreadable(f"its array {name} begins at byte {offset} of {len(self.appended)} that are appended")
             content, text = self.appended[offset:], self.appended_base64
@@ -136,8 +137,11 @@ class Decoder:
         return b"".join(out)
 
     def _unpacked(self, content: bytes, expected: int) -> bytes:
-        made: Any = zlib.decompressobj() if "ZLib" in self.compressor else lzma.LZMADecompressor()
-        found: bytes = made.decompress(content, expected)
+        if not expected:
+            raise ValueError("a block has no bytes")
+        zipped = "ZLib" in self.compressor
+        made: Any = zlib.decompressobj() if zipped else lzma.LZMADecompressor(memlimit=_MAX_LZMA_BYTES)
+        found: bytes = made.decompress(content, expected + 1)  # a limit of none would be no limit
         if len(found) != expected:
             raise ValueError(f"a block has {len(found)} of {expected} bytes")
         return found
@@ -149,10 +153,3 @@ class Decoder:
 def _decoded(text: bytes, count: int) -> bytes:
     """Decode the first bytes of base64 text."""
     return base64.b64decode(text[: 4 * ((count + 2) // 3)])[:count]
-
-
-def _whole(text: str | None) -> int:
-    try:
-        return int(text or "")
-    except ValueError:
-        return -1

@@ -5,15 +5,21 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from defusedxml import ElementTree as Xml
-from defusedxml.common import DefusedXmlException
 
-from core.arrays import Float
-from server.formats.models.cells import NODES
-from server.formats.models.mesh_file import Index, MeshFile, require_count, unreadable
-from server.formats.models.vtk_data import Decoder
+from stereorig.core.arrays import Float
+from stereorig.server.formats.models.cells import NODES, plain_cells
+from stereorig.server.formats.models.mesh_file import (
+    Index,
+    MeshFile,
+    require_count,
+    require_nodes,
+    unreadable,
+    whole_number,
+)
+from stereorig.server.formats.models.vtk_data import Decoder
+from stereorig.server.formats.xml_tree import read_xml
 
-_MOST_NODES = 64  # of a cell
+_MOST_NODES, _MOST_SHARED = 64, 4  # of a cell, and of long strips, of a node
 
 
 def read_vtu(content: bytes) -> MeshFile:
@@ -26,8 +32,8 @@ def read_vtu(content: bytes) -> MeshFile:
     """
     xml, appended, is_text = _without_appended(content)
     try:
-        root = Xml.fromstring(xml)
-    except (Xml.ParseError, DefusedXmlException, ValueError) as error:
+        root = read_xml(xml)
+    except ValueError as error:
         raise unreadable(f"it is no XML ({error})") from error
     grid = root.find("UnstructuredGrid")
     if root.tag != "VTKFile" or grid is None:
@@ -37,22 +43,20 @@ def read_vtu(content: bytes) -> MeshFile:
     if not pieces:
         raise unreadable("it has no piece")
     units: dict[str, str] = {}
-    for _, _, _, stated in pieces:
-        units |= stated
-    begin = np.cumsum([0, *(len(points) for points, _, _, _ in pieces)])
-    names = set.intersection(*(set(data) for _, _, data, _ in pieces))
+    for piece in pieces:
+        units |= piece.units
+    begin = np.cumsum([0, *(len(piece.points) for piece in pieces)])
+    names = set.intersection(*(set(piece.data) for piece in pieces))
     return MeshFile(
-        np.concatenate([points for points, _, _, _ in pieces]),
-        [(kind, cells + start) for (_, held, _, _), start in zip(pieces, begin, strict=False) for kind, cells in held],
-        {name: np.concatenate([data[name] for _, _, data, _ in pieces]) for name in names},
+        np.concatenate([piece.points for piece in pieces]),
+        [(kind, cells + start) for piece, start in zip(pieces, begin, strict=False) for kind, cells in piece.cells],
+        {name: np.concatenate([piece.data[name] for piece in pieces]) for name in names},
         units,
+        corners_only=sum(piece.corners_only for piece in pieces),
     )
 
 
-_Piece = tuple[Float, list[tuple[int, Index]], dict[str, Float], dict[str, str]]
-
-
-def _piece(element: Any, decoder: Decoder) -> _Piece:
+def _piece(element: Any, decoder: Decoder) -> MeshFile:
     n, m = (_count(element, name) for name in ("NumberOfPoints", "NumberOfCells"))
     units: dict[str, str] = {}
     points = element.find("Points/DataArray")
@@ -64,7 +68,8 @@ def _piece(element: Any, decoder: Decoder) -> _Piece:
     _note_unit(points, "", units)
     data: dict[str, Float] = {}
     for array in element.findall("PointData/DataArray"):
-        name, parts = array.get("Name") or "", max(1, int(array.get("NumberOfComponents") or 1))
+        name = array.get("Name") or ""
+        parts = whole_number(array.get("NumberOfComponents") or "1", "a number of components") or 1
         if not name or array.get("type") == "String" or parts > 9:
             continue
         values = decoder.array(array, most=parts * n).astype(np.float64)
@@ -72,39 +77,38 @@ def _piece(element: Any, decoder: Decoder) -> _Piece:
             raise unreadable(f"the array {name} has {values.size} numbers for {n} points of {parts} components")
         data[name] = values if parts == 1 else values.reshape(n, parts)
         _note_unit(array, name, units)
-    return xyz.reshape(n, 3), _cells(element, decoder, n, m), data, units
+    cells, corners_only = _cells(element, decoder, n, m)
+    return MeshFile(xyz.reshape(n, 3), cells, data, units, corners_only=corners_only)
 
 
-def _cells(element: Any, decoder: Decoder, n: int, m: int) -> list[tuple[int, Index]]:
+def _cells(element: Any, decoder: Decoder, n: int, m: int) -> tuple[list[tuple[int, Index]], int]:
+    """Return the cells by their kind, and the number of cells that were reduced to their corners."""
     arrays = {one.get("Name"): one for one in element.findall("Cells/DataArray")}
     if m == 0 or not {"connectivity", "offsets", "types"} <= set(arrays):
-        return []
-    kinds = decoder.array(arrays["types"], most=m).astype(np.int64)
-    ends = decoder.array(arrays["offsets"], most=m).astype(np.int64)
-    nodes = decoder.array(arrays["connectivity"], most=_MOST_NODES * m).astype(np.int64)
+        return [], 0
+    kinds, ends = (_whole(decoder.array(arrays[name], most=m)) for name in ("types", "offsets"))
+    nodes = require_nodes(decoder.array(arrays["connectivity"], most=_MOST_NODES * m + _MOST_SHARED * n), n)
     begins = np.r_[0, ends[:-1]]
     if len(kinds) != m or len(ends) != m or (ends < begins).any() or (m and ends[-1] > len(nodes)):
         raise unreadable(f"its {m} cells have {len(kinds)} kinds and {len(ends)} ends over {len(nodes)} nodes")
-    if len(nodes) and not (nodes.min() >= 0 and nodes.max() < n):
-        raise unreadable(f"a cell has the node {nodes.max()}, but there are {n}")
-    out = []
-    for kind in np.unique(kinds):
-        of_kind = kinds == kind
-        count = NODES.get(int(kind))
-        if count is None:
-            out.append((int(kind), np.zeros((int(of_kind.sum()), 0), np.int64)))
-            continue
-        if (ends[of_kind] - begins[of_kind] != count).any():
-            raise unreadable(f"a cell of VTK's kind {kind} has other than {count} nodes")
-        out.append((int(kind), nodes[begins[of_kind][:, None] + np.arange(count)]))
-    return out
+    out, corners_only, counts = [], 0, ends - begins
+    for kind, count in ((k, c) for k in np.unique(kinds).tolist() for c in np.unique(counts[kinds == k]).tolist()):
+        if count != NODES.get(kind, count):
+            raise unreadable(f"a cell of VTK's kind {kind} has other than {NODES[kind]} nodes")
+        alike = begins[(kinds == kind) & (counts == count)]
+        plain, cells, reduced = plain_cells(kind, nodes[alike[:, None] + np.arange(count)])
+        out.append((plain, cells))
+        corners_only += reduced * len(cells)
+    return out, corners_only
+
+
+def _whole(numbers: Any) -> Index:
+    """Return numbers as whole ones; -1 in place of one that is none."""
+    return np.where(np.abs(numbers.astype(np.float64)) < 2**53, numbers, -1).astype(np.int64)
 
 
 def _count(element: Any, name: str) -> int:
-    try:
-        count = int(element.get(name, ""))
-    except ValueError:
-        raise unreadable(f"a piece does not say its {name}") from None
+    count = whole_number(element.get(name), f"{name} of a piece")
     require_count(3 * count, "a piece")
     return count
 
@@ -116,7 +120,7 @@ def _note_unit(array: Any, name: str, units: dict[str, str]) -> None:
 
 
 def _without_appended(content: bytes) -> tuple[bytes, bytes, bool]:
-    """Return the file without what is appended to it, which may be no XML, that, and True if it is base64."""
+    """Return the file without its appended data, which may be no XML; the appended data; True if they are base64."""
     begin = content.find(b"<AppendedData")
     if begin < 0:
         return content, b"", False

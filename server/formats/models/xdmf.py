@@ -1,4 +1,4 @@
-"""XDMF: light data in XML, heavy data in it or in HDF5 files beside it."""
+"""XDMF: light data in XML; heavy data in the same XML, or in HDF5 files of the same folder."""
 
 from __future__ import annotations
 
@@ -8,13 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from defusedxml import ElementTree as Xml
-from defusedxml.common import DefusedXmlException
 
-from core.arrays import Float
-from server.formats.models.cells import NODES
-from server.formats.models.mesh_file import Index, MeshFile, require_count, unreadable
-from server.formats.results.netcdf import opened
+from stereorig.core.arrays import Float
+from stereorig.server.formats.hdf5_parts import require_own_parts
+from stereorig.server.formats.models.cells import NODES, plain_cells
+from stereorig.server.formats.models.mesh_file import (
+    Index,
+    MeshFile,
+    require_count,
+    require_nodes,
+    unreadable,
+    whole_number,
+)
+from stereorig.server.formats.results.netcdf import opened
+from stereorig.server.formats.xml_tree import read_xml
 
 #: XDMF's name and number of each kind of cell, and VTK's
 _KINDS = {
@@ -34,11 +41,21 @@ _KINDS = {
     "tet_10": (38, 24),
     "hexahedron_20": (48, 25),
     "hex_20": (48, 25),
+    "pyramid_13": (39, 27),
+    "wedge_15": (40, 26),
+    "wedge_18": (41, 32),
+    "hexahedron_24": (49, 33),
+    "hex_24": (49, 33),
+    "hexahedron_27": (50, 29),
+    "hex_27": (50, 29),
 }
+_NODES = NODES | {27: 13, 26: 15, 32: 18, 33: 24, 29: 27}
+_POLYGON = 3, 7
 _BY_NUMBER = dict(_KINDS.values())
-_COUNTED = (1, 2, 3)  # kinds in a mixed list that state their number of nodes
+_COUNTED = (1, 2, _POLYGON[0])  # kinds in a mixed list that state their number of nodes
 _COMPONENTS = {"scalar": 1, "vector": 3, "tensor": 9, "tensor6": 6}
-Heavy = Callable[[str], Path]
+#: path of a file of heavy data, and its content if the file is not to be opened
+Heavy = Callable[[str], tuple[Path, Any]]
 
 
 def read_xdmf(content: bytes, heavy: Heavy, *, time: float | None = None) -> MeshFile:
@@ -49,18 +66,18 @@ def read_xdmf(content: bytes, heavy: Heavy, *, time: float | None = None) -> Mes
     content
         The light data.
     heavy
-        Gives the path of a file of heavy data by its name, or raises an error.
+        Gives a file of heavy data by its name, or raises an error.
     time
         The state nearest to this time of a series; None: the last.
 
     Raises
     ------
     FileFormatError
-        ``model_unreadable``; what ``heavy`` raises.
+        ``model_unreadable``; errors that ``heavy`` raises.
     """
     try:
-        root = Xml.fromstring(content)
-    except (Xml.ParseError, DefusedXmlException, ValueError) as error:
+        root = read_xml(content)
+    except ValueError as error:
         raise unreadable(f"it is no XML ({error})") from error
     if not root.tag.lower().endswith("xdmf"):
         raise unreadable(f"it begins with {root.tag!r}, not with Xdmf")
@@ -89,6 +106,8 @@ def read_xdmf(content: bytes, heavy: Heavy, *, time: float | None = None) -> Mes
 
     xyz = numbers(geometry)
     parts = 2 if geometry.get("GeometryType", geometry.get("Type", "XYZ")).upper() == "XY" else 3
+    if xyz.size % parts or not xyz.size:
+        raise unreadable(f"its geometry has {xyz.size} numbers, no multiple of {parts}")
     points = xyz.reshape(-1, parts)
     if parts == 2:
         points = np.column_stack([points, np.zeros(len(points))])
@@ -109,8 +128,10 @@ def read_xdmf(content: bytes, heavy: Heavy, *, time: float | None = None) -> Mes
         data[name] = values.reshape(n, -1) if values.size != n else values.ravel()
         if _unit(one):
             units[name] = _unit(one)
-    cells = [] if topology is None else _cells(topology, numbers(topology), n)
-    return MeshFile(points.astype(np.float64), cells, data, units, at[k])
+    plain = [] if topology is None else [plain_cells(*one) for one in _cells(topology, numbers(topology), n)]
+    cells = [(kind, nodes) for kind, nodes, _ in plain]
+    corners_only = sum(len(nodes) for _, nodes, reduced in plain if reduced)
+    return MeshFile(points.astype(np.float64), cells, data, units, at[k], corners_only)
 
 
 def _away(at: float | None, time: float) -> float:
@@ -138,10 +159,7 @@ def _unit(element: Any) -> str:
 
 
 def _numbers(item: Any, heavy: Heavy) -> Float:
-    try:
-        shape = [int(v) for v in item.get("Dimensions", "").split()]
-    except ValueError:
-        raise unreadable(f"a data item has the dimensions {item.get('Dimensions')!r}") from None
+    shape = [whole_number(v, "a data item's dimension") for v in item.get("Dimensions", "").split()]
     count = math.prod(shape)
     require_count(count, "a data item")
     text, form = (item.text or "").strip(), item.get("Format", "XML").upper()
@@ -160,9 +178,12 @@ def _numbers(item: Any, heavy: Heavy) -> Float:
     return values.astype(np.float64)
 
 
-def _from_hdf(path: Path, inside: str, count: int) -> Float:
+def _from_hdf(file: tuple[Path, Any], inside: str, count: int) -> Float:
+    path, content = file
     parts = [part for part in inside.split("/") if part]
-    with opened(path) as data:
+    if content is None or isinstance(content, bytes):  # an open data set was looked through before
+        require_own_parts(path, content)
+    with opened(path, content) as data:
         group: Any = data
         for part in parts[:-1]:
             group = getattr(group, "groups", {}).get(part)
@@ -174,39 +195,42 @@ def _from_hdf(path: Path, inside: str, count: int) -> Float:
             raise unreadable(f"{path.name}:{inside} has {held.size} of {count} numbers")
         try:
             return np.asarray(held[...], dtype=np.float64).ravel()
-        except (OSError, RuntimeError, ValueError) as error:
-            raise unreadable(f"{path.name}:{inside} is damaged ({error})") from error
+        except (OSError, RuntimeError, ValueError, TypeError, IndexError) as error:
+            raise unreadable(f"{path.name}:{inside} is damaged, or holds no numbers") from error
 
 
 def _cells(topology: Any, flat: Float, n: int) -> list[tuple[int, Index]]:
     name = topology.get("TopologyType", topology.get("Type", "")).lower()
-    nodes = flat.astype(np.int64)
     if name == "mixed":
-        found = _mixed(nodes)
-    elif name in _KINDS:
-        kind = _KINDS[name][1]
-        if nodes.size % NODES[kind]:
-            raise unreadable(f"its topology {name} has {nodes.size} nodes, no multiple of {NODES[kind]}")
-        found = [(kind, nodes.reshape(-1, NODES[kind]))]
+        if not (np.abs(flat) < 2**53).all():
+            raise unreadable("its mixed topology holds a number that is not whole")
+        found = _mixed(flat.astype(np.int64))
+        for _, cells in found:
+            require_nodes(cells.ravel(), n)
+    elif name in _KINDS or name == "polygon":
+        kind = _KINDS.get(name, _POLYGON)[1]
+        count = _NODES.get(kind) or whole_number(topology.get("NodesPerElement"), "NodesPerElement of its polygons")
+        if count < 1 or flat.size % count:
+            raise unreadable(f"its topology {name} has {flat.size} nodes, no multiple of {count}")
+        found = [(kind, require_nodes(flat, n).reshape(-1, count))]
     else:
         return []
-    for _, cells in found:
-        if cells.size and not (cells.min() >= 0 and cells.max() < n):
-            raise unreadable(f"a cell has the node {cells.max()}, but there are {n}")
     return found
 
 
 def _mixed(nodes: Index) -> list[tuple[int, Index]]:
-    lists: dict[int, list[Index]] = {}
+    lists: dict[tuple[int, int], list[Index]] = {}
     at = 0
     while at < len(nodes):
-        number = int(nodes[at])
-        if number in _COUNTED and at + 1 < len(nodes):
-            at += 2 + max(0, int(nodes[at + 1]))
-            continue
-        kind = _BY_NUMBER.get(number)
-        if kind is None or at + 1 + NODES[kind] > len(nodes):
-            raise unreadable(f"its mixed topology has a cell of the kind {number}, or ends inside one")
-        lists.setdefault(kind, []).append(nodes[at + 1 : at + 1 + NODES[kind]])
-        at += 1 + NODES[kind]
-    return [(kind, np.stack(cells)) for kind, cells in lists.items()]
+        number, begin = int(nodes[at]), at + 1
+        if number in _COUNTED and begin < len(nodes):
+            kind, count, begin = (_POLYGON[1] if number == _POLYGON[0] else 0), max(0, int(nodes[begin])), begin + 1
+        else:
+            kind = _BY_NUMBER.get(number, -1)
+            count = _NODES.get(kind, 0)
+        at = begin + count
+        if kind < 0 or at > len(nodes):
+            raise unreadable(f"its mixed topology has a cell of an unknown kind at number {begin}, or ends inside one")
+        if kind:
+            lists.setdefault((kind, count), []).append(nodes[begin:at])
+    return [(kind, np.stack(cells)) for (kind, _), cells in lists.items()]

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arrays import Bool, Float, Floats
-from core.common.factor import Causes
-from core.field.points.result import Field
-from core.names import BUDGET, BudgetName, Cause
-from core.robust import median, spread_indices
-from core.strain import StrainField
-from core.strain.reference import reference_share
-from server.formats.results.layout import COVARIANCE_NAMES
+from stereorig.core.arrays import Bool, Float, Floats
+from stereorig.core.common.factor import Causes
+from stereorig.core.field.points.result import Field
+from stereorig.core.names import ALL_PARTS, BudgetName, Cause
+from stereorig.core.robust import median, spread_indices
+from stereorig.core.strain import StrainField
+from stereorig.core.strain.reference import reference_share
+from stereorig.server.formats.results.layout import COVARIANCE_NAMES
+from stereorig.server.formats.results.variables import STRAIN_NAMES
 
-STRAIN_NAMES = ("exx", "eyy", "exy")
 _MEDIANS_OF = 2000  # points: a median of a tenth's scatter is known to a few thousandths from them
 
 
@@ -27,8 +27,8 @@ class PointBudget:
     Attributes
     ----------
     parts
-        (n,) standard uncertainty by name, of those that are known, in the order of :data:`core.names.BUDGET`; their
-        squares add up to the square of the whole.
+        (n,) standard uncertainty by name, of those that are known, in the order of
+        :data:`stereorig.core.names.ALL_PARTS`; their squares add up to the square of the whole.
     """
 
     parts: Mapping[BudgetName, Float]
@@ -92,14 +92,14 @@ def field_budgets(field: Field, points: Bool) -> dict[str, PointBudget]:
 
 
 def strain_budgets(field: Field, strain: StrainField, points: Bool) -> dict[str, PointBudget]:
-    """Return the budgets of exx, eyy and exy; the reference's share goes the strain's own way.
+    """Return the budgets of exx, eyy and exy; the reference's share is propagated through the strain's own derivatives.
 
     Parameters
     ----------
     field
-        What the strain was made of.
+        The field that the strain was computed from.
     strain
-        Of the same points.
+        The strain of the same points.
     points
         (r, c) True at the points that are asked for.
     """
@@ -124,7 +124,7 @@ def _squares(common: Floats | None, causes: Causes | None, points: Bool) -> Mapp
     """Variances (n, m) by cause at points (r, c); none where the common factor (r, c, m, k) is not known."""
     if common is None:
         return {}
-    return (Causes.untold(common.shape[-1]) if causes is None else causes).squares(common[points])
+    return (Causes.unseparated(common.shape[-1]) if causes is None else causes).squares(common[points])
 
 
 def _budget(own: Float, frozen: Float | None, common: Mapping[Cause, Float]) -> PointBudget:
@@ -133,4 +133,4 @@ def _budget(own: Float, frozen: Float | None, common: Mapping[Cause, Float]) -> 
         known["reference"] = np.minimum(frozen, own)
     for cause, square in common.items():
         known[cause] = square
-    return PointBudget({name: np.sqrt(np.maximum(known[name], 0.0)) for name in BUDGET if name in known})
+    return PointBudget({name: np.sqrt(np.maximum(known[name], 0.0)) for name in ALL_PARTS if name in known})

@@ -1,40 +1,40 @@
-"""What a step's epipolar offsets say about the cameras: an entry of ``summary.json`` and of the API."""
+"""Camera motion seen in a step's epipolar offsets: an entry of ``summary.json`` and of the API."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from core.orientation import OffsetFinding
+from stereorig.core.orientation import OffsetJudgement
 
-#: what a user can do about a camera that moved
+#: advice to the user about a camera that moved
 MOVED_REMEDY = "Repair the calibration from steps taken since (stereorig calibration repair), or calibrate again."
 
 
 @dataclass(frozen=True)
-class CameraMotion:
-    """Whether a camera moved.
+class MotionCheck:
+    """Result of the check that neither camera moved.
 
     Attributes
     ----------
     camera_moved
         True if one moved since the calibration, the reference or the step before; False if none of these is seen; None
-        where that cannot be told.
+        if that cannot be decided.
     text
-        The finding in a sentence: that of the motion seen last.
+        The finding in a sentence; of several motions the last one seen.
     calibration, reference, last_step
-        The findings; None where there is nothing to hold the step against.
+        The findings; None if there is nothing to compare the step with.
     """
 
     camera_moved: bool | None
     text: str
-    calibration: OffsetFinding | None
-    reference: OffsetFinding | None
-    last_step: OffsetFinding | None
+    calibration: OffsetJudgement | None
+    reference: OffsetJudgement | None
+    last_step: OffsetJudgement | None
 
     @staticmethod
     def of(
-        calibration: OffsetFinding | None, reference: OffsetFinding | None, last_step: OffsetFinding | None
-    ) -> CameraMotion | None:
+        calibration: OffsetJudgement | None, reference: OffsetJudgement | None, last_step: OffsetJudgement | None
+    ) -> MotionCheck | None:
         """Put the findings of a step together; None without any."""
         found = [f for f in (last_step, reference, calibration) if f is not None]
         if not found:
@@ -43,7 +43,7 @@ class CameraMotion:
         unknown = [f for f in found if f.camera_moved is None]
         moved = True if moving else None if unknown else False
         told = (moving or unknown or found)[0]
-        return CameraMotion(moved, told.text, calibration, reference, last_step)
+        return MotionCheck(moved, told.text, calibration, reference, last_step)
 
     def document(self) -> dict[str, object]:
         """Return it as plain values."""

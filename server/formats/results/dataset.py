@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import netCDF4
 
-from core.errors import InputError
-from core.field.points.result import Field
-from core.strain import StrainField
-from server.formats.results.netcdf import dataset_bytes, library
-from server.formats.results.writing import Provenance, fill
+from stereorig.core.errors import InputError
+from stereorig.core.field.points.result import Field
+from stereorig.core.strain import StrainField
+from stereorig.server.formats.results.netcdf import dataset_bytes, library
+from stereorig.server.formats.results.writing import Provenance, fill
 
 if TYPE_CHECKING:
     import xarray

@@ -1,4 +1,4 @@
-"""Variables that follow from those of a result file, read as if it held them: the size of the displacement."""
+"""Variables computed from a result file's variables and read as if it held them: the size of the displacement."""
 
 from __future__ import annotations
 
@@ -7,15 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from server.formats.results.layout import COVARIANCE_NAMES, unpacked
+from stereorig.server.formats.results.layout import COVARIANCE_NAMES, unpacked
+from stereorig.server.formats.results.variables import SIGMA, SIZE, described
 
-MAGNITUDE = "d_mm"
+MAGNITUDE = SIZE.name
 _UVW = ("u_mm", "v_mm", "w_mm")
 # name -> unit, meaning
-DERIVED = {
-    MAGNITUDE: ("mm", "size of the displacement from the reference, sqrt(u^2 + v^2 + w^2)"),
-    f"sigma_{MAGNITUDE}": ("mm", f"standard deviation of {MAGNITUDE}, linearised; none where the point did not move"),
-}
+DERIVED = {name: (SIZE.units, described(name).long_name) for name in (MAGNITUDE, SIGMA + MAGNITUDE)}
 
 
 def derived_names(held: Any) -> list[str]:
@@ -49,7 +47,7 @@ def magnitude(
 
 
 def derive(held: Any, name: str) -> NDArray[np.float32]:
-    """Return (r, c) values of a derived variable from the variables of an open file that has what it needs."""
+    """Return (r, c) values of a derived variable; the open file must hold the variables that it is computed from."""
     uvw = np.stack([np.asarray(held[one][...], dtype=np.float64) for one in _UVW], axis=-1)
     covariance = np.asarray(held["covariance"][...], dtype=np.float64)
     if covariance.ndim == uvw.ndim:

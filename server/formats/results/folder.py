@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from core.errors import InputError
+from stereorig.core.errors import InputError
 
-_RESULT = re.compile(r"step_\d{4,}\.nc")
+_RESULT = re.compile(r"step_[0-9]{4,9}\.nc")
 
 
 DENSE = "dense"
 """Folder of the dense fields, inside that of the ordinary results: files of the same names and contract."""
-TILES = ".tiles_"
-"""What the names of folders begin with in which workers share the fits of a step that is being measured."""
 
 
 def dense_result(path: Path) -> Path:
@@ -37,6 +35,24 @@ def number_of(path: Path) -> int:
     return int(path.stem.removeprefix("step_"))
 
 
+def file_of_step(files: Mapping[int, Path], step: int) -> Path:
+    """Return the result file of a step, of files by step.
+
+    Raises
+    ------
+    InputError
+        ``step_missing``, with the first steps that there are.
+    """
+    if step not in files:
+        raise InputError(
+            f"There is no result of step {step}; there are {', '.join(map(str, sorted(files)[:8]))}"
+            f"{' ...' if len(files) > 8 else ''}.",
+            code="step_missing",
+            remedy="Name a step that was measured.",
+        )
+    return files[step]
+
+
 def first_results(folder: Path, folders: Iterable[Path]) -> list[Path]:
     """Return the result files of the first folder that has any.
 
@@ -45,7 +61,7 @@ def first_results(folder: Path, folders: Iterable[Path]) -> list[Path]:
     folder
         The folder that the user named.
     folders
-        Where its results may lie.
+        Folders that may have its results, in the order of search.
 
     Raises
     ------

@@ -17,8 +17,9 @@ from typing import Any
 
 import netCDF4
 
-from core.errors import FileFormatError
-from server.formats.files import written_temporary
+from stereorig.core.errors import FileFormatError
+from stereorig.server.formats.files import written_temporary
+from stereorig.server.formats.manifest import is_there, require_sound
 
 #: the netCDF and HDF5 libraries are not built for several threads at once
 library = threading.RLock()
@@ -29,7 +30,7 @@ class NewDataset(netCDF4.Dataset):
     """An empty data set whose values are written once all is defined: :meth:`put` and :meth:`finish`."""
 
     def __init__(self, *args: Any, **more: Any) -> None:
-        # what is set in the usual way becomes an attribute of the file
+        # an attribute set in the usual way becomes an attribute of the file
         self.__dict__["_waiting"] = []
         super().__init__(*args, **more)
 
@@ -38,7 +39,7 @@ class NewDataset(netCDF4.Dataset):
         self.__dict__["_waiting"].append((variable, values))
 
     def finish(self) -> None:
-        """Close the definitions and write what waits."""
+        """Close the definitions and write the waiting variables."""
         super()._enddef()  # type: ignore[misc]
         waiting = self.__dict__["_waiting"]
         while waiting:
@@ -54,21 +55,31 @@ class NewDataset(netCDF4.Dataset):
 
 
 @contextlib.contextmanager
-def opened(path: Path) -> Iterator[Any]:
+def opened(path: Path, content: bytes | netCDF4.Dataset | None = None) -> Iterator[Any]:
     """Yield a file's data set to read; values come as they are stored, without masks.
+
+    Parameters
+    ----------
+    content
+        Content of the file, or its data set, which are then used instead of the path.
 
     Raises
     ------
     FileFormatError
-        ``file_missing``, ``file_unreadable``.
+        ``file_missing``, ``file_unreadable``; ``checksum_mismatch`` if it is not as it was written.
     """
-    if not path.exists():
+    if isinstance(content, netCDF4.Dataset):
+        yield content
+        return
+    if content is None and not is_there(path):
         raise FileFormatError(f"The result file {path} does not exist.", code="file_missing", remedy="Check the path.")
+    if content is None:
+        require_sound(path, just_read=True)
     with library:
         try:
-            dataset = netCDF4.Dataset(path, "r")
-        except OSError as error:
-            text = f"{path} cannot be read as a result file: {error.strerror or error}."
+            dataset = netCDF4.Dataset(path, "r", memory=content)
+        except (OSError, RuntimeError, ValueError) as error:  # the last for names that are no text
+            text = f"{path} cannot be read as a result file: {getattr(error, 'strerror', None) or 'it is damaged'}."
             raise FileFormatError(text, file=path.name) from error
         with dataset:
             dataset.set_auto_mask(False)
@@ -77,7 +88,7 @@ def opened(path: Path) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def written_dataset(path: Path, *, classic: bool = True, checksum: bool = False) -> Iterator[Any]:
-    """Yield a :class:`NewDataset`; on leaving, it is the file; see :func:`server.formats.files.written_temporary`.
+    """Yield a :class:`NewDataset`; on leaving, it is the file; see :func:`.formats.files.written_temporary`.
 
     Parameters
     ----------

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.common.factor import Causes
-from core.field.points.result import Field, References, Rejected
-from core.field.region.cuts import Cuts, as_arrays
-from core.field.sequence.propagated import current_covariance
-from core.names import CAUSES
-from server.formats.results.layout import COLUMN_BY_COLUMN, ENTRIES, FROZEN, PROPAGATED_FROM, packed
+from stereorig.core.common.factor import Causes
+from stereorig.core.field.points.result import Field, References, Rejected
+from stereorig.core.field.region.cuts import Cuts, as_arrays
+from stereorig.core.field.sequence.propagated import current_covariance
+from stereorig.core.names import CAUSES
+from stereorig.server.formats.results.layout import COLUMN_BY_COLUMN, ENTRIES, FROZEN, PROPAGATED_FROM, packed
+from stereorig.server.formats.results.variables import VARIABLES
 
 _REPETITIVE = ("x_px", "y_px", "status", "iterations", "zncc")
 
@@ -28,7 +29,7 @@ def put(
     dtype: str,
     sparse: bool = False,
 ) -> None:
-    """Write one variable with its units and name; deflated where it repeats itself or most points have none."""
+    """Write one variable with its units and name; deflated if its values repeat or most points have none."""
     fill = np.nan if dtype.startswith("f") else False
     pack: dict[str, Any] = {}
     if sparse or name in _REPETITIVE:
@@ -41,8 +42,8 @@ def put(
 
 
 def put_causes(dataset: Any, causes: Causes) -> None:
-    """Write the names of the causes that the common factors stand for."""
-    width = max(len(name) for name in CAUSES)
+    """Write the cause of each column of the common factors."""
+    width = max(len(name) for name in CAUSES)  # ``sensor`` is shorter than the longest
     dataset.createDimension("cause_length", width)
     variable = dataset.createVariable("cause", "S1", ("cause", "cause_length"))
     variable.setncatts(
@@ -57,7 +58,7 @@ def put_causes(dataset: Any, causes: Causes) -> None:
 
 
 def put_rejected(dataset: Any, rejected: Rejected) -> None:
-    """Write what was found at points that a check rejected."""
+    """Write the values found at points that a check rejected."""
     of_point = [("x_mm", rejected.xyz_mm[..., 0]), ("y_mm", rejected.xyz_mm[..., 1]), ("z_mm", rejected.xyz_mm[..., 2])]
     if rejected.uvw_mm is not None:
         of_point += [(f"{name}_mm", rejected.uvw_mm[..., k]) for k, name in enumerate("uvw")]
@@ -113,7 +114,7 @@ def put_cuts(dataset: Any, cuts: Cuts) -> None:
 
 
 def put_references(dataset: Any, references: References) -> None:
-    """Write which step each point was matched against, and what it took over from there."""
+    """Write the step that each point was matched against, and the errors that it took over from there."""
     put(
         dataset,
         "reference_step",
@@ -121,7 +122,7 @@ def put_references(dataset: Any, references: References) -> None:
         ("row", "col"),
         units="1",
         dtype="i4",
-        long_name="step that the point was matched against; without numbers, the newest such step that shows it",
+        long_name=VARIABLES["reference_step"].long_name,
         sparse=True,
     )
     for origin, cause in PROPAGATED_FROM.items():
@@ -140,7 +141,7 @@ def put_references(dataset: Any, references: References) -> None:
 
 
 def put_measured(dataset: Any, result: Field, measured: Field) -> None:
-    """Write the start values of later steps, where they differ from the field that is shown."""
+    """Write the start values of later steps, if they differ from the field that is shown."""
     if result.smoothing is not None and measured.uvw_mm is not None:
         for k, name in enumerate(("u", "v", "w")):
             put(

@@ -1,4 +1,4 @@
-"""Reading result files back, see :mod:`server.formats.results.writing`."""
+"""Reading result files back, see :mod:`stereorig.server.formats.results.writing`."""
 
 from __future__ import annotations
 
@@ -12,29 +12,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.common.factor import Causes
-from core.errors import FileFormatError
-from core.field.points.dense_record import DenseRecord
-from core.field.points.patch import PatchChoice
-from core.field.points.result import Field, References
-from core.field.points.smoothing_record import Smoothing
-from core.field.region.cuts import Cuts, from_arrays
-from core.names import CAUSES, CameraName
-from core.status import PointStatus
-from server.formats.results.layout import CURVATURE, ENTRIES, FORMAT_VERSION, MOTION, PROPAGATED_FROM, SHAPE, unpacked
-from server.formats.results.netcdf import opened
-from server.formats.results.settings import current_entries, current_inputs, current_settings, variable_name
+from stereorig.core.common.factor import Causes
+from stereorig.core.errors import FileFormatError
+from stereorig.core.field.points.dense_record import DenseRecord
+from stereorig.core.field.points.patch import PatchChoice
+from stereorig.core.field.points.result import Field, References
+from stereorig.core.field.points.smoothing_record import Smoothing
+from stereorig.core.field.region.cuts import Cuts, from_arrays
+from stereorig.core.names import ALL_CAUSES, CameraName
+from stereorig.core.status import PointStatus
+from stereorig.server.formats.results.layout import ENTRIES, FORMAT_VERSION, PROPAGATED_FROM, unpacked
+from stereorig.server.formats.results.netcdf import opened
+from stereorig.server.formats.results.variables import CURVATURE, MOTION, SHAPE, Of
 
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     with opened(path) as dataset:
         version = int(getattr(dataset, "format_version", 0))
-        if not 1 <= version <= FORMAT_VERSION:
+        if version == 0:
+            raise FileFormatError(f"{path} is no result of this program: it states no format.", code="file_unreadable")
+        if version != FORMAT_VERSION:
             raise FileFormatError(
-                f"{path} has the result format {version or 'none'}; this program reads up to {FORMAT_VERSION}.",
-                code="format_too_new" if version else "file_unreadable",
-                remedy="Read it with the program's version that wrote it.",
+                f"{path} has the result format {version}; this program reads {FORMAT_VERSION}.",
+                code="format_too_old" if version < FORMAT_VERSION else "format_too_new",
+                remedy="Read it with the program's version that wrote it, or measure the images again.",
             )
         yield dataset
 
@@ -45,7 +47,8 @@ def read_field(path: str | Path) -> Field:
     Raises
     ------
     FileFormatError
-        ``file_missing``, ``file_unreadable`` (not such a file, a variable missing) or ``format_too_new``.
+        ``file_missing``, ``file_unreadable`` (not such a file, a variable missing), ``format_too_old`` or
+        ``format_too_new``.
     """
     path = Path(path)
     with _opened(path) as dataset:
@@ -60,11 +63,13 @@ def read_field(path: str | Path) -> Field:
         arrays: dict[str, Any] = {}
         for v in wanted:
             values = np.asarray(variables[v.name][...], dtype=np.float64)
-            if v.component is None:
-                arrays[v.attribute] = values
+            at = v.values
+            assert isinstance(at, Of)
+            if at.component is None:
+                arrays[at.attribute] = values
             else:
-                tail = 2 if v in CURVATURE else 3
-                arrays.setdefault(v.attribute, np.full((*shape, tail), np.nan))[..., v.component] = values
+                tail = len(CURVATURE) if v in CURVATURE else 3
+                arrays.setdefault(at.attribute, np.full((*shape, tail), np.nan))[..., at.component] = values
         total = np.asarray(variables["covariance"][...], dtype=np.float64)
         if total.ndim == 3:  # packed
             total = unpacked(total, 6)
@@ -83,11 +88,14 @@ def read_field(path: str | Path) -> Field:
             common=common,
             causes=causes,
             frozen=_frozen_of(variables),
-            smoothing=None if smoothing is None else Smoothing.from_document(current_entries(json.loads(smoothing))),
-            patch=None if choice is None else PatchChoice.from_document(current_entries(json.loads(choice))),
+            smoothing=None if smoothing is None else Smoothing.from_document(json.loads(smoothing)),
+            patch=None if choice is None else PatchChoice.from_document(json.loads(choice)),
             cuts=_cuts_of(variables),
             dense=None if dense is None else DenseRecord.from_document(json.loads(dense)),
             references=_references_of(dataset),
+            patch_degree=(
+                np.asarray(variables["patch_degree"][...], dtype=np.int8) if "patch_degree" in variables else None
+            ),
         )
 
 
@@ -108,12 +116,11 @@ def read_measured(path: str | Path) -> Field:
         }
     if field.smoothing is not None:
         if "measured_u_mm" not in read:
-            raise FileFormatError(f"{path} holds a smoothed displacement only; later steps cannot go on from it.")
+            raise FileFormatError(f"{path} holds a smoothed displacement only; later steps cannot continue from it.")
         uvw = np.stack([read[f"measured_{name}_mm"] for name in ("u", "v", "w")], axis=-1)
         field = replace(field, uvw_mm=uvw, smoothing=None)
-    # files of format 1 have it only beside a smoothed displacement: there, marked points keep the calibration's part
     covariance = read.get("measured_covariance", field.covariance)
-    if "measured_current_covariance" in read:  # what later steps go on from, exact: the other parts are as they are
+    if "measured_current_covariance" in read:  # later steps start from it, exactly: the other parts are as they are
         now, both = unpacked(read["measured_current_covariance"], 3), covariance[..., :3, 3:]
         covariance = covariance.copy()
         covariance[..., 3:, 3:] = now - (covariance[..., :3, :3] + (both + np.swapaxes(both, -1, -2)))
@@ -128,13 +135,13 @@ class ResultHead:
     Attributes
     ----------
     step, kind, label, load_n
-        Of the step; ``shape`` or ``displacement``.
+        The step's number, kind (``shape`` or ``displacement``), label and load in N.
     frame, created, software_version
         As written.
     reference_step
-        The step it was matched against; None for a shape.
+        The step that this one was matched against; None for a shape.
     settings, inputs_sha256
-        In today's form, see :mod:`server.formats.results.settings`.
+        As written.
     attributes
         All global attributes, as they are stored.
     """
@@ -176,8 +183,8 @@ def read_head(path: str | Path) -> ResultHead:
         created=str(recorded.get("created", "")),
         software_version=str(recorded.get("software_version", "")),
         reference_step=int(recorded["reference_step"]) if "reference_step" in recorded else None,
-        settings=current_settings(json.loads(recorded.get("settings", "{}"))),
-        inputs_sha256=current_inputs(json.loads(recorded.get("inputs_sha256", "{}"))),
+        settings=json.loads(recorded.get("settings", "{}")),
+        inputs_sha256=json.loads(recorded.get("inputs_sha256", "{}")),
         attributes=recorded,
     )
 
@@ -198,23 +205,21 @@ def _references_of(dataset: Any) -> References | None:
     for origin in PROPAGATED_FROM:
         values[origin] = np.full((*steps.shape, 2, 2), np.nan)
         for name, (i, j) in ENTRIES.items():
-            read = np.asarray(
-                variables[variable_name(f"propagated_{origin}_{name}_px2", variables)][...], dtype=np.float64
-            )
+            read = np.asarray(variables[f"propagated_{origin}_{name}_px2"][...], dtype=np.float64)
             values[origin][..., i, j] = values[origin][..., j, i] = read
     return References(int(dataset.reference_step), steps, values["noise"], values["pattern"])
 
 
 def causes_of(variables: Any, count: int) -> Causes:
     """Return the causes of the columns of an open result file's common factor, which has so many."""
-    if "cause" not in variables:  # files before they were told apart
-        return Causes.untold(count)
+    if "cause" not in variables:  # a field whose common part was not split by cause
+        return Causes.unseparated(count)
     names = [str(name) for name in variables["cause"][...]]
     told = str(getattr(variables["common_factor"], "causes", "calibration")).split()
-    columns = [cause for name in names for cause in CAUSES if cause == name]
+    columns = [cause for name in names for cause in ALL_CAUSES if cause == name]
     if len(columns) != count:
         raise FileFormatError(f"The causes {', '.join(names)} of a result file are not known to this program.")
-    return Causes(tuple(columns), tuple(cause for cause in CAUSES if cause in told))
+    return Causes(tuple(columns), tuple(cause for cause in ALL_CAUSES if cause in told))
 
 
 def _frozen_of(variables: Any) -> NDArray[np.float64] | None:

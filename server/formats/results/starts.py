@@ -1,7 +1,7 @@
-"""The matcher's own unknowns of a step, kept beside its result for as long as the analysis may have to go on from it.
+"""The matcher's own unknowns of a step, in a file next to its result for as long as the analysis may continue from it.
 
-A result file has the measured values; the start values of the next step are not all in it. An analysis that goes on in
-another process finds the same starts here, and comes to the same numbers, to the last bit.
+A result file has the measured values; the start values of the next step are not all in it. An analysis that continues
+in another process finds the same starts here, and computes the same numbers, to the last bit.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from core.field.points.result import Field
-from core.field.points.starts import Starts
-from server.formats.files import write_bytes
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.starts import Starts
+from stereorig.server.formats.files import write_bytes
 
 #: values that a result file holds in single precision
 _SINGLE = ("covariance", "zncc", "epipolar_px", "noise_grey")
@@ -35,8 +35,8 @@ def write_starts(path: Path, measured: Field, *, exact: bool) -> None:
     measured
         The field, with its starts.
     exact
-        Also keep in double precision what the result file has in single: of the reference, whose errors every step's
-        are computed from, and of a step that may become a later reference.
+        Also write in double precision the values that the result file has in single: for the reference, whose errors
+        every step's are computed from, and for a step that may become a later reference.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def write_starts(path: Path, measured: Field, *, exact: bool) -> None:
 
 
 def with_starts(measured: Field, path: Path) -> Field:
-    """Return a field with the starts beside its result file; where they cannot be read, they are searched again."""
+    """Return a field with the starts from the file next to its result; unreadable starts are searched again."""
     try:
         with np.load(path, allow_pickle=False) as arrays:
             exact = {name: arrays[name] for name in _SINGLE if name in arrays}

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from core.errors import FileFormatError
-from core.strain import STRAIN_STATUS_MEANINGS, StrainField, StrainOptions, StrainStatus
-from server.formats.results.layout import COLUMN_BY_COLUMN
-from server.formats.results.netcdf import opened
-from server.formats.results.settings import current_entries
+from stereorig.core.errors import FileFormatError
+from stereorig.core.strain import STRAIN_STATUS_MEANINGS, StrainField, StrainOptions, StrainStatus
+from stereorig.server.formats.results.layout import COLUMN_BY_COLUMN
+from stereorig.server.formats.results.netcdf import opened
+from stereorig.server.formats.results.variables import PATCH, SIGMA, STRAIN, STRAIN_NAMES, VARIABLES, described
 
 _TENSOR = {
     "green_lagrange": "Green-Lagrange strain",
@@ -24,44 +24,28 @@ _AXES = (
     "axis 1 is X_sys projected on the reference surface, axis 2 completes it with the normal that points away from "
     "camera 1; shear is the tensor's, half the engineering shear"
 )
-_COMPONENTS = (("exx", "along axis 1"), ("eyy", "along axis 2"), ("exy", "shear of the tensor"))
 
 
 def put_strain(dataset: Any, strain: StrainField, *, included: str, sparse: bool = False) -> None:
     """Add the strain's variables (``row``, ``col``) to an open result file; strain as a pure number.
 
-    ``included`` says what its uncertainties include.
+    ``included`` states the terms that its uncertainties include.
     """
     tensor = _TENSOR[strain.options.tensor]
-    principal, sigma, sigma_principal = strain.principal, strain.sigma, strain.sigma_principal
-    found: list[tuple[str, Any, str, str]] = []
-    for k, (name, component) in enumerate(_COMPONENTS):
-        found.append((name, strain.strain[..., k], "1", f"{tensor}, {component}"))
-        found.append((f"sigma_{name}", sigma[..., k], "1", f"standard deviation of {name}"))
-    for k, which in enumerate(("larger", "smaller")):
-        found.append((f"e{k + 1}", principal[..., k], "1", f"{tensor}, {which} principal value"))
-        found.append((f"sigma_e{k + 1}", sigma_principal[..., k], "1", f"standard deviation of e{k + 1}, linearised"))
-    found += [
-        ("strain_angle_rad", strain.angle_rad, "rad", "direction of e1 from axis 1 towards axis 2"),
-        ("max_shear", strain.max_shear, "1", "largest in-plane shear of the tensor, (e1 - e2) / 2"),
-        ("von_mises", strain.von_mises, "1", "equivalent strain, sqrt(e1^2 - e1 e2 + e2^2)"),
-    ]
-    for name, values, units, long_name in found:
-        about = {"gauge_px": strain.gauge_px, "gauge_mm": strain.gauge_mm}
-        variable = _variable(dataset, name, values, units, long_name, sparse=sparse)
-        variable.setncatts(about | {"window_points": np.int32(strain.options.window)})
-        if name.startswith("sigma_"):
-            variable.includes = included
+    about = {"gauge_px": strain.gauge_px, "gauge_mm": strain.gauge_mm, "window_points": np.int32(strain.options.window)}
+    for one in STRAIN:
+        for name, read in ((one.name, one.values), (SIGMA + one.name, one.sigma)):
+            if read is not None:
+                long_name = described(name).long_name.format(tensor=tensor)
+                variable = _variable(dataset, name, read(strain), one.units, long_name, sparse=sparse)
+                variable.setncatts(about)
+                if name.startswith(SIGMA):
+                    variable.includes = included
     if strain.patch is not None:
-        for k, (name, component) in enumerate(_COMPONENTS):
-            _variable(
-                dataset,
-                f"{name}_patch",
-                strain.patch[..., k],
-                "1",
-                f"{tensor} of the patch itself, {component}",
-                sparse=sparse,
-            ).setncatts({"gauge_px": float(strain.subset_px)})
+        for k, one in enumerate(STRAIN[: len(STRAIN_NAMES)]):
+            long_name = one.long_name.format(tensor=f"{tensor} of the patch itself")
+            variable = _variable(dataset, one.name + PATCH, strain.patch[..., k], one.units, long_name, sparse=sparse)
+            variable.setncatts({"gauge_px": float(strain.subset_px)})
     total = strain.total_covariance
     _variable(dataset, "strain_covariance_exx_eyy", total[..., 0, 1], "1", "covariance of exx and eyy", sparse=sparse)
     for k, name in enumerate(("exx", "eyy")):
@@ -74,7 +58,7 @@ def put_strain(dataset: Any, strain: StrainField, *, included: str, sparse: bool
             sparse=sparse,
         )
     if strain.common is not None:
-        dataset.createDimension("strain_component", len(_COMPONENTS))
+        dataset.createDimension("strain_component", len(STRAIN_NAMES))
         common = dataset.createVariable(
             "common_factor_strain",
             "f4",
@@ -83,7 +67,7 @@ def put_strain(dataset: Any, strain: StrainField, *, included: str, sparse: bool
             chunksizes=(*strain.common.shape[:2], 1, 1),
             **COLUMN_BY_COLUMN,
         )
-        names = ", ".join(name for name, _ in _COMPONENTS)
+        names = ", ".join(STRAIN_NAMES)
         common.setncatts({"units": "1", "long_name": f"F: what all points share of the uncertainty of {names}"})
         dataset.put(common, strain.common.astype(np.float32, copy=False))
     status = dataset.createVariable(
@@ -92,7 +76,7 @@ def put_strain(dataset: Any, strain: StrainField, *, included: str, sparse: bool
     status.setncatts(
         {
             "units": "1",
-            "long_name": "what can be said about the strain at the point",
+            "long_name": VARIABLES["strain_status"].long_name,
             "flag_values": np.array([s.value for s in StrainStatus], dtype=np.int8),
             "flag_meanings": " ".join(s.name.lower() for s in StrainStatus),
             "comment": "; ".join(f"{s.value} = {s.name.lower()}: {STRAIN_STATUS_MEANINGS[s]}" for s in StrainStatus),
@@ -136,12 +120,12 @@ def read_strain(path: str | Path) -> StrainField | None:
 def _strain_of(dataset: Any) -> StrainField | None:
     if "strain" not in dataset.ncattrs():
         return None
-    document = current_entries(json.loads(dataset.strain))
+    document = json.loads(dataset.strain)
     variables = dataset.variables
 
     def stacked(suffix: str = "", prefix: str = "") -> Any:
         return np.stack(
-            [np.asarray(variables[f"{prefix}{n}{suffix}"][...], dtype=np.float64) for n, _ in _COMPONENTS], axis=-1
+            [np.asarray(variables[f"{prefix}{n}{suffix}"][...], dtype=np.float64) for n in STRAIN_NAMES], axis=-1
         )
 
     strain, sigma = stacked(), stacked(prefix="sigma_")
@@ -154,10 +138,8 @@ def _strain_of(dataset: Any) -> StrainField | None:
     ):
         covariance[..., i, j] = covariance[..., j, i] = variables[name][...]
     common = None
-    # older files have it under another name
-    found = next((name for name in ("common_factor_strain", "strain_common_factor") if name in variables), None)
-    if found is not None:
-        common = np.asarray(variables[found][...], dtype=np.float64)
+    if "common_factor_strain" in variables:
+        common = np.asarray(variables["common_factor_strain"][...], dtype=np.float64)
         covariance = covariance - common @ np.swapaxes(common, -1, -2)
     known = StrainOptions.__dataclass_fields__
     return StrainField(

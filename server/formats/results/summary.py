@@ -11,19 +11,24 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from core.field.checks.epipolar_offset import EpipolarCheck, check_epipolar
-from core.field.points.patch import PatchChoice
-from core.field.points.result import Field
-from core.field.points.smoothing_record import Smoothing
-from core.robust import median
-from core.status import PointStatus
-from server.formats.results.budgets import field_budgets, spread_points
-from server.formats.results.camera_motion import CameraMotion
-from server.formats.results.layout import COMPARISONS, FORMAT_VERSION
-from server.formats.results.uncertainty import Included
+from stereorig.core.common.factor import Causes
+from stereorig.core.field.checks.epipolar_offset import EpipolarCheck, check_epipolar
+from stereorig.core.field.points.patch import PatchChoice
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.smoothing_record import Smoothing
+from stereorig.core.robust import median
+from stereorig.core.status import PointStatus
+from stereorig.server.formats.results.budgets import field_budgets, spread_points
+from stereorig.server.formats.results.camera_motion import MotionCheck
+from stereorig.server.formats.results.layout import COMPARISONS, FORMAT_VERSION
+from stereorig.server.formats.results.uncertainty import Included
 
 if TYPE_CHECKING:
-    from core.field.seeding.specimen import Specimen
+    from stereorig.core.field.seeding.specimen import Specimen
+
+
+ROWS_APART = "rows_apart"
+"""Attribute of a result file whose images have rows of two moments: the finding in words."""
 
 
 def plane_residuals_mm(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -55,46 +60,46 @@ class StepSummary:
     kind
         ``shape`` or ``displacement``.
     points, valid, valid_fraction
-        Points in the region, those of them with numbers, and their share.
+        Points in the region, points with numbers, and the share of the latter.
     status
         Counts by the state's name.
     epipolar_offset_mean_px, epipolar_offset_rms_px, epipolar_offset_sd_px
-        Of the full offset across the epipolar line in camera 2, ``epipolar_px``: its mean (what the calibration is
-        off), its root mean square, its standard deviation about the mean.
+        Full offset across the epipolar line in camera 2, ``epipolar_px``: its mean (the calibration's error
+        across it), its root mean square, its standard deviation about the mean.
     epipolar_residual_rms_px
         The error left in each image when both cameras share the misfit equally: half of ``epipolar_offset_rms_px``.
     epipolar_check
         Check that the cameras are still as calibrated.
     camera_motion
-        Whether a camera moved since the calibration, the reference or the step before (`camera_moved`, `text`), with
-        the offset's size and pattern, its significance and its consequence, against each.
+        Result of the check that neither camera moved since the calibration, the reference or the step before
+        (`camera_moved`, `text`), with the offset's size, pattern, significance and consequence, against each.
     plane_residual_rms_mm
-        Of the reference positions.
+        Root mean square of the reference positions' distances from their plane.
     zncc_median, sigma_median_mm
-        By comparison, and by coordinate (``x_mm`` ...).
+        ZNCC by comparison, and standard uncertainty by coordinate (``x_mm`` ...).
     sigma_calibration_median_mm
-        The calibration's part of it; None where it is not known, and then not included.
+        The calibration's part of it; None if it is not known, and then not included.
     budget_median_mm
         By coordinate, the medians of the parts of the standard uncertainty (of large fields over 2,000 points):
         `matching`, `reference` (noise of the reference pair, common to all steps), `calibration`, `stage`, `target`. A
-        part that is not told apart is left out, and in the one before it.
+        part that cannot be separated is left out, and contained in the part before it.
     uncertainty_includes
-        In words; ``calibration not included`` where that is so.
+        The included terms in words; ``calibration not included`` if so.
     smoothing
         Smoothing of the displacement, and its spatial resolution.
     patch
         The patch of the measurement, with the reason and the numbers of the choice.
     failed_seeds_px
-        (x, y) of given seeds that did not match, though the step was measured from others; left out where there are
-        none.
+        (x, y) of given seeds that did not match, though the step was measured from others; left out if all matched.
     systematic
-        What no standard uncertainty holds: `interpolation` (of sharp texture), `patch_order`, `strain_window`, each
-        with `text` (how it was estimated, or why it cannot be told) and `figures` by quantity and unit: `rms` and
-        `largest` over the points (null where noise hides them), and what the rms is `below`; null where it was not
+        Errors outside the standard uncertainties: `interpolation` (of sharp texture), `patch_order`, `strain_window`,
+        each with `text` (how it was estimated, or why it cannot be estimated) and `figures` by quantity and unit: `rms`
+        and `largest` over the points (null if noise hides them), and the bound that the rms is `below`; null if it was
+        not estimated.
         estimated.
     reference_step, points_by_reference, displacement_mm
-        Of displacements alone: what the step was matched against, valid points by what they were matched against, and
-        the components' spans.
+        For displacements only: the step that this one was matched against, valid points by the step that each was
+        matched against, and the components' spans.
     """
 
     kind: Literal["shape", "displacement"]
@@ -115,7 +120,7 @@ class StepSummary:
     uncertainty_includes: str
     smoothing: Smoothing | None
     patch: PatchChoice | None
-    camera_motion: CameraMotion | None = None
+    camera_motion: MotionCheck | None = None
     systematic: Mapping[str, object] | None = None
     reference_step: int | None = None
     points_by_reference: dict[str, int] | None = None
@@ -139,8 +144,9 @@ def summarise(
     rbe_px: float | None = None,
     reference: int = 0,
     imported: bool = False,
-    camera_motion: CameraMotion | None = None,
+    camera_motion: MotionCheck | None = None,
     systematic: Mapping[str, object] | None = None,
+    rows_apart: str = "",
 ) -> StepSummary:
     """Summarise one field.
 
@@ -149,16 +155,19 @@ def summarise(
     result
         The field.
     rbe_px
-        The calibration's own reprojection error, where it is known.
+        The calibration's own reprojection error, if it is known.
     reference
         Number of the sequence's reference.
     imported
         True for another program's calibration, whose own error is not known.
     camera_motion
-        What was found about the cameras when the step was measured.
+        The finding about the cameras when the step was measured.
     systematic
-        The systematic terms, as :meth:`core.systematic.terms.Systematic.document` gives them.
+        The systematic terms, as :meth:`stereorig.core.systematic.terms.Systematic.document` gives them.
+    rows_apart
+        The finding about images whose rows are of two moments; empty for none.
     """
+    check = check_epipolar(result, rbe_px, imported=imported)
     status = result.status
     valid = result.valid
     points = int((status != PointStatus.MASKED).sum())
@@ -167,7 +176,11 @@ def summarise(
     names = ("x_mm", "y_mm", "z_mm", "u_mm", "v_mm", "w_mm")[: result.covariance.shape[-1]]
     sigma = result.sigma_mm[valid]
     zncc = result.zncc[valid]
-    of_calibration = None if result.common_variance is None else np.sqrt(result.common_variance[valid])
+    of_calibration = None
+    if result.common is not None:
+        causes = Causes.unseparated(result.common.shape[-1]) if result.causes is None else result.causes
+        if "calibration" in causes.separate:
+            of_calibration = causes.of_calibration(result.common[valid])
     summary = StepSummary(
         kind="displacement" if result.has_motion else "shape",
         points=points,
@@ -178,7 +191,7 @@ def summarise(
         epipolar_offset_rms_px=_rms(epipolar),
         epipolar_offset_sd_px=float(epipolar.std()) if n else None,
         epipolar_residual_rms_px=_rms(epipolar / 2),
-        epipolar_check=check_epipolar(result, rbe_px, imported=imported),
+        epipolar_check=None if check is None else check.with_finding(rows_apart),
         plane_residual_rms_mm=_rms(plane_residuals_mm(result.xyz_mm[valid])) if n >= 4 else None,
         zncc_median={name: median(zncc[:, k]) if n else None for k, name in enumerate(COMPARISONS[: zncc.shape[-1]])},
         sigma_median_mm={name: median(sigma[:, k]) if n else None for k, name in enumerate(names)},
@@ -218,9 +231,9 @@ class SequenceSummary:
     state
         ``succeeded``, or another final state of the analysis' job.
     calibration
-        ``sha256``; ``file`` and ``source`` where it was named by its file.
+        ``sha256``; ``file`` and ``source`` if a file was named.
     settings
-        As :class:`core.settings.StoredSettings`.
+        As :class:`stereorig.core.settings.StoredSettings`.
     seconds
         Duration of the measurement.
     steps
@@ -228,8 +241,8 @@ class SequenceSummary:
     steps_failed
         The problem of each step that could not be measured, by its number.
     region_found
-        How the specimen was found where no region was given: `text`, `outlines_px` of its parts and `holes_px` in
-        them, `share` of the image, `matches` on it; the mask is the region's.
+        The specimen's outline that was found because no region was given: `text`, `outlines_px` of its parts and
+        `holes_px` in them, `share` of the image, `matches` on it; the mask is the region's.
     """
 
     state: str

@@ -1,4 +1,4 @@
-"""What is stated beside every uncertainty: its coverage factor, what it includes, and what it does not."""
+"""The statement with every uncertainty: its coverage factor, the terms that it includes, and the missing ones."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from core.common.budget import CALIBRATION_UNKNOWN
-from core.errors import InputError
-from core.field.points.result import Field
-from core.settings import Coverage, CoverageFields
-from server.formats.results.netcdf import opened
+from stereorig.core.common.budget import CALIBRATION_UNKNOWN
+from stereorig.core.errors import InputError
+from stereorig.core.field.points.result import Field
+from stereorig.core.settings import Coverage, CoverageFields
+from stereorig.server.formats.results.netcdf import opened
 
 NOT_INCLUDED = CALIBRATION_UNKNOWN
-#: what no file's uncertainties hold
+#: terms that no file's uncertainties include
 SYSTEMATIC = (
     "systematic terms (interpolation, order of the patch, strain window)",
     "errors of the calibration that were not declared",
@@ -27,15 +27,15 @@ DISTRIBUTION = "normal, infinite degrees of freedom"
 
 @dataclass(frozen=True)
 class Included:
-    """What the uncertainties of a result include.
+    """The terms that a result's uncertainties include.
 
     Attributes
     ----------
     calibration
-        False where the calibration's covariance is not known, as of another program's.
+        False if the calibration's covariance is not known, as with another program's.
     causes
-        By name (:data:`core.names.BUDGET`), in their order; without ``reference`` it is in ``matching``, without
-        ``stage`` and ``target`` these are in ``calibration``.
+        By name (:data:`stereorig.core.names.BUDGET`), in their order; without ``reference`` it is in ``matching``,
+        without ``stage`` and ``target`` these are in ``calibration``.
     """
 
     calibration: bool
@@ -51,27 +51,28 @@ class Included:
         if "common_factor" not in variables:
             return Included(False, causes)
         told = str(getattr(variables["common_factor"], "causes", "calibration")).split()
-        return Included(True, (*causes, *told))
+        return Included("calibration" in told, (*causes, *told))
 
     @staticmethod
     def of_field(field: Field) -> Included:
-        """Return what the uncertainties of a field in memory include."""
+        """Return the terms that the uncertainties of a field in memory include."""
         causes: tuple[str, ...] = ("matching",)
-        if field.tells_reference:
+        if field.knows_reference:
             causes += ("reference",)
         if field.common is None:
             return Included(False, causes)
-        return Included(True, (*causes, *(("calibration",) if field.causes is None else field.causes.told)))
+        told = ("calibration",) if field.causes is None else field.causes.separate
+        return Included("calibration" in told, (*causes, *told))
 
     @staticmethod
     def in_all(each: Sequence[Included]) -> Included:
-        """Return what all of some results include."""
+        """Return the terms that all of some results include."""
         causes = [c for c in each[0].causes if all(c in one.causes for one in each)] if each else []
         return Included(bool(each) and all(one.calibration for one in each), tuple(causes))
 
     @property
     def lacking(self) -> str:
-        """What stands beside every number: empty, or that the calibration is not included."""
+        """The note with every number: empty, or that the calibration is not included."""
         return "" if self.calibration else NOT_INCLUDED
 
     @property
@@ -81,7 +82,7 @@ class Included:
 
 
 def read_included(path: Path) -> Included:
-    """Return what a result file's uncertainties include.
+    """Return the terms that a result file's uncertainties include.
 
     Raises
     ------
@@ -94,12 +95,12 @@ def read_included(path: Path) -> Included:
 
 @dataclass(frozen=True)
 class Statement:
-    """The interval that is stated beside values, and what it covers.
+    """The interval stated with values, and the terms that it covers.
 
     Parameters
     ----------
     included
-        What the uncertainties include.
+        The terms that the uncertainties include.
     asked
         Coverage factor or share of the interval.
     """
@@ -129,7 +130,7 @@ class Statement:
 
     @property
     def missing(self) -> list[str]:
-        """What is not included."""
+        """The terms that are not included."""
         return [*([] if self.included.calibration else ["calibration"]), *SYSTEMATIC]
 
     def document(self) -> dict[str, object]:

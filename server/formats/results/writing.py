@@ -1,7 +1,8 @@
 """Result files: one field, one NetCDF-4 file (classic model: xarray, MATLAB and ncdump all open it).
 
 Dimensions ``row``, ``col``; points that failed hold NaN and a ``status`` with the reason. Files are written under
-temporary names, so that a half-written one cannot be met. :mod:`server.formats.results.reading` reads them back.
+temporary names, so that a half-written one cannot be met. :mod:`stereorig.server.formats.results.reading` reads them
+back.
 """
 
 from __future__ import annotations
@@ -16,26 +17,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.common.factor import Causes
-from core.field.points.dense_record import METHOD, NEIGHBOURS
-from core.field.points.result import Field
-from core.status import STATUS_MEANINGS, PointStatus
-from core.strain import StrainField
-from server.formats.environment import current_environment
-from server.formats.results.layout import (
+from stereorig.core.common.factor import Causes
+from stereorig.core.field.points.dense_record import METHOD, NEIGHBOURS
+from stereorig.core.field.points.result import Field
+from stereorig.core.status import STATUS_MEANINGS, PointStatus
+from stereorig.core.strain import StrainField
+from stereorig.server.formats.environment import current_environment
+from stereorig.server.formats.results.layout import (
     COMPARISONS,
     COVARIANCE_NAMES,
-    CURVATURE,
     FORMAT_VERSION,
     FROZEN,
-    MOTION,
-    SHAPE,
+    PATCH_DEGREE,
     packed,
 )
-from server.formats.results.netcdf import written_dataset
-from server.formats.results.parts import put, put_causes, put_cuts, put_measured, put_references, put_rejected
-from server.formats.results.strain import put_strain
-from server.formats.results.uncertainty import Included
+from stereorig.server.formats.results.netcdf import written_dataset
+from stereorig.server.formats.results.parts import put, put_causes, put_cuts, put_measured, put_references, put_rejected
+from stereorig.server.formats.results.strain import put_strain
+from stereorig.server.formats.results.uncertainty import Included
+from stereorig.server.formats.results.variables import CURVATURE, MOTION, SHAPE, VARIABLES
 
 # measured numbers end in random bits: deflating them takes three quarters of the writing time and saves a quarter of
 # the file. Repeating values are always deflated; everything is where at least this share of the points has no numbers
@@ -57,7 +57,7 @@ class Provenance:
     inputs
         Name of each input file and the SHA-256 of its bytes.
     software_version
-        Of this program.
+        Version of this program.
     frame
         ``target`` or ``camera1``, which defines the system frame; or its description.
     step
@@ -78,7 +78,7 @@ class Provenance:
 
 
 def _put_status(dataset: Any, status: NDArray[np.int8]) -> None:
-    put(dataset, "status", status, ("row", "col"), units="1", long_name="what can be said about the point", dtype="i1")
+    put(dataset, "status", status, ("row", "col"), units="1", long_name=VARIABLES["status"].long_name, dtype="i1")
     dataset.variables["status"].setncatts(
         {
             "flag_values": np.array([s.value for s in PointStatus], dtype=np.int8),
@@ -97,10 +97,9 @@ def fill(dataset: Any, result: Field, provenance: Provenance, strain: StrainFiel
         dataset.createDimension(name, size)
     curved = CURVATURE if result.curvature_per_mm is not None else ()
     for v in SHAPE + (MOTION if result.has_motion else ()) + curved:
-        values = getattr(result, v.attribute)
-        if v.component is not None:
-            values = values[..., v.component]
-        smooth = result.smoothing is not None and v.attribute == "uvw_mm"
+        values = None if v.values is None else v.values(result)
+        assert values is not None, v.name
+        smooth = result.smoothing is not None and v.group == "Displacement"
         long_name = f"{v.long_name}, smoothed" if smooth else v.long_name
         put(dataset, v.name, values, ("row", "col"), units=v.units, long_name=long_name, dtype=v.dtype, sparse=sparse)
     _put_status(dataset, result.status)
@@ -110,7 +109,7 @@ def fill(dataset: Any, result: Field, provenance: Provenance, strain: StrainFiel
         result.iterations,
         ("row", "col"),
         units="1",
-        long_name="iterations of the fit",
+        long_name=VARIABLES["iterations"].long_name,
         dtype="i4",
     )
     put(
@@ -119,11 +118,13 @@ def fill(dataset: Any, result: Field, provenance: Provenance, strain: StrainFiel
         result.zncc,
         ("row", "col", "comparison"),
         units="1",
-        long_name="zero-mean normalised correlation of each comparison",
+        long_name=VARIABLES["zncc"].long_name,
         dtype="f4",
     )
     dataset.variables["zncc"].comparisons = " ".join(COMPARISONS[: result.zncc.shape[-1]])
     _put_covariance(dataset, result, sparse=sparse)
+    if result.patch_degree is not None:
+        put(dataset, "patch_degree", result.patch_degree, ("row", "col"), units="1", long_name=PATCH_DEGREE, dtype="i1")
     if result.rejected is not None:
         put_rejected(dataset, result.rejected)
     if result.cuts:
@@ -181,7 +182,7 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
         )
     if result.common is not None:
         dataset.createDimension("component", n)
-        causes = Causes.untold(result.common.shape[-1]) if result.causes is None else result.causes
+        causes = Causes.unseparated(result.common.shape[-1]) if result.causes is None else result.causes
         dataset.createDimension("cause", len(causes.columns))
         put_causes(dataset, causes)
         put(
@@ -197,7 +198,7 @@ def _put_covariance(dataset: Any, result: Field, *, sparse: bool) -> None:
         dataset.variables["common_factor"].setncatts(
             {
                 "comment": "points a and b have the covariance F_a F_b', a point with itself covariance = own + F F'",
-                "causes": " ".join(causes.told),
+                "causes": " ".join(causes.separate),
             }
         )
     if result.frozen is not None:
@@ -266,17 +267,18 @@ def write_field(
     Parameters
     ----------
     path
-        Of the file; its folder must exist.
+        Path of the file; its folder must exist.
     result
         A shape (no ``uvw_mm``) or a displacement field.
     provenance
         Origin of the result.
     strain
-        Of the same points, if it was computed; :func:`server.formats.results.strain.read_strain` reads it back.
+        Strain of the same points, if computed; :func:`stereorig.server.formats.results.strain.read_strain` reads it
+        back.
     measured
-        The field before its displacement was smoothed and points were marked; later steps go on from it.
+        The field before its displacement was smoothed and points were marked; later steps start from it.
     checksum
-        Put the file's SHA-256 beside it.
+        Write the file's SHA-256 next to it, in a file ``.sha256``.
 
     Raises
     ------

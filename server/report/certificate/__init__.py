@@ -1,1 +1,1 @@
-"""A verification certificate: measured results beside what is known, judged, and as a page."""
+"""A verification certificate: measured results compared with known values, judged, and as a page."""

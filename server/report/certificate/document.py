@@ -1,4 +1,4 @@
-"""A certificate: what it is of, what was found, until when it holds; as a document and as a page."""
+"""A certificate: its object, its findings, its validity; as a document and as a page."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from core.certify.certify import Verdict, certify, text_of
-from core.certify.comparison import Group, Judged
-from core.names import CAMERAS
-from server.base.json_values import without_nan
-from server.formats.files import sha256_of
-from server.formats.version import software_version
-from server.report.certificate.evidence import Gathered, gather
-from server.report.page import render
-from server.report.source import Source
-from server.results.certificate.findings import finding_lines
-from server.results.certificate.plan import CertificatePlan
+from stereorig.core.certify.certify import CertificateVerdict, certify, text_of
+from stereorig.core.certify.comparison import Group, Judged
+from stereorig.core.names import CAMERAS
+from stereorig.server.base.json_values import without_nan
+from stereorig.server.formats.files import sha256_of
+from stereorig.server.formats.version import software_version
+from stereorig.server.report.certificate.evidence import Gathered, gather
+from stereorig.server.report.page import render
+from stereorig.server.report.source import Source
+from stereorig.server.results.certificate.findings import finding_lines
+from stereorig.server.results.certificate.plan import CertificatePlan
 
 FORMAT = 1
 _HEADS: tuple[tuple[Group, str], ...] = (
@@ -30,7 +30,7 @@ _HEADS: tuple[tuple[Group, str], ...] = (
 
 
 @dataclass(frozen=True)
-class Made:
+class Certificate:
     """A certificate.
 
     Attributes
@@ -44,7 +44,7 @@ class Made:
     outcome
         ``pass``, ``conditional`` or ``fail``.
     lines
-        The verdict, its reasons and what is suspect, as text.
+        The verdict, its reasons and the suspected causes, as text.
     """
 
     document: dict[str, object]
@@ -61,15 +61,15 @@ def make_certificate(
     certificate_id: str = "",
     folder: Path | None = None,
     on_step: Callable[[int, int], None] = lambda _done, _total: None,
-) -> Made:
-    """Read what a plan names, judge it, and write the certificate.
+) -> Certificate:
+    """Read the steps that a plan names, judge them, and write the certificate.
 
     Parameters
     ----------
     source, plan
-        As of :func:`server.report.certificate.evidence.gather`, with its errors.
+        As in :func:`stereorig.server.report.certificate.evidence.gather`, with its errors.
     certificate_id
-        Id in a data folder; empty of files.
+        Id in a data folder; empty for a certificate from files.
     folder, on_step
         As there.
     """
@@ -99,10 +99,10 @@ def make_certificate(
     }
     document = without_nan(document)
     page, policy = _page(document, verdict, plan, gathered)
-    return Made(document, page, policy, verdict.outcome, lines_of(verdict))
+    return Certificate(document, page, policy, verdict.outcome, lines_of(verdict))
 
 
-def lines_of(verdict: Verdict) -> list[str]:
+def lines_of(verdict: CertificateVerdict) -> list[str]:
     """Return a verdict as text, the outcome last."""
     lines = finding_lines(verdict.reasons, verdict.suspects)
     largest = verdict.largest("length")
@@ -142,7 +142,7 @@ def _made_of(source: Source, gathered: Gathered) -> dict[str, object]:
 
 
 def _page(
-    document: dict[str, object], verdict: Verdict, plan: CertificatePlan, gathered: Gathered
+    document: dict[str, object], verdict: CertificateVerdict, plan: CertificatePlan, gathered: Gathered
 ) -> tuple[bytes, str]:
     tables = [(title, verdict.of_group(group)) for group, title in _HEADS]
     head = f"{document['title']}  \u00b7  certificate {document['id']}  \u00b7  {document['created_utc']}"

@@ -1,4 +1,4 @@
-"""The evidence of a certificate: every step that the plan names, read, beside what is known of it."""
+"""The evidence of a certificate: every step that the plan names, with its measured and its known values."""
 
 from __future__ import annotations
 
@@ -10,38 +10,38 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.checks.target_distance import check_target_images
-from core.certify.evidence import (
+from stereorig.core.calibration.checks.target_distance import check_target_images
+from stereorig.core.certify.evidence import (
     CameraOffset,
+    CheckedLength,
     Evidence,
     ExtensometerPoint,
     ExtensometerRun,
-    KnownLength,
     MovedStep,
     StaticStep,
 )
-from core.certify.measured import measured_of
-from core.errors import FileFormatError, InputError
-from core.names import CAMERAS
-from server.formats.calibrations.target_toml import target_of
-from server.formats.channel_units import unit_of
-from server.formats.files import known_sha256
-from server.formats.images import read_image
-from server.report.certificate.readings import Readings, length_between, read_step
-from server.report.floor import static_steps
-from server.report.source import Source
-from server.results.calibration_checks import distance_of_target, uncertain_pair
-from server.results.certificate import plan as asked
-from server.results.channels import recorded_with
-from server.store.durable import known_json
+from stereorig.core.certify.measured import measured_of
+from stereorig.core.errors import FileFormatError, InputError
+from stereorig.core.names import CAMERAS
+from stereorig.server.formats.calibrations.target_toml import target_of
+from stereorig.server.formats.channel_units import unit_of
+from stereorig.server.formats.images import read_image
+from stereorig.server.formats.manifest import known_sha256
+from stereorig.server.report.certificate.readings import Readings, length_between, read_step
+from stereorig.server.report.floor import static_steps
+from stereorig.server.report.source import Source
+from stereorig.server.results.calibration_checks import distance_of_target, uncertain_pair
+from stereorig.server.results.certificate import plan as asked
+from stereorig.server.results.channels import recorded_with
+from stereorig.server.store.durable import known_json
 
 _MM = {"mm": 1.0, "um": 1e-3}
-_REMEDY = "Restore the file from a backup, or leave what was read off it out of the plan."
+_REMEDY = "Restore the file from a backup, or leave the values read from it out of the plan."
 
 
 @dataclass(eq=False)
 class Gathered:
-    """What was read.
+    """The evidence, and the files that it was read from.
 
     Attributes
     ----------
@@ -50,9 +50,9 @@ class Gathered:
     static
         The static steps, as named or by their labels.
     images_sha256
-        Checksums of pictures that were read beside the results, by name.
+        Checksums of pictures that were read in addition to the results, by name.
     pictured
-        Steps that were read beside the results, with their pictures' checksums by camera.
+        Steps whose pictures were read in addition to the results, with the checksums by camera.
     """
 
     evidence: Evidence
@@ -75,9 +75,9 @@ def gather(
     source
         The measurement.
     plan
-        What is known of its steps.
+        The known values of its steps.
     folder
-        That the plan's images lie in; None: it may name none.
+        Folder of the plan's images; None: it may name none.
     on_step
         Called with the steps read and their number.
 
@@ -91,7 +91,7 @@ def gather(
     """
     if source.stale:
         raise InputError(
-            f"The results are not of what is stored now: {'; '.join(source.stale)}.",
+            f"The results do not belong to the stored data: {'; '.join(source.stale)}.",
             code="certificate_inputs_changed",
             remedy="Restore the images from a backup, or measure again; nothing was certified, nothing is lost.",
         )
@@ -104,7 +104,7 @@ def gather(
     wanted = _wanted(source, plan, static)
     at_rest: list[StaticStep] = []
     moved: list[MovedStep] = []
-    lengths: list[KnownLength] = []
+    lengths: list[CheckedLength] = []
     elongations: dict[int, tuple[float, float]] = {}
     gauge_length: float | None = None
     translations = {one.n: one for one in plan.translations}
@@ -203,7 +203,7 @@ def _moved(
     )
 
 
-def _between(step: Readings, one: asked.KnownLength) -> KnownLength:
+def _between(step: Readings, one: asked.KnownLength) -> CheckedLength:
     assert one.a_px is not None
     assert one.b_px is not None
     assert one.length_mm is not None
@@ -212,7 +212,7 @@ def _between(step: Readings, one: asked.KnownLength) -> KnownLength:
     return length_between(one.name, reading, known_mm=one.length_mm, sigma_mm=one.u_mm, artefact=one.artefact)
 
 
-def _of_target(source: Source, one: asked.KnownLength, folder: Path | None, gathered: Gathered) -> KnownLength:
+def _of_target(source: Source, one: asked.KnownLength, folder: Path | None, gathered: Gathered) -> CheckedLength:
     """Measure a target of known size in a pair of pictures; its own uncertainty counts as new at each place."""
     assert one.target is not None
     if source.calibration is None:
@@ -228,9 +228,9 @@ def _of_target(source: Source, one: asked.KnownLength, folder: Path | None, gath
     value, own = np.array([found.measured_mm]), np.array([[bare.sigma_mm**2]])
     common = None
     if uncertain_pair(source.calibration).covariance is not None:
-        # what the calibration adds is one error of all places
+        # the calibration adds one error that all places share
         common = np.array([[float(np.sqrt(max(found.sigma_mm**2 - bare.sigma_mm**2, 0.0)))]])
-    return KnownLength(one.name, measured_of(value, own, None, common), found.known_mm, 0.0, one.artefact or one.name)
+    return CheckedLength(one.name, measured_of(value, own, None, common), found.known_mm, 0.0, one.artefact or one.name)
 
 
 def _pictures(
@@ -288,7 +288,9 @@ def _extensometer(
         return None
     true = {one.n: one.elongation_mm for one in reference.readings}
     if reference.channel is not None:
-        factor = _MM.get(unit_of(reference.channel))
+        recorded = {n: recorded_with(source.files[n].parent, n, source.reference) for n in elongations}
+        units = {one.units.get(reference.channel, unit_of(reference.channel)) for one in recorded.values()}
+        factor = _MM.get(units.pop()) if len(units) == 1 else None
         if factor is None:
             raise InputError(
                 f"The channel {reference.channel!r} has no unit of length in its name.",
@@ -296,7 +298,7 @@ def _extensometer(
                 remedy="Name a channel that ends in _mm or _um.",
             )
         for n in elongations:
-            value = recorded_with(source.files[n].parent, n, source.reference).channels.get(reference.channel)
+            value = recorded[n].channels.get(reference.channel)
             if value is not None and n not in static:
                 true[n] = factor * value
     if not true:

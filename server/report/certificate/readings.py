@@ -1,4 +1,4 @@
-"""What a certificate reads off one result file: rigid motion, scatter and strain."""
+"""Readings of a certificate from one result file: rigid motion, scatter and strain."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from pathlib import Path
 
 import numpy as np
 
-from core.arrays import Float
-from core.certify.evidence import KnownLength, Scatter
-from core.certify.measured import Measured, mean_strain_of, measured_of, motion_of
-from core.certify.noise_floor import independent_values
-from core.errors import InputError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels
-from core.gauge.extensometer import Extensometer, extensometer
-from core.gauge.reading import Reading
-from core.gauge.rigid import RigidMotion, rigid_motion
-from core.strain.mean import mean_strain_variance
-from core.strain.result import StrainField
-from server.formats.results.reading import read_field, read_head
-from server.formats.results.strain import read_strain
+from stereorig.core.arrays import Float
+from stereorig.core.certify.evidence import CheckedLength, Scatter
+from stereorig.core.certify.measured import Measured, mean_strain_of, measured_of, motion_of
+from stereorig.core.certify.noise_floor import independent_values
+from stereorig.core.errors import InputError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.gauge.extensometer import Extensometer, extensometer
+from stereorig.core.gauge.reading import Reading
+from stereorig.core.gauge.rigid import RigidMotion, rigid_motion
+from stereorig.core.strain.mean import mean_strain_variance
+from stereorig.core.strain.result import StrainField
+from stereorig.server.formats.results.reading import read_field, read_head
+from stereorig.server.formats.results.strain import read_strain
 
 _LENGTHS = ("u_mm", "v_mm", "w_mm")
 _STRAINS = ("exx", "eyy", "exy")
@@ -35,7 +35,7 @@ class Readings:
     n, path
         The step and its result file.
     field, strain, shared
-        What is in the file.
+        Content of the file.
     motion
         Its rigid motion; None of the reference's shape.
     """
@@ -155,6 +155,6 @@ def measured_reading(reading: Reading) -> Measured:
     return measured_of(np.array([reading.value]), np.array([[own]]), np.array([[reference]]), common, reading.causes)
 
 
-def length_between(name: str, found: Reading, *, known_mm: float, sigma_mm: float, artefact: str) -> KnownLength:
-    """Return a known length beside what a virtual extensometer reads."""
-    return KnownLength(name, measured_reading(found), known_mm, sigma_mm, artefact)
+def length_between(name: str, found: Reading, *, known_mm: float, sigma_mm: float, artefact: str) -> CheckedLength:
+    """Return a known length with the reading of a virtual extensometer."""
+    return CheckedLength(name, measured_reading(found), known_mm, sigma_mm, artefact)

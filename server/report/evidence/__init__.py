@@ -1,1 +1,1 @@
-"""Parts of the report that show what a result is worth beside others."""
+"""Parts of the report that compare a result with other sources."""

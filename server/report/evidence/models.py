@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from core.errors import StereorigError
-from server.report.page import PNG, Picture
-from server.report.pictures import field_map
-from server.report.source import Source
-from server.results.models.compare import compare_files
-from server.results.models.document import ComparisonReply, FieldVerdict, RegionReply
-from server.results.models.request import CompareRequest
-from server.store.durable import known_json
-from server.store.models import FOLDER, check_file_name
+from stereorig.core.errors import StereorigError
+from stereorig.server.report.page import PNG, PagePicture
+from stereorig.server.report.pictures import field_map
+from stereorig.server.report.source import Source
+from stereorig.server.results.models.compare import compare_files
+from stereorig.server.results.models.document import FieldVerdict, ModelComparisonReply, RegionReply
+from stereorig.server.results.models.request import CompareRequest
+from stereorig.server.store.durable import known_json
+from stereorig.server.store.models import FOLDER, check_file_name
 
 _MOST = 3  # models, the newest
 _SHOWN = 20  # refuted regions
@@ -23,7 +23,7 @@ _NAMES = (("u_mm", "U"), ("v_mm", "V"), ("w_mm", "W"), ("exx", "exx"), ("eyy", "
 
 
 @dataclass(frozen=True)
-class Row:
+class QuantityRow:
     """A quantity's row: its name, verdict, probability, root mean squares with units."""
 
     name: str
@@ -39,25 +39,25 @@ class ModelPart:
     Attributes
     ----------
     name
-        Of its file.
+        Name of its file.
     problem
         Reason why it could not be compared; empty if it was.
     found
-        What the comparison says.
+        The comparison's document.
     rows
         By quantity.
     regions
-        The refuted ones: rectangle, quantity, what is off most.
+        The refuted ones: rectangle, quantity, the largest deviation.
     pictures
         Maps of z.
     """
 
     name: str
     problem: str = ""
-    found: ComparisonReply | None = None
-    rows: list[Row] = field(default_factory=list)
+    found: ModelComparisonReply | None = None
+    rows: list[QuantityRow] = field(default_factory=list)
     regions: list[tuple[str, str, str]] = field(default_factory=list)
-    pictures: list[Picture] = field(default_factory=list)
+    pictures: list[PagePicture] = field(default_factory=list)
 
 
 def compared_models(source: Source) -> list[ModelPart]:
@@ -89,7 +89,7 @@ def _part(source: Source, folder: Path) -> ModelPart:
         found=found,
         rows=_rows(found),
         regions=[_refuted(found.regions[k]) for k in found.refuted[:_SHOWN]],
-        pictures=[Picture(picture, PNG, f"Map of z of {label}", caption)],
+        pictures=[PagePicture(picture, PNG, f"Map of z of {label}", caption)],
     )
 
 
@@ -98,20 +98,20 @@ def _extent(values: np.ndarray) -> float:
     return float(np.ptp(held)) if held.size else 0.0
 
 
-def _rows(found: ComparisonReply) -> list[Row]:
+def _rows(found: ModelComparisonReply) -> list[QuantityRow]:
     out = [_row("displacement", found.displacement, 1e3, "\u00b5m")]
     if found.strain is not None:
         out.append(_row("strain", found.strain, 1e6, "microstrain"))
     return out
 
 
-def _row(name: str, one: FieldVerdict, scale: float, unit: str) -> Row:
+def _row(name: str, one: FieldVerdict, scale: float, unit: str) -> QuantityRow:
     parts = [
         f"{label} {scale * rms:.3g} {unit} ({z:.2f})"
         for key, label in _NAMES
         if (rms := one.rms.get(key)) is not None and (z := one.rms_z.get(key)) is not None
     ]
-    return Row(name, one.accepted, one.overall.probability, ", ".join(parts))
+    return QuantityRow(name, one.accepted, one.overall.probability, ", ".join(parts))
 
 
 def _refuted(region: RegionReply) -> tuple[str, str, str]:

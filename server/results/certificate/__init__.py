@@ -1,1 +1,1 @@
-"""What a verification certificate is made from, as it is asked for."""
+"""Request of a verification certificate, and its findings."""

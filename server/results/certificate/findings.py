@@ -1,4 +1,4 @@
-"""What a certificate found, as lines of text: the same for one made here and for one that a service made."""
+"""Findings of a certificate as lines of text: the same for one made here and for one that a service made."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Protocol
 
 
-class Finding(Protocol):
+class FindingText(Protocol):
     """A suspect."""
 
     @property
@@ -19,18 +19,18 @@ class Finding(Protocol):
 
     @property
     def remedy(self) -> str:
-        """What to do."""
+        """Advice on the finding."""
 
 
-class Reason(Finding, Protocol):
+class ReasonText(FindingText, Protocol):
     """Why a verdict is no pass."""
 
     @property
     def outcome(self) -> str:
-        """What it makes the verdict at least."""
+        """Lowest verdict that this finding allows."""
 
 
-def finding_lines(reasons: Iterable[Reason], suspects: Iterable[Finding]) -> list[str]:
+def finding_lines(reasons: Iterable[ReasonText], suspects: Iterable[FindingText]) -> list[str]:
     """Return reasons and suspects as text, a line each."""
     lines = [f"{one.outcome}: {one.code}: {one.text} Remedy: {one.remedy}" for one in reasons]
     return lines + [f"suspect: {one.code}: {one.text} Remedy: {one.remedy}" for one in suspects]

@@ -1,4 +1,4 @@
-"""The plan of a certificate: what is known of each step; the same for the command line and the API."""
+"""The plan of a certificate: the known values of each step; the same for the command line and the API."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from typing import Annotated, Self
 
 from pydantic import ConfigDict, Field, StringConstraints, ValidationError, model_validator
 
-from core.certify.limits import Above, CertificateLimits, NotNegative
-from core.errors import FileFormatError, InputError
-from core.settings import Pixel, Whole, disagreement
-from server.base.models import Label, Notes, Number, Request, StepNumber, not_both, one_of
-from server.config.rig_file import TargetSection
-from server.wording import problems_in
+from stereorig.core.certify.limits import Above, CertificateLimits, NotNegative
+from stereorig.core.errors import FileFormatError, InputError
+from stereorig.core.settings import Pixel, Whole, disagreement
+from stereorig.server.base.models import Label, Notes, Number, Request, StepNumber, not_both, one_of
+from stereorig.server.config.rig_file import TargetSection
+from stereorig.server.wording import problems_in
 
 Position = tuple[Pixel, Pixel]
 _MOST = 1000
 
 
 class StatedTarget(TargetSection):
-    """A target of known size; which fields its kind needs is told where it is used."""
+    """A target of known size; the fields that its kind needs are checked when it is used."""
 
     @model_validator(mode="after")
     def _fields_of_its_kind(self) -> Self:
-        # no schema says which fields go together: such a target is refused as a value, not as a malformed request
+        # no schema can state which fields go together: such a target is refused as a value, not as a malformed request
         return self
 
 
@@ -84,7 +84,7 @@ class KnownLength(Request):
         None, description="A target of known size, as in a rig file; another than the one that was calibrated with."
     )
     u_mm: NotNegative = Field(
-        0.0, description="Standard uncertainty of the length; of a target's, beside its own tolerances."
+        0.0, description="Standard uncertainty of the length; for a target's, besides its own tolerances."
     )
 
     @model_validator(mode="after")
@@ -98,14 +98,14 @@ class KnownLength(Request):
 
 
 class ReferenceReading(Request):
-    """What the reference extensometer read in a step."""
+    """Reading of the reference extensometer in a step."""
 
     n: StepNumber = Field(description="Number of the step.")
     elongation_mm: Number = Field(description="Elongation since the reference step.")
 
 
 class ReferenceExtensometer(Request):
-    """A reference extensometer beside a virtual one."""
+    """A reference extensometer to compare with a virtual one."""
 
     model_config = ConfigDict(json_schema_extra=not_both("readings", "channel"))
 
@@ -129,11 +129,11 @@ class ReferenceExtensometer(Request):
 
 
 class CertificatePlan(Request):
-    """What is known of the steps of a verification procedure, and what is asked of the system."""
+    """The known values of a verification procedure's steps, and the requirements on the system."""
 
-    title: Label = Field("", description="What is certified.", examples=["Bench 2, 50 mm lenses"])
+    title: Label = Field("", description="Object of the certificate.", examples=["Bench 2, 50 mm lenses"])
     laboratory: Label = Field("", description="Laboratory, address.")
-    operator: Label = Field("", description="Who took the procedure.")
+    operator: Label = Field("", description="Person who took the procedure.")
     notes: Notes = Field("", description="Standards used with their own certificates, temperature, anything else.")
     static_steps: list[StepNumber] | None = Field(
         None,
@@ -149,7 +149,7 @@ class CertificatePlan(Request):
     lengths: list[KnownLength] = Field(default_factory=list, description="Known lengths.", max_length=_MOST)
     extensometer: ReferenceExtensometer | None = Field(None, description="A reference extensometer.")
     limits: CertificateLimits = Field(
-        default_factory=lambda: CertificateLimits.model_validate({}), description="What is asked of the system."
+        default_factory=lambda: CertificateLimits.model_validate({}), description="Requirements on the system."
     )
     valid_days: Annotated[Whole, Field(ge=1, le=3650)] = Field(
         365, description="Days for which the certificate holds; it ends before with the calibration."
@@ -176,7 +176,7 @@ def plan_in(document: object, *, name: str) -> CertificatePlan:
     try:
         return CertificatePlan.model_validate(document)
     except ValidationError as error:
-        first = problems_in(error, CertificatePlan)[0]
+        first = problems_in(error)[0]
         where = f"{first.field}: " if first.field else ""
         raise InputError(
             f"{name}: {where}{first.problem}.",

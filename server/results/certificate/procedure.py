@@ -1,4 +1,4 @@
-"""A verification procedure, step by step: what a plan's numbers ask of the bench, what is taken, what comes next."""
+"""A verification procedure, step by step: the actions at the bench that a plan asks for, and the next one."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from core.errors import InputError
-from core.settings import Whole
-from server.base.models import Request
-from server.results.certificate.plan import CertificatePlan, Rotation, Translation
+from stereorig.core.errors import InputError
+from stereorig.core.settings import Whole
+from stereorig.server.base.models import Request
+from stereorig.server.results.certificate.plan import CertificatePlan, Rotation, Translation
 
 Kind = Literal["reference", "static", "translation", "rotation", "length", "free"]
 By = Literal["rest", "stage", "hand"]
-#: what the stage moves as a whole, so that one of its moves is a way of the specimen
+#: moving parts that a stage moves as a whole, so that one of its moves displaces the specimen against the cameras
 _WHOLE = ("target", "both_cameras")
 _MOST = 1000
 
@@ -39,15 +39,15 @@ class ProcedureStep:
     n
         The number that the test gives it.
     kind
-        What it is for.
+        Purpose of the step.
     by
-        Who brings the specimen there: nobody, the stage, or a person, who confirms it.
+        Mover of the specimen: ``rest``, nothing moves; ``stage``; ``hand``, a person, who confirms it.
     what
-        In words.
+        The action in words.
     label
-        Of the step that is taken.
+        Label of the step.
     stage_mm
-        Where the stage stands, along Z of the system frame, from where it stood at the reference; None: wherever it is.
+        Stage position along Z of the system frame, from its position at the reference; None: not moved.
     """
 
     n: int
@@ -79,13 +79,14 @@ def procedure_of(plan: CertificatePlan, *, moves: str) -> tuple[ProcedureStep, .
     plan
         The plan.
     moves
-        What the stage moves, as the rig file says. A way along Z alone is the stage's where that is the target or both
-        cameras; every other one is a person's.
+        Moving part of the stage, from the rig file. The stage makes a way along Z alone if that is the target or both
+        cameras; a person makes every other way.
 
     Raises
     ------
     InputError
-        ``procedure_order`` where a step rests on the specimen standing as it did, after one that was moved by hand;
+        ``procedure_order`` if a step needs the specimen at its place of the reference, but a step before was moved by
+        hand;
         ``procedure_long``.
     """
     static = static_numbers(plan)
@@ -117,7 +118,7 @@ def procedure_of(plan: CertificatePlan, *, moves: str) -> tuple[ProcedureStep, .
             by_hand = n
         elif by_hand is not None:
             raise InputError(
-                f"Step {n} ({step.kind}) needs the body where it stood at the reference, and step {by_hand} before it "
+                f"Step {n} ({step.kind}) needs the body at its place of the reference, and step {by_hand} before it "
                 "moves it by hand.",
                 code="procedure_order",
                 remedy="Number static steps and ways of the stage before all steps that are taken by hand.",
@@ -143,10 +144,10 @@ def _way(n: int, way: Translation, whole: bool) -> ProcedureStep:
         label = f"moved {x:g} {y:g} {z:g} mm"
         if whole and x == 0.0 and y == 0.0:
             return ProcedureStep(n, "translation", "stage", f"The stage moves by {z:g} mm along Z.", label, z)
-        text = f"Move the body by X {x:g}, Y {y:g}, Z {z:g} mm from where it stood at the reference."
+        text = f"Move the body by X {x:g}, Y {y:g}, Z {z:g} mm from its place at the reference."
     else:
         label = f"moved {way.distance_mm:g} mm"
-        text = f"Move the body by {way.distance_mm:g} mm, in any direction, from where it stood at the reference."
+        text = f"Move the body by {way.distance_mm:g} mm, in any direction, from its place at the reference."
     return ProcedureStep(n, "translation", "hand", text, label, 0.0 if whole else None)
 
 

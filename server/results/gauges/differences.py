@@ -1,4 +1,4 @@
-"""Differences of gauges' readings from those in one step: what both steps share of the uncertainty cancels."""
+"""Differences of gauges' readings from one step's: the uncertainty that both steps share cancels."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from core.errors import InputError
-from core.gauge.reading import Reading, difference
-from server.formats.gauges.readings import DifferenceReading, Number, StepReadings
-from server.results.gauges.numbers import number
+from stereorig.core.errors import InputError
+from stereorig.core.gauge.reading import Reading, difference
+from stereorig.server.formats.gauges.readings import DifferenceReading, Number, StepReadings
+from stereorig.server.results.gauges.numbers import number
 
 #: of the reference itself: no step differs in them
 _OF_REFERENCE = frozenset({"x_mm", "y_mm", "z_mm", "length0_mm"})
 
 
-class Kept(NamedTuple):
-    """A gauge's reading with what a difference needs of it."""
+class KeptReading(NamedTuple):
+    """A gauge's reading with the data that its difference from another step needs."""
 
     gauge: str | None
     kind: str
@@ -25,7 +25,9 @@ class Kept(NamedTuple):
     reading: Reading
 
 
-def with_differences(steps: Sequence[StepReadings], kept: Sequence[Sequence[Kept]], base: int) -> list[StepReadings]:
+def with_differences(
+    steps: Sequence[StepReadings], kept: Sequence[Sequence[KeptReading]], base: int
+) -> list[StepReadings]:
     """Return the readings of steps with their differences from one of them.
 
     Parameters
@@ -33,14 +35,14 @@ def with_differences(steps: Sequence[StepReadings], kept: Sequence[Sequence[Kept
     steps
         Readings of each step.
     kept
-        Of each step, what its gauges read.
+        For each step, the readings of its gauges.
     base
         Number of the step that is taken from the others.
 
     Raises
     ------
     InputError
-        ``gauge_unusable`` where that step is the reference, or has no readings.
+        ``gauge_unusable`` if that step is the reference, or has no readings.
     """
     at = [step.n for step in steps].index(base)
     if steps[at].kind != "displacement" or steps[at].problem is not None:
@@ -56,7 +58,7 @@ def with_differences(steps: Sequence[StepReadings], kept: Sequence[Sequence[Kept
     ]
 
 
-def _of(now: Sequence[Kept], before: dict[tuple[str | None, str, str], Reading]) -> list[DifferenceReading]:
+def _of(now: Sequence[KeptReading], before: dict[tuple[str | None, str, str], Reading]) -> list[DifferenceReading]:
     found: dict[tuple[str | None, str], dict[str, Number]] = {}
     for entry in now:
         if entry.quantity not in _OF_REFERENCE and entry[:3] in before:

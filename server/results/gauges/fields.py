@@ -6,18 +6,18 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-from core.errors import InputError
-from core.field.points.result import Field
-from core.strain import surface_strain
-from server.formats.files import make_folder
-from server.formats.gauges.readings import FrameReading, RigidMotionReading
-from server.formats.results.netcdf import rename_axes
-from server.formats.results.reading import ResultHead
-from server.formats.results.strain import read_strain
-from server.formats.results.writing import Provenance, write_field
-from server.formats.version import software_version
-from server.results.gauges.frames import text_of
-from server.results.gauges.request import GaugeRequest
+from stereorig.core.errors import InputError
+from stereorig.core.field.points.result import Field
+from stereorig.core.strain import surface_strain
+from stereorig.server.formats.files import make_folder
+from stereorig.server.formats.gauges.readings import FrameReading, RigidMotionReading
+from stereorig.server.formats.results.netcdf import rename_axes
+from stereorig.server.formats.results.reading import ResultHead
+from stereorig.server.formats.results.strain import read_strain
+from stereorig.server.formats.results.writing import Provenance, write_field
+from stereorig.server.formats.version import software_version
+from stereorig.server.results.gauges.frames import text_of
+from stereorig.server.results.gauges.request import GaugeRequest
 
 #: ending of the axes' names in another frame, as X_sys is of the system
 AXES = "_frame"
@@ -47,7 +47,7 @@ class FieldWriter:
     def __init__(self, folder: Path, source: Path, request: GaugeRequest, *, strain: bool = True) -> None:
         if request.align is None and request.remove_rigid is None:
             raise InputError(
-                "The fields are asked for as they were measured: they lie there already.",
+                "The fields are asked for as they were measured: they are there already.",
                 code="option_conflict",
                 remedy="Give a frame, or take the rigid motion out.",
             )
@@ -68,7 +68,7 @@ class FieldWriter:
         frame: FrameReading | None,
         motion: RigidMotionReading | None,
     ) -> None:
-        """Write one step; strain, where the result has it, is made anew along the new axes."""
+        """Write one step; strain, if the result has it, is computed again along the new axes."""
         strain = read_strain(path) if self._with_strain else None
         if strain is not None:
             strain = surface_strain(field, strain.options, subset_px=strain.subset_px)

@@ -6,21 +6,21 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from core.errors import MeasurementError
-from server.formats.files import recorded_sha256, write_bytes
-from server.formats.results.folder import home_of
-from server.formats.results.reading import read_head
-from server.results.gauges.fields import FieldWriter
-from server.results.gauges.frames import frame_asked, frame_of_test
-from server.results.gauges.readings import read_gauges
-from server.results.gauges.request import Alignment, GaugeRequest
-from server.store.durable import known_json
+from stereorig.core.errors import MeasurementError
+from stereorig.server.formats.files import recorded_sha256, write_bytes
+from stereorig.server.formats.results.folder import home_of
+from stereorig.server.formats.results.reading import read_head
+from stereorig.server.results.gauges.fields import FieldWriter
+from stereorig.server.results.gauges.frames import frame_asked, frame_of_test
+from stereorig.server.results.gauges.readings import read_gauges
+from stereorig.server.results.gauges.request import Alignment, GaugeRequest
+from stereorig.server.store.durable import known_json
 
 
 def write_framed(
     files: Sequence[Path], asked: Alignment, folder: Path, *, strain: bool = True, laid_through: Path | None = None
 ) -> list[Path]:
-    """Write result files in a frame that is laid through the first of them, or through another; return their paths.
+    """Write result files in a frame that the first of them defines, or another file; return their paths.
 
     Raises
     ------
@@ -32,7 +32,7 @@ def write_framed(
     readings = read_gauges(files, request, writer, laid_through=laid_through)
     problem = next((s.problem for s in readings.steps if s.problem is not None), None)
     if problem is not None:
-        raise MeasurementError(problem.cause, code=problem.code, remedy=problem.remedy)
+        raise MeasurementError(problem.detail, code=problem.code, remedy=problem.remedy)
     return writer.written
 
 
@@ -51,7 +51,7 @@ def put_into_frame(files: Sequence[Path], asked: Alignment) -> str:
 
 
 def asked_at(text: str | None, result: Path) -> Alignment | None:
-    """Return the frame that a command names for a result file and those beside it, None for the system frame.
+    """Return the frame that a command names for a result file and its neighbours, None for the system frame.
 
     Raises
     ------
@@ -65,8 +65,8 @@ def asked_at(text: str | None, result: Path) -> Alignment | None:
 def in_frame(files: Sequence[Path], asked: Alignment | None, out: Path, *, strain: bool = True) -> list[Path]:
     """Return result files in a frame, written into a folder; they themselves for the system frame.
 
-    The frame is laid through the reference of the measurement, where its result lies beside them: of dense fields that
-    of the ordinary ones. Without ``strain`` that is not made anew: for who reads none of it.
+    The frame is defined by the reference's result, if its file is among the measurement's; for dense fields by the
+    ordinary result of the reference. Without ``strain`` strain is not computed again, for callers that read none.
 
     Raises
     ------

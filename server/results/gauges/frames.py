@@ -2,61 +2,35 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
-from typing import Literal
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from core.errors import FileFormatError, RegionError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels
-from core.gauge.align import Alignment, align_3_2_1, align_given, align_plane, image_rows
-from core.gauge.area import points_within
-from core.gauge.sampling import sample
-from server.base.json_values import asked_in
-from server.results.gauges.request import Alignment as Asked
-from server.results.gauges.request import GivenAlignment, PlaneAlignment
+from stereorig.core.errors import FileFormatError, RegionError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.gauge.align import Alignment, align_3_2_1, align_given, align_plane, image_rows
+from stereorig.core.gauge.area import points_within
+from stereorig.core.gauge.sampling import sample
+from stereorig.server.base.json_values import asked_in
+from stereorig.server.results.gauges.request import Alignment as Asked
+from stereorig.server.results.gauges.request import GivenAlignment, PlaneAlignment
 
-#: the specimen's frame where none was chosen
+#: the specimen's frame if none was chosen
 SPECIMEN = PlaneAlignment(kind="plane", x_direction="image_rows")
 #: longest text of a frame that is written out
 MAX_TEXT = 2000
-#: variables that are the same in every frame
-_INVARIANT = frozenset(
-    [
-        "x_px",
-        "y_px",
-        "status",
-        "zncc",
-        "iterations",
-        "epipolar_px",
-        "noise_grey",
-        "reference_step",
-        "theta_rad",
-        "phi_rad",
-        "zp_mm",
-        "strain_status",
-        "e1",
-        "e2",
-        "sigma_e1",
-        "sigma_e2",
-        "max_shear",
-        "von_mises",
-    ]
-)
-_STRAIN = re.compile(r"(sigma_)?(exx|eyy|exy)(_patch)?$|strain_")
 _ASKED: TypeAdapter[Asked] = TypeAdapter(Asked)
 
 
 def frame_of_test(document: Mapping[str, object] | None) -> Asked:
-    """Return the frame that is kept with a test; its best plane with X along the image rows where there is none.
+    """Return the frame that is stored with a test; if none is, its best plane with X along the image rows.
 
     Raises
     ------
     FileFormatError
-        ``frame_invalid`` if what is kept is no frame.
+        ``frame_invalid`` if the stored document is no frame.
     """
     if document is None:
         return SPECIMEN
@@ -66,7 +40,7 @@ def frame_of_test(document: Mapping[str, object] | None) -> Asked:
         raise FileFormatError(
             f"The frame kept with the test is none: {error.errors()[0]['msg']}.",
             code="frame_invalid",
-            remedy="Choose the specimen's frame anew.",
+            remedy="Choose the specimen's frame again.",
         ) from error
 
 
@@ -94,7 +68,7 @@ def frame_asked(text: str | None, of_test: Asked) -> Asked | None:
 
 
 def lay(asked: Asked, field: Field, shared: SharedPixels) -> Alignment:
-    """Lay a frame through the reference shape of a field.
+    """Define a frame by the reference shape of a field.
 
     Raises
     ------
@@ -120,13 +94,6 @@ def lay(asked: Asked, field: Field, shared: SharedPixels) -> Alignment:
         first, second = ends.of(field.xyz_mm)
         direction = second - first
     return align_plane(field, shared=shared, chosen=points_within(field, asked.corners()), x_direction=direction)
-
-
-def part_of(name: str) -> Literal["none", "field", "strain"]:
-    """Return which part of a result holds a variable, of those that depend on the frame."""
-    if name in _INVARIANT:
-        return "none"
-    return "strain" if _STRAIN.match(name) else "field"
 
 
 def text_of(asked: Asked) -> str:

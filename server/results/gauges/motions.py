@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.gauge.align import Alignment
-from core.gauge.reading import Reading
-from core.gauge.rigid import RigidMotion
-from server.formats.gauges.readings import FrameReading, RigidMotionReading
-from server.results.gauges.numbers import number
+from stereorig.core.gauge.align import Alignment
+from stereorig.core.gauge.reading import Reading
+from stereorig.core.gauge.rigid import RigidMotion
+from stereorig.server.formats.gauges.readings import FrameReading, RigidMotionReading
+from stereorig.server.results.gauges.numbers import number
 
 _MOTION = (("rotation", "rad"), ("translation", "mm"))
 

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.common.budget import Budget
-from core.gauge.reading import Reading
-from server.formats.gauges.readings import Number
+from stereorig.core.common.budget import Budget
+from stereorig.core.gauge.reading import Reading
+from stereorig.server.formats.gauges.readings import Number
 
 
 def finite(value: float) -> float | None:
-    """Return a number; None where it is not one."""
+    """Return a number; None if it is not finite."""
     return float(value) if np.isfinite(value) else None
 
 
 def plain(budget: Budget) -> dict[str, float] | None:
-    """Return a budget's parts by name; None where nothing is known."""
+    """Return a budget's parts by name; None if no part is known."""
     return dict(budget.document()) or None
 
 

@@ -7,37 +7,37 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from core.arrays import Float
-from core.errors import InputError, MeasurementError, StateError
-from core.field.common import notes_of
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels
-from core.gauge.align import Alignment, aligned
-from core.gauge.area import points_within
-from core.gauge.line import positions_along
-from core.gauge.locate import positions_from_mm
-from core.gauge.rigid import rigid_motion, without_rigid_motion
-from server.formats.calibrations.in_test import calibration_id_in
-from server.formats.files import sha256_of
-from server.formats.gauges.readings import GaugeReadings, Problem, RigidMotionReading, StepReadings
-from server.formats.gauges.stated import stated
-from server.formats.results.folder import home_of, number_of
-from server.formats.results.layout import COVARIANCE_NAMES
-from server.formats.results.reading import ResultHead, read_field, read_head
-from server.formats.results.uncertainty import Included, Statement, read_included
-from server.formats.version import software_version
-from server.results.channels import recorded_with
-from server.results.gauges.differences import Kept, with_differences
-from server.results.gauges.fields import FieldWriter
-from server.results.gauges.frames import lay, text_of
-from server.results.gauges.motions import frame_reading, motion_reading
-from server.results.gauges.request import ExtensometerGauge, GaugeRequest, LineGauge, PointGauge
-from server.results.gauges.values import of_area, of_extensometer, of_line, of_point
-from server.results.gauges.variables import Variables
-from server.results.images.projected_pattern import check_gauges
-from server.results.reader import read_variable
-from server.results.staleness import stale_results
-from server.store.durable import known_json
+from stereorig.core.arrays import Float
+from stereorig.core.errors import InputError, MeasurementError, StateError
+from stereorig.core.field.common import notes_of
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.gauge.align import Alignment, aligned
+from stereorig.core.gauge.area import points_within
+from stereorig.core.gauge.line import positions_along
+from stereorig.core.gauge.locate import positions_from_mm
+from stereorig.core.gauge.rigid import rigid_motion, without_rigid_motion
+from stereorig.server.formats.calibrations.in_test import calibration_id_in
+from stereorig.server.formats.files import sha256_of
+from stereorig.server.formats.gauges.readings import GaugeReadings, RigidMotionReading, StepProblem, StepReadings
+from stereorig.server.formats.gauges.stated import stated
+from stereorig.server.formats.results.folder import home_of, number_of
+from stereorig.server.formats.results.layout import COVARIANCE_NAMES
+from stereorig.server.formats.results.reading import ResultHead, read_field, read_head
+from stereorig.server.formats.results.uncertainty import Included, Statement, read_included
+from stereorig.server.formats.version import software_version
+from stereorig.server.results.channels import recorded_with
+from stereorig.server.results.gauges.differences import KeptReading, with_differences
+from stereorig.server.results.gauges.fields import FieldWriter
+from stereorig.server.results.gauges.frames import lay, text_of
+from stereorig.server.results.gauges.motions import frame_reading, motion_reading
+from stereorig.server.results.gauges.request import ExtensometerGauge, GaugeRequest, LineGauge, PointGauge
+from stereorig.server.results.gauges.values import of_area, of_extensometer, of_line, of_point
+from stereorig.server.results.gauges.variables import Variables
+from stereorig.server.results.images.projected_pattern import check_gauges
+from stereorig.server.results.reader import read_variable
+from stereorig.server.results.staleness import stale_results
+from stereorig.server.store.durable import known_json
 
 _Positions = dict[str | None, list[tuple[float, float]]]
 MAX_NUMBERS = 3_000_000
@@ -64,6 +64,8 @@ class _Step:
             load_n=head.load_n if recorded.load_n is None else recorded.load_n,
             time_s=recorded.time_s,
             channels=recorded.channels,
+            channel_units=recorded.units,
+            channel_u=recorded.u,
             **found,
         )
 
@@ -88,9 +90,9 @@ def read_gauges(
         Takes each step's field in the frame and without the motion that was asked for.
     only
         Steps to be read of those that are asked for, as of a page; None: all. The first of those that are asked for is
-        read in any case: a frame is laid through it, and positions in mm are found on it.
+        read in any case: it defines the frame, and positions in mm are found on it.
     laid_through
-        Result file that a frame is laid through, where that is none of `files`.
+        Result file that defines the frame, if that is none of `files`.
 
     Raises
     ------
@@ -117,7 +119,7 @@ def read_gauges(
     moved_by: set[str] = set()
     found: set[str] = set()
     positions: _Positions = {}
-    kept: list[list[Kept]] = []
+    kept: list[list[KeptReading]] = []
     numbers = 0
     for path in chosen:
         step = _read(path)
@@ -182,7 +184,7 @@ def _calibration(path: Path, head: ResultHead) -> dict[str, str | None]:
 
 
 def steps_asked(files: Sequence[Path], request: GaugeRequest) -> list[Path]:
-    """Return the result files that a request names, that of `difference_from` among them, ascending.
+    """Return the result files that a request names, including the one of `difference_from`, ascending.
 
     Raises
     ------
@@ -274,7 +276,7 @@ def _read_step(
     request: GaugeRequest,
     positions: _Positions,
     found: set[str],
-    kept: list[Kept],
+    kept: list[KeptReading],
     fields: FieldWriter | None,
 ) -> StepReadings:
     field = measured = step.field if alignment is None else aligned(step.field, alignment)
@@ -285,7 +287,7 @@ def _read_step(
         try:
             motion = rigid_motion(field, shared=step.shared, chosen=inside, robust=removal.robust)
         except MeasurementError as error:
-            return step.reading(problem=Problem(error.code, error.cause, error.remedy))
+            return step.reading(problem=StepProblem(error.code, error.cause, error.remedy))
         field = without_rigid_motion(field, motion, shared=step.shared)
         taken_out = motion_reading(motion)
     if fields is not None:

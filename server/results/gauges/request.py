@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Literal, Self
 
-from pydantic import AliasChoices, ConfigDict, Field, StringConstraints, model_validator
+from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
-from core.settings import CoverageFields, Pixel, Whole, disagreement
-from server.base.models import Number, Request, StepNumber, Switch, any_of, given, not_both, one_of
+from stereorig.core.settings import CoverageFields, Pixel, Whole, disagreement
+from stereorig.server.base.models import Number, Request, StepNumber, Switch, any_of, given, not_both, one_of
 
 PositionPx = tuple[Pixel, Pixel]
 PositionMm = tuple[Number, Number]
@@ -130,7 +130,7 @@ class PlaneAlignment(_Area):
     kind: Literal["plane"] = Field(description="Best-fit plane.")
     x_direction: tuple[Number, Number, Number] | Literal["image_rows"] = Field(
         (1.0, 0.0, 0.0),
-        description="Direction in the system frame whose part along the plane becomes X; `image_rows`: that of camera "
+        description="Direction in the system frame whose part along the plane becomes X; `image_rows`: along camera "
         "1's image rows.",
     )
     x_line_px: tuple[PositionPx, PositionPx] | None = Field(
@@ -143,8 +143,7 @@ class ThreeTwoOneAlignment(Request):
 
     kind: Literal["3-2-1"] = Field(description="3-2-1.")
     positions_px: Annotated[list[PositionPx], Field(min_length=6, max_length=6)] = Field(
-        validation_alias=AliasChoices("positions_px", "places_px"),  # the second is its earlier name
-        description="Six positions: plane, plane, plane, from, to, origin.",
+        description="Six positions: plane, plane, plane, from, to, origin."
     )
 
 
@@ -196,8 +195,8 @@ class GaugeRequest(CoverageFields, Request):
     )
     difference_from: StepNumber | None = Field(
         None,
-        description="Step whose readings of points, extensometers and areas' means are also taken from those of each "
-        "other step: what both share of the uncertainty cancels. null: no differences.",
+        description="Step whose readings of points, extensometers and areas' means are also subtracted from each "
+        "other step's: the uncertainty that both share cancels. null: no differences.",
         examples=[1],
     )
 

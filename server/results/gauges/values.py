@@ -6,17 +6,17 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from core.arrays import Float
-from core.common.budget import UNKNOWN, Budget, budget_of
-from core.gauge.area import area_statistics, points_within
-from core.gauge.extensometer import extensometer
-from core.gauge.line import positions_along
-from core.gauge.reading import Reading
-from core.gauge.sampling import Samples, sample
-from core.names import BUDGET
-from core.strain.reference import reference_share
-from core.strain.result import StrainField
-from server.formats.gauges.readings import (
+from stereorig.core.arrays import Float
+from stereorig.core.common.budget import UNKNOWN, Budget, budget_of
+from stereorig.core.gauge.area import area_statistics, points_within
+from stereorig.core.gauge.extensometer import extensometer
+from stereorig.core.gauge.line import positions_along
+from stereorig.core.gauge.reading import Reading
+from stereorig.core.gauge.sampling import Samples, sample
+from stereorig.core.names import ALL_PARTS
+from stereorig.core.strain.reference import reference_share
+from stereorig.core.strain.result import StrainField
+from stereorig.server.formats.gauges.readings import (
     AreaReading,
     AreaStatistics,
     ExtensometerReading,
@@ -25,11 +25,11 @@ from server.formats.gauges.readings import (
     Numbers,
     PointReading,
 )
-from server.formats.results.budgets import STRAIN_NAMES
-from server.results.gauges.differences import Kept
-from server.results.gauges.numbers import finite, number, plain
-from server.results.gauges.request import LineGauge
-from server.results.gauges.variables import Variables, component_of
+from stereorig.server.formats.results.variables import STRAIN_NAMES
+from stereorig.server.results.gauges.differences import KeptReading
+from stereorig.server.results.gauges.numbers import finite, number, plain
+from stereorig.server.results.gauges.request import LineGauge
+from stereorig.server.results.gauges.variables import Variables, component_of
 
 _EXTENSOMETER_UNITS = {"length0_mm": "mm", "length_mm": "mm", "elongation_mm": "mm", "strain": "1", "true_strain": "1"}
 
@@ -47,13 +47,14 @@ def _at_positions(
         else np.diagonal(at_reference.covariance(variables.shared, own, own), axis1=-2, axis2=-1)
     )
     common, causes = positions.common(), variables.field.causes
-    of_calibration = np.full(variance.shape, np.nan) if common is None else (common**2).sum(axis=-1)
+    shared = np.full(variance.shape, np.nan) if common is None else (common**2).sum(axis=-1)
+    of_calibration = shared if common is None or causes is None else causes.of_calibration(common) ** 2
     out = {}
     for name in names:
         variable, sigma = variables.get(name)
         k = component_of(name)
         if k is not None:
-            s = np.sqrt(variance[:, k] + np.nan_to_num(of_calibration[:, k]))
+            s = np.sqrt(variance[:, k] + np.nan_to_num(shared[:, k]))
         elif sigma is not None:
             s = positions.of(sigma)  # as if the errors of the points about it were one
         else:
@@ -104,9 +105,9 @@ def _of_strain(
 
 
 def _by_part(budgets: Sequence[Budget]) -> dict[str, list[float | None]] | None:
-    """Return budgets of positions as a list a part; None where nothing is known."""
+    """Return budgets of positions as a list a part; None if no part is known."""
     found = [one.document() for one in budgets]
-    names = [name for name in BUDGET if any(name in one for one in found)]
+    names = [name for name in ALL_PARTS if any(name in one for one in found)]
     return {name: [one.get(name) for one in found] for name in names} or None
 
 
@@ -116,13 +117,13 @@ def _at(budget: Mapping[str, Sequence[float | None]] | None, i: int) -> dict[str
 
 
 def of_point(
-    variables: Variables, kept: list[Kept], names: Sequence[str], name: str | None, xy: tuple[float, float]
+    variables: Variables, kept: list[KeptReading], names: Sequence[str], name: str | None, xy: tuple[float, float]
 ) -> PointReading:
-    """Return variables at a point; `kept` takes what differences are made of."""
+    """Return variables at a point; `kept` collects the readings that differences need."""
     positions = sample(variables.field, [xy])
     rows: dict[str, Reading] = {}
     found = _at_positions(variables, names, positions, rows)
-    kept += [Kept(name, "point", n, found[n].units, reading) for n, reading in rows.items()]
+    kept += [KeptReading(name, "point", n, found[n].units, reading) for n, reading in rows.items()]
     values = {
         n: Number(
             reading.value[0], reading.sigma[0], reading.units, reading.sigma_calibration[0], _at(reading.budget, 0)
@@ -147,24 +148,24 @@ def of_line(variables: Variables, names: Sequence[str], line: LineGauge) -> Line
 
 
 def of_extensometer(
-    variables: Variables, kept: list[Kept], name: str | None, a: tuple[float, float], b: tuple[float, float]
+    variables: Variables, kept: list[KeptReading], name: str | None, a: tuple[float, float], b: tuple[float, float]
 ) -> ExtensometerReading:
-    """Return an extensometer between two pixels; `kept` takes what differences are made of."""
+    """Return an extensometer between two pixels; `kept` collects the readings that differences need."""
     got = extensometer(variables.field, a, b, shared=variables.shared)
     readings: dict[str, Reading] = {n: getattr(got, n) for n in _EXTENSOMETER_UNITS}
     values = {n: number(r, _EXTENSOMETER_UNITS[n]) for n, r in readings.items()}
-    kept += [Kept(name, "extensometer", n, _EXTENSOMETER_UNITS[n], r) for n, r in readings.items()]
+    kept += [KeptReading(name, "extensometer", n, _EXTENSOMETER_UNITS[n], r) for n, r in readings.items()]
     return ExtensometerReading(name, a, b, got.missing, values)
 
 
 def of_area(
     variables: Variables,
-    kept: list[Kept],
+    kept: list[KeptReading],
     names: Sequence[str],
     name: str | None,
     corners: list[tuple[float, float]] | None,
 ) -> AreaReading:
-    """Return statistics of variables in an area; `kept` takes what differences are made of."""
+    """Return statistics of variables in an area; `kept` collects the readings that differences need."""
     field = variables.field
     inside = points_within(field, corners)
     values = {}
@@ -186,7 +187,7 @@ def of_area(
         of_strain = variables.mean_strain_variance(inside) if n in STRAIN_NAMES and got.count else None
         if of_strain is not None:
             got = got.with_mean_variance(*of_strain.of(STRAIN_NAMES.index(n)))
-        kept.append(Kept(name, "area", n, variable.units, got.mean_reading))
+        kept.append(KeptReading(name, "area", n, variable.units, got.mean_reading))
         values[n] = AreaStatistics(
             units=variable.units,
             count=got.count,

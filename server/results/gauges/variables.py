@@ -1,4 +1,4 @@
-"""The variables that gauges read: of a field in its new frame where it has them, else of its result file."""
+"""The variables that gauges read: from the field in its new frame if it has them, else from its result file."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float, Floats
-from core.errors import InputError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels
-from core.strain import surface_strain
-from core.strain.mean import MeanStrainVariance, mean_strain_variance
-from core.strain.result import StrainField
-from server.base.errors import NotFoundError
-from server.formats.results.budgets import STRAIN_NAMES
-from server.formats.results.derived import DERIVED, MAGNITUDE, magnitude
-from server.formats.results.layout import COVARIANCE_NAMES, field_variable
-from server.formats.results.strain import read_strain
-from server.results.reader import Variable, read_variable
+from stereorig.core.arrays import Float, Floats
+from stereorig.core.errors import InputError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.strain import surface_strain
+from stereorig.core.strain.mean import MeanStrainVariance, mean_strain_variance
+from stereorig.core.strain.result import StrainField
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.formats.results.derived import DERIVED, MAGNITUDE, magnitude
+from stereorig.server.formats.results.layout import COVARIANCE_NAMES
+from stereorig.server.formats.results.strain import read_strain
+from stereorig.server.formats.results.variables import along_axes, field_variable
+from stereorig.server.results.reader import FileVariable, read_variable
 
 
 @dataclass(frozen=True)
 class OwnSigma:
-    """Of one component: its own standard deviation (r, c), the reference pair's part, its common factor (r, c, k)."""
+    """One component's own standard deviation (r, c), the reference pair's part, its common factor (r, c, k)."""
 
     own: Float
     reference: Float | None
@@ -36,24 +36,24 @@ class OwnSigma:
 
 
 class Variables:
-    """Variables by name: of the field as it is now, else of the file as it was written.
+    """Variables by name: from the field as it is now, else from the file as it was written.
 
     Parameters
     ----------
     measured
         The field as measured, in the frame that is read in.
     turned
-        True if its axes are not the file's: components of strain are then made anew along them.
+        True if its axes are not the file's: components of strain are then computed again along them.
     """
 
     def __init__(
         self, path: Path, field: Field, shared: SharedPixels, *, measured: Field, turned: bool = False
     ) -> None:
         self.path, self.field, self.shared, self.measured, self._turned = path, field, shared, measured, turned
-        self._read: dict[str, tuple[Variable, Float | None]] = {}
+        self._read: dict[str, tuple[FileVariable, Float | None]] = {}
 
-    def get(self, name: str) -> tuple[Variable, Float | None]:
-        """Return values and standard deviations, (r, c) each; the latter None where they are not known."""
+    def get(self, name: str) -> tuple[FileVariable, Float | None]:
+        """Return values and standard deviations, (r, c) each; the latter None if they are not known."""
         if name not in self._read:
             self._read[name] = self._find(name)
         return self._read[name]
@@ -94,19 +94,19 @@ class Variables:
                 known.append(name)
         return known
 
-    def _find(self, name: str) -> tuple[Variable, Float | None]:
+    def _find(self, name: str) -> tuple[FileVariable, Float | None]:
         sigma = self._sigma(name)
         if name.startswith("sigma_"):
             own = self._sigma(name.removeprefix("sigma_"))
             if own is not None:
-                return Variable(own, "mm", f"standard deviation of {name[6:]}"), None
+                return FileVariable(own, "mm", f"standard deviation of {name[6:]}"), None
         of_field = field_variable(self.field, name)
         if of_field is not None:
-            return Variable(*of_field), sigma
+            return FileVariable(*of_field), sigma
         if name in DERIVED and self.field.uvw_mm is not None:  # of the field as it is now, its rigid motion removed
             size, of_size = magnitude(self.field.uvw_mm, self.field.total_covariance[..., 3:, 3:])
             held = np.where(self.field.valid, size if name == MAGNITUDE else of_size, np.nan)
-            return Variable(held, *DERIVED[name]), of_size if name == MAGNITUDE else None
+            return FileVariable(held, *DERIVED[name]), of_size if name == MAGNITUDE else None
         variable = read_variable(self.path, name)
         values = self._along_axes.get(name, variable.values)
         if values.shape != self.field.shape or not np.issubdtype(values.dtype, np.number):
@@ -116,7 +116,7 @@ class Variables:
                 remedy="Choose a variable with one number a point.",
             )
         held = np.where(self.field.valid, values.astype(np.float64), np.nan)
-        return Variable(held, variable.units, variable.long_name), sigma
+        return FileVariable(held, variable.units, variable.long_name), sigma
 
     @cached_property
     def _along_axes(self) -> dict[str, Float]:
@@ -124,11 +124,7 @@ class Variables:
         made = self.strain if self._turned and self.measured.has_motion else None
         if made is None:
             return {}
-        found = {name: made.strain[..., k] for k, name in enumerate(STRAIN_NAMES)}
-        found |= {f"sigma_{name}": made.sigma[..., k] for k, name in enumerate(STRAIN_NAMES)}
-        if made.patch is not None:
-            found |= {f"{name}_patch": made.patch[..., k] for k, name in enumerate(STRAIN_NAMES)}
-        return found | {"strain_angle_rad": made.angle_rad}
+        return along_axes(made)
 
     def _sigma(self, name: str) -> Float | None:
         k = component_of(name)

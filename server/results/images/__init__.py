@@ -1,1 +1,1 @@
-"""What images show: their quality and texture, previews, the specimen, a region projected into them."""
+"""Evaluation of images: their quality and texture, previews, the specimen, a region projected into them."""

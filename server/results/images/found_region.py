@@ -7,9 +7,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from core.arrays import Float
-from core.field.seeding.specimen import Specimen
-from core.settings import MAX_CORNERS, MAX_CUTS
+from stereorig.core.arrays import Float
+from stereorig.core.field.seeding.specimen import Specimen
+from stereorig.core.settings import MAX_CORNERS, MAX_CUTS
 
 _TOLERANCE_OF_SUBSET = 0.125  # of an outline for the hand: a subset that reaches over by so much shows nothing of it
 _MIN_HOLE_OF_SUBSET = 1.0
@@ -23,7 +23,7 @@ def region_to_edit(specimen: Specimen, subset_px: int) -> dict[str, Any]:
     specimen
         The specimen.
     subset_px
-        Width of the subsets, which says what is too small to matter.
+        Width of the subsets; holes that are small against it are left out.
     """
     outline = specimen.outlines_px[0]
     inside = [

@@ -1,7 +1,7 @@
-"""8-bit previews of images, and maps that are laid over an image.
+"""8-bit previews of images, and maps that are drawn over an image.
 
 A preview is not the measurement's image: grey levels are brought to 8 bit and it may be smaller. Maps are transparent
-where they have no value.
+at pixels without a value.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from server.results.images.texture import GOOD_PX, NOISE_SHARE, USABLE_PX, errors_at
+from stereorig.server.results.images.texture import GOOD_PX, NOISE_SHARE, USABLE_PX, errors_at
 
 MapKind = Literal["saturation", "texture"]
 _TILES_ACROSS = 64
@@ -78,8 +78,8 @@ def predicted_error_px(pixels: NDArray[Any], full_scale: float, subset_px: int) 
     Returns
     -------
     ndarray
-        Error in px for noise of `NOISE_SHARE`, of subsets about ``max(rows, cols) / 64`` apart; infinite where there is
-        no texture.
+        Error in px for noise of `NOISE_SHARE`, at subsets about ``max(rows, cols) / 64`` from each other; infinite
+        without texture.
     """
     pitch = max(max(pixels.shape) // _TILES_ACROSS, 1)
     y, x = np.mgrid[tuple(slice(1 + pitch // 2, size - 1, pitch) for size in pixels.shape)]

@@ -1,19 +1,18 @@
-"""A projected pattern stays where it is as the surface moves: shape can be measured, displacement cannot."""
+"""A projected pattern does not move with the surface: shape can be measured, displacement cannot."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from core.errors import InputError
-from core.settings import AnalysisSettings
-from server.formats.results.budgets import STRAIN_NAMES
-from server.formats.results.layout import COVARIANCE_NAMES
+from stereorig.core.errors import InputError
+from stereorig.core.settings import AnalysisSettings
+from stereorig.server.formats.results.variables import VARIABLES
 
 if TYPE_CHECKING:  # a measurement's start needs no gauges' models
-    from server.results.gauges.request import GaugeRequest
+    from stereorig.server.results.gauges.request import GaugeRequest
 
-_OF_DISPLACEMENT = frozenset({*COVARIANCE_NAMES[3:], *STRAIN_NAMES})
+_OF_DISPLACEMENT = frozenset(name for name, one in VARIABLES.items() if one.relative)
 
 
 def check_settings(settings: AnalysisSettings, *, displacement: bool) -> None:

@@ -1,7 +1,7 @@
 """Quality of a captured image, before anyone relies on it.
 
 Figures are cheap and plain: mean grey level, share of saturated pixels, gradient (texture) and how much of it
-survives at the pixel scale (focus). A code names what is wrong with an image that cannot be measured on.
+survives at the pixel scale (focus). A code names the fault of an image that cannot be measured on.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ def gradients(pixels: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.flo
 def _noise_variance(a: NDArray[np.float32]) -> float:
     """Return the variance of the pixels' own noise, grey levels squared.
 
-    Half the mean squared difference of pixels h apart is that of the picture, which vanishes with h, and that of the
-    noise, which is the same at any h.
+    Half the mean squared difference of pixels at a distance h is the sum of the picture's part, which vanishes with h,
+    and the noise's variance, which is the same at any h.
     """
     every = max(a.size // _NOISE_PIXELS, 1)
     along, down = a[::every], a[:, ::every]
@@ -89,9 +89,28 @@ def _focus(first2: float, second2: float, noise2: float) -> float | None:
     return float(np.sqrt(max(second2 - 1.25 * noise2, 0.0) / seen))
 
 
+def clipping_level(pixels: NDArray[Any], bit_depth: int) -> int:
+    """Return the grey level at which an image is clipped, by the end of its own histogram.
+
+    A camera may put 12 bits to the left or to the right of 16, and video has its white at 235 of 255. Such an end is
+    taken for the converter's only if the image reaches it exactly, and often.
+    """
+    # bits that are zero in every pixel: the levels' distance
+    levels = int(np.bitwise_or.reduce(pixels, axis=None)) | 1 << max(bit_depth - 8, 0)
+    full = 2**bit_depth - (levels & -levels)
+    top = int(pixels.max())
+    ends = [2**bits - 1 for bits in (10, 12, 14) if bits < bit_depth] + [235 << max(bit_depth - 8, 0)]
+    return top if top in ends and np.mean(pixels == top) > SATURATED_SHARE else full
+
+
+def saturated_share(pixels: NDArray[Any], bit_depth: int) -> float:
+    """Return the share of an image's pixels at the level at which it is clipped."""
+    return float(np.mean(pixels >= clipping_level(pixels, bit_depth)))
+
+
 def image_quality(pixels: NDArray[Any], bit_depth: int) -> ImageQuality:
     """Rate one image (rows, cols)."""
-    full = float(2**bit_depth - 1)
+    full = float(clipping_level(pixels, bit_depth))
     a = pixels.astype(np.float32)
     mean, contrast = float(a.mean()), float(a.std())
     saturated = float(np.mean(pixels >= full))
@@ -118,18 +137,23 @@ def image_quality(pixels: NDArray[Any], bit_depth: int) -> ImageQuality:
     return ImageQuality(code, mean, mean / full, saturated, contrast, texture, focus)
 
 
+def saturation_text(share: float) -> str:
+    """Return the warning of an image that is saturated over whole speckles."""
+    return f"{share:.1%} of its pixels are at full scale. Lower exposure, gain or light"
+
+
 def quality_warning(name: str, quality: ImageQuality) -> str | None:
-    """Return what to warn of in an image, with what to do; None where nothing is wrong with it.
+    """Return a warning about an image, with advice; None if it is good.
 
     Parameters
     ----------
     name
-        Of its camera.
+        Name of its camera.
     quality
         Its figures.
     """
     said = {
-        "saturated": f"{quality.saturated_share:.1%} of its pixels are at full scale. Lower exposure, gain or light",
+        "saturated": saturation_text(quality.saturated_share),
         "dark": f"it is too dark, {quality.mean_share:.1%} of full scale in the mean. Check lens cap, light, exposure",
         "blank": "it shows noise alone. Check lens cap, light, exposure and that the specimen carries a pattern",
         "low_texture": "it has too little texture. Check focus, light and that the specimen carries a pattern",

@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from server.results.images.quality import gradients
+from stereorig.server.results.images.quality import gradients
 
-#: noise for which errors are reported where it is not known, as a share of full scale: 2.55 grey levels of 255
+#: noise for which errors are reported if it is not known, as a share of full scale: 2.55 grey levels of 255
 NOISE_SHARE = 0.01
 #: expected errors in px up to which texture is called good, and usable
 GOOD_PX, USABLE_PX = 0.01, 0.05
 #: subsets that are tried for a proposal, px
 SIZES = (11, 15, 19, 23, 27, 31, 35, 41, 47, 55, 65, 77, 91)
-#: share of a region's subsets that the proposed size has below GOOD_PX, or below USABLE_PX where none has
+#: share of a region's subsets that the proposed size has below GOOD_PX, or below USABLE_PX if no size has it
 MIN_SHARE = 0.95
 
 
@@ -26,8 +26,8 @@ def errors_at(
 ) -> dict[int, NDArray[np.float64]]:
     """Return the expected random error in px at points, for each subset width.
 
-    From the noise of two images and the smaller eigenvalue of the summed squared gradients over the subset; gradients
-    of the noise itself are taken off.
+    The error follows from the noise of two images and the smaller eigenvalue of the summed squared gradients over the
+    subset; the gradients of the noise itself are subtracted.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def errors_at(
     Returns
     -------
     dict
-        (n,) for each width; infinite where there is no texture.
+        (n,) for each width; infinite without texture.
     """
     gx, gy = gradients(pixels)  # of all pixels but the outermost: one less on each side
     rows, cols = gx.shape
@@ -85,7 +85,7 @@ class SpeckleQuality:
     level
         ``good``, ``usable`` or ``poor``.
     median_error_px
-        Median of the predicted standard deviations of the match; None where there is no texture.
+        Median of the predicted standard deviations of the match; None without texture.
     good_share, usable_share, good_px, usable_px
         Shares of the subsets whose error stays below the limits, and these.
     proposed_subset_px

@@ -9,37 +9,43 @@ from pathlib import Path
 
 import numpy as np
 
-from core.arrays import Float
-from core.errors import InputError, StateError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels
-from core.gauge.align import align_3_2_1, align_given
-from core.model.compare import compare_with_model
-from core.model.placement import Placement, place_by_fit, place_by_markers, place_given, place_in_frame
-from core.model.regions import Verdict
-from core.model.result import MODEL_STATUS_MEANINGS, Compared, CompareOptions, Comparison, ModelStatus
-from server.formats.files import sha256_of
-from server.formats.models.read import read_model
-from server.formats.results.folder import number_of
-from server.formats.results.reading import ResultHead, read_field, read_head
-from server.formats.results.strain import read_strain
-from server.formats.results.uncertainty import read_included
-from server.formats.version import software_version
-from server.results.gauges.numbers import finite
-from server.results.models.document import (
+from stereorig.core.arrays import Float
+from stereorig.core.errors import InputError, StateError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.gauge.align import align_3_2_1, align_given
+from stereorig.core.model.compare import compare_with_model
+from stereorig.core.model.placement import Placement, place_by_fit, place_by_markers, place_given, place_in_frame
+from stereorig.core.model.regions import ChiSquare
+from stereorig.core.model.result import MODEL_STATUS_MEANINGS, Compared, CompareOptions, ModelComparison, ModelStatus
+from stereorig.server.formats.files import sha256_of
+from stereorig.server.formats.models.read import ModelFile, read_model
+from stereorig.server.formats.results.folder import file_of_step, number_of
+from stereorig.server.formats.results.reading import ResultHead, read_field, read_head
+from stereorig.server.formats.results.strain import read_strain
+from stereorig.server.formats.results.uncertainty import read_included
+from stereorig.server.formats.version import software_version
+from stereorig.server.results.gauges.numbers import finite
+from stereorig.server.results.models.document import (
+    ChiSquareReply,
     ComparedNumber,
-    ComparisonReply,
     FactorReply,
     FieldVerdict,
+    ModelComparisonReply,
     ModelReply,
     PlacementReply,
     RegionReply,
     ShapeReply,
-    VerdictReply,
 )
-from server.results.models.request import BestFitPlacement, CompareRequest, GivenPlacement, MarkersPlacement, Start
-from server.results.reader import Variable
-from server.results.steps import StepResult
+from stereorig.server.results.models.request import (
+    BestFitPlacement,
+    CompareRequest,
+    GivenPlacement,
+    MarkersPlacement,
+    Start,
+)
+from stereorig.server.results.reader import FileVariable
+from stereorig.server.results.steps import StepResult
 
 _DISPLACEMENT, _STRAIN = ("u_mm", "v_mm", "w_mm"), ("exx", "eyy", "exy")
 _GRID = ("row", "col")
@@ -54,11 +60,11 @@ class ComparedStep:
     comparison
         As computed.
     document
-        What it says.
+        The comparison's document for API, command line and report.
     """
 
-    comparison: Comparison
-    document: ComparisonReply
+    comparison: ModelComparison
+    document: ModelComparisonReply
 
     def added_to(self, step: StepResult) -> StepResult:
         """Return a step's result with the model, the difference, its uncertainty, z and regions at its points."""
@@ -66,7 +72,12 @@ class ComparedStep:
 
 
 def compare_files(
-    files: Sequence[Path], model: Path, request: CompareRequest, *, model_name: str | None = None
+    files: Sequence[Path],
+    model: Path,
+    request: CompareRequest,
+    *,
+    read: ModelFile | None = None,
+    model_name: str | None = None,
 ) -> ComparedStep:
     """Compare one of the result files of a measurement with a model.
 
@@ -77,9 +88,11 @@ def compare_files(
     model
         The model's file.
     request
-        Which step, how the model is read and where it lies.
+        The step, the reading options of the model and its placement.
+    read
+        The model, if it was read already.
     model_name
-        Name to state; that of the file if left out.
+        Name to state; None: the file's.
 
     Raises
     ------
@@ -87,7 +100,7 @@ def compare_files(
         ``no_results`` without files.
     InputError
         ``step_missing``, ``comparison_needs_motion``, ``settings_missing``, ``model_no_overlap``,
-        ``model_geometry_differs``; what reading a model raises.
+        ``model_geometry_differs``; errors of reading a model.
     MeasurementError
         ``too_few_points`` for a marker or a position of 3-2-1.
     """
@@ -101,7 +114,7 @@ def compare_files(
             remedy="Measure again with this program.",
         )
     shared = SharedPixels.of(field, float(subset))
-    read = read_model(model, unit=request.unit, displacement=request.displacement, time=request.time)
+    read = read or read_model(model, unit=request.unit, displacement=request.displacement, time=request.time)
     asked = request.align
     start = _start(asked.start if isinstance(asked, BestFitPlacement) else asked, field, shared)
     towards = field.normal_sys[field.valid].mean(axis=0) if field.valid.any() else np.array([0.0, 0.0, 1.0])
@@ -131,6 +144,7 @@ def compare_files(
         nodes=len(read.nodes_mm),
         triangles=len(surface.triangles),
         time=read.mesh.time,
+        corners_only=read.mesh.corners_only,
     )
     return ComparedStep(found, _document(found, field, head, path, about, request))
 
@@ -139,14 +153,7 @@ def _chosen(files: Sequence[Path], step: int | None) -> Path:
     if not files:
         raise StateError("There is no result file yet.", code="no_results", remedy="Measure first.")
     there = {number_of(path): path for path in files}
-    if step is not None and step not in there:
-        raise InputError(
-            f"There is no result of step {step}; there are {', '.join(map(str, sorted(there)[:8]))}"
-            f"{' ...' if len(there) > 8 else ''}.",
-            code="step_missing",
-            remedy="Name a step that was measured.",
-        )
-    return there[max(there) if step is None else step]
+    return file_of_step(there, max(there) if step is None else step)
 
 
 def _start(asked: Start, field: Field, shared: SharedPixels) -> Placement:
@@ -182,10 +189,10 @@ def _interpolation(head: ResultHead) -> tuple[float, float, float]:
 
 
 def _document(
-    found: Comparison, field: Field, head: ResultHead, path: Path, about: ModelReply, request: CompareRequest
-) -> ComparisonReply:
+    found: ModelComparison, field: Field, head: ResultHead, path: Path, about: ModelReply, request: CompareRequest
+) -> ModelComparisonReply:
     place, rigid = found.placement, found.rigid
-    return ComparisonReply(
+    return ModelComparisonReply(
         step=head.step,
         accepted=found.accepted,
         model=about,
@@ -208,16 +215,17 @@ def _document(
         rigid=None if rigid is None else {"rotation_rad": rigid[:3].tolist(), "shift_mm": rigid[3:].tolist()},
         regions=_regions(found, field),
         refuted=[k for k in range(found.tiles.count) if _refuted(found, k)],
+        left_out=None if found.left_out is None else _DISPLACEMENT[found.left_out],
         not_included=read_included(path).lacking,
         inputs_sha256={path.name: sha256_of(path)},
         software_version=software_version(),
     )
 
 
-def _verdict(one: Verdict | None) -> VerdictReply | None:
+def _verdict(one: ChiSquare | None) -> ChiSquareReply | None:
     if one is None:
         return None
-    return VerdictReply(chi_square=finite(one.chi_square), degrees=one.degrees, probability=finite(one.probability))
+    return ChiSquareReply(chi_square=finite(one.chi_square), degrees=one.degrees, probability=finite(one.probability))
 
 
 def _field_verdict(one: Compared, names: tuple[str, ...]) -> FieldVerdict:
@@ -241,12 +249,12 @@ def _field_verdict(one: Compared, names: tuple[str, ...]) -> FieldVerdict:
     )
 
 
-def _refuted(found: Comparison, k: int) -> list[str]:
+def _refuted(found: ModelComparison, k: int) -> list[str]:
     parts: Mapping[str, Compared | None] = {"displacement": found.displacement, "strain": found.strain}
     return [name for name, part in parts.items() if part is not None and part.refuted[k]]
 
 
-def _regions(found: Comparison, field: Field) -> list[RegionReply]:
+def _regions(found: ModelComparison, field: Field) -> list[RegionReply]:
     out = []
     for k in range(found.tiles.count):
         inside = found.tiles.number == k
@@ -279,12 +287,12 @@ def _numbers(one: Compared, names: tuple[str, ...], k: int, units: str) -> dict[
     }
 
 
-def _variables(found: Comparison) -> dict[str, Variable]:
+def _variables(found: ModelComparison) -> dict[str, FileVariable]:
     """Return the comparison's variables over the grid, as result files name theirs."""
-    out: dict[str, Variable] = {}
+    out: dict[str, FileVariable] = {}
 
     def add(name: str, values: Float, units: str, text: str) -> None:
-        out[name] = Variable(np.asarray(values), units, text, _GRID)
+        out[name] = FileVariable(np.asarray(values), units, text, _GRID)
 
     parts = ((found.displacement, _DISPLACEMENT, "mm"), (found.strain, _STRAIN, "1"))
     for one, names, units in parts:
@@ -296,10 +304,10 @@ def _variables(found: Comparison) -> dict[str, Variable]:
             add(f"z_{name.removesuffix('_mm')}", one.z[..., c], "1", f"difference_{name} over its standard uncertainty")
     add("model_distance_mm", found.at_points.distance_mm, "mm", "height of the point above the model's surface")
     flags = {int(state): state.name.lower() for state in MODEL_STATUS_MEANINGS}
-    out["model_status"] = Variable(found.status, "1", "status of the point in the comparison", _GRID, flags)
-    out["region"] = Variable(found.tiles.number, "1", "region of the verdict, -1 without", _GRID)
+    out["model_status"] = FileVariable(found.status, "1", "status of the point in the comparison", _GRID, flags)
+    out["region"] = FileVariable(found.tiles.number, "1", "region of the verdict, -1 without", _GRID)
     bad = np.array([bool(_refuted(found, k)) for k in range(found.tiles.count)] + [False])
-    out["region_refuted"] = Variable(
+    out["region_refuted"] = FileVariable(
         bad[found.tiles.number].astype(np.int8), "1", "1 where the model is refuted in the region", _GRID
     )
     return out

@@ -7,11 +7,11 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field, StringConstraints, TypeAdapter
 
-from core.settings import Real
-from server.base.json_values import asked_in
-from server.base.models import Number, Request, StepNumber, Switch
-from server.formats.models.read import UNITS, Unit
-from server.results.gauges.request import GivenAlignment, PositionPx, PositionXyz
+from stereorig.core.settings import Real
+from stereorig.server.base.json_values import asked_in
+from stereorig.server.base.models import Number, Request, StepNumber, Switch
+from stereorig.server.formats.models.read import UNITS, Unit
+from stereorig.server.results.gauges.request import GivenAlignment, PositionPx, PositionXyz
 
 _Small = Annotated[Real, Field(ge=0.0, le=1e3, allow_inf_nan=False)]
 ArrayName = Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f]+$")]
@@ -56,7 +56,7 @@ class MarkersPlacement(Request):
         description="Three or more that span an area."
     )
     sigma_mm: _Small = Field(
-        0.0, description="Standard uncertainty of finding a marker, each axis, beside the measurement's own."
+        0.0, description="Standard uncertainty of finding a marker, each axis, besides the measurement's own."
     )
 
 
@@ -64,12 +64,12 @@ Start = Annotated[GivenPlacement | ThreeTwoOnePlacement | MarkersPlacement, Fiel
 
 
 class BestFitPlacement(Request):
-    """The model's surface laid onto the measured shape; what the shape does not tell stays as in `start`."""
+    """The model's surface fitted to the measured shape; motions that the shape leaves open stay as in `start`."""
 
     kind: Literal["best-fit"] = Field(description="Best fit of the shapes.")
     start: Start = Field(
         default_factory=lambda: GivenPlacement(kind="given"),
-        description="Where the model lies at first; its frame is the system frame if left out.",
+        description="First placement of the model; its frame is the system frame if left out.",
     )
 
 
@@ -82,28 +82,26 @@ _PLACEMENT: TypeAdapter[ModelPlacement] = TypeAdapter(ModelPlacement)
 
 
 class ModelReading(Request):
-    """How a model's file is read and where the model lies."""
+    """Reading options of a model's file, and the model's placement."""
 
     model_config = ConfigDict(protected_namespaces=())
 
-    unit: Unit | None = Field(
-        None, description=f"Unit of length of the file, where it states none: {', '.join(UNITS)}."
-    )
+    unit: Unit | None = Field(None, description=f"Unit of length of the file, if it states none: {', '.join(UNITS)}.")
     displacement: ArrayName | None = Field(
         None,
-        description="Name of the nodes' displacement, or three names parted by commas; the one whose name says so if "
-        "left out.",
+        description="Name of the nodes' displacement, or of its two or three components, with commas between; if left "
+        "out, the array whose name means a displacement.",
         examples=["U", "ux,uy,uz"],
     )
     time: Number | None = Field(None, description="Time of the state to take from a series; the last if left out.")
     align: ModelPlacement = Field(
         default_factory=lambda: GivenPlacement(kind="given"),
-        description="Where the model lies; in the system frame if left out.",
+        description="Placement of the model; in the system frame if left out.",
     )
 
 
 class Judging(Request):
-    """Which step is compared with a model, and how it is judged."""
+    """Step to compare with a model, and limits of the judgement."""
 
     step: StepNumber | None = Field(None, description="Step to compare; the last one measured if left out.")
     tile_px: Annotated[Real, Field(gt=0.0, le=1e5)] | None = Field(
@@ -135,7 +133,7 @@ class ComparisonRequest(Judging):
     model_id: Annotated[str, StringConstraints(max_length=40)] = Field(
         description="Id of the model.", examples=["m000001-4b1e09"]
     )
-    align: ModelPlacement | None = Field(None, description="Where the model lies; as kept with it if left out.")
+    align: ModelPlacement | None = Field(None, description="Placement of the model; as stored with it if left out.")
 
     def with_model(self, reading: Mapping[str, object]) -> CompareRequest:
         """Return the whole request, with how the model is read as it is kept."""

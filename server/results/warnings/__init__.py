@@ -1,1 +1,1 @@
-"""What must be known before a result is used: one list for the API, the page and the report."""
+"""Warnings to know before a result is used: one list for the API, the page and the report."""

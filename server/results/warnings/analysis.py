@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from server.base.long_json import nothing
-from server.formats.calibrations.in_test import calibration_id_in, calibration_in, measured_with
-from server.formats.results.camera_motion import MOVED_REMEDY
-from server.formats.results.settings import current_step
-from server.store.durable import UnchangedFiles, known_json
+from stereorig.server.base.long_json import Keep, nothing
+from stereorig.server.formats.calibrations.in_test import calibration_id_in, calibration_in, measured_with
+from stereorig.server.formats.manifest import DamagedError
+from stereorig.server.formats.results.camera_motion import MOVED_REMEDY
+from stereorig.server.store.durable import UnchangedFiles, known_json
 
 Level = Literal["failed", "warning"]
 _Summary = Mapping[str, Any]
@@ -50,7 +51,7 @@ class ResultWarning:
     text
         The finding with its figures, in a sentence.
     remedy
-        What to do.
+        Advice to the user.
     steps
         Steps that it holds for; empty: the whole analysis.
     """
@@ -81,14 +82,14 @@ def analysis_warnings(
     Parameters
     ----------
     folder
-        Of its results; beside a test's steps, or alone.
+        Folder of its results; in a test's folder, or alone.
     stale
         Inputs that are gone or were replaced since.
     failed
         Steps that could not be measured, by their numbers; as ``summary.json`` has them if left out.
     """
     found = {int(one["n"]): one for one in _own_summaries(folder)}
-    summary = known_json(folder / "summary.json", {"steps": nothing if found else _used})
+    summary = _known(folder / "summary.json", {"steps": nothing if found else _used})
     found = found or {int(one["n"]): one for one in summary.get("steps") or [] if isinstance(one.get("n"), int)}
     home = folder.parent.parent if (folder.parent.parent / "steps").is_dir() else None
     taken = {} if home is None else {n: _step_in(home / "steps" / f"{n:04d}" / "step.json") for n in found}
@@ -100,20 +101,28 @@ def analysis_warnings(
         *([] if home is None else _calibration(home, measured_with(folder))),
         *_moved(found),
         *_failed_steps(problems if isinstance(problems, dict) else {}),
-        *_quality(taken),
+        *_quality(taken or found),
         *_stale(stale),
     ]
     return sorted(made, key=lambda one: one.level != "failed")
 
 
+def _known(path: Path, keep: Mapping[str, Keep] | None = None) -> dict[str, Any]:
+    """Return a document; empty without one, and for one that is damaged, which is among the reasons to be stale."""
+    try:
+        return known_json(path, keep)
+    except DamagedError:
+        return {}
+
+
 def _used(step: object) -> _Summary:
-    """Return the entries of a step that are asked for here, in today's form."""
-    found = current_step(step) if isinstance(step, dict) else {}
+    """Return the entries of a step that are asked for here."""
+    found = step if isinstance(step, dict) else {}
     return {name: value for name, value in found.items() if name in _ASKED_FOR}
 
 
 def _read_step(path: Path) -> _Summary:
-    return _used(known_json(path))
+    return _used(_known(path))
 
 
 def _step_in(path: Path) -> _Summary:
@@ -122,7 +131,7 @@ def _step_in(path: Path) -> _Summary:
 
 
 def _own_summaries(folder: Path) -> Iterable[_Summary]:
-    """Yield the summaries that the service keeps beside each step's result."""
+    """Yield the summaries that the service stores with each step's result."""
     there = set(os.listdir(folder)) if folder.is_dir() else set()  # noqa: PTH208 - names of some thousand files
     for name in sorted(there):
         if name.startswith("step_") and name.endswith(".json") and f"{name[:-5]}.nc" in there:
@@ -200,10 +209,10 @@ def _coverage(steps: _Steps) -> list[ResultWarning]:
 
 
 def _calibration(home: Path, sha256: str | None) -> list[ResultWarning]:
-    name = calibration_id_in(known_json(home / "test.json"), sha256) or ""
+    name = calibration_id_in(_known(home / "test.json"), sha256) or ""
     made = []
     folder = home.parent.parent / "calibrations" / Path(name).name
-    review = next((kept for n in ("review.json", "judgement.json") if (kept := known_json(folder / n))), {})
+    review = _known(folder / "review.json")
     if name and review.get("decision") == "discarded":
         note = f": {review['note']}" if review.get("note") else ""
         made.append(
@@ -214,17 +223,24 @@ def _calibration(home: Path, sha256: str | None) -> list[ResultWarning]:
                 "Measure with another calibration, or take the decision back.",
             )
         )
-    verdict = known_json(calibration_in(home, sha256)).get("verdict")
+    with contextlib.suppress(DamagedError):  # that its calibration is gone is among the reasons to be stale
+        return made + _verdict(_known(calibration_in(home, sha256)).get("verdict"), review)
+    return made
+
+
+def _verdict(verdict: object, review: Mapping[str, Any]) -> list[ResultWarning]:
+    """Return the warning that follows from a calibration's own verdict."""
+    made: list[ResultWarning] = []
     found = verdict.get("level") if isinstance(verdict, dict) else None
     accepted = review.get("decision") == "accepted"  # by someone who saw the verdict
     if isinstance(verdict, dict) and (found == "failed" or (found == "warning" and not accepted)):
-        reasons = "; ".join(map(str, verdict.get("reasons") or []))
+        reasons = " ".join(map(str, verdict.get("reasons") or []))
         made.append(
             ResultWarning(
                 f"calibration_{found}",
                 "failed" if found == "failed" and not accepted else "warning",
                 f"The calibration's own verdict is {found}{': ' + reasons.rstrip('.') if reasons else ''}.",
-                "Calibrate again; the calibration's page says what to put right.",
+                "Calibrate again; the calibration's page lists the faults to put right.",
             )
         )
     return made
@@ -244,7 +260,7 @@ def _failed_steps(failed: Mapping[str, object]) -> list[ResultWarning]:
     if not numbers:
         return []
     first = failed[str(numbers[0])]
-    cause = str(first.get("cause", "")).rstrip(".") if isinstance(first, dict) else ""
+    cause = str(first.get("detail", "")).rstrip(".") if isinstance(first, dict) else ""
     remedy = str(first.get("remedy") or "") if isinstance(first, dict) else ""
     text = f"{_of(numbers)} could not be measured; step {numbers[0]}: {cause}."
     return [ResultWarning("steps_failed", "warning", text, remedy or "Read each step's problem.", tuple(numbers))]

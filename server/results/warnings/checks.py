@@ -9,13 +9,20 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from core.names import CAMERAS
-from server.formats.calibrations.in_test import LATER, calibration_id_in, calibration_in, measured_with
-from server.formats.files import mark_of
-from server.results.staleness import stale_inputs
-from server.results.warnings.analysis import ResultWarning, analysis_warnings
-from server.store.documents import AnalysisRecord
-from server.store.durable import known_json, read_record
+from stereorig.core.names import CAMERAS
+from stereorig.server.documents.tests import AnalysisRecord
+from stereorig.server.formats.calibrations.in_test import (
+    LATER,
+    calibration_id_in,
+    calibration_in,
+    later_file,
+    measured_with,
+)
+from stereorig.server.formats.files import mark_of
+from stereorig.server.formats.manifest import DamagedError
+from stereorig.server.results.staleness import stale_inputs
+from stereorig.server.results.warnings.analysis import ResultWarning, analysis_warnings
+from stereorig.server.store.durable import known_json, read_record
 
 
 @dataclass(frozen=True)
@@ -60,13 +67,13 @@ def checks_of(folder: Path, failed: Mapping[str, object] | None = None) -> Check
 def checks_if_changed(
     folder: Path, failed: Mapping[str, object] | None, before: bytes | None
 ) -> tuple[bytes, Checks | None]:
-    """Return the state of what the checks look at, and the findings; None for these where it is as ``before``.
+    """Return the state of the checked files, and the findings; None for these if it is the same as ``before``.
 
     Parameters
     ----------
     folder, failed
         As in :func:`checks_of`.
-    before
+        State at the last call.
         State at which the same was asked for.
     """
     state = state_of(folder)
@@ -76,7 +83,7 @@ def checks_if_changed(
 def state_of(folder: Path) -> bytes:
     """Return a digest that differs whenever a file differs that :func:`checks_of` looks at.
 
-    By the files' sizes, and by times that no program can set; without a look into those of the steps, of which there
+    It is made of the files' sizes, and of times that no program can set; the steps' files are not read, of which there
     may be thousands in each of a hundred analyses.
     """
     test = folder.parent.parent
@@ -114,12 +121,16 @@ def _stated(paths: Iterable[str]) -> Iterator[bytes]:
 
 
 def stale_reasons(test: Path, document: AnalysisRecord) -> list[str]:
-    """Return what is gone or was replaced since an analysis was made; see :func:`stale_inputs`."""
+    """Return the inputs that are gone or were replaced since an analysis was made; see :func:`stale_inputs`."""
     inputs = document.inputs
+    try:
+        calibration = calibration_in(test, inputs.calibration_sha256)
+    except DamagedError:  # test.json is unreadable, so that the calibration in force is not known
+        calibration = later_file(test, str(inputs.calibration_sha256))
     return stale_inputs(
         test,
         {int(n): hashes for n, hashes in inputs.steps.items()},
-        calibration=calibration_in(test, inputs.calibration_sha256),
+        calibration=calibration,
         calibration_sha256=inputs.calibration_sha256,
         reference=document.steps[0],
     )

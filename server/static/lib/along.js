@@ -1,6 +1,6 @@
 // Positions along a line, and values of several lines on common positions.
 
-/** @typedef {(number | null)[]} Numbers null where there is none */
+/** @typedef {(number | null)[]} Numbers null for missing ones */
 
 /**
  * Distance along the surface from the first position, mm; null where a point is missing on the way.
@@ -20,7 +20,7 @@ export function distanceMm(xyz) {
 }
 
 /**
- * Values on other positions, straight between neighbours; null beyond the ends and beside a missing value.
+ * Values on other positions, straight between neighbours; null beyond the ends and next to a missing value.
  * @param {readonly number[]} x in rising order
  * @param {Numbers} values
  * @param {readonly number[]} at in rising order
@@ -32,7 +32,7 @@ export function resampled(x, values, at) {
     while (k < x.length - 2 && x[k + 1] < v) k += 1;
     const [a, b] = [values[k], values[k + 1]];
     if (v === x[k]) return a ?? null;
-    if (v < x[k] || v > (x[k + 1] ?? NaN) || a === null || b === null || a === undefined || b === undefined) return v === x[k + 1] ? b ?? null : null;
+    if (v < x[k] || v > (x[k + 1] ?? NaN) || a === null || b === null || a === undefined || b === undefined) return v === x[k + 1] ? (b ?? null) : null;
     return a + ((b - a) * (v - x[k])) / (x[k + 1] - x[k]);
   });
 }

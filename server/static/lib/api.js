@@ -12,7 +12,7 @@ export class Problem extends Error {
    * @param {string | null} [requestId]
    */
   constructor(status, document_, requestId = null) {
-    super(document_.detail || document_.cause || document_.title || `The service answered ${status}.`);
+    super(document_.detail || document_.title || `The service answered ${status}.`);
     this.name = "Problem";
     this.status = status;
     this.code = document_.code;
@@ -20,7 +20,9 @@ export class Problem extends Error {
     this.requestId = requestId;
     this.document = document_;
     this.fields = (document_.errors ?? []).map((/** @type {any} */ one) =>
-      typeof one === "string" ? one : `${(one.loc ?? [one.field ?? ""]).filter((/** @type {unknown} */ p) => p !== "body").join(".")}: ${one.msg ?? one.detail ?? one.cause ?? ""}`,
+      typeof one === "string"
+        ? one
+        : `${(one.loc ?? [one.field ?? ""]).filter((/** @type {unknown} */ p) => p !== "body").join(".")}: ${one.msg ?? one.detail ?? ""}`,
     );
   }
 }
@@ -95,7 +97,11 @@ async function send(method, path, { body, query, headers = {}, signal, making = 
       if (aborted(error)) throw error;
       if (attempt >= 1 || !(method === "GET" || making)) {
         announce("down");
-        throw new Problem(0, { detail: "The service does not answer.", remedy: "Is it running? The page continues by itself once the service answers.", code: "no_answer" });
+        throw new Problem(0, {
+          detail: "The service does not answer.",
+          remedy: "Is it running? The page continues by itself once the service answers.",
+          code: "no_answer",
+        });
       }
       await new Promise((resolve) => setTimeout(resolve, 300));
     }
@@ -185,7 +191,7 @@ export const upload = async (path, form) => json(await send("POST", path, { body
 export const raw = async (path, query) => ok(await send("GET", path, { query }));
 
 /**
- * Read something together with its ETag, for a change that must not overwrite that of another client.
+ * Read something together with its ETag, for a change that must not overwrite another client's.
  * @template {string} const P
  * @param {P & Address<"get", P>} path
  * @returns {Promise<{ value: Reply<"get", P>, etag: string | null }>}
@@ -196,7 +202,7 @@ export async function getTagged(path) {
 }
 
 /**
- * Replace something; with the ETag of what is there now.
+ * Replace something; with the ETag of its present state.
  * @template {string} const P
  * @param {P & Address<"put", P>} path
  * @param {Body<"put", P>} body
@@ -240,8 +246,22 @@ export async function npy(path, query) {
   const start = (wide ? 12 : 10) + length;
   const header = new TextDecoder("latin1").decode(new Uint8Array(buffer, wide ? 12 : 10, length));
   const descr = /'descr':\s*'([^']+)'/.exec(header)?.[1] ?? "";
-  const shape = (/'shape':\s*\(([^)]*)\)/.exec(header)?.[1] ?? "").split(",").map((s) => s.trim()).filter(Boolean).map(Number);
-  const kinds = { f8: Float64Array, f4: Float32Array, i4: Int32Array, u4: Uint32Array, i2: Int16Array, u2: Uint16Array, i1: Int8Array, u1: Uint8Array, b1: Uint8Array };
+  const shape = (/'shape':\s*\(([^)]*)\)/.exec(header)?.[1] ?? "")
+    .split(",")
+    .map((s) => s.trim())
+    .filter(Boolean)
+    .map(Number);
+  const kinds = {
+    f8: Float64Array,
+    f4: Float32Array,
+    i4: Int32Array,
+    u4: Uint32Array,
+    i2: Int16Array,
+    u2: Uint16Array,
+    i1: Int8Array,
+    u1: Uint8Array,
+    b1: Uint8Array,
+  };
   const Kind = kinds[/** @type {keyof typeof kinds} */ (descr.slice(1))];
   if (!Kind || descr[0] === ">") throw new Error(`An array of ${descr} cannot be shown.`);
   return { data: new Kind(buffer.slice(start)), shape };

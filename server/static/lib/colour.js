@@ -1,8 +1,10 @@
 // Colour maps and scales: numbers to colours, the same for the map, the surface and the bar.
 
 // every eighth entry of matplotlib's maps of these names (CC0)
-const VIRIDIS = "440154470d6048186a482374472d7b4537814240863e49893b528b375b8d33638d2f6b8e2c728e297a8e26828e23898e21918c1f978b1f9f8821a68527ad8131b57b3dbc744cc26c5cc8636ece5881d34d95d840aadc32c0df25d5e21aeae51afde725";
-const CIVIDIS = "00224e00285b002e6a0533711a386f273e6e32436d3b496c434e6c4b546c535a6d5a5f6e61656f686a716f70737676767d7c788381798b8778928d789a9376a29975aaa073b3a670bbad6dc3b369ccba64d4c15fddc858e6d051efd748f8df3cfee838";
+const VIRIDIS =
+  "440154470d6048186a482374472d7b4537814240863e49893b528b375b8d33638d2f6b8e2c728e297a8e26828e23898e21918c1f978b1f9f8821a68527ad8131b57b3dbc744cc26c5cc8636ece5881d34d95d840aadc32c0df25d5e21aeae51afde725";
+const CIVIDIS =
+  "00224e00285b002e6a0533711a386f273e6e32436d3b496c434e6c4b546c535a6d5a5f6e61656f686a716f70737676767d7c788381798b8778928d789a9376a29975aaa073b3a670bbad6dc3b369ccba64d4c15fddc858e6d051efd748f8df3cfee838";
 
 /** @typedef {"viridis" | "cividis" | "diverging" | "grey"} MapName */
 
@@ -16,8 +18,16 @@ const points = (hex) => (hex.match(/.{6}/g) ?? []).map((one) => [0, 2, 4].map((k
  * @param {number} b
  */
 function okLab(lightness, a, b) {
-  const [l, m, s] = [lightness + 0.3963377774 * a + 0.2158037573 * b, lightness - 0.1055613458 * a - 0.0638541728 * b, lightness - 0.0894841775 * a - 1.291485548 * b].map((v) => v ** 3);
-  const linear = [4.0767416621 * l - 3.3077115913 * m + 0.2309699292 * s, -1.2684380046 * l + 2.6097574011 * m - 0.3413193965 * s, -0.0041960863 * l - 0.7034186147 * m + 1.707614701 * s];
+  const [l, m, s] = [
+    lightness + 0.3963377774 * a + 0.2158037573 * b,
+    lightness - 0.1055613458 * a - 0.0638541728 * b,
+    lightness - 0.0894841775 * a - 1.291485548 * b,
+  ].map((v) => v ** 3);
+  const linear = [
+    4.0767416621 * l - 3.3077115913 * m + 0.2309699292 * s,
+    -1.2684380046 * l + 2.6097574011 * m - 0.3413193965 * s,
+    -0.0041960863 * l - 0.7034186147 * m + 1.707614701 * s,
+  ];
   return linear.map((v) => 255 * Math.min(1, Math.max(0, v <= 0.0031308 ? 12.92 * v : 1.055 * Math.max(v, 0) ** (1 / 2.4) - 0.055)));
 }
 
@@ -37,7 +47,13 @@ const grey = () => Array.from({ length: 33 }, (_, k) => okLab(0.12 + (0.86 * k) 
 
 /** @type {Record<MapName, number[][]>} */
 const CONTROL = { viridis: points(VIRIDIS), cividis: points(CIVIDIS), diverging: diverging(), grey: grey() };
-export const MAPS = [["auto", "Automatic"], ["viridis", "Viridis"], ["cividis", "Cividis"], ["diverging", "Blue to brown"], ["grey", "Grey"]];
+export const MAPS = [
+  ["auto", "Automatic"],
+  ["viridis", "Viridis"],
+  ["cividis", "Cividis"],
+  ["diverging", "Blue to brown"],
+  ["grey", "Grey"],
+];
 
 /**
  * @param {MapName} name
@@ -79,7 +95,7 @@ export function entry(value, low, high) {
 }
 
 /**
- * Low and high percentile of the finite numbers; null where there is none.
+ * Low and high percentile of the finite numbers; null if there are none.
  * @param {ArrayLike<number>} values
  * @param {number} low
  * @param {number} high

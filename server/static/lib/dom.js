@@ -93,7 +93,7 @@ function sign(control) {
 /**
  * @param {Drawn} node
  * @param {Control} control
- * @returns {Control[]} those of its kind with the same sign
+ * @returns {Control[]} the controls of its kind with the same sign
  */
 function alike(node, control, mine = sign(control)) {
   return [.../** @type {NodeListOf<Control>} */ (node.querySelectorAll(control.tagName))].filter((one) => sign(one) === mine);
@@ -115,7 +115,7 @@ function refocus(node, { control: before, mine, index }) {
   const same = alike(node, before, mine).filter((one) => !one.disabled);
   const next = same[index] ?? same.at(-1);
   if (next) return next.focus({ preventScroll: true });
-  // it is gone: the next Tab goes on from where it was
+  // it is gone: the next Tab continues from its place
   if (!(node instanceof HTMLElement)) return /** @type {HTMLElement | null} */ (node.closest("[tabindex]"))?.focus({ preventScroll: true });
   if (!node.hasAttribute("tabindex")) node.tabIndex = -1;
   return node.focus({ preventScroll: true });
@@ -129,7 +129,11 @@ export function num(value, digits = 4) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   if (value === 0) return "0";
   const size = Math.abs(value);
-  if (size >= 1e6 || size < 1e-4) return value.toExponential(Math.max(digits - 1, 0)).replace("e", "\u00a0e").replaceAll("-", "−");
+  if (size >= 1e6 || size < 1e-4)
+    return value
+      .toExponential(Math.max(digits - 1, 0))
+      .replace("e", "\u00a0e")
+      .replaceAll("-", "−");
   const decimals = Math.max(0, digits - 1 - Math.floor(Math.log10(size)));
   return value.toFixed(Math.min(decimals, 6)).replace("-", "−");
 }
@@ -139,7 +143,11 @@ export function num(value, digits = 4) {
  * @param {number | null | undefined} value
  */
 export function count(value) {
-  return value === null || value === undefined ? "–" : Math.round(value).toString().replace(/\B(?=(\d{3})+$)/g, "\u202f");
+  return value === null || value === undefined
+    ? "–"
+    : Math.round(value)
+        .toString()
+        .replace(/\B(?=(\d{3})+$)/g, "\u202f");
 }
 
 /**
@@ -202,7 +210,11 @@ export function number(value, attributes_ = {}) {
  * @param {Attributes} [attributes_]
  */
 export function select(options, chosen, attributes_ = {}) {
-  return h("select", attributes_, options.map(([value, text]) => h("option", { value, selected: String(value) === String(chosen) }, text)));
+  return h(
+    "select",
+    attributes_,
+    options.map(([value, text]) => h("option", { value, selected: String(value) === String(chosen) }, text)),
+  );
 }
 
 /**
@@ -255,7 +267,15 @@ export function table(columns, rows, { caption, onrow, empty = "No entries yet."
     h(
       "table",
       caption ? h("caption", caption) : null,
-      h("thead", h("tr", columns.map(([name, , options]) => h("th", { scope: "col", class: options?.numeric ? "numeric" : null }, options?.unseen ? h("span.unseen", name) : name)))),
+      h(
+        "thead",
+        h(
+          "tr",
+          columns.map(([name, , options]) =>
+            h("th", { scope: "col", class: options?.numeric ? "numeric" : null }, options?.unseen ? h("span.unseen", name) : name),
+          ),
+        ),
+      ),
       h(
         "tbody",
         rows.map((row) =>
@@ -275,8 +295,18 @@ export function table(columns, rows, { caption, onrow, empty = "No entries yet."
  * @param {readonly (readonly [string, Part])[]} pairs name and value of each
  */
 export function definitions(pairs) {
-  return h("dl.definitions", pairs.map(([name, value]) => [h("dt", name), h("dd", value ?? "–")]));
+  return h(
+    "dl.definitions",
+    pairs.map(([name, value]) => [h("dt", name), h("dd", value ?? "–")]),
+  );
 }
+
+/**
+ * Put other names and values into a definition list.
+ * @param {HTMLElement} list
+ * @param {readonly (readonly [string, Part])[]} pairs
+ */
+export const describe = (list, pairs) => replace(list, [...definitions(pairs).children]);
 
 /** @param {string | undefined} text */
 export function badge(text, kind = "") {
@@ -285,9 +315,24 @@ export function badge(text, kind = "") {
 
 /** @type {Record<string, string>} */
 export const STATE_KIND = {
-  succeeded: "good", complete: "good", accepted: "good", ok: "good", pass: "good", passed: "good", ready: "good",
-  running: "busy", queued: "busy", cancelling: "busy", starting: "busy", unfinished: "busy",
-  failed: "bad", fault: "bad", refused: "bad", interrupted: "warn", cancelled: "warn", warning: "warn",
+  succeeded: "good",
+  complete: "good",
+  accepted: "good",
+  ok: "good",
+  pass: "good",
+  passed: "good",
+  ready: "good",
+  running: "busy",
+  queued: "busy",
+  cancelling: "busy",
+  starting: "busy",
+  unfinished: "busy",
+  failed: "bad",
+  fault: "bad",
+  refused: "bad",
+  interrupted: "warn",
+  cancelled: "warn",
+  warning: "warn",
 };
 
 /**
@@ -307,15 +352,16 @@ export function part(id) {
 export function notify(what, kind = "") {
   const notices = part("notices");
   const problem = what instanceof Error;
+  const dismiss = () => {
+    const next = box.nextElementSibling ?? box.previousElementSibling;
+    box.remove();
+    (next?.querySelector("button") ?? part("main")).focus({ preventScroll: true });
+  };
   const box = h(
     `div.notice${problem ? ".bad" : kind ? `.${kind}` : ""}`,
     { role: problem ? "alert" : "status" },
     problem ? problemText(what) : h("p", String(what)),
-    h("button.plain", { type: "button", "aria-label": "Dismiss this message", onclick: () => {
-      const next = box.nextElementSibling ?? box.previousElementSibling;
-      box.remove();
-      (next?.querySelector("button") ?? part("main")).focus({ preventScroll: true });
-    } }, "×"),
+    h("button.plain", { type: "button", "aria-label": "Dismiss this message", onclick: dismiss }, "×"),
   );
   const same = [...notices.children].find((node) => node.firstChild?.textContent === box.firstChild?.textContent);
   if (same) same.remove();
@@ -323,7 +369,7 @@ export function notify(what, kind = "") {
   while (notices.children.length > 4) notices.firstElementChild?.remove();
   /** @returns {unknown} */
   const fade = () => (box.contains(document.activeElement) ? setTimeout(fade, 2000) : box.remove());
-  setTimeout(fade, problem ? 30_000 : 6000); // an error is read for longer, but does not lie over the page for ever
+  setTimeout(fade, problem ? 30_000 : 6000); // an error is read for longer, but does not cover the page for ever
   return box;
 }
 
@@ -338,12 +384,17 @@ export function problemText(problem) {
     h("p", h("strong", error.message || String(problem))),
     error.remedy ? h("p", error.remedy) : null,
     error.code ? h("p.quiet", h("code", error.code), error.requestId ? ` · request ${error.requestId}` : "") : null,
-    error.fields?.length ? h("ul", error.fields.map((text) => h("li", text))) : null,
+    error.fields?.length
+      ? h(
+          "ul",
+          error.fields.map((text) => h("li", text)),
+        )
+      : null,
   );
 }
 
 /**
- * Open a dialog: Tab goes round in it, and the focus goes back to where it was once it is closed.
+ * Open a dialog: Tab goes round in it, and the focus returns to its place once it is closed.
  * @param {HTMLDialogElement} node
  * @param {HTMLElement} [first] control that has the focus first
  */
@@ -351,7 +402,9 @@ export function modal(node, first) {
   const before = /** @type {HTMLElement | null} */ (document.activeElement);
   node.addEventListener("keydown", (event) => {
     if (event.key !== "Tab") return;
-    const stops = [.../** @type {NodeListOf<Control>} */ (node.querySelectorAll("a[href], button, input, select, textarea, summary, [tabindex='0']"))].filter((one) => !one.disabled && one.checkVisibility());
+    const stops = [.../** @type {NodeListOf<Control>} */ (node.querySelectorAll("a[href], button, input, select, textarea, summary, [tabindex='0']"))].filter(
+      (one) => !one.disabled && one.checkVisibility(),
+    );
     const at = stops.indexOf(/** @type {Control} */ (document.activeElement));
     const next = event.shiftKey ? (at <= 0 ? stops.at(-1) : null) : at === stops.length - 1 ? stops[0] : null;
     if (!next) return;
@@ -377,13 +430,35 @@ export function modal(node, first) {
  */
 export function ask(heading, body, buttons) {
   return new Promise((resolve) => {
-    const stop = h("button.stop", { type: "button", title: "Stop every axis at once (Esc, twice)", onclick: () => window.dispatchEvent(new Event("stopstage")) }, "STOP");
+    const stop = h(
+      "button.stop",
+      { type: "button", title: "Stop every axis at once (Esc, twice)", onclick: () => window.dispatchEvent(new Event("stopstage")) },
+      "STOP",
+    );
     const node = h("dialog", { "aria-label": heading }, h("div.spread", h("h2", heading), stop), body);
-    const close = (/** @type {string | null} */ value) => { node.close(); resolve(value); };
+    const close = (/** @type {string | null} */ value) => {
+      node.close();
+      resolve(value);
+    };
     const choices = buttons.map(([text, value], index) =>
-      h(index === buttons.length - 1 ? "button.primary" : "button", { type: "button", onclick: () => close(value) }, text));
+      h(index === buttons.length - 1 ? "button.primary" : "button", { type: "button", onclick: () => close(value) }, text),
+    );
     node.append(h("div.row.end", choices));
-    node.addEventListener("cancel", (event) => { event.preventDefault(); close(null); });
+    node.addEventListener("cancel", (event) => {
+      event.preventDefault();
+      close(null);
+    });
     modal(node, /** @type {HTMLElement | null} */ (body.querySelector("input, select, textarea")) ?? choices[0]);
   });
+}
+
+/**
+ * Ask before something is done; true if it was confirmed.
+ * @param {string} heading
+ * @param {HTMLElement} body
+ * @param {string} verb on the button
+ */
+export async function confirmed(heading, body, verb) {
+  const no = /** @type {const} */ (["Cancel", null]);
+  return (await ask(heading, body, [no, [verb, "yes"]])) !== null;
 }

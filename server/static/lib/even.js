@@ -1,7 +1,7 @@
 // Round numbers: 1, 2 or 5 times a power of ten, and even marks of such steps.
 
 /**
- * 1, 2 or 5 times a power of ten, not above `value`; 1 where there is none.
+ * 1, 2 or 5 times a power of ten, not above `value`; 1 if there is none.
  * @param {number} value
  */
 export function round125(value) {

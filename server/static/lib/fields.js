@@ -1,23 +1,28 @@
-// Errors of fields, each beside its own control, in the user's words, before anything is sent.
+// Errors of fields, each next to its own control, in the user's words, before anything is sent.
 import { h } from "./dom.js";
 
 /** @typedef {HTMLInputElement | HTMLSelectElement | HTMLTextAreaElement} Entry */
-/** @typedef {() => boolean} Rule says what is wrong with a field beside it; true if nothing is */
+/** @typedef {() => boolean} Rule shows a field's error next to it; true if it has none */
 
 let told = 0;
 let pressed = false;
-window.addEventListener("pointerdown", () => { pressed = true; }, true);
-for (const end of ["pointerup", "pointercancel"]) window.addEventListener(end, () => { pressed = false; }, true);
+/** @param {Event} event */
+const press = ({ type }) => {
+  pressed = type === "pointerdown";
+};
+for (const name of ["pointerdown", "pointerup", "pointercancel"]) window.addEventListener(name, press, true);
 
 /**
- * Put an error beside a control; an empty text takes it away.
+ * Put an error next to a control; an empty text removes it.
  * @param {Entry} control
  * @param {string} text
  */
 export function tell(control, text) {
   const place = control.closest(".field") ?? control.closest(".row") ?? control.parentElement;
   const described = (control.getAttribute("aria-describedby") ?? "").split(" ").filter(Boolean);
-  const known = described.map((id) => document.getElementById(id) ?? place?.querySelector(`#${CSS.escape(id)}`)).find((node) => node?.classList.contains("error"));
+  const known = described
+    .map((id) => document.getElementById(id) ?? place?.querySelector(`#${CSS.escape(id)}`))
+    .find((node) => node?.classList.contains("error"));
   if (!text) {
     if (!known) return;
     known.remove();
@@ -37,18 +42,21 @@ export function tell(control, text) {
 }
 
 /**
- * A rule of a field: said when the field is left or sent, taken back as soon as it is put right.
+ * A rule of a field: its error is shown when the field is left or sent, and removed as soon as it is put right.
  * @param {Entry} control
- * @param {(text: string) => string} wrong what is wrong with its text; empty: nothing
+ * @param {(text: string) => string} wrong the error in its text; empty: none
  * @returns {Rule}
  */
 export function rule(control, wrong) {
   const check = () => {
-    const text = control instanceof HTMLInputElement && control.validity.badInput ? "This is no number. Write it with a point, such as 12.5." : wrong(control.value.trim());
+    const text =
+      control instanceof HTMLInputElement && control.validity.badInput
+        ? "This is no number. Write it with a point, such as 12.5."
+        : wrong(control.value.trim());
     tell(control, text);
     return !text;
   };
-  // a press that leaves the field is a click on something: an error that came meanwhile would push that away from under it
+  // a press that leaves the field is a click on something: an error that appears before the click would push the target away
   control.addEventListener("change", () => (pressed ? window.addEventListener("pointerup", () => setTimeout(check), { once: true }) : check()));
   control.addEventListener("input", () => control.getAttribute("aria-invalid") === "true" && check());
   return check;
@@ -71,7 +79,7 @@ export function allRight(rules) {
 }
 
 /**
- * What is wrong with a number's text, of these limits; empty: nothing.
+ * The error in a number's text by these limits; empty: none.
  * @param {{ low?: number | null, high?: number | null, unit?: string, whole?: boolean, odd?: boolean, required?: boolean, above?: number, what?: string }} limits
  * @returns {(text: string) => string}
  */
@@ -88,7 +96,8 @@ export function numberWithin({ low = null, high = null, unit = "", whole = false
       if (high === null) return `Give ${shown(low)} at least, not ${shown(value)}.`;
       return `Give ${low} to ${shown(high)}, not ${shown(value)}.`;
     }
-    if (odd && value % 2 === 0) return `Give an odd number, ${[value - 1, value + 1].filter((near) => (low === null || near >= low) && (high === null || near <= high)).join(" or ")}, not ${shown(value)}: it has a middle.`;
+    if (odd && value % 2 === 0)
+      return `Give an odd number, ${[value - 1, value + 1].filter((near) => (low === null || near >= low) && (high === null || near <= high)).join(" or ")}, not ${shown(value)}: it has a middle.`;
     return "";
   };
 }
@@ -103,7 +112,7 @@ export function numberWithin({ low = null, high = null, unit = "", whole = false
 export function limited(control, what, { unit = "", required = true, more } = {}) {
   const [low, high] = [control.min, control.max].map((text) => (text === "" ? null : Number(text)));
   const within = numberWithin({ low, high, unit, what, required, whole: ["1", "2"].includes(control.step), odd: control.step === "2" });
-  return [control, rule(control, (text) => within(text) || (text && more?.(Number(text)) || ""))];
+  return [control, rule(control, (text) => within(text) || (text && more?.(Number(text))) || "")];
 }
 
 /**
@@ -115,7 +124,7 @@ export function again(rules) {
 }
 
 /**
- * What is wrong with a list of numbers; empty: nothing.
+ * The error in a list of numbers; empty: none.
  * @param {{ low?: number, high?: number, least?: number, unit: string }} limits
  * @returns {(text: string) => string}
  */

@@ -21,7 +21,15 @@ export function trianglesOf(grid, whole, onCell) {
       const [p, q, s, t] = corners;
       const good = corners.map((i) => Boolean(whole(i)));
       const number = good.filter(Boolean).length;
-      const each = number === 4 ? [[p, s, q], [q, s, t]] : number === 3 ? [[p, s, t, q].filter((_, k) => good[[0, 2, 3, 1][k]])] : [];
+      const each =
+        number === 4
+          ? [
+              [p, s, q],
+              [q, s, t],
+            ]
+          : number === 3
+            ? [[p, s, t, q].filter((_, k) => good[[0, 2, 3, 1][k]])]
+            : [];
       for (const three of each) if (grid.whole(cell, three)) out.push(...three);
       if (each.length) onCell?.(cell, corners, good);
     }

@@ -1,5 +1,5 @@
-// The grid of points: values between them, never over a missing point or a cut. The rule is that of the gauges:
-// four corners bilinearly; three where the fourth is missing or lies beyond a cut and the position lies in their triangle.
+// The grid of points: values between them, never over a missing point or a cut. The gauges have the same rule:
+// bilinear from four corners; from three, in their triangle, if the fourth is missing or beyond a cut.
 
 const NEAR = 1e-6;
 
@@ -89,11 +89,16 @@ export class Grid {
     const [x0, y0] = piece;
     const within = x0 >= left && x0 <= right && y0 >= top && y0 <= bottom;
     // a line that enters and leaves a rectangle meets one of its diagonals; one that ends in it has an end within, or meets a side
-    return within || meet(left, top, right, bottom, ...piece) || meet(right, top, left, bottom, ...piece) || (piece[2] >= left && piece[2] <= right && piece[3] >= top && piece[3] <= bottom);
+    return (
+      within ||
+      meet(left, top, right, bottom, ...piece) ||
+      meet(right, top, left, bottom, ...piece) ||
+      (piece[2] >= left && piece[2] <= right && piece[3] >= top && piece[3] <= bottom)
+    );
   }
 
   /**
-   * Return true if no cut meets a side of the triangle of three points, and none lies inside it.
+   * Return true if no cut meets a side of the triangle of three points, and none is inside it.
    * @param {number} cell that the three are corners of
    * @param {number[]} three numbers of points
    */
@@ -107,8 +112,9 @@ export class Grid {
       });
       return turns.every((turn) => turn >= 0) || turns.every((turn) => turn <= 0);
     };
-    return pieces.every((piece) => !inside(piece[0], piece[1]) || !inside(piece[2], piece[3]))
-      && three.every((a, k) => !this.parted(cell, a, three[(k + 1) % 3]));
+    return (
+      pieces.every((piece) => !inside(piece[0], piece[1]) || !inside(piece[2], piece[3])) && three.every((a, k) => !this.parted(cell, a, three[(k + 1) % 3]))
+    );
   }
 
   /**
@@ -133,7 +139,7 @@ export class Grid {
   }
 
   /**
-   * Nearest of points at `positions`; -1 where none has a position.
+   * Nearest of points at `positions`; -1 if none has a position.
    * @param {ArrayLike<number>} positions
    * @param {number} x
    * @param {number} y
@@ -143,7 +149,10 @@ export class Grid {
     let min = Infinity;
     for (let i = 0; i < this.x.length; i += 1) {
       const d = (positions[2 * i] - x) ** 2 + (positions[2 * i + 1] - y) ** 2;
-      if (d < min) { min = d; best = i; }
+      if (d < min) {
+        min = d;
+        best = i;
+      }
     }
     return best;
   }
@@ -169,7 +178,7 @@ export class Grid {
   }
 
   /**
-   * Value in a cell at shares s, t of its width and height; NaN where it has none.
+   * Value in a cell at shares s, t of its width and height; NaN if it has none.
    * @param {ArrayLike<number>} values
    * @param {number} cell
    * @param {number} s
@@ -203,7 +212,7 @@ export class Grid {
   }
 
   /**
-   * Value at a position in the reference image; NaN where it has none.
+   * Value at a position in the reference image; NaN if it has none.
    * @param {ArrayLike<number>} values
    * @param {number} x
    * @param {number} y
@@ -225,7 +234,7 @@ export class Grid {
    * @param {number} height of the image, px
    * @param {ArrayLike<number> | null} positions of the points in it (x, y, x, y ...); null: the reference image
    * @param {boolean} steps each pixel takes its nearest point's value, failed or not (for a status)
-   * @returns {Raster} the part of the image where points lie
+   * @returns {Raster} the part of the image that has points
    */
   raster(values, width, height, positions = null, steps = false) {
     let [left, top, right, bottom] = [Infinity, Infinity, -Infinity, -Infinity];
@@ -243,7 +252,13 @@ export class Grid {
     right = Math.min(Math.ceil(right) + margin, width - 1);
     bottom = Math.min(Math.ceil(bottom) + margin, height - 1);
     if (!(right >= left && bottom >= top)) return { x: 0, y: 0, width: 0, height: 0, values: new Float32Array(0) };
-    const out = { x: left, y: top, width: right - left + 1, height: bottom - top + 1, values: new Float32Array((right - left + 1) * (bottom - top + 1)).fill(NaN) };
+    const out = {
+      x: left,
+      y: top,
+      width: right - left + 1,
+      height: bottom - top + 1,
+      values: new Float32Array((right - left + 1) * (bottom - top + 1)).fill(NaN),
+    };
     if (steps && !positions) this.#nearestEach(values, out);
     else this.#cells(values, out, positions);
     return out;
@@ -330,7 +345,7 @@ export class Grid {
   }
 
   /**
-   * The half of a cell at its corner `o`, where its corners lie at `positions`.
+   * The half of a cell at its corner `o`, with its corners at `positions`.
    * @param {ArrayLike<number>} values
    * @param {Raster} out
    * @param {ArrayLike<number>} positions
@@ -354,7 +369,10 @@ export class Grid {
     const area = ux * vy - uy * vx;
     if (!Number.isFinite(area) || Math.abs(area) < 1e-9) return;
     const from = [Math.max(Math.ceil(Math.min(px, ax, bx) - NEAR), out.x), Math.max(Math.ceil(Math.min(py, ay, by) - NEAR), out.y)];
-    const to = [Math.min(Math.floor(Math.max(px, ax, bx) + NEAR), out.x + out.width - 1), Math.min(Math.floor(Math.max(py, ay, by) + NEAR), out.y + out.height - 1)];
+    const to = [
+      Math.min(Math.floor(Math.max(px, ax, bx) + NEAR), out.x + out.width - 1),
+      Math.min(Math.floor(Math.max(py, ay, by) + NEAR), out.y + out.height - 1),
+    ];
     const plain = !this.cutCells.has(cell);
     const vo = values[io];
     const va = values[ia];
@@ -385,7 +403,11 @@ export class Grid {
    * @param {Grid} other
    */
   same(other) {
-    return this.rows === other.rows && this.cols === other.cols && /** @type {const} */ (["x0", "y0", "dx", "dy"]).every((name) => Math.abs(this[name] - other[name]) < 1e-3);
+    return (
+      this.rows === other.rows &&
+      this.cols === other.cols &&
+      /** @type {const} */ (["x0", "y0", "dx", "dy"]).every((name) => Math.abs(this[name] - other[name]) < 1e-3)
+    );
   }
 }
 

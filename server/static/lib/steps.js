@@ -80,7 +80,7 @@ export async function readAnalysis(testId, analysisId) {
  */
 export async function figuresOf(testId, analysisId, n) {
   const { steps } = await api.get(`/tests/${testId}/analyses/${analysisId}/steps`, { first: n, limit: 1 });
-  return steps[0]?.n === n ? steps[0].figures ?? null : null;
+  return steps[0]?.n === n ? (steps[0].figures ?? null) : null;
 }
 
 /**

@@ -53,7 +53,7 @@ function fixed(value, decimals) {
  * @param {number | null | undefined} value
  * @param {number | null | undefined} u in the same unit
  * @param {string} unit
- * @param {number} [size] of the largest number beside it: a column has one unit
+ * @param {number} [size] of the largest number in its column: a column has one unit
  * @returns {string} a value without an uncertainty with four digits; an unknown value is a dash
  */
 export function uncertain(value, u, unit, size = 0) {
@@ -71,7 +71,7 @@ export function uncertain(value, u, unit, size = 0) {
  * A number in the unit that suits.
  * @param {number | null | undefined} value
  * @param {string} unit
- * @param {number} [size] of the largest number beside it: a column has one unit
+ * @param {number} [size] of the largest number in its column: a column has one unit
  */
 export function amount(value, unit, digits = 4, size = 0) {
   const to = shown(unit, value === null || value === undefined ? null : Math.max(Math.abs(value), size));
@@ -80,11 +80,16 @@ export function amount(value, unit, digits = 4, size = 0) {
 }
 
 /**
- * Marks of a scale, all with the same decimals, as few as tell neighbours apart.
+ * Marks of a scale, all with the same decimals, as few as distinguish neighbours.
  * @param {readonly number[]} values
  */
 export function evenMarks(values) {
-  const step = Math.min(...values.slice(1).map((v, k) => Math.abs(v - values[k])).filter((v) => v > 0));
+  const step = Math.min(
+    ...values
+      .slice(1)
+      .map((v, k) => Math.abs(v - values[k]))
+      .filter((v) => v > 0),
+  );
   const largest = Math.max(...values.map(Math.abs));
   if (!Number.isFinite(step) || largest >= 1e5 || largest < 1e-3) return values.map((v) => tick(Number(v.toPrecision(3))));
   const decimals = Math.max(0, 1 - Math.floor(Math.log10(step) + 1e-9));
@@ -95,7 +100,12 @@ export function evenMarks(values) {
  * The service's words as the page writes units: µm, ±, µm/m.
  * @param {string | null | undefined} text
  */
-export const inUnits = (text) => (text ?? "").replaceAll("+-", "±").replace(/(?<=\d )um\b/g, "µm").replace(/(?<=\d )microstrain\b/g, "µm/m").replace(/(?<=\d )sigma\b/g, "σ");
+export const inUnits = (text) =>
+  (text ?? "")
+    .replaceAll("+-", "±")
+    .replace(/(?<=\d )um\b/g, "µm")
+    .replace(/(?<=\d )microstrain\b/g, "µm/m")
+    .replace(/(?<=\d )sigma\b/g, "σ");
 
 /**
  * A duration in the units that people use: 0.4 s, 12 s, 29 min 31 s, 3 h 5 min, 2 d 4 h.
@@ -105,9 +115,18 @@ export function duration(seconds) {
   if (seconds === null || seconds === undefined || !Number.isFinite(seconds)) return "–";
   if (seconds < 9.95) return `${Number(seconds.toFixed(1))}\u00a0s`;
   const whole = Math.round(seconds);
-  const parts = /** @type {[number, string][]} */ ([[Math.floor(whole / 86400), "d"], [Math.floor(whole / 3600) % 24, "h"], [Math.floor(whole / 60) % 60, "min"], [whole % 60, "s"]]);
+  const parts = /** @type {[number, string][]} */ ([
+    [Math.floor(whole / 86400), "d"],
+    [Math.floor(whole / 3600) % 24, "h"],
+    [Math.floor(whole / 60) % 60, "min"],
+    [whole % 60, "s"],
+  ]);
   const first = parts.findIndex(([n]) => n > 0);
-  return parts.slice(first, first + 2).filter(([n]) => n > 0).map(([n, unit]) => `${n}\u00a0${unit}`).join(" ");
+  return parts
+    .slice(first, first + 2)
+    .filter(([n]) => n > 0)
+    .map(([n, unit]) => `${n}\u00a0${unit}`)
+    .join(" ");
 }
 
 /**

@@ -1,10 +1,10 @@
-// Vectors on the points: which of them are drawn, how long, and what the arrow of the legend means.
+// Vectors on the points: the choice of the drawn ones, their lengths, and the meaning of the legend's arrow.
 import { round125 } from "./even.js";
 
 /** @import { Grid } from "./point_grid.js" */
 
 /**
- * Every so many points that some fifteen lie along the longer side of the grid.
+ * Every so many points that some fifteen are along the longer side of the grid.
  * @param {Grid} grid
  */
 export const usualSpacing = (grid) => Math.max(1, Math.round(Math.max(grid.rows, grid.cols) / 15));

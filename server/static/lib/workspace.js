@@ -1,4 +1,4 @@
-// What is drawn and set for a test, saved with it as it is drawn: it outlives the screen, the browser and the service.
+// Drawing and settings of a test, saved with it as they are made: it outlives the screen, the browser and the service.
 import * as api from "./api.js";
 import { h, replace } from "./dom.js";
 
@@ -8,7 +8,7 @@ import { h, replace } from "./dom.js";
 
 const LATER_MS = 300;
 const AGAIN_MS = 2000;
-/** Told to the window once something drawn or set was saved. */
+/** Event of the window after a drawing or setting was saved. */
 export const SAVED = "workspacesaved";
 // browsers send no more than this for a page that is being closed
 const CLOSING_BYTES = 60_000;
@@ -32,7 +32,9 @@ export class Workspace {
     /** @type {Promise<void>} */
     this.saving = Promise.resolve();
     this.state = h("span.quiet", { role: "status", "data-role": "saved" });
-    this.closing = () => { if (document.visibilityState === "hidden") this.flush(true); };
+    this.closing = () => {
+      if (document.visibilityState === "hidden") this.flush(true);
+    };
     document.addEventListener("visibilitychange", this.closing);
     window.addEventListener("pagehide", this.closing);
   }
@@ -52,7 +54,7 @@ export class Workspace {
   }
 
   /**
-   * Parts that were drawn or set; what is the same as before is not sent.
+   * Parts that were drawn or set; unchanged ones are not sent.
    * @param {Kept} parts
    */
   change(parts) {
@@ -65,7 +67,7 @@ export class Workspace {
     this.timer = setTimeout(() => this.flush(), LATER_MS);
   }
 
-  /** Save what is open, after what is being saved. */
+  /** Save the open changes, after the save that is under way. */
   flush(closing = false) {
     clearTimeout(this.timer);
     this.saving = this.saving.then(() => this.#save(closing));
@@ -109,7 +111,7 @@ export class Workspace {
   }
 
   /**
-   * Another window changed it: other parts than these are taken over; of these, the operator says which to keep.
+   * Another window changed it: other parts than these are taken over; for these, the operator chooses the version to keep.
    * @param {Kept} part
    * @returns {Promise<void>}
    */
@@ -119,9 +121,13 @@ export class Workspace {
     const same = /** @type {(keyof Kept)[]} */ (Object.keys(part)).every((name) => text(this.stored[name]) === text(before[name]));
     if (same) return this.#save();
     this.state.classList.add("problem");
-    replace(this.state, "Changed in another window meanwhile. ",
-      h("button", { type: "button", onclick: () => location.reload() }, "Take that"), " ",
-      h("button", { type: "button", onclick: () => this.flush() }, "Keep this one"));
+    replace(
+      this.state,
+      "Changed in another window since. ",
+      h("button", { type: "button", onclick: () => location.reload() }, "Take that"),
+      " ",
+      h("button", { type: "button", onclick: () => this.flush() }, "Keep this one"),
+    );
     clearTimeout(this.timer);
   }
 
@@ -131,7 +137,7 @@ export class Workspace {
     replace(this.state, words);
   }
 
-  /** The screen is left: what is open is saved now. */
+  /** The screen is left: save the open changes now. */
   close() {
     document.removeEventListener("visibilitychange", this.closing);
     window.removeEventListener("pagehide", this.closing);

@@ -13,7 +13,8 @@ import { h, replace, field, select, action, table, when, notify, problemText } f
 
 /** @import { Here } from "../main.js" */
 /** @import { Ends } from "#dom" */
-/** @import { Reply } from "#routes" */
+/** @import { Model, Reply } from "#routes" */
+/** @typedef {Model<"TestReply">} Test */
 
 /**
  * @param {HTMLElement} root
@@ -30,7 +31,8 @@ export async function open(root, { path }) {
 async function calibrationChoice(chosen) {
   const usable = (await api.get("/calibrations")).calibrations.filter((c) => c.state === "complete" && c.decision !== "discarded").toReversed();
   const first = usable.find((c) => c.decision === "accepted") ?? usable[0];
-  const text = (/** @type {Reply<"get", "/calibrations">["calibrations"][number]} */ c) => `${c.label || c.id} · ${c.verdict?.level ?? "imported"}${c.decision === "accepted" ? " · accepted" : ""} · ${when(c.created_utc)}`;
+  const text = (/** @type {Reply<"get", "/calibrations">["calibrations"][number]} */ c) =>
+    `${c.label || c.id} · ${c.verdict?.level ?? "imported"}${c.decision === "accepted" ? " · accepted" : ""} · ${when(c.created_utc)}`;
   /** @type {[string, string][]} */
   const options = usable.map((c) => [c.id, text(c)]);
   if (chosen === undefined) return select([...options, ["", "none: images only"]], first?.id ?? "");
@@ -45,24 +47,72 @@ async function all(root) {
   const notes = h("textarea", { rows: 2, maxlength: 20000 });
   const calibration = await calibrationChoice();
   const named = rule(name, (text) => (text ? "" : "The test has no name. Give it one; it can be changed later."));
-  const uncalibrated = calibration.value ? null : h("div.caution", { role: "status" }, h("p", "No calibration can be used yet: images can be taken, and measured once there is one."), h("a.button", { href: "#/calibrate" }, "Calibrate first"));
-  const make = action("Make the test", async () => {
-    if (!allRight([[name, named]])) return;
-    const made = await api.post("/tests", { name: name.value.trim(), specimen: specimen.value, notes: notes.value, calibration_id: calibration.value || null });
-    location.hash = `#/test/${made.id}`;
-  }, { kind: "primary" });
+  const uncalibrated = calibration.value
+    ? null
+    : h(
+        "div.caution",
+        { role: "status" },
+        h("p", "No calibration can be used yet: images can be taken, and measured once there is one."),
+        h("a.button", { href: "#/calibrate" }, "Calibrate first"),
+      );
+  const make = action(
+    "Make the test",
+    async () => {
+      if (!allRight([[name, named]])) return;
+      const made = await api.post("/tests", {
+        name: name.value.trim(),
+        specimen: specimen.value,
+        notes: notes.value,
+        calibration_id: calibration.value || null,
+      });
+      location.hash = `#/test/${made.id}`;
+    },
+    { kind: "primary" },
+  );
   const list = h("div");
   async function refresh() {
     const { tests } = await api.get("/tests");
-    replace(list, table([
-      ["Test", (test) => h("a", { href: `#/test/${test.id}` }, test.name)], ["Specimen", (test) => test.specimen || "–"],
-      ["Calibration", (test) => (test.calibration_id ? h("a", { href: `#/calibrate/${test.calibration_id}` }, test.calibration_id) : "none")],
-      ["Made", (test) => when(test.created_utc)], ["Id", (test) => h("code", test.id)],
-    ], tests.toReversed(), { caption: "Tests, newest first", onrow: (test) => { location.hash = `#/test/${test.id}`; }, empty: "No test yet." }));
+    replace(
+      list,
+      table(
+        [
+          ["Test", (test) => h("a", { href: `#/test/${test.id}` }, test.name)],
+          ["Specimen", (test) => test.specimen || "–"],
+          ["Calibration", (test) => (test.calibration_id ? h("a", { href: `#/calibrate/${test.calibration_id}` }, test.calibration_id) : "none")],
+          ["Made", (test) => when(test.created_utc)],
+          ["Id", (test) => h("code", test.id)],
+        ],
+        tests.toReversed(),
+        {
+          caption: "Tests, newest first",
+          onrow: (test) => {
+            location.hash = `#/test/${test.id}`;
+          },
+          empty: "No test yet.",
+        },
+      ),
+    );
   }
   await refresh();
-  replace(root, h("h1", "Tests"), h("div.grid.side", h("section.panel", list),
-    h("section.panel", { "aria-label": "New test" }, h("h2", "New test"), field("Name", name), field("Specimen", specimen), field("Calibration", calibration, "", "The test keeps its own copy."), field("Notes", notes), uncalibrated, make)));
+  replace(
+    root,
+    h("h1", "Tests"),
+    h(
+      "div.grid.side",
+      h("section.panel", list),
+      h(
+        "section.panel",
+        { "aria-label": "New test" },
+        h("h2", "New test"),
+        field("Name", name),
+        field("Specimen", specimen),
+        field("Calibration", calibration, "", "The test keeps its own copy."),
+        field("Notes", notes),
+        uncalibrated,
+        make,
+      ),
+    ),
+  );
   return events.on("test", () => refresh().catch(notify));
 }
 
@@ -82,52 +132,62 @@ async function one(root, id) {
     const { etag } = await api.getTagged(`/tests/${id}`);
     return api.patch(`/tests/${id}`, changes, etag === null ? {} : { "If-Match": etag });
   }
-  /** The calibration that new analyses are measured with; a test that has none says what to do about it. */
-  async function calibrationRow() {
-    const choice = Object.assign(await calibrationChoice(test.calibration_id ?? ""), { id: "test-calibration" });
-    choice.style.maxWidth = "100%";
-    const said = h("small.hint", { role: "status" }, "Analyses that are there keep theirs.");
-    choice.addEventListener("change", async () => {
-      if (!choice.value) return;
-      try {
-        test = await change({ calibration_id: choice.value });
-        drawHead();
-        await measure.steps(test);
-        notify("New analyses are measured with this calibration.", "good");
-      } catch (error) {
-        choice.value = test.calibration_id ?? "";
-        replace(said, problemText(error));
-      }
-    });
-    const row = h("div.row", h("label", { for: "test-calibration" }, "Calibration"), choice, h("a", { href: test.calibration_id ? `#/calibrate/${test.calibration_id}` : "#/calibrate" }, test.calibration_id ? "look at it" : "make or import one"), said);
-    return test.calibration_id ? row : h("div.caution", { "data-role": "uncalibrated" }, h("p", "This test names no calibration: choose one, and its images can be measured. It can be changed at any time."), row);
+  /** @param {string} calibration */
+  async function calibrate(calibration) {
+    test = await change({ calibration_id: calibration });
+    drawHead();
+    await measure.steps(test);
+    notify("New analyses are measured with this calibration.", "good");
   }
   let drawn = 0;
   function drawHead() {
     drawn += 1;
     const mine = drawn;
     const calibration = h("div", { "data-role": "calibration" });
-    calibrationRow().then((row) => { if (mine === drawn) replace(calibration, row); }, (error) => replace(calibration, problemText(error)));
+    calibrationRow(test, calibrate).then(
+      (row) => {
+        if (mine === drawn) replace(calibration, row);
+      },
+      (error) => replace(calibration, problemText(error)),
+    );
     const name = h("input", { type: "text", maxlength: 300, value: test.name });
     const specimen = h("input", { type: "text", maxlength: 300, value: test.specimen });
     const notes = h("textarea", { rows: 3, maxlength: 20000, value: test.notes });
-    replace(head, h("p", test.specimen ? `${test.specimen} · ` : "", `made ${when(test.created_utc)} · `, h("code", test.id)),
-      test.notes ? h("p.quiet", test.notes) : null, calibration,
-      h("details", h("summary", "Name, specimen and notes"), h("div.fields", field("Name", name), field("Specimen", specimen)), field("Notes", notes),
-        action("Save", async () => { test = await change({ name: name.value, specimen: specimen.value, notes: notes.value }); title.textContent = test.name; drawHead(); notify("Saved.", "good"); })),
-      metadataPanel(id));
+    replace(
+      head,
+      h("p", test.specimen ? `${test.specimen} · ` : "", `made ${when(test.created_utc)} · `, h("code", test.id)),
+      test.notes ? h("p.quiet", test.notes) : null,
+      calibration,
+      h(
+        "details",
+        h("summary", "Name, specimen and notes"),
+        h("div.fields", field("Name", name), field("Specimen", specimen)),
+        field("Notes", notes),
+        action("Save", async () => {
+          test = await change({ name: name.value, specimen: specimen.value, notes: notes.value });
+          title.textContent = test.name;
+          drawHead();
+          notify("Saved.", "good");
+        }),
+      ),
+      metadataPanel(id),
+    );
   }
-  function drawAnalyses() {
-    replace(analyses, h("h2", "Analyses"), table([
-      ["Analysis", (a) => h("a", { href: `#/results/${id}/${a.id}` }, a.label || a.id)], ["Kind", (a) => a.kind], ["Checks", warningsCell],
-      ["Calibration", (a) => (a.calibration_id ? h("a", { href: `#/calibrate/${a.calibration_id}` }, a.calibration_id) : "–")], ["Made", (a) => when(a.created_utc)],
-    ], (test.analyses ?? []).toReversed(), { caption: "Newest first", empty: "None yet." }));
-  }
+  const drawAnalyses = () => replace(analyses, h("h2", "Analyses"), analysesTable(test));
   const title = h("h1", test.name);
-  const steps = await stepsPanel(id, test, ends, async () => { test = await readTest(id); return test; });
+  const steps = await stepsPanel(id, test, ends, async () => {
+    test = await readTest(id);
+    return test;
+  });
   const liveValues = await liveValuesPanel(id, ends);
-  const measure = await measurePanel(id, test, ends, async () => { test = await readTest(id); drawAnalyses(); });
-  steps.onchange((/** @type {typeof test} */ fresh) => { test = fresh; measure.steps(fresh); });
+  const measure = await measurePanel(id, test, ends, async () => {
+    test = await readTest(id);
+    drawAnalyses();
+  });
+  steps.onchange((/** @type {typeof test} */ fresh) => {
+    test = fresh;
+    measure.steps(fresh);
+  });
   drawHead();
   drawAnalyses();
   // at most five times a second, and once more after the last one: a burst's steps come faster than they rest
@@ -147,8 +207,64 @@ async function one(root, id) {
     events.on("step", (event) => {
       if (event.test_id === id) soon();
     }),
-    () => { clearTimeout(later); more = false; },
+    () => {
+      clearTimeout(later);
+      more = false;
+    },
   );
-  replace(root, h("div.spread", title, measure.head, h("a", { href: "#/test" }, "All tests")), h("div.grid", head, steps.root, procedurePanel(id, ends), measure.root, liveValues, analyses));
+  replace(
+    root,
+    h("div.spread", title, measure.head, h("a", { href: "#/test" }, "All tests")),
+    h("div.grid", head, steps.root, procedurePanel(id, ends), measure.root, liveValues, analyses),
+  );
   return () => ends.forEach((end) => end());
 }
+
+/**
+ * The calibration that new analyses are measured with; a test without one shows the way to one.
+ * @param {Test} test
+ * @param {(calibration: string) => Promise<void>} calibrate
+ */
+async function calibrationRow(test, calibrate) {
+  const choice = Object.assign(await calibrationChoice(test.calibration_id ?? ""), { id: "test-calibration" });
+  choice.style.maxWidth = "100%";
+  const said = h("small.hint", { role: "status" }, "Analyses that are there keep theirs.");
+  choice.addEventListener("change", async () => {
+    if (!choice.value) return;
+    try {
+      await calibrate(choice.value);
+    } catch (error) {
+      choice.value = test.calibration_id ?? "";
+      replace(said, problemText(error));
+    }
+  });
+  const row = h(
+    "div.row",
+    h("label", { for: "test-calibration" }, "Calibration"),
+    choice,
+    h("a", { href: test.calibration_id ? `#/calibrate/${test.calibration_id}` : "#/calibrate" }, test.calibration_id ? "look at it" : "make or import one"),
+    said,
+  );
+  return test.calibration_id
+    ? row
+    : h(
+        "div.caution",
+        { "data-role": "uncalibrated" },
+        h("p", "This test names no calibration: choose one, and its images can be measured. It can be changed at any time."),
+        row,
+      );
+}
+
+/** @param {Test} test */
+const analysesTable = (test) =>
+  table(
+    [
+      ["Analysis", (a) => h("a", { href: `#/results/${test.id}/${a.id}` }, a.label || a.id)],
+      ["Kind", (a) => a.kind],
+      ["Checks", warningsCell],
+      ["Calibration", (a) => (a.calibration_id ? h("a", { href: `#/calibrate/${a.calibration_id}` }, a.calibration_id) : "–")],
+      ["Made", (a) => when(a.created_utc)],
+    ],
+    (test.analyses ?? []).toReversed(),
+    { caption: "Newest first", empty: "None yet." },
+  );

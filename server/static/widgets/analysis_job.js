@@ -1,4 +1,4 @@
-// A running analysis in one row: how far it is, Finish where it follows its test, Cancel.
+// A running analysis in one row: its progress, Finish if it follows its test, Cancel.
 import * as api from "../lib/api.js";
 import { h, replace, action, num } from "../lib/dom.js";
 
@@ -8,7 +8,7 @@ import { h, replace, action, num } from "../lib/dom.js";
 export const ENDED = ["succeeded", "failed", "cancelled", "interrupted"];
 
 /**
- * What a running job does, in a few words.
+ * Present work of a running job, in a few words.
  * @param {Pick<Job, "state"> & { progress?: Partial<Job["progress"]> }} job
  */
 export function doing({ state, progress }) {
@@ -23,14 +23,21 @@ export function doing({ state, progress }) {
  * @param {string} of.testId
  * @param {string} of.analysisId
  * @param {string} of.jobId
- * @param {boolean} of.follow true: it goes on with each step of its test, until it is finished
- * @param {import("#dom").Part[]} [of.before] what stands at the row's beginning
+ * @param {boolean} of.follow true: it measures each new step of its test, until it is finished
+ * @param {import("#dom").Part[]} [of.before] parts at the row's beginning
  */
 export function analysisJob({ testId, analysisId, jobId, follow, before = [] }) {
   const bar = h("progress", { max: 1, value: 0, "aria-label": "Progress of the analysis" });
   const text = h("span.doing", { "data-role": "doing" });
-  const finish = action("Finish", async () => { await api.post(`/tests/${testId}/analyses/${analysisId}:finish`); finishing = true; draw(last); },
-    { title: "Measure the steps that are there, then end; Cancel ends it at once" });
+  const finish = action(
+    "Finish",
+    async () => {
+      await api.post(`/tests/${testId}/analyses/${analysisId}:finish`);
+      finishing = true;
+      draw(last);
+    },
+    { title: "Measure the steps that are there, then end; Cancel ends it at once" },
+  );
   const cancel = action("Cancel", () => api.post(`/jobs/${jobId}:cancel`), { kind: "danger" });
   const root = h("div.row.analysis-job", { "data-role": "analysis-job" });
   /** @type {Job | null} */
@@ -47,7 +54,7 @@ export function analysisJob({ testId, analysisId, jobId, follow, before = [] }) 
     text.textContent = finishing && !ended ? "finishing: measures the steps that are there" : doing(job);
     text.title = text.textContent;
     finish.hidden = !follow;
-    // what cannot be pressed any more keeps its place, so that nothing moves
+    // a button that cannot be pressed any more keeps its place, so that nothing moves
     for (const button of [finish, cancel]) button.disabled = ended || (finishing && button === finish);
   }
   replace(root, before, h("span.bar", bar), text, finish, cancel);

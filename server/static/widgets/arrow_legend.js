@@ -1,4 +1,4 @@
-// The legend of vectors: an arrow in a corner of the picture, and what its length means.
+// The legend of vectors: an arrow in a corner of the picture, and the meaning of its length.
 import { h, svg, replace } from "../lib/dom.js";
 
 const LONGEST = 140;
@@ -15,9 +15,21 @@ export function arrowLegend(frame) {
     const cut = now.length * now.scale() > LONGEST;
     const long = Math.max(px, 1);
     const wide = Math.max(Math.ceil(long), 8) + 1;
-    replace(root, svg("svg", { width: wide, height: 14, viewBox: `0 0 ${wide} 14`, "aria-hidden": "true" },
-      svg("path", { d: `M${wide - long} 7H${wide - 1}M${wide - 6} 3L${wide - 1} 7L${wide - 6} 11`, stroke: "#fff", "stroke-width": 1.5, fill: "none", "stroke-dasharray": cut ? "4 3" : null })),
-    h("span", now.text));
+    replace(
+      root,
+      svg(
+        "svg",
+        { width: wide, height: 14, viewBox: `0 0 ${wide} 14`, "aria-hidden": "true" },
+        svg("path", {
+          d: `M${wide - long} 7H${wide - 1}M${wide - 6} 3L${wide - 1} 7L${wide - 6} 11`,
+          stroke: "#fff",
+          "stroke-width": 1.5,
+          fill: "none",
+          "stroke-dasharray": cut ? "4 3" : null,
+        }),
+      ),
+      h("span", now.text),
+    );
     root.setAttribute("aria-label", `Legend of the vectors: the arrow is ${now.text}`);
     root.dataset.length = String(now.length * now.scale());
     root.dataset.text = now.text;
@@ -33,7 +45,10 @@ export function arrowLegend(frame) {
       root.hidden = !(length > 0);
       again();
     },
-    hide() { now = null; root.hidden = true; },
+    hide() {
+      now = null;
+      root.hidden = true;
+    },
     again,
   };
 }

@@ -36,7 +36,7 @@ export class FieldMap {
     this.now = null;
     this.asked = 0;
     this.factor = 1; // of the standard uncertainties shown under the mouse
-    this.lacking = ""; // what they do not include
+    this.lacking = ""; // the terms that they do not include
     this.noImage = false;
     this.address = "";
     /** @type {Raster | null} */
@@ -44,7 +44,10 @@ export class FieldMap {
     this.size = ""; // of the picture that the raster was made for
     /** @type {Scale | null} */
     this.scale = null;
-    this.view.image.addEventListener("load", () => { this.noImage = false; this.redraw(); });
+    this.view.image.addEventListener("load", () => {
+      this.noImage = false;
+      this.redraw();
+    });
     this.view.image.addEventListener("error", () => {
       if (!this.view.image.getAttribute("src")) return;
       this.noImage = true;
@@ -63,19 +66,22 @@ export class FieldMap {
    * @param {number} n step
    * @param {Shown} info entry of `result.fields`
    * @param {Over} image
-   * @returns {Promise<boolean>} false if a newer one was requested meanwhile
+   * @returns {Promise<boolean>} false if a newer one was requested since
    */
   async load(result, n, info, image) {
     this.asked += 1;
     const mine = this.asked;
     const of = image === "reference" ? [result.reference, "cam1"] : [n, image];
     const address = api.address(`/tests/${result.testId}/steps/${of[0]}/${of[1]}/preview`);
-    if (!this.address) { // the first picture comes while the numbers do; later ones come with their numbers
+    if (!this.address) {
+      // the first picture comes while the numbers do; later ones come with their numbers
       this.address = address;
       this.view.show(address);
     }
     const [grid, values, positions] = await Promise.all([
-      result.grid(n), result.values(n, info.key), image === "reference" ? null : result.positions(n, image).then((one) => one.data),
+      result.grid(n),
+      result.values(n, info.key),
+      image === "reference" ? null : result.positions(n, image).then((one) => one.data),
     ]);
     if (mine !== this.asked) return false;
     if (this.address !== address) {
@@ -86,13 +92,16 @@ export class FieldMap {
     const now = { result, n, info, image, grid, values, sigma: null, positions, statistics: statistics(grid, values), withSigma: Promise.resolve() };
     this.now = now;
     // not needed for the picture: it may arrive later
-    now.withSigma = result.sigma(n, info.key).then((sigma) => {
-      if (now.info === info) now.sigma = sigma;
-      if (this.now === now) this.view.reread();
-      return sigma;
-    }, () => null);
+    now.withSigma = result.sigma(n, info.key).then(
+      (sigma) => {
+        if (now.info === info) now.sigma = sigma;
+        if (this.now === now) this.view.reread();
+        return sigma;
+      },
+      () => null,
+    );
     this.raster = null;
-    this.view.readout.textContent = ""; // its text was that of another field or step
+    this.view.readout.textContent = ""; // its text belonged to another field or step
     this.view.reread();
     return true;
   }
@@ -122,7 +131,10 @@ export class FieldMap {
     if (this.noImage && this.now.image === "reference") {
       // no picture: its size follows from the points
       const { grid } = this.now;
-      this.view.size(Math.ceil(Math.max(...[0, grid.cols - 1].map((c) => grid.x0 + c * grid.dx)) + grid.x0), Math.ceil(grid.y0 * 2 + (grid.rows - 1) * grid.dy));
+      this.view.size(
+        Math.ceil(Math.max(...[0, grid.cols - 1].map((c) => grid.x0 + c * grid.dx)) + grid.x0),
+        Math.ceil(grid.y0 * 2 + (grid.rows - 1) * grid.dy),
+      );
     }
     const { width, height } = this.view;
     if (!width) return; // drawn when the picture has come

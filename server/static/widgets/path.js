@@ -12,10 +12,15 @@ const KEPT = "test.open";
 const SEEN = "results.seen";
 const PAUSE_MS = 400; // events come in bursts
 
-/** @type {readonly [Name, string, string][]} name, text, and what its tick says */
+/** @type {readonly [Name, string, string][]} name, text, and the meaning of its tick */
 const STEPS = [
-  ["rig", "Rig", "cameras and stage are ready"], ["calibrate", "Calibrate", "a calibration is accepted"], ["test", "Test", "a test is open"],
-  ["capture", "Capture", "the reference and a step are captured"], ["region", "Region", "a region is drawn"], ["measure", "Measure", "the test is measured"], ["results", "Results", "results were looked at"],
+  ["rig", "Rig", "cameras and stage are ready"],
+  ["calibrate", "Calibrate", "a calibration is accepted"],
+  ["test", "Test", "a test is open"],
+  ["capture", "Capture", "the reference and a step are captured"],
+  ["region", "Region", "a region is drawn"],
+  ["measure", "Measure", "the test is measured"],
+  ["results", "Results", "results were looked at"],
 ];
 /** Where a part of the test's screen is. @type {Record<string, string>} */
 const PLACES = { capture: '[aria-label="Capture"]', region: '[aria-label="Region and analysis"]', measure: '[data-role="progress"]' };
@@ -43,8 +48,12 @@ async function look() {
   const [test, drawn] = known ? await Promise.all([api.get(`/tests/${known}`), api.get(`/tests/${known}/workspace`)]) : [null, null];
   const measured = Boolean(test?.analyses?.length);
   return {
-    rig: rig.connected && !rig.fault && !Object.values(rig.cameras).some((one) => one.fault), calibrated: calibrations.length > 0, test: known,
-    steps: test?.n_steps ?? 0, region: Boolean(drawn?.region) || measured, measured, // what was measured had a region, kept or not
+    rig: rig.connected && !rig.fault && !Object.values(rig.cameras).some((one) => one.fault),
+    calibrated: calibrations.length > 0,
+    test: known,
+    steps: test?.n_steps ?? 0,
+    region: Boolean(drawn?.region) || measured,
+    measured, // a measured test had a region, stored or not
     seen: measured && localStorage.getItem(SEEN) === known,
   };
 }
@@ -65,19 +74,36 @@ export function goTo(at = "") {
 /** @param {HTMLElement} others links that follow the steps */
 export function path(others) {
   /** @type {Map<Name, HTMLAnchorElement>} */
-  const links = new Map(STEPS.map(([name, text], index) => [name, h("a", { href: `#/${name}`, "data-screen": name },
-    h("span.tick", { "aria-hidden": "true" }, String(index + 1)), h("span.word", text))]));
+  const links = new Map(
+    STEPS.map(([name, text], index) => [
+      name,
+      h("a", { href: `#/${name}`, "data-screen": name }, h("span.tick", { "aria-hidden": "true" }, String(index + 1)), h("span.word", text)),
+    ]),
+  );
   /** @type {Here | null} */
   let here = null;
   /** @type {Done | null} */
   let done = null;
 
   function draw() {
-    const current = here?.screen === "test" && here.path.length ? here.query.get("at") ?? "test" : here?.screen;
+    const current = here?.screen === "test" && here.path.length ? (here.query.get("at") ?? "test") : here?.screen;
     const test = done?.test ?? lastTest();
-    const ticks = { rig: done?.rig, calibrate: done?.calibrated, test: Boolean(done?.test), capture: (done?.steps ?? 0) > 1, region: done?.region, measure: done?.measured, results: done?.seen };
+    const ticks = {
+      rig: done?.rig,
+      calibrate: done?.calibrated,
+      test: Boolean(done?.test),
+      capture: (done?.steps ?? 0) > 1,
+      region: done?.region,
+      measure: done?.measured,
+      results: done?.seen,
+    };
     const within = test ? `#/test/${encodeURIComponent(test)}` : "#/test";
-    const to = { rig: "#/rig", calibrate: "#/calibrate", test: within, results: test && done?.measured ? `#/results/${encodeURIComponent(test)}` : "#/results" };
+    const to = {
+      rig: "#/rig",
+      calibrate: "#/calibrate",
+      test: within,
+      results: test && done?.measured ? `#/results/${encodeURIComponent(test)}` : "#/results",
+    };
     STEPS.forEach(([name, , why], index) => {
       const link = /** @type {HTMLAnchorElement} */ (links.get(name));
       link.href = name in to ? to[/** @type {keyof typeof to} */ (name)] : test ? `${within}?at=${name}` : "#/test";
@@ -98,7 +124,7 @@ export function path(others) {
         done = await look();
         draw();
       } catch {
-        // the shell says that the service is silent; the ticks stay
+        // the shell shows that the service is silent; the ticks stay
       }
     }, PAUSE_MS);
   }
@@ -106,7 +132,15 @@ export function path(others) {
   window.addEventListener(SAVED, refresh);
   events.on("job", (job) => !["queued", "running", "cancelling"].includes(job.state) && refresh());
 
-  const root = h("nav", { "aria-label": "Screens" }, h("ol.path", [...links.values()].map((link) => h("li", link))), others);
+  const root = h(
+    "nav",
+    { "aria-label": "Screens" },
+    h(
+      "ol.path",
+      [...links.values()].map((link) => h("li", link)),
+    ),
+    others,
+  );
   // a part of the screen that is open is only brought into view: nothing drawn on it is lost
   root.addEventListener("click", (event) => {
     const link = /** @type {Element} */ (event.target).closest("a");

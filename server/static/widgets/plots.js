@@ -3,6 +3,8 @@ import { num, tick, h } from "../lib/dom.js";
 import { STEPS, colourOf, plotButtons, valueText } from "./plot_files.js";
 
 /** @import uPlot from "uplot" */
+/** @typedef {ReturnType<typeof chartIn>} ChartPlace */
+/** @typedef {(number | null)[]} Known values; null: none */
 
 /** Of an abscissa that has whole numbers alone. */
 const WHOLE = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000];
@@ -18,16 +20,16 @@ async function uplot() {
 }
 
 /**
- * Width of an axis: that of its longest number, so that its name is beside and not over it.
+ * Width of an axis: its longest number's, so that its name is next to and not over it.
  * @param {uPlot} plot
  * @param {string[] | null} values
  * @param {number} index
  * @param {number} cycle
  */
 function wide(plot, values, index, cycle) {
-  // what uPlot keeps of an axis beyond its types
+  // uPlot's data of an axis that its types lack
   const axis = /** @type {any} */ (plot.axes[index]);
-  if (cycle > 1) return axis._size; // it may not go on for ever
+  if (cycle > 1) return axis._size; // it must not repeat for ever
   const longest = (values ?? []).reduce((longer, one) => (one.length > longer.length ? one : longer), "");
   plot.ctx.font = axis.font[0];
   return Math.max(50, Math.ceil(axis.ticks.size + axis.gap + plot.ctx.measureText(longest).width / (window.devicePixelRatio || 1) + 4));
@@ -44,8 +46,18 @@ function axes() {
   probe.remove();
   faint.remove();
   /** @returns {uPlot.Axis} */
-  return (/** @type {string} */ text) => ({ label: text, labelSize: 18, labelGap: 0, stroke: soft, size: 50, font: `12px ${css.fontFamily}`, labelFont: `12px ${css.fontFamily}`,
-    grid: { stroke: grid, width: 1 }, ticks: { stroke: grid, width: 1 }, values: (_, ticks) => ticks.map(tick) });
+  return (/** @type {string} */ text) => ({
+    label: text,
+    labelSize: 18,
+    labelGap: 0,
+    stroke: soft,
+    size: 50,
+    font: `12px ${css.fontFamily}`,
+    labelFont: `12px ${css.fontFamily}`,
+    grid: { stroke: grid, width: 1 },
+    ticks: { stroke: grid, width: 1 },
+    values: (_, ticks) => ticks.map(tick),
+  });
 }
 
 /**
@@ -60,8 +72,8 @@ function axes() {
  * @param {uPlot.AlignedData} options.data
  * @param {string} [options.label] name of the plot for screen readers
  * @param {boolean} [options.files] whether it can be saved as CSV, PNG and SVG
- * @param {string} [options.said] what its band is; goes into the files
- * @param {() => [number, number]} [options.range] of the ordinate, asked at each drawing; that of the data if left out
+ * @param {string} [options.said] meaning of its band; written into the files
+ * @param {() => [number, number]} [options.range] of the ordinate, asked at each drawing; the data's if left out
  * @param {number[][]} [options.bands] pairs of series (counted from 1) between which the ground is shaded
  */
 export async function chart(box, { x, y, series, height = 200, data, bars = false, bands = [], label, files = true, said = "", range }) {
@@ -74,7 +86,10 @@ export async function chart(box, { x, y, series, height = 200, data, bars = fals
       width: Math.max(box.clientWidth, 200),
       height,
       scales: { x: { time: false }, ...(range ? { y: { range: () => range() } } : {}) },
-      axes: [{ ...axis(x), size: 34, ...(x === STEPS ? { incrs: WHOLE } : {}) }, { ...axis(y), size: wide }],
+      axes: [
+        { ...axis(x), size: 34, ...(x === STEPS ? { incrs: WHOLE } : {}) },
+        { ...axis(y), size: wide },
+      ],
       legend: { show: files || series.filter((one) => !one.edge).length > 1, live: true },
       cursor: { y: false },
       series: [
@@ -82,8 +97,15 @@ export async function chart(box, { x, y, series, height = 200, data, bars = fals
         ...series.map((one, index) => {
           const colour = colourOf(one, index);
           return {
-            label: one.label, class: one.edge ? "edge" : undefined, stroke: colour, width: one.points || one.edge ? 0 : 1.5, points: { show: Boolean(one.points || one.dots), size: 5 },
-            value: (/** @type {uPlot} */ _, /** @type {number | null} */ v, /** @type {number} */ __, /** @type {number | null} */ at) => valueText(v, at === null ? null : one.u?.[at]), spanGaps: false, paths: isBar(index) ? Plot.paths.bars?.({ size: [1, 100] }) : undefined,
+            label: one.label,
+            class: one.edge ? "edge" : undefined,
+            stroke: colour,
+            width: one.points || one.edge ? 0 : 1.5,
+            points: { show: Boolean(one.points || one.dots), size: 5 },
+            value: (/** @type {uPlot} */ _, /** @type {number | null} */ v, /** @type {number} */ __, /** @type {number | null} */ at) =>
+              valueText(v, at === null ? null : one.u?.[at]),
+            spanGaps: false,
+            paths: isBar(index) ? Plot.paths.bars?.({ size: [1, 100] }) : undefined,
             fill: isBar(index) ? `${colour}99` : undefined,
           };
         }),
@@ -109,7 +131,10 @@ export async function chart(box, { x, y, series, height = 200, data, bars = fals
   const observer = new ResizeObserver(() => box.clientWidth > 0 && plot.setSize({ width: box.clientWidth, height }));
   observer.observe(box);
   return {
-    set: (/** @type {uPlot.AlignedData} */ next) => { now = next; plot.setData(next); },
+    set: (/** @type {uPlot.AlignedData} */ next) => {
+      now = next;
+      plot.setData(next);
+    },
     close: () => {
       observer.disconnect();
       window.removeEventListener("themechange", recolour);
@@ -117,4 +142,50 @@ export async function chart(box, { x, y, series, height = 200, data, bars = fals
       plot.destroy();
     },
   };
+}
+
+/**
+ * Place of one chart at a time: the next one replaces it.
+ * @param {HTMLElement} box
+ */
+export function chartIn(box) {
+  /** @type {Awaited<ReturnType<typeof chart>> | null} */
+  let now = null;
+  function close() {
+    now?.close();
+    now = null;
+  }
+  return {
+    box,
+    close,
+    /** @param {Parameters<typeof chart>[1]} options */
+    async draw(options) {
+      close();
+      const made = await chart(box, options);
+      close();
+      now = made;
+    },
+  };
+}
+
+/**
+ * Curves over an abscissa, each with the band of its uncertainty.
+ * @param {number[]} x
+ * @param {{ label: string, edge?: string, dots?: boolean, value: Known, u: Known }[]} each `edge`: name of its band's edges, before the sign
+ * @param {string} symbol of the uncertainty
+ */
+export function banded(x, each, symbol) {
+  const series = each.flatMap(({ label, edge = "", dots, u }, colour) => [
+    { label, colour, dots, u },
+    ...["+", "−"].map((sign) => ({ label: `${edge}${sign} ${symbol}`, edge: true, colour })),
+  ]);
+  /** @type {(one: { value: Known, u: Known }, sign: 1 | -1) => Known} */
+  const limit = ({ value, u }, sign) =>
+    value.map((v, k) => {
+      const half = u[k];
+      return v === null || half === null ? null : v + sign * half;
+    });
+  /** @type {[number[], ...Known[]]} */
+  const data = [x, ...each.flatMap((one) => [one.value, limit(one, 1), limit(one, -1)])];
+  return { series, bands: each.map((_, k) => [3 * k + 2, 3 * k + 3]), data };
 }

@@ -43,7 +43,10 @@ export class RegionEditor {
     this.lines = []; // epipolar line of each seed in camera 2
     this.layer = svg("g", { "data-role": "region" });
     this.layer2 = svg("g", { "data-role": "seeds2" });
-    for (const [view, layer, label] of /** @type {[View, SVGElement, string][]} */ ([[one, this.layer, "Region"], [two, this.layer2, "Seeds"]])) {
+    for (const [view, layer, label] of /** @type {[View, SVGElement, string][]} */ ([
+      [one, this.layer, "Region"],
+      [two, this.layer2, "Seeds"],
+    ])) {
       view.svg.append(layer);
       view.svg.removeAttribute("aria-hidden");
       view.svg.setAttribute("role", "group");
@@ -57,12 +60,16 @@ export class RegionEditor {
     two.aimFrom = () => this.#onLine();
     one.image.addEventListener("load", () => this.#changed(false));
     this.hint = h("p.quiet", { role: "status", style: { minHeight: "3em", margin: "0.25rem 0 0" } });
-    this.buttons = TOOLS.map(([name, text, title]) => h("button", { type: "button", title, "aria-pressed": String(name === this.tool), onclick: (event) => this.use(name, event.detail === 0) }, text));
-    this.modes = MODES.map(([name, text, title]) => h("button", { type: "button", title, "aria-pressed": String(name === this.mode), onclick: () => this.as(name) }, text));
+    this.buttons = TOOLS.map(([name, text, title]) =>
+      h("button", { type: "button", title, "aria-pressed": String(name === this.tool), onclick: (event) => this.use(name, event.detail === 0) }, text),
+    );
+    this.modes = MODES.map(([name, text, title]) =>
+      h("button", { type: "button", title, "aria-pressed": String(name === this.mode), onclick: () => this.as(name) }, text),
+    );
     this.undoButton = h("button", { type: "button", title: "Undo (Ctrl+Z)", onclick: () => this.undo() }, "Undo");
     this.redoButton = h("button", { type: "button", title: "Redo (Ctrl+Y)", onclick: () => this.redo() }, "Redo");
     this.bar = h("div.row", { role: "toolbar", "aria-label": "Drawing" }, this.buttons, this.undoButton, this.redoButton);
-    this.more = h("div.row.region-more", h("div.row", { role: "group", "aria-label": "What the next shape does" }, this.modes), this.painting.controls);
+    this.more = h("div.row.region-more", h("div.row", { role: "group", "aria-label": "Action of the next shape" }, this.modes), this.painting.controls);
     this.list = h("div", { "data-role": "shapes" });
     listen(this);
     this.draw();
@@ -86,7 +93,7 @@ export class RegionEditor {
   }
 
   /**
-   * What the next shape does to the region.
+   * Action of the next shape on the region.
    * @param {Mode} mode
    */
   as(mode) {
@@ -143,13 +150,16 @@ export class RegionEditor {
     this.#changed();
   }
 
-  /** Draw again what is kept; `told`: it has changed. */
+  /** Draw the kept drawing again; `told`: it has changed. */
   #changed(told = true) {
-    this.mask.show(this.drawn.mask, this.one).then((other) => {
-      if (!other) return;
-      this.drawList();
-      this.onchange();
-    }).catch(() => this.painting.say("The mask cannot be read."));
+    this.mask
+      .show(this.drawn.mask, this.one)
+      .then((other) => {
+        if (!other) return;
+        this.drawList();
+        this.onchange();
+      })
+      .catch(() => this.painting.say("The mask cannot be read."));
     this.draw();
     if (!told) return;
     this.drawList();
@@ -162,13 +172,13 @@ export class RegionEditor {
     this.#changed(false);
   }
 
-  /** What is drawn, as plain JSON. */
+  /** The drawing, as plain JSON. */
   state() {
     return structuredClone(this.drawn);
   }
 
   /**
-   * Put back what `state()` gave; what is drawn now, and its history, is gone.
+   * Restore a drawing of `state()`; the present one and its history are lost.
    * @param {Partial<State>} state
    */
   restore(state) {

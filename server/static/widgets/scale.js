@@ -23,8 +23,20 @@ export class Scale {
     /** numbers at the bar: where, from 0 to 1, and their texts */
     this.marked = { shares: /** @type {number[]} */ ([]), texts: /** @type {string[]} */ ([]), unit: "" };
     this.map = select(MAPS, "auto");
-    this.limits = select([["auto", "by percentiles"], ["given", "given limits"]], "auto");
-    this.span = select([["step", "each step"], ["all", "all steps"]], "step");
+    this.limits = select(
+      [
+        ["auto", "by percentiles"],
+        ["given", "given limits"],
+      ],
+      "auto",
+    );
+    this.span = select(
+      [
+        ["step", "each step"],
+        ["all", "all steps"],
+      ],
+      "step",
+    );
     this.lowest = number(1, { min: 0, max: 50, "aria-label": "Lower percentile" });
     this.highest = number(99, { min: 50, max: 100, "aria-label": "Upper percentile" });
     this.lowGiven = number(null, { "aria-label": "Lower limit" });
@@ -41,8 +53,13 @@ export class Scale {
     this.limitUnits = [h("span.unit"), h("span.unit")];
     this.byLimits = h("div.fields", { hidden: true }, field("From", this.lowGiven), this.limitUnits[0], field("to", this.highGiven), this.limitUnits[1]);
     this.levels.title = "0: smooth";
-    this.controls = h("div.tight", h("div.fields", field("Colours", this.map), field("Levels", this.levels), h("label.check", this.reverse, "reversed")),
-      field("Limits", this.limits), this.byPercentiles, this.byLimits);
+    this.controls = h(
+      "div.tight",
+      h("div.fields", field("Colours", this.map), field("Levels", this.levels), h("label.check", this.reverse, "reversed")),
+      field("Limits", this.limits),
+      this.byPercentiles,
+      this.byLimits,
+    );
     this.root = h("div", this.legend, this.flagList, this.controls);
     for (const control of [this.map, this.limits, this.span, this.lowest, this.highest, this.lowGiven, this.highGiven, this.levels, this.reverse]) {
       control.addEventListener("change", () => {
@@ -67,13 +84,20 @@ export class Scale {
    * @returns {[number, number]}
    */
   get percentiles() {
-    const of = (/** @type {HTMLInputElement} */ input, /** @type {number} */ usual) => (input.value === "" || !Number.isFinite(Number(input.value)) ? usual : Math.min(Math.max(Number(input.value), 0), 100));
+    const of = (/** @type {HTMLInputElement} */ input, /** @type {number} */ usual) =>
+      input.value === "" || !Number.isFinite(Number(input.value)) ? usual : Math.min(Math.max(Number(input.value), 0), 100);
     return [of(this.lowest, 1), of(this.highest, 99)];
   }
 
-  /** What was chosen, besides limits that were given. */
+  /** The choices, without given limits. */
   state() {
-    return { colours: this.map.value, levels: Math.round(Number(this.levels.value) || 0), reversed: this.reverse.checked, over: this.span.value, percentiles: this.percentiles };
+    return {
+      colours: this.map.value,
+      levels: Math.round(Number(this.levels.value) || 0),
+      reversed: this.reverse.checked,
+      over: this.span.value,
+      percentiles: this.percentiles,
+    };
   }
 
   /** @param {{ colours?: string, levels?: number, reversed?: boolean, over?: string, percentiles?: readonly number[] }} state */
@@ -107,7 +131,7 @@ export class Scale {
     this.byPercentiles.hidden = true;
   }
 
-  /** Drop given limits: those of another field do not apply. */
+  /** Drop given limits: another field's do not apply. */
   forget() {
     this.lowGiven.value = "";
     this.highGiven.value = "";
@@ -121,7 +145,7 @@ export class Scale {
    * @param {ArrayLike<number>[]} values of one step, or of all
    * @param {string} unit
    * @param {Record<string, string> | null} flags meanings of a status' values
-   * @param {boolean} signed true: zero is the middle whatever the limits (a difference)
+   * @param {boolean} signed true: zero is the middle for all limits (a difference)
    */
   lay(values, unit, flags = null, signed = false) {
     this.unit = unit;
@@ -133,7 +157,8 @@ export class Scale {
       const found = values.map((one) => percentiles(one, ...this.percentiles)).filter((one) => one !== null);
       this.low = found.length ? Math.min(...found.map((one) => one[0])) : 0;
       this.high = found.length ? Math.max(...found.map((one) => one[1])) : 1;
-      if (!(this.high - this.low > 1e-9 * Math.abs(this.low))) { // all the same but for rounding
+      if (!(this.high - this.low > 1e-9 * Math.abs(this.low))) {
+        // all the same but for rounding
         const pad = Math.abs(this.low) * 0.01 || 0.5;
         this.low -= pad;
         this.high += pad;
@@ -152,7 +177,12 @@ export class Scale {
     this.legend.hidden = Boolean(this.flags);
     this.flagList.hidden = !this.flags;
     if (this.flags) {
-      replace(this.flagList, Object.entries(this.flags).map(([value, word]) => h("li", { "data-flag": value }, h("span.swatch", { style: { background: statusColour(Number(value)) } }), word.replace(/_/g, " "))));
+      replace(
+        this.flagList,
+        Object.entries(this.flags).map(([value, word]) =>
+          h("li", { "data-flag": value }, h("span.swatch", { style: { background: statusColour(Number(value)) } }), word.replace(/_/g, " ")),
+        ),
+      );
       return;
     }
     const image = new ImageData(ENTRIES, 1);
@@ -163,7 +193,11 @@ export class Scale {
     let { shares, texts } = at([0, 0.25, 0.5, 0.75, 1]);
     if (texts.some((text) => text.length > 6)) ({ shares, texts } = at([0, 0.5, 1])); // long numbers need room
     this.marked = { shares, texts, unit };
-    replace(this.marks, shares.map((share, k) => h("span", { style: { left: `${100 * share}%` } }, texts[k])), h("span.of", unit));
+    replace(
+      this.marks,
+      shares.map((share, k) => h("span", { style: { left: `${100 * share}%` } }, texts[k])),
+      h("span.of", unit),
+    );
     for (const one of this.limitUnits) one.textContent = this.unit;
     this.legend.setAttribute("aria-label", `Colour bar from ${amount(this.low, this.unit)} to ${amount(this.high, this.unit)}`);
     this.legend.dataset.low = String(this.low);
@@ -204,7 +238,10 @@ export class Scale {
       for (let i = 0; i < out.length; i += 1) {
         const v = values[i];
         if (Number.isNaN(v)) continue;
-        if (!table.has(v)) { const [r, g, b] = this.colour(v); table.set(v, (255 << 24) | (b << 16) | (g << 8) | r); }
+        if (!table.has(v)) {
+          const [r, g, b] = this.colour(v);
+          table.set(v, (255 << 24) | (b << 16) | (g << 8) | r);
+        }
         out[i] = table.get(v);
       }
     } else {

@@ -1,6 +1,6 @@
 // A picture that can be zoomed and read, with a canvas and an SVG laid over it in its own pixels.
 //
-// Pixel coordinates are those of the API: the first pixel's centre is (0, 0).
+// Pixel coordinates as in the API: the first pixel's centre is (0, 0).
 import { h, svg, num } from "../lib/dom.js";
 
 /** @typedef {{ x: number, y: number }} Position in the picture, px */
@@ -53,17 +53,40 @@ export class View {
     this.svg = svg("svg", { "aria-hidden": "true" });
     this.content = h("div.content", this.image, this.canvas, this.svg);
     this.empty = h("div.empty", { hidden: true });
-    this.frame = h("div.frame", { tabindex: 0, role: "application", "aria-roledescription": "zoomable picture",
-      "aria-label": `${label}: arrow keys move, + and − zoom, 0 fits, 1 shows pixels one to one, Enter begins to point` }, this.content, this.empty);
+    this.frame = h(
+      "div.frame",
+      {
+        tabindex: 0,
+        role: "application",
+        "aria-roledescription": "zoomable picture",
+        "aria-label": `${label}: arrow keys move, + and − zoom, 0 fits, 1 shows pixels one to one, Enter begins to point`,
+      },
+      this.content,
+      this.empty,
+    );
     this.readout = h("div.readout", { "data-role": "readout" });
-    this.crossButton = h("button", { type: "button", "aria-pressed": "false", title: "Cross-hair through the middle of the picture (c); double-click puts it elsewhere", onclick: () => this.toggleCross() },
-      svg("svg", { viewBox: "0 0 16 16", width: 16, height: 16, "aria-hidden": "true" }, svg("path", { d: "M8 1v14M1 8h14", stroke: "currentColor", fill: "none", "stroke-width": 1.5 })));
-    this.tools = h("div.tools",
+    this.crossButton = h(
+      "button",
+      {
+        type: "button",
+        "aria-pressed": "false",
+        title: "Cross-hair through the middle of the picture (c); double-click puts it elsewhere",
+        onclick: () => this.toggleCross(),
+      },
+      svg(
+        "svg",
+        { viewBox: "0 0 16 16", width: 16, height: 16, "aria-hidden": "true" },
+        svg("path", { d: "M8 1v14M1 8h14", stroke: "currentColor", fill: "none", "stroke-width": 1.5 }),
+      ),
+    );
+    this.tools = h(
+      "div.tools",
       h("button", { type: "button", "aria-label": "Zoom in", onclick: () => this.zoom(STEP) }, "+"),
       h("button", { type: "button", "aria-label": "Zoom out", onclick: () => this.zoom(1 / STEP) }, "−"),
       h("button", { type: "button", title: "Fit the whole picture (0)", onclick: () => this.fit() }, "Fit"),
       h("button", { type: "button", title: "One picture pixel on one screen pixel (1)", onclick: () => this.one() }, "1:1"),
-      this.crossButton);
+      this.crossButton,
+    );
     this.crossButton.setAttribute("aria-label", "Cross-hair");
     this.root = h("div.view", tools ? this.tools : h("div"), this.frame, this.readout);
 
@@ -219,7 +242,10 @@ export class View {
     if (event.ctrlKey || event.metaKey) return;
     const by = ARROWS[event.key];
     const own = event.target === this.frame; // not a handle that is drawn over it
-    const zoom = (/** @type {number} */ factor) => { const at = this.aim && this.#onFrame(this.aim); this.zoom(factor, at?.[0], at?.[1]); };
+    const zoom = (/** @type {number} */ factor) => {
+      const at = this.aim && this.#onFrame(this.aim);
+      this.zoom(factor, at?.[0], at?.[1]);
+    };
     const far = nudge(event);
     if (far && own && (this.aim || this.drawing)) {
       this.setAim(this.aim ? { x: this.aim.x + far[0], y: this.aim.y + far[1] } : this.#aimStart());
@@ -297,8 +323,14 @@ export class View {
     const { x, y } = this.aim;
     const gap = 5 / this.scale; // the pixel itself stays visible
     const d = `M${x} -0.5V${y - gap}M${x} ${y + gap}V${this.height - 0.5}M-0.5 ${y}H${x - gap}M${x + gap} ${y}H${this.width - 0.5}`;
-    this.svg.append(svg("g", { class: "aim", "data-x": x, "data-y": y },
-      svg("path", { ...stroke("#000", 3), d, opacity: 0.55 }), svg("path", { ...stroke("#ff9d1e", 1.5), d })));
+    this.svg.append(
+      svg(
+        "g",
+        { class: "aim", "data-x": x, "data-y": y },
+        svg("path", { ...stroke("#000", 3), d, opacity: 0.55 }),
+        svg("path", { ...stroke("#ff9d1e", 1.5), d }),
+      ),
+    );
   }
 
   #pointers() {
@@ -308,7 +340,10 @@ export class View {
     /** @type {Spot | null} */
     let start = null;
     let moved = false;
-    this.hold = (id, at) => { down.set(id, at); moved = true; };
+    this.hold = (id, at) => {
+      down.set(id, at);
+      moved = true;
+    };
     this.frame.addEventListener("pointerdown", (event) => {
       if (event.button !== 0 || onGrab(event)) return;
       this.frame.setPointerCapture(event.pointerId);
@@ -327,7 +362,7 @@ export class View {
         const [other] = [...down].filter(([id]) => id !== event.pointerId).map(([, position]) => position);
         const span = (/** @type {Spot} */ a) => Math.hypot(a[0] - other[0], a[1] - other[1]);
         const box = this.frame.getBoundingClientRect();
-        // what lies between the two fingers stays there
+        // the point between the two fingers stays there
         this.left += (now[0] - before[0]) / 2;
         this.top += (now[1] - before[1]) / 2;
         if (span(before) > 5) this.zoom(span(now) / span(before), (now[0] + other[0]) / 2 - box.left, (now[1] + other[1]) / 2 - box.top);
@@ -348,7 +383,9 @@ export class View {
     };
     this.frame.addEventListener("pointerup", up);
     this.frame.addEventListener("pointercancel", up);
-    this.frame.addEventListener("pointerleave", () => { this.hover = this.aim; });
+    this.frame.addEventListener("pointerleave", () => {
+      this.hover = this.aim;
+    });
   }
 
   /** @param {MouseEvent} event */
@@ -370,7 +407,7 @@ export class View {
   }
 
   async #updateReadout() {
-    // one request at a time: positions passed meanwhile are not requested
+    // one request at a time: positions passed in between are not requested
     if (this.asking) return;
     this.asking = true;
     try {
@@ -393,7 +430,7 @@ export class View {
   }
 
   toggleCross() {
-    this.cross = this.cross ? null : this.aim ?? { x: (this.width - 1) / 2, y: (this.height - 1) / 2 };
+    this.cross = this.cross ? null : (this.aim ?? { x: (this.width - 1) / 2, y: (this.height - 1) / 2 });
     this.crossButton.setAttribute("aria-pressed", String(Boolean(this.cross)));
     this.#drawCross();
   }
@@ -408,8 +445,7 @@ export class View {
     this.svg.querySelector(".crosshair")?.remove();
     if (!this.cross || !this.width) return;
     const { x, y } = this.cross;
-    const style = { class: "crosshair", ...stroke("#ff9d1e", 1.5),
-      d: `M${x} -0.5V${this.height - 0.5}M-0.5 ${y}H${this.width - 0.5}` };
+    const style = { class: "crosshair", ...stroke("#ff9d1e", 1.5), d: `M${x} -0.5V${this.height - 0.5}M-0.5 ${y}H${this.width - 0.5}` };
     this.svg.append(svg("path", style));
   }
 }

@@ -7,7 +7,7 @@ import { h, action, notify, quantity, replace } from "../lib/dom.js";
 export const OFF_ZERO_MM = 0.01; // as the service judges a capture
 
 /**
- * Axes that move cameras and stand off dZ = 0; empty while one moves.
+ * Axes that move cameras and are off dZ = 0; empty while one moves.
  * @param {Stage} stage
  */
 export function offZero(stage) {
@@ -21,13 +21,17 @@ export function offZero(stage) {
  * @param {() => unknown} [done]
  */
 export function backToZero(done = () => {}) {
-  return action("Back to the calibrated position", async () => {
-    const { job } = await api.post("/stage/moves", { dz_mm: { cam1: 0, cam2: 0 } });
-    const ended = await api.finished(job.id);
-    if (ended.state !== "succeeded") throw api.jobProblem(ended);
-    notify("The cameras are back at their calibrated position.", "good");
-    await done();
-  }, { kind: "primary" });
+  return action(
+    "Back to the calibrated position",
+    async () => {
+      const { job } = await api.post("/stage/moves", { dz_mm: { cam1: 0, cam2: 0 } });
+      const ended = await api.finished(job.id);
+      if (ended.state !== "succeeded") throw api.jobProblem(ended);
+      notify("The cameras are back at their calibrated position.", "good");
+      await done();
+    },
+    { kind: "primary" },
+  );
 }
 
 /** A line with that button where the cameras are off their place, empty otherwise; `update` looks again. */
@@ -36,11 +40,22 @@ export function wayBackNote() {
   async function update() {
     try {
       const off = offZero(await api.get("/stage"));
-      replace(box, off.length ? h("div.caution", { role: "status" },
-        h("p", `The cameras are off their calibrated position: ${off.map((axis) => `${axis.cameras.join(", ") || `axis ${axis.axis}`} by ${quantity(axis.position_mm - axis.zero_mm, "mm", 4)}`).join("; ")}. What is captured here is not measured rightly.`),
-        backToZero(update)) : null);
+      replace(
+        box,
+        off.length
+          ? h(
+              "div.caution",
+              { role: "status" },
+              h(
+                "p",
+                `The cameras are off their calibrated position: ${off.map((axis) => `${axis.cameras.join(", ") || `axis ${axis.axis}`} by ${quantity(axis.position_mm - axis.zero_mm, "mm", 4)}`).join("; ")}. What is captured here is not measured rightly.`,
+              ),
+              backToZero(update),
+            )
+          : null,
+      );
     } catch {
-      replace(box); // the bar says that the stage is silent
+      replace(box); // the bar shows that the stage is silent
     }
   }
   return { root: box, update };

@@ -1,4 +1,4 @@
-// Part of a long list, with what leads to the others: a document of thousands of entries is neither drawn nor laid out at once.
+// Part of a long list, with controls that lead to the others: a document of thousands of entries is neither drawn nor laid out at once.
 import { h, replace, number } from "../lib/dom.js";
 
 const MOST = 100;
@@ -15,7 +15,7 @@ export const partOf = (index, length) => Math.max(0, Math.min(Math.floor(index /
  * @template T
  * @param {HTMLElement} box where the entries are drawn
  * @param {(entry: T) => Node} draw
- * @param {{ what: string, name: (entry: T) => number }} of what the entries are called, and the number of each
+ * @param {{ what: string, name: (entry: T) => number }} of name of the entries, and the number of each
  */
 export function windowOfList(box, draw, { what, name }) {
   /** @type {readonly T[]} */

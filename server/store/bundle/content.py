@@ -1,4 +1,4 @@
-"""What a bundle holds: the files of one test by name, its manifest, and what is refused."""
+"""Content of a bundle: the files of one test by name, its manifest, and the checks of both."""
 
 from __future__ import annotations
 
@@ -8,22 +8,23 @@ from pathlib import Path
 
 from pydantic import Field
 
-from core.errors import FileFormatError
-from server.base.models import Document
+from stereorig.core.errors import FileFormatError
+from stereorig.server.base.models import Document
 
 FORMAT = 1
 MANIFEST = "stereorig-bundle.json"
 CRATE = "ro-crate-metadata.json"
 #: files that only an unfinished analysis needs, and that go when it is finished
-UNFINISHED = re.compile(r"analyses/[^/]+/(starts_\d+\.npz|head_\d+\.nc(\.sha256)?|head_starts_\d+\.npz)")
+UNFINISHED = re.compile(r"analyses/[^/]+/(starts_[0-9]+\.npz|head_[0-9]+\.nc(\.sha256)?|head_starts_[0-9]+\.npz)")
 
-_ID = r"\d{6}-[0-9a-f]{6}"
+_ID = r"[0-9]{6}-[0-9a-f]{6}"
 #: names below the test's folder; nothing else ever becomes a path
 _NAMES = re.compile(
     r"test\.json|workspace\.json|certificate_plan\.json|calibration\.json|calibrations/[0-9a-f]{64}\.json|"
-    r"steps/\d{4}/(step\.json|cam[12]\.tif)|steps/\d{4}\.deleted|"
-    rf"analyses/a{_ID}/((analysis|jobs|noise|summary)\.json|mask\.png|step_\d{{4}}\.(nc|nc\.sha256|json)|"
-    r"starts_\d{4}\.npz)|"
+    r"channels/[0-9]{4}\.csv|"
+    r"steps/[0-9]{4}/(step\.json|cam[12]\.tif)|steps/[0-9]{4}\.deleted|"
+    rf"analyses/a{_ID}/((analysis|jobs|noise|summary)\.json|mask\.png|(dense/)?step_[0-9]{{4}}\.(nc|nc\.sha256|json)|"
+    r"starts_[0-9]{4}\.npz)|manifest\.json|manifest/[0-9]{8}\.json|"
     rf"models/m{_ID}/(model\.json|[A-Za-z0-9_][A-Za-z0-9._-]{{0,99}})"
 )
 _TEST = re.compile(rf"tests/(t{_ID})/(.+)", re.DOTALL)
@@ -36,8 +37,8 @@ class BundleFile(Document):
     sha256: str = Field(pattern="^[0-9a-f]{64}$")
 
 
-class Manifest(Document):
-    """``stereorig-bundle.json``: every file with its checksum, and by what the bundle was written."""
+class Contents(Document):
+    """``stereorig-bundle.json``: every file with its checksum, and the program that wrote the bundle."""
 
     format: int
     test_id: str = Field(pattern=rf"^t{_ID}$")
@@ -48,9 +49,9 @@ class Manifest(Document):
 
 
 def files_of(test: Path) -> list[Path]:
-    """Return the files of a test's folder that belong into a bundle, sorted; what is half written stays outside.
+    """Return the files of a test's folder that belong into a bundle, sorted; half-written ones are left out.
 
-    The state of a watched channel stays outside too: it is of the service that watches.
+    The state of a watched channel is left out too: it belongs to the service that watches.
     """
     found = []
     for path in sorted(test.rglob("*")):
@@ -64,8 +65,8 @@ def files_of(test: Path) -> list[Path]:
     return found
 
 
-def check_names(manifest: Manifest, members: list[str]) -> None:
-    """Refuse a bundle whose members are not those of its manifest, or that are no files of one test.
+def check_names(manifest: Contents, members: list[str]) -> None:
+    """Refuse a bundle whose members differ from its manifest's, or are no files of one test.
 
     Raises
     ------
@@ -96,7 +97,7 @@ def altered(cause: str, **context: object) -> FileFormatError:
     return FileFormatError(
         f"The bundle is not as it was written: {cause}.",
         code="bundle_altered",
-        remedy="Copy it again from where it was made, or make it anew there; nothing was opened.",
+        remedy="Copy it again from its origin, or make it again there; nothing was opened.",
         **context,
     )
 

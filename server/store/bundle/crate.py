@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
-from server.store.bundle.content import CRATE, MANIFEST, BundleFile
-from server.store.documents import AnalysisRecord, SummaryRecord, TestRecord
+from stereorig.server.documents.tests import AnalysisRecord, SummaryRecord, TestRecord
+from stereorig.server.store.bundle.content import CRATE, MANIFEST, BundleFile
 
 _FORMATS = {
     ".json": "application/json",
@@ -17,13 +17,14 @@ _FORMATS = {
     ".npz": "application/zip",
     ".sha256": "text/plain",
     ".deleted": "application/json",
+    ".csv": "text/csv",
 }
 _PERSON = ("operator", "laboratory")
 Entity = dict[str, object]
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredAnalysis:
     """An analysis and its summary, None while it has none."""
 
     record: AnalysisRecord
@@ -32,7 +33,7 @@ class Measured:
 
 def crate(
     test: TestRecord,
-    analyses: Iterable[Measured],
+    analyses: Iterable[MeasuredAnalysis],
     files: Mapping[str, BundleFile],
     *,
     created_utc: str,
@@ -110,10 +111,11 @@ def _description(test: TestRecord, files: Mapping[str, BundleFile]) -> str:
 
 
 def _people(test: TestRecord) -> list[Entity]:
-    stated = test.metadata if isinstance(test.metadata, dict) else {}
     kinds = {"operator": "Person", "laboratory": "Organization"}
     return [
-        {"@id": f"#{name}", "@type": kinds[name], "name": str(stated[name])} for name in _PERSON if stated.get(name)
+        {"@id": f"#{name}", "@type": kinds[name], "name": str(test.metadata[name])}
+        for name in _PERSON
+        if test.metadata.get(name)
     ]
 
 
@@ -125,7 +127,7 @@ def _file(name: str, found: BundleFile | None) -> Entity:
     return {**entity, "contentSize": str(found.bytes), "sha256": found.sha256}
 
 
-def _action(measured: Measured, files: Mapping[str, BundleFile], program: str) -> Entity:
+def _action(measured: MeasuredAnalysis, files: Mapping[str, BundleFile], program: str) -> Entity:
     record = measured.record
     home = f"tests/{record.test_id}"
     read = [f"{home}/steps/{n:04d}/{cam}.tif" for n in record.steps for cam in ("cam1", "cam2")]

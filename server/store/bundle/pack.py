@@ -9,15 +9,16 @@ import zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from core.errors import FileFormatError, InputError
-from server.formats.environment import current_environment
-from server.formats.files import sha256_of, written_temporary
-from server.formats.version import software_version
-from server.store.bundle.content import CRATE, FORMAT, MANIFEST, UNFINISHED, BundleFile, files_of
-from server.store.bundle.crate import Measured, crate
-from server.store.folder import DataFolder, now_utc
-from server.store.tests.tests import TestStore
-from server.store.verify import verify_test
+from stereorig.core.errors import FileFormatError, InputError, StateError
+from stereorig.server.formats.environment import current_environment
+from stereorig.server.formats.files import sha256_of, written_temporary
+from stereorig.server.formats.manifest import NAME, read_manifest
+from stereorig.server.formats.version import software_version
+from stereorig.server.store.bundle.content import CRATE, FORMAT, MANIFEST, UNFINISHED, BundleFile, files_of
+from stereorig.server.store.bundle.crate import MeasuredAnalysis, crate
+from stereorig.server.store.folder import DataFolder, now_utc
+from stereorig.server.store.tests.tests import TestStore
+from stereorig.server.store.verify import verify_test
 
 _CHUNK_BYTES = 1 << 20
 #: texts shrink to a tenth; images and results end in noise, and are stored as they are
@@ -31,7 +32,7 @@ class Packed:
     Attributes
     ----------
     sha256
-        Of the whole file: noted elsewhere, it proves that nobody changed the bundle since.
+        SHA-256 of the whole file: noted elsewhere, it proves that the bundle was not changed since.
     """
 
     file: Path
@@ -58,6 +59,8 @@ def pack(data: Path, test_id: str, out: Path, *, licence: str | None = None) -> 
         There is no such test.
     FileFormatError
         ``test_damaged`` if a file does not match its checksum.
+    StateError
+        ``test_changed`` if the test was changed during packing: its manifest would not be of these files.
     InputError
         ``output_unusable`` if there is something at ``out``.
     StorageError
@@ -66,7 +69,7 @@ def pack(data: Path, test_id: str, out: Path, *, licence: str | None = None) -> 
     tests = TestStore(DataFolder(data))
     test = tests.path(test_id)
     if out.exists() or not out.absolute().parent.is_dir():
-        cause = "is there already" if out.exists() else "would lie in a folder that is not there"
+        cause = "is there already" if out.exists() else "would be in a folder that does not exist"
         raise InputError(f"{out} {cause}.", code="output_unusable", remedy="Give another name with -o.")
     damaged = [one for one in verify_test(data, test_id).findings if one.level == "damaged"]
     if damaged:
@@ -76,6 +79,7 @@ def pack(data: Path, test_id: str, out: Path, *, licence: str | None = None) -> 
             remedy="Restore the file from a backup, or delete the step or analysis; 'stereorig verify' lists all.",
             file=damaged[0].path,
         )
+    written = read_manifest(test) if (test / NAME).is_file() else None
     created_utc, environment = now_utc(), current_environment()
     with written_temporary(out) as temporary, zipfile.ZipFile(temporary, "x", zipfile.ZIP_STORED) as archive:
         files: dict[str, BundleFile] = {}
@@ -86,6 +90,12 @@ def pack(data: Path, test_id: str, out: Path, *, licence: str | None = None) -> 
             except FileNotFoundError:
                 if UNFINISHED.search(name) is None:  # those go when the analysis ends
                     raise
+        if written is not None and read_manifest(test).number != written.number:
+            raise StateError(
+                f"Test {test_id} was changed while it was packed.",
+                code="test_changed",
+                remedy="Wait until captures and analyses of the test have ended, then pack it again.",
+            )
         manifest = {
             "format": FORMAT,
             "test_id": test_id,
@@ -95,7 +105,7 @@ def pack(data: Path, test_id: str, out: Path, *, licence: str | None = None) -> 
             "files": {name: found.plain() for name, found in files.items()},
         }
         analyses = [
-            Measured(tests.analyses.read(test_id, one), tests.analyses.summary(test_id, one))
+            MeasuredAnalysis(tests.analyses.read(test_id, one), tests.analyses.summary(test_id, one))
             for one in tests.analyses.ids(test_id)
         ]
         shown = crate(
@@ -124,7 +134,7 @@ def _add(archive: zipfile.ZipFile, name: str, path: Path) -> BundleFile:
     digest, size = hashlib.sha256(), 0
     with path.open("rb") as source:
         member = _member(name, path.stat().st_mtime)
-        member.file_size = path.stat().st_size  # tells the archive whether it needs 64 bits
+        member.file_size = path.stat().st_size  # from it the archive decides on 64 bits
         with archive.open(member, "w") as target:
             while chunk := source.read(_CHUNK_BYTES):
                 digest.update(chunk)

@@ -1,1 +1,1 @@
-"""When the catalogue's index is believed, and how it is made anew behind a running service."""
+"""Conditions under which the catalogue's index is believed, and its rebuilding while the service runs."""

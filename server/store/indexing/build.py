@@ -12,16 +12,18 @@ import threading
 import time
 from collections.abc import Mapping
 
-from core.errors import FileFormatError, StereorigError
-from server.base.problem import RESTART, problem_of
-from server.store.calibrations import CalibrationStore
-from server.store.catalog import Catalog, Entry
-from server.store.folder import DataFolder, is_id, remove_temporaries
-from server.store.indexing.clean_stop import Times, leave_mark, take_mark, times_of
-from server.store.indexing.entries import calibration_entry, check_trash, entries_of_test, test_entry
-from server.store.indexing.lost_jobs import LostJobs
-from server.store.noise import NoiseStore
-from server.store.tests.tests import TestStore
+from stereorig.core.errors import FileFormatError, StereorigError
+from stereorig.server.base.problem import RESTART, problem_of
+from stereorig.server.formats.manifest import NAME, DamagedError, differs_from, kept, read_manifest
+from stereorig.server.store.calibrations import CalibrationStore
+from stereorig.server.store.catalog import Catalog, Entry
+from stereorig.server.store.folder import DataFolder, is_id
+from stereorig.server.store.indexing.clean_stop import Times, leave_mark, take_mark, times_of
+from stereorig.server.store.indexing.entries import calibration_entry, check_trash, entries_of_test, test_entry
+from stereorig.server.store.indexing.lost_jobs import LostJobs
+from stereorig.server.store.manifests import finish_renaming
+from stereorig.server.store.noise import NoiseStore
+from stereorig.server.store.tests.tests import TestStore
 
 _log = logging.getLogger("stereorig.service")
 #: the background's share of a processor: requests come first
@@ -64,17 +66,19 @@ class Index:
         ----------
         known
             Times of the tests that the index is right about if they are unchanged, see
-            :func:`server.store.indexing.clean_stop.take_mark`.
+            :func:`stereorig.server.store.indexing.clean_stop.take_mark`.
         """
         lost, trouble = LostJobs(), check_trash(self._folder)
         calibrations = self._read_calibrations(lost, trouble)
         indexed = self._catalog.entry_ids("test")
+        self._finish_halves_of_tests()
         there = self._tests.ids()
         tests: list[Entry] = []
         for test_id in there:
             self._reserve(test_id)
             path = self._folder.tests / test_id
-            if known is not None and test_id in indexed and known.get(test_id) == times_of(path):
+            unchanged = known is not None and test_id in indexed and known.get(test_id) == times_of(path)
+            if unchanged and (path / NAME).exists():
                 continue
             self._waiting[test_id] = None
             try:
@@ -84,7 +88,6 @@ class Index:
             except (FileFormatError, KeyError) as error:
                 trouble.append(f"test {test_id}: {error}")
         self._waiting = dict.fromkeys(reversed(self._waiting))
-        self._remove_halves_of_tests(set(there))
         self.differences += self._catalog.replace_tests(calibrations, tests, gone=indexed - set(there)) + trouble
         lost.restore(self._catalog, self._folder.ids)
         self._catalog.before_parts = self._tests.folders.before_change = self.read
@@ -99,8 +102,13 @@ class Index:
 
     def _read_calibrations(self, lost: LostJobs, trouble: list[str]) -> list[Entry]:
         entries: list[Entry] = []
+        root = self._folder.root
+        for home in (root / "recipes", *root.glob("noise/n*"), *root.glob("certificates/v*")):
+            if home.is_dir() and (home.name == "recipes" or is_id(home.name, home.name[0])):
+                self._folder.manifests.settle(home)
         for calibration_id in self._calibrations.ids():
             self._folder.ids.reserve(calibration_id)
+            self._folder.manifests.settle(self._folder.calibrations / calibration_id)
             try:
                 if self._calibrations.read(calibration_id).state == "unfinished":
                     # no job works on it any more: the job that did ended with the last service
@@ -118,11 +126,11 @@ class Index:
                 trouble.append(f"noise measurement {noise_id}: {error}")
         return entries
 
-    def _remove_halves_of_tests(self, there: set[str]) -> None:
-        """Remove temporary files from folders that never became tests."""
+    def _finish_halves_of_tests(self) -> None:
+        """Finish folders that were about to become tests, or remove the temporary files from them."""
         for path in self._folder.tests.iterdir():
-            if path.name not in there and path.is_dir():
-                remove_temporaries(path)
+            if path.is_dir() and not (path / "test.json").is_file():
+                finish_renaming(path)
 
     # reading --------------------------------------------------------------------------------------------------------
 
@@ -150,11 +158,17 @@ class Index:
         trouble: list[str] = []
         lost = LostJobs()
         path = self._folder.tests / test_id
-        remove_temporaries(path)
-        gone = not (path / "test.json").is_file()  # taken away by hand meanwhile
-        entries = [] if gone else entries_of_test(self._tests, test_id, lost, trouble)
-        lost.restore(self._catalog, self._folder.ids)
-        found = self._catalog.replace_test(test_id, entries) + trouble
+        self._folder.manifests.settle(path)
+        gone = not (path / "test.json").is_file()  # removed by hand since
+        found: list[str] = []
+        try:
+            entries = [] if gone else entries_of_test(self._tests, test_id, lost, trouble)
+        except DamagedError as error:  # of the manifest: the list stays, and each request names the damage
+            trouble = [f"test {test_id}: {error}"]
+        else:
+            lost.restore(self._catalog, self._folder.ids)
+            found = self._catalog.replace_test(test_id, entries)
+        found += trouble
         for line in found:
             _log.info("catalogue: %s", line)
         self.differences += found
@@ -184,7 +198,7 @@ class Index:
         for entry in sorted((self._folder.root / "trash").glob("x*/content")):
             if self._ending.is_set():
                 return
-            remove_temporaries(entry)
+            finish_renaming(entry)
 
     def waiting(self) -> int:
         """Number of tests that are not read yet."""
@@ -219,6 +233,29 @@ class Index:
         leave_mark(self._catalog.path, [self._folder.tests / test_id for test_id in self._tests.ids()])
 
 
+def _accept(folder: DataFolder) -> list[str]:
+    """Take folders whose manifests were lost, or are older than the record, as they are; return a line for each."""
+    done = []
+    for home in sorted(
+        path for kind in ("tests/t", "calibrations/c", "noise/n") for path in folder.root.glob(f"{kind}*")
+    ):
+        name = home.relative_to(folder.root)
+        try:
+            reason = differs_from(read_manifest(home), kept.anchors.get(home))
+        except FileNotFoundError:
+            if kept.anchors.pop(home, None) is not None:
+                folder.manifests.settle(home, adopt=True)
+                done.append(f"made the manifest of {name} from its files: it was gone")
+        except DamagedError:
+            continue  # verify names it
+        else:
+            if reason is not None:
+                del kept.anchors[home]
+                folder.manifests.put(home, {})
+                done.append(f"took {name} as it is: its manifest {reason}")
+    return done
+
+
 def rebuild(
     catalog: Catalog,
     folder: DataFolder,
@@ -239,19 +276,24 @@ def rebuild(
     return index.differences
 
 
-def reindex(folder: DataFolder, *, believe: bool = False) -> list[str]:
-    """Make the catalogue of a data folder right that no service runs on; return what was different, a line each.
+def reindex(folder: DataFolder, *, believe: bool = False, accept: bool = False) -> list[str]:
+    """Correct the catalogue of a data folder on which no service runs; return the differences, a line each.
 
     Parameters
     ----------
     believe
-        After a clean stop, read only what was changed since; else everything.
+        After a clean stop, read only changed tests; else everything.
+    accept
+        Take a folder that was put back from a backup, or that lost its manifest, as it is from now on.
     """
     path = folder.root / "catalog.sqlite"
     known = take_mark(path)
-    catalog = Catalog(path).open(sound=known is not None)
+    catalog = Catalog(path)
+    catalog.unsettled = folder.manifests.unsettled
+    catalog.open(sound=known is not None)
     try:
-        was_reset = ["the catalogue could not be read; it was quarantined and begun anew"] if catalog.was_reset else []
+        was_reset = ["the catalogue could not be read; it was quarantined and replaced"] if catalog.was_reset else []
+        was_reset += _accept(folder) if accept else []
         noise = NoiseStore(folder)
         noise.end_unfinished()
         index = Index(catalog, folder, CalibrationStore(folder), TestStore(folder), noise)

@@ -2,7 +2,7 @@
 
 It is written last when a service ends, and removed first when one begins. It names the catalogue by its checksum and
 each test by the times of its folders: an index that is stale, cut, or of another folder is seen by that, and so is a
-test that was changed, copied or removed by hand meanwhile.
+test that was changed, copied or removed by hand since.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Literal
 
-from core.errors import FileFormatError
-from server.base.models import Document
-from server.formats.files import fsync_path, sha256_of, storage_error
-from server.formats.version import software_version
-from server.store.durable import read_record, write_json
+from stereorig.core.errors import FileFormatError
+from stereorig.server.base.models import Document
+from stereorig.server.formats.files import fsync_path, sha256_of, storage_error
+from stereorig.server.formats.version import software_version
+from stereorig.server.store.durable import read_record, write_json
 
-#: beside the catalogue, and of its name: who leaves the catalogue out of a copy leaves the mark out
+#: in the catalogue's folder, and named after it: a copy without the catalogue lacks the mark too
 MARK = "catalog.sqlite.clean"
-#: a test that was changed so shortly before the stop is read again: what changed it may not have reached the index
+#: a test that was changed so shortly before the stop is read again: the change may not have reached the index
 _SETTLED_S = 60.0
-#: what shows a change of a test: entries of its folders, and its document
+#: files and folders whose times show a change of a test
 _WATCHED = ("", "test.json", "steps", "analyses")
 
 Times = tuple[int, ...]
@@ -38,7 +38,7 @@ class CleanStop(Document):
 
 
 def times_of(test: Path) -> Times:
-    """Return when a test's folders and its document were changed, ns; 0 for what is not there."""
+    """Return the times at which a test's folders and its document were changed, ns; 0 for missing ones."""
     found = []
     for name in _WATCHED:
         try:

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from core.errors import FileFormatError
-from server.base.errors import NotFoundError
-from server.store.calibrations import CalibrationStore
-from server.store.catalog import Entry
-from server.store.documents import AnalysisRecord, StepRecord, TestRecord
-from server.store.folder import DataFolder, is_id
-from server.store.indexing.lost_jobs import LostJobs
-from server.store.tests.tests import TestStore
-from server.store.trash import Trash
+from stereorig.core.errors import FileFormatError
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.documents.steps import StepRecord
+from stereorig.server.documents.tests import AnalysisRecord, TestRecord
+from stereorig.server.store.calibrations import CalibrationStore
+from stereorig.server.store.catalog import Entry
+from stereorig.server.store.folder import DataFolder, is_id
+from stereorig.server.store.indexing.lost_jobs import LostJobs
+from stereorig.server.store.tests.tests import TestStore
+from stereorig.server.store.trash import Trash
 
 
 def calibration_entry(store: CalibrationStore, calibration_id: str) -> dict[str, object]:

@@ -1,6 +1,6 @@
 """Jobs and requests as the folders have them, for a catalogue that was lost, or did not have them yet at a kill.
 
-Everything that a job makes bears the job's id and the Idempotency-Key that asked for it. Both are recovered from there:
+Everything that a job makes has the job's id and the Idempotency-Key that asked for it. Both are recovered from there:
 a client that repeats its request gets the result of the first, with its job as it ended.
 """
 
@@ -8,21 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from server.base.models import Ids, JobState
-from server.base.problem import RESTART, JobProblem, problem_of
-from server.store.catalog import Catalog
-from server.store.documents import (
-    AnalysisJob,
-    AnalysisRecord,
-    BurstIndex,
-    JobRecord,
-    KeptRequest,
-    MadeRecord,
-    Progress,
-    StepRecord,
-    SummaryRecord,
-)
-from server.store.folder import IdMaker, is_id
+from stereorig.server.base.models import Ids, JobState
+from stereorig.server.base.problem import RESTART, JobProblem, problem_of
+from stereorig.server.documents.jobs import JobRecord, KeptRequest, Progress
+from stereorig.server.documents.made import MadeRecord
+from stereorig.server.documents.steps import BurstIndex, StepRecord
+from stereorig.server.documents.tests import AnalysisJob, AnalysisRecord, SummaryRecord
+from stereorig.server.store.catalog import Catalog
+from stereorig.server.store.folder import IdMaker, is_id
 
 
 class LostJobs:
@@ -59,7 +52,7 @@ class LostJobs:
         self.made(plan.request, {**ids, "job_id": plan.job_id})
 
     def step(self, test_id: str, document: StepRecord) -> None:
-        """A step; those of a burst belong to its job."""
+        """Take a step; the steps of a burst belong to its job."""
         if document.burst is None:
             self.made(document.request, {"test_id": test_id, "n": document.n})
             return

@@ -8,7 +8,7 @@ import time
 from collections import OrderedDict
 from pathlib import Path
 
-#: a folder's time may stand still for some milliseconds while it changes
+#: a folder's time may remain the same for some milliseconds while it changes
 _SETTLED_NS = 1_000_000_000
 _MANY = 500
 _MAX_KEPT = 16
@@ -18,7 +18,7 @@ _kept: OrderedDict[str, tuple[tuple[int, int], tuple[str, ...]]] = OrderedDict()
 
 
 def names_in(folder: Path) -> tuple[str, ...]:
-    """Return the names of everything in a folder, in order; empty where there is no folder."""
+    """Return the names of everything in a folder, in order; empty if there is no folder."""
     try:
         stat = folder.stat()
         mark, key = (stat.st_ino, stat.st_mtime_ns), str(folder)

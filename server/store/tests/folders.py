@@ -1,4 +1,4 @@
-"""Folders of the tests: where each lies, the lock under which they are changed, and who is told before."""
+"""Folders of the tests: their paths, the lock under which they are changed, and the callback before a change."""
 
 from __future__ import annotations
 
@@ -6,16 +6,15 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from server.base.errors import NotFoundError
-from server.store.documents import TestRecord
-from server.store.durable import read_record
-from server.store.folder import DataFolder, is_id
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.documents.tests import TestRecord
+from stereorig.server.formats.manifest import is_there
+from stereorig.server.store.durable import read_record
+from stereorig.server.store.folder import DataFolder, is_id
 
 
 class TestFolders:
-    """What the stores of tests, steps and analyses share."""
-
-    __test__ = False  # the name is the domain's, not pytest's
+    """Common base of the stores of tests, steps and analyses."""
 
     def __init__(self, folder: DataFolder) -> None:
         self.data = folder
@@ -32,7 +31,7 @@ class TestFolders:
             If there is none with this id.
         """
         path = self.data.tests / test_id if is_id(test_id, "t") else None
-        if path is None or not (path / "test.json").is_file():
+        if path is None or not is_there(path / "test.json"):
             raise NotFoundError(f"There is no test {test_id[:40]!r}.", kind="test")
         return path
 

@@ -1,4 +1,4 @@
-"""Tests on disk: documents, metadata, calibrations; their steps and analyses beside them."""
+"""Tests on disk: documents, metadata, calibrations; `steps` and `analyses` are stores of their own."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ import hashlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from core.errors import StateError
-from server.formats.calibrations.in_test import LATER, calibration_in, later_file
-from server.store.documents import METADATA_NAMES, TestRecord
-from server.store.durable import make_folder, read_json, record_of, write_bytes, write_json
-from server.store.folder import DataFolder, is_id, now_utc
-from server.store.tests.analyses import AnalysisStore
-from server.store.tests.folders import TestFolders
-from server.store.tests.steps import StepStore
+from stereorig.core.errors import StateError
+from stereorig.server.documents.tests import TestRecord
+from stereorig.server.formats.calibrations.in_test import LATER, calibration_in, later_file
+from stereorig.server.formats.manifest import checked_bytes, is_there, require_sound
+from stereorig.server.store.durable import make_folder, read_json, record_of
+from stereorig.server.store.folder import DataFolder, is_id, now_utc
+from stereorig.server.store.tests.analyses import AnalysisStore
+from stereorig.server.store.tests.folders import TestFolders
+from stereorig.server.store.tests.steps import StepStore
 
 
 class TestStore:
@@ -23,15 +24,14 @@ class TestStore:
     Attributes
     ----------
     folders
-        Where they lie, and who is told before one is changed.
+        Their paths, and the callback before one is changed.
     steps, analyses
-        What belongs to them.
+        Stores of the tests' steps and analyses.
     """
-
-    __test__ = False  # the name is the domain's, not pytest's
 
     def __init__(self, folder: DataFolder) -> None:
         self.folders = TestFolders(folder)
+        self._manifests = folder.manifests
         self.steps = StepStore(self.folders)
         self.analyses = AnalysisStore(self.folders)
 
@@ -51,11 +51,10 @@ class TestStore:
         make_folder(path / "steps")
         make_folder(path / "analyses")
         if calibration is not None:
-            content = calibration.read_bytes()
-            digest = write_bytes(path / "calibration.json", content)
+            digest = self._manifests.write(path / "calibration.json", checked_bytes(calibration))
             document = {**document, "calibration_sha256": digest}
         document = {"id": test_id, "created_utc": now_utc(), **document}
-        write_json(path / "test.json", document)
+        self._manifests.write_json(path / "test.json", document)
         return TestRecord.model_validate(document)
 
     def read(self, test_id: str) -> TestRecord:
@@ -67,19 +66,18 @@ class TestStore:
         path = self.folders.to_change(test_id) / "test.json"
         with self.folders.lock:
             document = {**read_json(path), **changes}
-            write_json(path, document)
+            self._manifests.write_json(path, document)
         return record_of(TestRecord, document, path)
 
     @contextlib.contextmanager
     def still(self) -> Iterator[None]:
-        """Hold the lock: no step is added and no test changed meanwhile."""
+        """Hold the lock: no step is added and no test changed inside the block."""
         with self.folders.lock:
             yield
 
     def metadata(self, test_id: str) -> dict[str, object]:
-        """Return a test's metadata; empty where nothing was stated."""
-        found = self.read(test_id).metadata
-        return found if isinstance(found, dict) else {}
+        """Return a test's metadata; empty if none were stated."""
+        return self.read(test_id).metadata
 
     def put_metadata(
         self, test_id: str, metadata: Mapping[str, object], expected: Mapping[str, object] | None = None
@@ -94,41 +92,67 @@ class TestStore:
         Raises
         ------
         StateError
-            ``metadata_changed`` if they are not what was expected.
+            ``metadata_changed`` if the present ones are others.
         """
         self.folders.to_change(test_id)
         with self.folders.lock:
             if expected is not None and self.metadata(test_id) != expected:
                 raise StateError(
-                    f"The metadata of test {test_id} were changed meanwhile.",
+                    f"The metadata of test {test_id} were changed since.",
                     code="metadata_changed",
                     remedy="Read them again, then send the change.",
                 )
             path = self.path(test_id) / "test.json"
-            document = {name: value for name, value in read_json(path).items() if name not in METADATA_NAMES}
-            write_json(path, document | {"metadata": metadata})
+            self._manifests.write_json(path, read_json(path) | {"metadata": metadata})
 
     def workspace(self, test_id: str) -> dict[str, object]:
-        """Return what is drawn and set for a test; empty where nothing is."""
+        """Return the drawing and settings of a test; empty if there are none."""
         path = self.path(test_id) / "workspace.json"
-        return read_json(path) if path.is_file() else {}
+        return read_json(path) if is_there(path) else {}
 
     def put_workspace(self, test_id: str, document: Mapping[str, object]) -> None:
-        """Replace what is drawn and set for a test; durable when this returns."""
-        write_json(self.folders.to_change(test_id) / "workspace.json", document)
+        """Replace the drawing and settings of a test; durable when this returns."""
+        self._manifests.write_json(self.folders.to_change(test_id) / "workspace.json", document)
 
     def procedure(self, test_id: str) -> dict[str, object]:
-        """Return a test's verification procedure; empty where there is none."""
+        """Return a test's verification procedure; empty if it has none."""
         path = self.path(test_id) / "certificate_plan.json"
-        return read_json(path) if path.is_file() else {}
+        return read_json(path) if is_there(path) else {}
 
     def put_procedure(self, test_id: str, document: Mapping[str, object]) -> None:
         """Replace a test's verification procedure; durable when this returns."""
-        write_json(self.folders.to_change(test_id) / "certificate_plan.json", document)
+        self._manifests.write_json(self.folders.to_change(test_id) / "certificate_plan.json", document)
+
+    def readings(self, test_id: str) -> list[Path]:
+        """Return the tables of channels' readings, in the order of time."""
+        return sorted((self.path(test_id) / "channels").glob("[0-9][0-9][0-9][0-9].csv"))
+
+    def add_readings(self, test_id: str, rows: bytes, header: bytes, table_bytes: int, tables: int) -> bool:
+        """Add rows to the newest table of readings, or begin one; durable when this returns.
+
+        Parameters
+        ----------
+        header
+            First line of each table.
+        table_bytes, tables
+            A table of that size gets no further rows; with that many tables nothing is added, and False returned.
+        """
+        folder = self.folders.to_change(test_id) / "channels"
+        with self.folders.lock:
+            there = self.readings(test_id)
+            number, data = len(there), b""
+            if there and there[-1].stat().st_size < table_bytes:
+                number, data = number - 1, checked_bytes(there[-1])
+            if number >= tables:
+                return False
+            if not folder.is_dir():
+                make_folder(folder)
+            self._manifests.write(folder / f"{number:04d}.csv", (data or header) + rows)
+        return True
 
     def is_calibrated(self, test_id: str) -> bool:
         """Return True if the test has a calibration to measure with."""
-        return calibration_in(self.path(test_id)).is_file()
+        return is_there(calibration_in(self.path(test_id)))
 
     def keep_calibration(self, test_id: str, calibration_id: str, content: bytes, *, in_force: bool) -> TestRecord:
         """Give the test its own copy of another calibration; durable when this returns.
@@ -150,12 +174,12 @@ class TestStore:
             if sha256 not in {before, *document.get("calibrations", {})}:
                 if not (test / LATER).is_dir():
                     make_folder(test / LATER)
-                write_bytes(later_file(test, sha256), content)
+                self._manifests.write(later_file(test, sha256), content)
             first = {} if before is None else {before: document.get("calibration_id")}
             document["calibrations"] = {**first, **document.get("calibrations", {}), sha256: calibration_id}
             if in_force:
                 document |= {"calibration_id": calibration_id, "calibration_sha256": sha256}
-            write_json(test / "test.json", document)
+            self._manifests.write_json(test / "test.json", document)
         return record_of(TestRecord, document, test / "test.json")
 
     def calibration_file(self, test_id: str, sha256: str | None = None) -> Path:
@@ -163,11 +187,15 @@ class TestStore:
 
         Raises
         ------
+        DamagedError
+            If it is not as the test was given it.
         StateError
             ``not_calibrated`` if the test has none.
         """
         path = calibration_in(self.path(test_id), sha256)
-        if not path.is_file():
+        if is_there(path):
+            require_sound(path)
+        else:
             raise StateError(
                 f"Test {test_id} has no calibration.",
                 code="not_calibrated",

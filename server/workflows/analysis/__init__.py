@@ -1,1 +1,1 @@
-"""Analyses: begun, measured, read in a frame, and what is to be told of them."""
+"""Analyses: begun, measured, read in a frame, and the warnings about their results."""

@@ -1,4 +1,4 @@
-"""A block of a sequence, and what a plan of blocks asks for."""
+"""A block of a sequence, and the measurements that a plan of blocks asks for."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from core.errors import StereorigError
-from server.worker.tasks import Earlier
+from stereorig.core.errors import StereorigError
+from stereorig.server.compute.tasks import Earlier
 
 Summary = Mapping[str, object]
 Outcome = Summary | StereorigError
@@ -15,19 +15,19 @@ Kind = Literal["head", "step", "joint", "again"]
 
 
 @dataclass(frozen=True, eq=False)
-class Ask:
+class BlockStep:
     """A measurement that can be done now.
 
     Attributes
     ----------
     block, kind, n
-        For which block, what, and the step.
+        The block, the kind of measurement, and the step's number.
     previous
-        Step that gives the start values, None of a head; ``from_head``: as the head of its block measured it.
+        Step that gives the start values, None for a head; ``from_head``: as the head of its block measured it.
     against
-        Of a head: the reference.
+        The reference of a head; None for other kinds.
     compared
-        What the measurement is held against.
+        The earlier result that the measurement is compared with.
     references
         Steps that have been references so far, the first one not among them.
     generation
@@ -50,20 +50,20 @@ class Block:
     """Steps that follow one another, and how far they are."""
 
     steps: list[int]
-    against: int | None  # reference of its head; None: it goes on where the block before ends
+    against: int | None  # reference of its head; None: it begins from the last step of the block before
     head: Literal["none", "open", "there", "missing"] = "none"
     joint: Literal["none", "open", "through"] = "none"
     compared: Earlier | None = "head"
     at: int = 0  # index of the step to be measured next
     again: int | None = None  # index of the step to be measured again next
-    at_least: int = 0  # index before which agreement does not end that: an earlier round was to go on there
-    running: Ask | None = None
+    at_least: int = 0  # agreement before this index does not end measuring again: an earlier round had to reach it
+    running: BlockStep | None = None
     stale: bool = False  # the step before the one that runs was replaced
     outcomes: dict[int, Outcome] = field(default_factory=dict)
 
     @property
     def through(self) -> bool:
-        """True if all its steps are measured, and none again."""
+        """True if all its steps are measured, and none is to be measured again."""
         return self.at == len(self.steps) and self.again is None
 
     def good(self, n: int) -> bool:
@@ -78,5 +78,5 @@ def reference_of(outcome: Outcome, first: int) -> int:
 
 
 def agrees(outcome: Outcome) -> bool:
-    """Return True if what was measured from the same step before stands."""
+    """Return True if the new measurement agrees with the earlier one from the same step before."""
     return not isinstance(outcome, StereorigError) and bool(outcome.get("agrees"))

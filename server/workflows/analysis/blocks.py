@@ -1,12 +1,12 @@
 """Plan of a sequence in blocks that are measured side by side, with the results of one after the other.
 
 Steps of a block follow one another. The first of a block, its head, is matched against the current reference from
-seeds; once the block before is through, it is measured again from that one's last step: the joint. Where both agree,
-the block stands. Where they do not, its steps are measured again from the joint on, until one agrees with what was
-there. A step that went over to another reference gives all later blocks new heads. A block whose head cannot be found
-waits, and goes on where the one before ends.
+seeds; once the block before is through, it is measured again from that block's last step: the joint. If both agree,
+the block is accepted. If not, its steps are measured again from the joint on, until one agrees with its earlier
+result. A step that changed to another reference gives all later blocks new heads. A block whose head cannot be found
+waits, and begins from the last step of the block before.
 
-Decisions only: what is to be measured next, and what follows from an outcome. Nothing here measures or waits.
+The plan only decides: the next measurement, and the consequences of an outcome. Nothing here measures or waits.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Literal
 
-from core.errors import StereorigError
-from server.worker.tasks import Earlier
-from server.workflows.analysis.block import Ask, Block, Kind, Outcome, Summary, agrees, reference_of
+from stereorig.core.errors import StereorigError
+from stereorig.server.compute.tasks import Earlier
+from stereorig.server.workflows.analysis.block import Block, BlockStep, Kind, Outcome, Summary, agrees, reference_of
 
 #: a head and a joint cost two to four steps
 SHORTEST = 4
-#: what is certain grows block by block
+#: the steps whose outcome is certain grow block by block
 LONGEST = 64
 
 
 class Blocks:
-    """The plan: :meth:`ask` for what to do, tell its outcome by :meth:`ended`.
+    """The plan: :meth:`ask` returns the next measurement, :meth:`ended` takes its outcome.
 
     Parameters
     ----------
@@ -87,18 +87,18 @@ class Blocks:
 
     @property
     def ahead(self) -> int:
-        """Number of steps that are measured, whether or not they stand."""
+        """Number of steps that are measured, accepted or not."""
         return sum(b.at for b in self._blocks)
 
-    def ask(self) -> Ask | None:
-        """Return what can be measured now, the earliest first; None if nothing can before another one has ended.
+    def ask(self) -> BlockStep | None:
+        """Return the next possible measurement, the earliest step first; None if all must wait for the end of another.
 
-        Whoever asks has nothing to do: where no block has work, the one with the most steps left is cut in two.
+        If no block has work, the block with the most steps left is cut in two.
         """
         found = self._next()
         return self._next() if found is None and self._cut() else found
 
-    def _next(self) -> Ask | None:
+    def _next(self) -> BlockStep | None:
         for i, block in enumerate(self._blocks):
             if block.running is None:
                 ask = self._of(i, block)
@@ -108,8 +108,8 @@ class Blocks:
                     return ask
         return None
 
-    def ended(self, ask: Ask, outcome: Outcome) -> None:
-        """Take up what came of an ask: a step's summary, or why it could not be measured."""
+    def ended(self, ask: BlockStep, outcome: Outcome) -> None:
+        """Take the outcome of a measurement: a step's summary, or the error that prevented it."""
         self._busy.discard(ask.n)
         block = ask.block
         block.running = None
@@ -128,7 +128,7 @@ class Blocks:
                 self._from_start(block)
             self._put(i, ask.n, outcome)
         elif ask.kind == "joint" and block.stale:
-            block.stale, block.compared = False, None  # what it was held against is overwritten
+            block.stale, block.compared = False, None  # the result that it was compared with is overwritten
         elif ask.kind == "joint":
             block.joint = "through"
             self._put(i, ask.n, outcome)
@@ -156,7 +156,7 @@ class Blocks:
                 self._if_last(i)
 
     def certain(self) -> Iterator[tuple[int, Outcome]]:
-        """Yield the steps whose outcome is that of one after another, in their order."""
+        """Yield in order the steps whose outcome is the same as if all were measured one after another."""
         for block in self._blocks:
             if block.joint == "open" or block.stale:
                 return
@@ -182,9 +182,9 @@ class Blocks:
         self._blocks.insert(i + 1, Block(steps, reference, "open"))
         return True
 
-    # what can be done ------------------------------------------------------------------------------------------
+    # measurements that are possible -----------------------------------------------------------------------------
 
-    def _of(self, i: int, block: Block) -> Ask | None:
+    def _of(self, i: int, block: Block) -> BlockStep | None:
         through_before = all(b.through for b in self._blocks[max(i - 1, 0) : i])
         if block.again == 0 and not through_before:
             return None
@@ -211,8 +211,10 @@ class Blocks:
         from_head: bool = False,
         against: int | None = None,
         compared: Earlier | None = None,
-    ) -> Ask:
-        return Ask(block, kind, n, previous, from_head, against, compared, tuple(self._references), self._generation)
+    ) -> BlockStep:
+        return BlockStep(
+            block, kind, n, previous, from_head, against, compared, tuple(self._references), self._generation
+        )
 
     def _good_before(self, i: int, index: int) -> int:
         """Return the last step that was measured before one of a block."""
@@ -223,10 +225,10 @@ class Blocks:
                     return n
         return self._before
 
-    # what follows ----------------------------------------------------------------------------------------------
+    # consequences of an outcome ---------------------------------------------------------------------------------
 
     def _put(self, i: int, n: int, outcome: Outcome) -> None:
-        """Take an outcome; if the step went over to a later reference, later blocks begin anew from that."""
+        """Take an outcome; if the step changed to a later reference, later blocks begin again from it."""
         block, old = self._blocks[i], set()
         if block.good(n):
             old.add(reference_of(block.outcomes[n], self._first))
@@ -261,12 +263,12 @@ class Blocks:
             self._if_last(k)
 
     def _replaced(self, i: int, n: int) -> None:
-        """Begin anew what is matched against a step that was measured again with another outcome."""
+        """Begin again the steps that are matched against a step that was measured again with another outcome."""
         if n in self._references:
             self._begin_anew(i, {n}, n)
 
     def _if_last(self, i: int) -> None:
-        """The last step of a block may be another one now: what began there is measured again."""
+        """The last step of a block may have changed: steps that began from it are measured again."""
         if i + 1 == len(self._blocks):
             return
         after = self._blocks[i + 1]

@@ -1,7 +1,7 @@
-"""What must be known before an analysis' results are used, kept from one question to the next for those of many steps.
+"""Checks and warnings to know before an analysis' results are used; kept between requests if it has many steps.
 
-Of an analysis of few steps it is found anew with every question. Of one of many, which takes a second for some thousand
-steps, it is found beside the requests; until it is known for the first time, a warning says so.
+For an analysis of few steps they are made at every request. For some thousand steps they take a second and are made
+in the background; until they are known for the first time, a warning states that.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from core.errors import StereorigError
-from server.base.problem import JobProblem
-from server.results.warnings.analysis import ResultWarning
-from server.results.warnings.checks import Checks, checks_if_changed, checks_of
-from server.store.tests.tests import TestStore
-from server.worker.executor import WorkerDiedError
-from server.worker.resting import RestingWorker
+from stereorig.core.errors import StereorigError
+from stereorig.server.base.problem import JobProblem
+from stereorig.server.results.warnings.analysis import ResultWarning
+from stereorig.server.results.warnings.checks import Checks, checks_if_changed, checks_of
+from stereorig.server.store.tests.tests import TestStore
+from stereorig.server.worker.executor import WorkerDiedError
+from stereorig.server.worker.resting import RestingWorker
 
 _log = logging.getLogger("stereorig.service")
 #: an ``analysis.json`` of more bytes is of many steps: each takes some 190
@@ -31,14 +31,14 @@ _MANY_BYTES = 8_000
 _LONG_BYTES = 200_000
 #: by the first who asks
 _WAIT_FIRST_S = 0.25
-#: files may be replaced in place, which no folder's time shows; then only what has changed is read again
+#: files may be replaced in place, which no folder's time shows; then only changed files are read again
 _FRESH_S = 30.0
 #: share of a processor that the checks may take
 _SHARE = 0.2
 
 
 @dataclass
-class _Kept:
+class _KeptChecks:
     mark: object = None
     checks: Checks | None = None
     state: bytes | None = None
@@ -54,27 +54,27 @@ class AnalysisChecks:
     def __init__(self, tests: TestStore) -> None:
         self._tests = tests
         self._lock = threading.Lock()
-        self._kept: dict[tuple[str, str, bool], _Kept] = {}
+        self._kept: dict[tuple[str, str, bool], _KeptChecks] = {}
         self._process = RestingWorker()
         self._beside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="checks")
 
     def close(self) -> None:
-        """End what runs beside."""
+        """End the background thread and its process."""
         self._beside.shutdown(wait=False, cancel_futures=True)
         self._process.close()
 
     def of(self, test_id: str, analysis_id: str, failed: Mapping[str, JobProblem] | None = None) -> Checks:
-        """Return what is known of an analysis.
+        """Return the checks of an analysis.
 
         Parameters
         ----------
         failed
-            Steps that could not be measured, where more is known than ``summary.json`` has.
+            Steps that could not be measured, if the caller knows more than ``summary.json``.
 
         Raises
         ------
         FileFormatError, NotFoundError
-            Of an analysis of few steps that is not there, or cannot be read.
+            If an analysis of few steps does not exist or cannot be read.
         """
         folder = self._tests.analyses.path(test_id, analysis_id)
         problems = None if failed is None else {n: one.plain() for n, one in failed.items()}
@@ -82,13 +82,13 @@ class AnalysisChecks:
             return checks_of(folder, problems)
         mark = self._mark(test_id, folder, problems)
         with self._lock:
-            kept = self._kept.setdefault((test_id, analysis_id, problems is None), _Kept())
+            kept = self._kept.setdefault((test_id, analysis_id, problems is None), _KeptChecks())
             age_s = time.monotonic() - kept.at
             current = kept.checks is not None and kept.mark == mark and age_s < _FRESH_S
             rested = kept.checks is None or age_s > kept.took_s / _SHARE
             first = kept.checks is None and kept.running is None
             if not current and rested and kept.running is None:
-                # a request that was begun before the service closes gets what is known
+                # a request that was begun before the service closes gets the last known checks
                 with contextlib.suppress(RuntimeError):
                     kept.running = self._beside.submit(self._renew, kept, folder, problems, mark)
             running = kept.running
@@ -97,7 +97,7 @@ class AnalysisChecks:
                 running.result(timeout=_WAIT_FIRST_S)
         return kept.checks or _NOT_YET
 
-    def _renew(self, kept: _Kept, folder: Path, problems: Mapping[str, object] | None, mark: object) -> None:
+    def _renew(self, kept: _KeptChecks, folder: Path, problems: Mapping[str, object] | None, mark: object) -> None:
         began = time.monotonic()
         found: Checks | None = None
         state: bytes | None = None

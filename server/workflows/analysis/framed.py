@@ -10,24 +10,25 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from server.formats.files import known_sha256
-from server.results.gauges.framed import in_frame, write_framed
-from server.results.gauges.frames import frame_asked, frame_of_test, part_of
-from server.results.gauges.request import Alignment
+from stereorig.server.formats.manifest import known_sha256
+from stereorig.server.formats.results.variables import described
+from stereorig.server.results.gauges.framed import in_frame, write_framed
+from stereorig.server.results.gauges.frames import frame_asked, frame_of_test
+from stereorig.server.results.gauges.request import Alignment
 
 if TYPE_CHECKING:
-    from server.workflows.service import Service
+    from stereorig.server.workflows.service import Service
 
 _KEPT_BYTES = 1 << 30
 
 
 class FramedResults:
-    """Result files in other frames; those used least recently go first.
+    """Result files in other frames; the least recently used are deleted first.
 
     Parameters
     ----------
     folder
-        Where they lie; made with the first one.
+        Folder of the files; made with the first one.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -36,7 +37,7 @@ class FramedResults:
         self._kept: OrderedDict[str, Path] = OrderedDict()
 
     def file(self, source: Path, asked: Alignment, laid_through: Path | None, *, strain: bool = True) -> Path:
-        """Return a result file in a frame that is laid through it, or through another.
+        """Return a result file in a frame that it defines, or another file.
 
         Raises
         ------
@@ -80,8 +81,8 @@ def result_in(
     Parameters
     ----------
     name
-        Variable that will be read of it: one that is the same in every frame is read where it is stored, and strain is
-        made anew for its own components alone.
+        Variable that will be read from it: if it is the same in every frame, the stored file is returned; strain is
+        computed again only if a strain component is read.
     """
     return file_in(
         service, test_id, analysis_id, service.tests.analyses.result_file(test_id, analysis_id, n), frame, name
@@ -93,7 +94,7 @@ def file_in(
 ) -> Path:
     """Return one of an analysis' result files, dense or not, in a frame; see :func:`result_in`."""
     asked = asked_of(service, test_id, frame)
-    part = "strain" if name is None else part_of(name)
+    part = "strain" if name is None else described(name).part
     if asked is None or part == "none":
         return source
     reference = _reference(service, test_id, analysis_id)
@@ -114,23 +115,23 @@ def results_in_frame(
     Parameters
     ----------
     variables
-        Those that are read of them: strain is not made anew for others. None: all.
+        Variables that will be read: strain is computed again only if one of them is a strain. None: all.
     """
     asked = asked_of(service, test_id, frame)
     if asked is None:
         return list(files)
     name = variable_of_frame(variables)
-    return in_frame(files, asked, folder, strain=name is None or part_of(name) == "strain")
+    return in_frame(files, asked, folder, strain=name is None or described(name).part == "strain")
 
 
 def variable_of_frame(variables: Sequence[str] | None) -> str | None:
-    """Return the one of several variables for which most has to be made anew in another frame; None: all of them."""
+    """Return the variable that needs the most computation in another frame; None, for all variables, if None."""
     order = ("none", "field", "strain")
-    return None if variables is None else max(variables, key=lambda name: order.index(part_of(name)))
+    return None if variables is None else max(variables, key=lambda name: order.index(described(name).part))
 
 
 def _reference(service: Service, test_id: str, analysis_id: str) -> Path | None:
-    """Return the reference's result, through which a frame is laid; None where it is not there."""
+    """Return the reference's result, which defines the frame; None if it is not measured."""
     reference = service.tests.analyses.read(test_id, analysis_id).steps[0]
     if reference not in service.tests.analyses.finished_steps(test_id, analysis_id):
         return None

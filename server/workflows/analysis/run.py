@@ -1,6 +1,6 @@
 """An analysis at work: one task a step in the worker, each step's file announced once it can be read.
 
-A run keeps no state but the folder's: it begins anew, goes on where another one stopped, or follows a test, and
+A run keeps no state but the folder's: it begins from the start, continues an interrupted run, or follows a test, and
 measures each step from the same steps before it in any case.
 """
 
@@ -12,27 +12,28 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from typing import Any
 
-from core.errors import Cancelled, MeasurementError, StereorigError, StorageError
-from server.base.json_values import without_nan
-from server.base.problem import problem_of
-from server.formats.results.summary import SequenceSummary
-from server.formats.version import software_version
-from server.jobs.job import Job, Waiting
-from server.results.warnings.analysis import analysis_warnings
-from server.store.documents import AnalysisRecord, Finished, StepOutcome
-from server.store.folder import now_utc
-from server.store.indexing.entries import analysis_entry
-from server.store.tests.steps import StepFiles
-from server.worker.dask_cluster import ClusterError
-from server.worker.executor import WorkerDiedError
-from server.worker.tasks import StepTask, measure_step
-from server.workflows.analysis.block import Outcome
-from server.workflows.analysis.blocks import Blocks
-from server.workflows.analysis.side_by_side import goes_in_blocks, has_helpers, is_certain, measure_in_blocks
-from server.workflows.analysis.tasks import is_independent, task_of
-from server.workflows.camera_identity import check_same_cameras
-from server.workflows.service import Service
-from server.workflows.waiting import run_side_by_side, run_task
+from stereorig.core.errors import Cancelled, MeasurementError, StereorigError, StorageError
+from stereorig.server.base.json_values import without_nan
+from stereorig.server.base.problem import problem_of
+from stereorig.server.compute.functions import measure_step
+from stereorig.server.compute.tasks import StepTask
+from stereorig.server.documents.tests import AnalysisRecord, Finished, StepOutcome
+from stereorig.server.formats.results.summary import SequenceSummary
+from stereorig.server.formats.version import software_version
+from stereorig.server.jobs.job import Job, Waiting
+from stereorig.server.results.warnings.analysis import analysis_warnings
+from stereorig.server.store.folder import now_utc
+from stereorig.server.store.indexing.entries import analysis_entry
+from stereorig.server.store.tests.steps import StepFiles
+from stereorig.server.worker.dask_cluster import ClusterError
+from stereorig.server.worker.executor import WorkerDiedError
+from stereorig.server.workflows.analysis.block import Outcome
+from stereorig.server.workflows.analysis.blocks import Blocks
+from stereorig.server.workflows.analysis.side_by_side import goes_in_blocks, is_certain, measure_in_blocks
+from stereorig.server.workflows.analysis.tasks import is_independent, task_of
+from stereorig.server.workflows.camera_identity import check_same_cameras
+from stereorig.server.workflows.service import Service
+from stereorig.server.workflows.waiting import report_away, run_side_by_side, run_task
 
 
 class StepsFailedError(MeasurementError):
@@ -58,23 +59,24 @@ class AnalysisRun:
         self._summaries: dict[int, StepOutcome] = {}  # of the steps that are finished
         self._plain: dict[int, tuple[StepOutcome, dict[str, object]]] = {}
         self._failed: dict[int, StereorigError] = {}  # in this run
-        self._done: dict[int, StepFiles] = {}  # in their order: what the next step is measured from, the last one last
+        self._done: dict[int, StepFiles] = {}  # steps that the next one is measured from, in order, the last one last
         self._references: dict[int, None] = {}  # of the steps measured so far, in the order of their first use
         self._next = 0  # index of that step
 
     def __call__(self, job: Job) -> dict[str, object]:
-        """Measure what is not measured yet: a step that fails does not take the others, or the analysis, with it.
+        """Measure the steps that are not measured yet: a step that fails ends neither the others nor the analysis.
 
         Raises
         ------
         StereorigError
-            What went wrong with the reference; or, with its code, with the first other step where all of them failed.
+            The reference's error; or, with its code, the first other step's error if all of them failed.
         Waiting
             It follows a test and has measured all that there is.
         """
         if self._loaded is None:
             self._load(job)
         while True:
+            report_away(self._service.executor, job)
             self._measure(job)
             if job.work.follows is None:
                 break
@@ -96,7 +98,7 @@ class AnalysisRun:
         return self._loaded
 
     def _load(self, job: Job) -> None:
-        """Take over what another run finished; a result without summary, or damaged, is measured again."""
+        """Take over the results of an earlier run; a result without summary, or damaged, is measured again."""
         tests, analysis_id = self._service.tests, str(job.subject["analysis_id"])
         document = tests.analyses.read(self._test_id, analysis_id)
         known = tests.analyses.step_summaries(self._test_id, analysis_id)
@@ -109,7 +111,7 @@ class AnalysisRun:
         self._publish(job)
 
     def _publish(self, job: Job) -> dict[str, object]:
-        """Put what is finished into the job's result, and return it."""
+        """Put the finished steps into the job's result, and return it."""
         finished = [self._summaries[n] for n in self._document.steps if n in self._summaries]
         found: dict[str, object] = {
             "analysis_id": self._document.id,
@@ -124,7 +126,7 @@ class AnalysisRun:
         return found
 
     def _plain_of(self, found: StepOutcome) -> dict[str, object]:
-        """Return a step's figures as plain values, made once: they are published anew after every step."""
+        """Return a step's figures as plain values; kept, since they are published again after every step."""
         known = self._plain.get(found.n)
         if known is None or known[0] is not found:
             self._plain[found.n] = known = found, found.plain()
@@ -147,12 +149,12 @@ class AnalysisRun:
             self._go_on_from(n)
         else:
             job.check()
-            self._service.require_room()  # while what the job ends with can still be written
+            self._service.require_room()  # while the job's last files can still be written
             self._measure_one(job, self._next, n)
         self._next += 1
 
     def _go_on_from(self, n: int) -> None:
-        """Keep what later steps may be measured from: this step, and the references so far, not all steps before it."""
+        """Keep the steps that later ones may be measured from: this step and the references so far."""
         reference = self._plain_of(self._summaries[n]).get("reference_step")
         if reference is not None:
             self._references[int(str(reference))] = None
@@ -171,10 +173,11 @@ class AnalysisRun:
         try:
             self._check_cameras(n)
             following = steps[index + 1] if index + 1 < len(steps) else None
-            task = task_of(service.tests, document, n, self._done, following, shares=has_helpers(service, document, 1))
+            task = task_of(service.tests, document, n, self._done, following)
+            service.tests.analyses.begin_step(self._test_id, document.id, n)
             summary = run_task(service.executor, job, measure_step, task, progress=progress)
         except StereorigError as error:
-            self._note_failure(job, n, error)
+            self._record_failure(job, n, error)
             return
         self._note(job, n, summary, time.monotonic() - started)
 
@@ -182,7 +185,7 @@ class AnalysisRun:
         """Measure steps that follow one another in blocks, several at once."""
         steps = self._document.steps
         while self._next < len(steps) and (self._next == 0 or is_certain(self._summaries.get(steps[self._next]))):
-            self._measure_next(job)  # the reference, and what goes on without a gap
+            self._measure_next(job)  # the reference, and the steps that follow it without a gap
         later = [n for n in self._references if n != steps[0]]
         order = steps[self._next :]
         plan = Blocks(
@@ -209,10 +212,10 @@ class AnalysisRun:
         self._next = len(steps)
 
     def _take(self, job: Job, n: int, outcome: Outcome) -> None:
-        """Note a step whose outcome is that of one after another."""
+        """Note a step whose outcome is the same as if all steps were measured one after another."""
         if isinstance(outcome, StereorigError):
             self._summaries.pop(n, None)
-            self._note_failure(job, n, outcome)
+            self._record_failure(job, n, outcome)
         else:
             found = {name: value for name, value in outcome.items() if name != "agrees"}
             self._note(job, n, found, float(str(found.get("wall_s") or 0.0)))
@@ -226,7 +229,6 @@ class AnalysisRun:
                 self._measure_one(job, 0, steps[0])
             self._next = 1
         open_steps = [n for n in steps[self._next :] if n not in self._summaries]
-        shares = has_helpers(self._service, self._document, len(open_steps))
         began = time.monotonic()
         parts: dict[int, float] = {}
 
@@ -234,9 +236,10 @@ class AnalysisRun:
             for n in open_steps:
                 try:
                     self._check_cameras(n)
-                    task = task_of(self._service.tests, self._document, n, {}, None, shares=shares)
+                    task = task_of(self._service.tests, self._document, n, {}, None)
+                    self._service.tests.analyses.begin_step(self._test_id, self._document.id, n)
                 except StereorigError as error:
-                    self._note_failure(job, n, error)
+                    self._record_failure(job, n, error)
                     continue
                 yield n, lambda task=task: task  # type: ignore[misc]
 
@@ -251,15 +254,15 @@ class AnalysisRun:
             try:
                 summary = future.result()
             except StereorigError as error:
-                self._note_failure(job, n, error)
+                self._record_failure(job, n, error)
             else:
                 self._note(job, n, summary, time.monotonic() - began)
 
         run_side_by_side(self._service.executor, job, measure_step, tasks(), ended, progress)
         self._next = len(steps)
 
-    def _note_failure(self, job: Job, n: int, error: StereorigError) -> None:
-        """Keep and show a step's own failure; raise what is not its doing, or what nothing can go on without."""
+    def _record_failure(self, job: Job, n: int, error: StereorigError) -> None:
+        """Record and publish a step's own failure; raise an error that is not the step's, or that ends the analysis."""
         self._raise_what_ends_all(n, error)
         self._failed[n] = error
         self._publish(job)
@@ -285,7 +288,7 @@ class AnalysisRun:
         service.hub.publish("result", {"test_id": self._test_id, "analysis_id": analysis_id, "n": n, "job_id": job.id})
 
     def _check_cameras(self, n: int) -> None:
-        """Refuse a step of other cameras: what lands later was not there to be checked when the analysis was made."""
+        """Refuse a step of other cameras: steps added later were not checked when the analysis was made."""
         if not self._document.follow:
             return
         measured = self._document.inputs.calibration_sha256
@@ -321,7 +324,7 @@ class AnalysisRun:
 
 
 def close(service: Service, job: Job, test_id: str, analysis_id: str, state: str) -> None:
-    """Write ``summary.json``: what was found in the steps that were finished, however the job ended."""
+    """Write ``summary.json`` with the figures of the finished steps, for every final state of the job."""
     found, document = Finished.model_validate(job.result or {}), service.tests.analyses.read(test_id, analysis_id)
     summary = SequenceSummary(
         state=state,

@@ -7,30 +7,31 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from core.errors import StereorigError
-from server.formats.results.settings import stored_settings
-from server.jobs.job import Job
-from server.store.documents import AnalysisRecord, StepOutcome
-from server.worker.executor import TaskFuture
-from server.worker.tasks import StepTask, measure_step
-from server.workflows.analysis.block import Ask, Outcome
-from server.workflows.analysis.blocks import SHORTEST, Blocks
-from server.workflows.analysis.tasks import task_of
-from server.workflows.service import Service
-from server.workflows.waiting import SideBySide
+from stereorig.core.errors import StereorigError
+from stereorig.server.compute.functions import measure_step
+from stereorig.server.compute.tasks import StepTask
+from stereorig.server.documents.tests import AnalysisRecord, StepOutcome
+from stereorig.server.formats.results.layout import stored_settings
+from stereorig.server.jobs.job import Job
+from stereorig.server.worker.executor import TaskFuture
+from stereorig.server.workflows.analysis.block import BlockStep, Outcome
+from stereorig.server.workflows.analysis.blocks import SHORTEST, Blocks
+from stereorig.server.workflows.analysis.tasks import task_of
+from stereorig.server.workflows.service import Service
+from stereorig.server.workflows.waiting import SideBySide
 
 
 def goes_in_blocks(
     service: Service, document: AnalysisRecord, steps: Sequence[int], summaries: Mapping[int, StepOutcome]
 ) -> bool:
-    """Return True if what is left is measured in blocks: what was begun so, or enough steps for several workers.
+    """Return True if the rest is measured in blocks: it was begun so, or has enough steps for several workers.
 
     Parameters
     ----------
     steps
-        Those that are left, and of a run that goes on some that are measured.
+        The steps left; of a continued run also some that are measured.
     summaries
-        Of the steps that are measured.
+        Summaries of the measured steps.
     """
     settings = stored_settings(document.settings)
     if settings.side_by_side == "never" or settings.reference_update == "always":
@@ -41,16 +42,8 @@ def goes_in_blocks(
     return len(open_steps) >= 2 * SHORTEST and service.executor.width > 1
 
 
-def has_helpers(service: Service, document: AnalysisRecord, steps: int) -> bool:
-    """Return True if workers are left to help where so many steps are measured at once."""
-    executor = service.executor
-    if stored_settings(document.settings).split_step == "never" or not executor.shares_files:
-        return False
-    return executor.width > steps
-
-
 def is_certain(summary: StepOutcome | None) -> bool:
-    """Return True for a step that was announced: its worker alone does not know that what came before it stands."""
+    """Return True for an announced step; a worker's summary alone does not show that the steps before it are final."""
     return summary is not None and summary.wall_s is not None
 
 
@@ -64,12 +57,12 @@ def measure_in_blocks(
     take: Callable[[Job, int, Outcome], None],
     progress: Callable[[float], None],
 ) -> None:
-    """Do what a plan asks for, as much at once as the executor takes.
+    """Do the measurements that a plan asks for, as many at once as the executor takes.
 
     Parameters
     ----------
     prepare
-        Called with a step before it is measured; raises what is wrong with it.
+        Called with a step before it is measured; raises an error if it cannot be.
     refuse
         Called with an error; raises it if it ends the whole.
     take
@@ -78,23 +71,21 @@ def measure_in_blocks(
         Called with the number of steps measured.
     """
     parts: dict[int, float] = {}
-    # a block has at least so many steps: where there are fewer, workers have nothing to do
-    shares = has_helpers(service, document, plan.size // SHORTEST)
-    asked: dict[TaskFuture, tuple[Ask, float]] = {}
+    asked: dict[TaskFuture, tuple[BlockStep, float]] = {}
     certain = 0
 
     def shown(number: int, _phase: str, share: float) -> None:
         parts[number] = share
         progress(plan.ahead + sum(parts.values()))
 
-    def outcome_of(ask: Ask, future: TaskFuture, started: float) -> Outcome:
+    def outcome_of(ask: BlockStep, future: TaskFuture, started: float) -> Outcome:
         try:
             return {**future.result(), "wall_s": time.monotonic() - started}
         except StereorigError as error:
             refuse(ask.n, error)
             return error
 
-    def ended(ask: Ask, outcome: Outcome) -> None:
+    def ended(ask: BlockStep, outcome: Outcome) -> None:
         nonlocal certain
         plan.ended(ask, outcome)
         for n, found in itertools.islice(plan.certain(), certain, None):
@@ -106,7 +97,7 @@ def measure_in_blocks(
             while side.has_room and (ask := plan.ask()) is not None:
                 try:
                     prepare(ask.n)
-                    task = _task_of(service, document, ask, shares=shares)
+                    task = _task_of(service, document, ask)
                 except StereorigError as error:
                     refuse(ask.n, error)
                     ended(ask, error)
@@ -118,11 +109,13 @@ def measure_in_blocks(
                 ended(ask, outcome_of(ask, future, started))
 
 
-def _task_of(service: Service, document: AnalysisRecord, ask: Ask, *, shares: bool) -> StepTask:
+def _task_of(service: Service, document: AnalysisRecord, ask: BlockStep) -> StepTask:
     needed = [n for n in ask.references if n != ask.previous] + ([] if ask.previous is None else [ask.previous])
     earlier = {n: service.tests.steps.read(document.test_id, n) for n in needed}
+    if ask.against is None:  # a head is no result
+        service.tests.analyses.begin_step(document.test_id, document.id, ask.n)
     return replace(
-        task_of(service.tests, document, ask.n, earlier, None, shares=shares),
+        task_of(service.tests, document, ask.n, earlier, None),
         previous=ask.previous,
         against=ask.against,
         from_head=ask.from_head,

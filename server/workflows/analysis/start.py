@@ -1,4 +1,4 @@
-"""Analyses: what is checked before one is begun, beginning one, and going on with one that was interrupted."""
+"""Analyses: the checks before one is begun, beginning one, and continuing an interrupted one."""
 
 from __future__ import annotations
 
@@ -6,27 +6,28 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from core.errors import InputError, StateError
-from core.field.region.lay_points import make_grid
-from core.settings import AnalysisSettings, NoiseRecord, StoredSettings
-from server.base.models import Ids
-from server.compute.seeds import check_seeds
-from server.formats.calibrations.in_test import calibration_id_in
-from server.formats.files import sha256_of
-from server.formats.images import decode_mask, read_image
-from server.formats.noise_json import load_noise
-from server.formats.version import software_version
-from server.jobs.idempotency import RequestMark
-from server.jobs.job import Job, Phase
-from server.results.images.projected_pattern import check_settings
-from server.results.warnings import checks
-from server.store.documents import AnalysisRecord
-from server.store.indexing.entries import analysis_entry
-from server.workflows.analysis.run import AnalysisRun, close
-from server.workflows.analysis.tasks import calibration_changed
-from server.workflows.camera_identity import check_same_cameras
-from server.workflows.service import Service
-from server.workflows.test_start import calibration_asked, give_calibration
+from stereorig.core.errors import InputError, StateError
+from stereorig.core.field.region.lay_points import make_grid
+from stereorig.core.settings import AnalysisSettings, NoiseRecord, StoredSettings
+from stereorig.server.base.models import Ids
+from stereorig.server.cell.images import mask as read_mask
+from stereorig.server.compute.seeds import check_seeds
+from stereorig.server.documents.tests import AnalysisRecord
+from stereorig.server.formats.calibrations.in_test import calibration_id_in
+from stereorig.server.formats.files import sha256_of
+from stereorig.server.formats.images import read_image
+from stereorig.server.formats.noise_json import load_noise
+from stereorig.server.formats.version import software_version
+from stereorig.server.jobs.idempotency import RequestMark
+from stereorig.server.jobs.job import Job, Phase
+from stereorig.server.results.images.projected_pattern import check_settings
+from stereorig.server.results.warnings import checks
+from stereorig.server.store.indexing.entries import analysis_entry
+from stereorig.server.workflows.analysis.run import AnalysisRun, close
+from stereorig.server.workflows.analysis.tasks import calibration_changed
+from stereorig.server.workflows.camera_identity import check_same_cameras
+from stereorig.server.workflows.service import Service
+from stereorig.server.workflows.test_start import calibration_asked, give_calibration
 
 
 def steps_to_measure(service: Service, test_id: str, reference: int, wanted: list[int] | None) -> list[int]:
@@ -75,19 +76,19 @@ def inputs_of(service: Service, test_id: str, steps: list[int], calibration: Pat
 
 
 def stale_reasons(service: Service, test_id: str, document: AnalysisRecord) -> list[str]:
-    """Return what is gone or was replaced since an analysis was made; see :func:`stale_inputs`."""
+    """Return the inputs that are gone or were replaced since an analysis was made; see :func:`stale_inputs`."""
     return checks.stale_reasons(service.tests.path(test_id), document)
 
 
 @dataclass(frozen=True)
-class MeasuredWith:
+class CalibrationCopy:
     """A test's own copy of a calibration."""
 
     calibration_id: str | None
     file: Path
 
 
-def calibration_of(service: Service, test_id: str, calibration_id: str | None) -> MeasuredWith:
+def calibration_of(service: Service, test_id: str, calibration_id: str | None) -> CalibrationCopy:
     """Return the calibration of a new analysis: the one it names, of which the test then has a copy, or the test's.
 
     Raises
@@ -107,7 +108,7 @@ def calibration_of(service: Service, test_id: str, calibration_id: str | None) -
     file = service.tests.calibration_file(test_id, sha256)
     if sha256 is not None and sha256_of(file) != sha256:
         raise calibration_changed(f"of test {test_id}")
-    return MeasuredWith(calibration_id_in(test.model_dump(), sha256), file)
+    return CalibrationCopy(calibration_id_in(test.model_dump(), sha256), file)
 
 
 def check_region(
@@ -115,7 +116,7 @@ def check_region(
 ) -> None:
     """Refuse a region that leaves nothing to measure, before a job is made of it; see :func:`make_grid`."""
     image = read_image(service.tests.steps.read(test_id, reference).cam1)
-    make_grid(settings, None if mask is None else decode_mask(mask), (image.shape[0], image.shape[1]))
+    make_grid(settings, None if mask is None else read_mask(service.cell, mask), (image.shape[0], image.shape[1]))
 
 
 def begin(
@@ -137,17 +138,17 @@ def begin(
     Parameters
     ----------
     settings
-        Those asked for, without a noise model.
+        The requested settings, without a noise model.
     steps
         Steps to measure; None: all after the reference.
     follow
-        Go on with each step that is captured.
+        Measure also each step that is captured later.
     mask
-        Image file of camera 1's size, white where points may lie.
+        Image file of camera 1's size, white where points are allowed.
     noise_id
         Noise measurement that weighs the pixels.
     calibration_id
-        Calibration to measure with; None: that of the test.
+        Calibration to measure with; None: the test's.
 
     Returns
     -------
@@ -219,12 +220,12 @@ def submit(
 def continue_analysis(
     service: Service, test_id: str, analysis_id: str, request: RequestMark, *, other_version: bool = False
 ) -> Job:
-    """Queue what an analysis has not measured yet, on the same inputs, with the same settings.
+    """Queue the steps that an analysis has not measured yet, on the same inputs, with the same settings.
 
     Parameters
     ----------
     other_version
-        Go on although another version of the program began it.
+        Continue although another version of the program began it.
 
     Raises
     ------
@@ -255,7 +256,7 @@ def _continue(service: Service, test_id: str, analysis_id: str, request: Request
     stale = stale_reasons(service, test_id, document)
     if stale:
         raise StateError(
-            f"Analysis {analysis_id} cannot go on: {'; '.join(stale)}.",
+            f"Analysis {analysis_id} cannot continue: {'; '.join(stale)}.",
             code="analysis_stale",
             remedy="Restore the files from a backup, or start a new analysis.",
             reasons=stale,

@@ -1,17 +1,17 @@
-"""What the steps of a stored analysis are measured from: their images, the calibration, the settings, earlier steps."""
+"""Inputs of a stored analysis' steps: their images, the calibration, the settings, earlier steps."""
 
 from __future__ import annotations
 
 import contextlib
 from pathlib import Path
 
-from core.errors import FileFormatError, StereorigError
-from server.formats.files import sha256_of
-from server.formats.results.settings import stored_settings
-from server.store.documents import AnalysisRecord
-from server.store.tests.steps import StepFiles
-from server.store.tests.tests import TestStore
-from server.worker.tasks import StepImages, StepTask, averages_of, grey_from_of
+from stereorig.core.errors import FileFormatError, StereorigError
+from stereorig.server.compute.tasks import StepImages, StepTask, averages_of, grey_from_of
+from stereorig.server.documents.tests import AnalysisRecord
+from stereorig.server.formats.files import sha256_of
+from stereorig.server.formats.results.layout import stored_settings
+from stereorig.server.store.tests.steps import StepFiles
+from stereorig.server.store.tests.tests import TestStore
 
 
 def calibration_changed(where: str) -> FileFormatError:
@@ -36,8 +36,6 @@ def task_of(
     done: dict[int, StepFiles],
     following: int | None,
     folder: Path | None = None,
-    *,
-    shares: bool = False,
 ) -> StepTask:
     """Return the task of one step, its inputs compared with those that the analysis was made of.
 
@@ -49,8 +47,6 @@ def task_of(
         Number of the step that will probably be asked for next.
     folder
         Where the results go, and mask and noise models lie; the analysis' own when left out.
-    shares
-        True if workers without a task may fit parts of the step.
 
     Raises
     ------
@@ -76,7 +72,7 @@ def task_of(
         earlier = {k: step for k, step in done.items() if k != reference}
     after = None
     if following is not None and displacement:
-        with contextlib.suppress(StereorigError):  # what is wrong with it is said at its own turn
+        with contextlib.suppress(StereorigError):  # its error is reported when the step itself is measured
             after = tests.steps.read(test_id, following)
     about = {"label": now.document.label or "", "test_step": str(n)}
     if now.document.load_n is not None:
@@ -94,7 +90,6 @@ def task_of(
         noise=folder / "noise.json" if settings.noise is not None else None,
         earlier={k: images_of(k, step) for k, step in earlier.items()},
         keeps_starts=displacement and (n == reference or not is_independent(document)),
-        shares=shares,
     )
 
 

@@ -1,4 +1,4 @@
-"""The guided acquisition: free poses of the target, each taken when it stands still and is new, until the goal is met.
+"""The guided acquisition: free poses of the target, each taken when it is at rest and new, until the goal is met.
 
 A job holds the cameras from the first live pair to the last view; every view is on disk, with its entry in
 ``view.json``, before the next live pair is looked at. The points are found in a process of its own, so that neither an
@@ -14,30 +14,32 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from core.errors import StateError, StereorigError
-from core.names import CAMERAS
-from server.base.errors import NotFoundError
-from server.base.models import Ids
-from server.jobs.idempotency import RequestMark
-from server.jobs.job import Job, Phase
-from server.rig.cameras import CapturedPair
-from server.store.durable import read_json, write_json
-from server.worker.embedded import ComputeWorker
-from server.worker.tasks import GuideTask, guide_views, look_at_pair
-from server.workflows.acquisition import begin_acquisition
-from server.workflows.calibration.sequence import close, fit, rig_metadata
-from server.workflows.service import Service
-from server.workflows.waiting import run_task
+from stereorig.core.errors import StateError, StereorigError
+from stereorig.core.names import CAMERAS
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.base.models import Ids
+from stereorig.server.compute.functions import guide_views, look_at_pair
+from stereorig.server.compute.tasks import GuideTask
+from stereorig.server.formats.manifest import is_there
+from stereorig.server.jobs.idempotency import RequestMark
+from stereorig.server.jobs.job import Job, Phase
+from stereorig.server.rig.cameras import CapturedPair
+from stereorig.server.store.calibrations import GUIDANCE
+from stereorig.server.store.durable import read_json
+from stereorig.server.worker.embedded import ComputeWorker
+from stereorig.server.workflows.acquisition import begin_acquisition
+from stereorig.server.workflows.calibration.sequence import close, fit, rig_metadata
+from stereorig.server.workflows.service import Service
+from stereorig.server.workflows.waiting import run_task
 
 _LONGEST_RATE_S = 0.1  # between two live pairs: ten a second are more than an eye follows
 _MOST_FAILURES = 5  # captures one after another
 MOST_VIEWS = 200
 GUIDED_PURPOSE = "a guided calibration"
-STATE_FILE = "guide.json"
 
 
 UNATTENDED_S = 120.0
-"""An acquisition whose state nobody asks for lets the cameras go after so long; its views are kept."""
+"""Seconds without a request for its state after which an acquisition releases the cameras; its views are kept."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class GuidePlan:
     Parameters
     ----------
     quantity, goal_um
-        What ends it: uncertainty of ``z`` or of ``shape`` at the specimen below so many micrometres; None: somebody.
+        It ends when the uncertainty of ``z`` or ``shape`` at the specimen is below this, um; None: by a request.
     frames
         Frames averaged for a view.
     automatic
@@ -91,7 +93,7 @@ class Guides:
         Raises
         ------
         BusyError
-            Somebody has the cameras.
+            A job or another client has the cameras.
         StorageError
             ``storage_full``.
         """
@@ -119,7 +121,7 @@ class Guides:
         )
 
     def state(self, calibration_id: str) -> dict[str, Any]:
-        """Return what is seen now, and what the views taken say.
+        """Return the findings of the newest live pair, and the guidance from the views taken.
 
         Raises
         ------
@@ -130,8 +132,8 @@ class Guides:
         plan = record.plan.plain()
         if plan.get("kind") != "guided":
             raise NotFoundError(f"Calibration {calibration_id} was not guided.", kind="guide")
-        path = self._service.calibrations.path(calibration_id) / STATE_FILE
-        guidance = read_json(path) if path.is_file() else None
+        path = self._service.calibrations.path(calibration_id) / GUIDANCE
+        guidance = read_json(path) if is_there(path) else None
         live = self._live.get(calibration_id)
         if live is not None:
             live.asked = time.monotonic()
@@ -164,7 +166,7 @@ class Guides:
         Raises
         ------
         StateError
-            ``calibration_complete`` where that was done.
+            ``calibration_complete`` if they were fitted already.
         """
         live = self._live.get(calibration_id)
         if live is not None:
@@ -205,7 +207,7 @@ class Guides:
     # the job -------------------------------------------------------------------------------------------------------
 
     def _acquire(self, job: Job, calibration_id: str, plan: GuidePlan) -> dict[str, object]:
-        """Hardware phase: look, take, ask what comes next."""
+        """Hardware phase: take live pairs and views until the goal is met or a request ends it."""
         service, live = self._service, self._live[calibration_id]
         made = service.calibrations.read(calibration_id)
         task = GuideTask(str(service.calibrations.path(calibration_id)), made.plan.plain())
@@ -218,7 +220,7 @@ class Guides:
                 begun = time.monotonic()
                 if begun - live.asked > UNATTENDED_S:
                     raise StateError(
-                        f"Nobody has asked for the acquisition for {UNATTENDED_S:.0f} s: the cameras are let go.",
+                        f"No request for the acquisition came for {UNATTENDED_S:.0f} s: the cameras are released.",
                         code="guide_unattended",
                         remedy="POST /calibrations/{id}/guide:finish fits the views taken; or begin another one.",
                     )
@@ -253,7 +255,7 @@ class Guides:
     def _guided(self, job: Job, process: ComputeWorker, task: GuideTask, views: list[dict[str, Any]]) -> dict[str, Any]:
         guidance: dict[str, Any] = run_task(process, job, guide_views, task, views)
         calibration_id = str(task.plan["id"])
-        write_json(self._service.calibrations.path(calibration_id) / STATE_FILE, guidance)
+        self._service.calibrations.put_guidance(calibration_id, guidance)
         shown = {name: guidance[name] for name in ("taken", "used", "uncertainty", "reached", "text")}
         self._service.hub.publish("guide", {"calibration_id": calibration_id, **shown})
         return guidance
@@ -270,7 +272,7 @@ class Guides:
                 "dz_mm": None,
                 "frames": captured.frames,
                 "full_scale": (2 ** captured.bit_depth[cam] - 1) * captured.scale,
-                "skew_ms": captured.skew_ms,
+                **captured.skew,
             }
             views.append(view | store.put_view(calibration_id, number, cam, captured.pixels[cam]))
         return views

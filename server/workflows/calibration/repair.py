@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from core.errors import StateError
-from server.base.models import Ids
-from server.jobs.idempotency import RequestMark
-from server.jobs.job import Job, Phase
-from server.store.calibrations import REJECTED
-from server.worker.tasks import RepairTask, StepImages, averages_of, repair_calibration
-from server.workflows.calibration.sequence import close
-from server.workflows.camera_identity import check_same_cameras
-from server.workflows.service import Service
-from server.workflows.waiting import run_task
+from stereorig.core.errors import StateError
+from stereorig.server.base.models import Ids
+from stereorig.server.compute.functions import repair_calibration
+from stereorig.server.compute.tasks import RepairTask, StepImages, averages_of
+from stereorig.server.formats.manifest import is_there
+from stereorig.server.jobs.idempotency import RequestMark
+from stereorig.server.jobs.job import Job, Phase
+from stereorig.server.store.calibrations import REJECTED
+from stereorig.server.workflows.calibration.sequence import close
+from stereorig.server.workflows.camera_identity import check_same_cameras
+from stereorig.server.workflows.service import Service
+from stereorig.server.workflows.waiting import run_task
 
 
 def begin(
@@ -40,9 +42,9 @@ def begin(
     test_id, steps
         Images taken after the bump.
     mask
-        Image file of camera 1's size, white where points may lie.
+        Image file of camera 1's size, white where points are allowed.
     region, subset_px, spacing_px, limits
-        As :class:`server.worker.tasks.RepairTask`.
+        As :class:`stereorig.server.compute.tasks.RepairTask`.
 
     Raises
     ------
@@ -59,7 +61,7 @@ def begin(
     """
     service.require_room()
     original = service.calibrations.path(calibration_id) / "calibration.json"
-    if not original.is_file():
+    if not is_there(original):
         state = service.calibrations.read(calibration_id).state
         rejected = (original.parent / REJECTED).exists()
         raise StateError(
@@ -106,7 +108,9 @@ def begin(
             spacing_px=spacing_px,
             limits=limits,
         )
-        return dict(run_task(service.worker, job, repair_calibration, task))
+        found = dict(run_task(service.worker, job, repair_calibration, task))
+        service.calibrations.take_over(made["calibration_id"])
+        return found
 
     job = service.jobs.submit(
         "calibration_repair",

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import Literal
 
-from core.errors import StateError
-from core.plan.settings import PlannedMeasurement, PlannedRig
-from server.compute.calibration.expectation import PlannedCalibration, expectation_document, rig_as_planned
-from server.store.folder import now_utc
-from server.store.indexing.entries import calibration_entry
-from server.workflows.calibration.sequence import CalibrationPlan, check_plan, rig_metadata, targets_of
-from server.workflows.service import Service
+from stereorig.core.errors import StateError
+from stereorig.core.plan.settings import PlannedMeasurement, PlannedRig
+from stereorig.server.compute.calibration.expectation import PlannedCalibration, expectation_document, rig_as_planned
+from stereorig.server.store.folder import now_utc
+from stereorig.server.store.indexing.entries import calibration_entry
+from stereorig.server.workflows.calibration.sequence import CalibrationPlan, check_plan, rig_metadata, targets_of
+from stereorig.server.workflows.service import Service
 
 Decision = Literal["accepted", "discarded"]
-#: names of the newest accepted calibration; the second is the earlier one
-LATEST = ("latest", "accepted")
+#: name of the newest accepted calibration
+LATEST = "latest"
 
 
 def expectation(
@@ -26,14 +26,14 @@ def expectation(
     rig: PlannedRig,
     measurement: PlannedMeasurement,
 ) -> dict[str, object]:
-    """Return what a plan may be expected to leave uncertain, as the API shows it.
+    """Return the uncertainty to expect from a calibration plan, as the API shows it.
 
     Raises
     ------
     CalibrationInputError
         A plan that would be refused before anything moves.
     StateError
-        Where the stage cannot go there.
+        If the stage cannot reach a position of the plan.
     """
     check_plan(plan)
     as_it_is = rig == PlannedRig()
@@ -56,7 +56,7 @@ def decide(service: Service, calibration_id: str, decision: Decision | None, not
     NotFoundError
         If there is no such calibration.
     StateError
-        ``calibration_not_complete`` where there is nothing to accept.
+        ``calibration_not_complete`` if there is no calibration to accept.
     """
     state = service.calibrations.read(calibration_id).state
     if state == "unfinished" or (state != "complete" and decision == "accepted"):

@@ -12,22 +12,24 @@ from typing import Any, Literal
 
 import numpy as np
 
-from core.errors import CalibrationInputError, StereorigError, TargetError
-from core.names import CAMERAS
-from server.base.models import Ids
-from server.config.rig_file import RigConfig
-from server.jobs.idempotency import RequestMark
-from server.jobs.job import Job
-from server.store.indexing.entries import calibration_entry
-from server.worker.tasks import FitTask, LookTask, find_in_pair, fit_calibration
-from server.workflows.acquisition import begin_acquisition
-from server.workflows.capture import OFF_ZERO_MM
-from server.workflows.service import Service
-from server.workflows.waiting import run_task
+from stereorig.core.calibration.inputs import least_count_sigma_mm
+from stereorig.core.errors import CalibrationInputError, StereorigError, TargetError
+from stereorig.core.names import CAMERAS
+from stereorig.server.base.models import Ids
+from stereorig.server.compute.functions import find_in_pair, fit_calibration
+from stereorig.server.compute.tasks import FitTask, LookTask
+from stereorig.server.config.rig_file import RigConfig
+from stereorig.server.jobs.idempotency import RequestMark
+from stereorig.server.jobs.job import Job
+from stereorig.server.store.indexing.entries import calibration_entry
+from stereorig.server.workflows.acquisition import begin_acquisition
+from stereorig.server.workflows.capture import OFF_ZERO_MM
+from stereorig.server.workflows.service import Service
+from stereorig.server.workflows.waiting import run_task
 
 SAME_POSITION_MM = 1e-6
 #: settings of ``[calibration]`` that the fit needs
-_SETTINGS = ("moves", "lens", "axis_tilt_sigma_rad", "stage_scale_sigma", "stage_step_sigma_mm")
+_SETTINGS = ("moves", "lens", "axis_tilt_sigma_rad", "stage_scale_sigma", "aspect_sigma")
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ def check_plan(plan: CalibrationPlan) -> None:
         raise CalibrationInputError(
             f"The plan fits {fitted.size} position ({', '.join(f'{p:g} mm' for p in fitted)}); with one, a camera's "
             "pinhole distance cannot be distinguished from its distance to the target.",
-            remedy="Give two or more positions that lie millimetres apart.",
+            remedy="Give two or more positions at least some millimetres apart.",
         )
     both = set(plan.positions_mm) & set(plan.held_out_mm)
     if both:
@@ -95,16 +97,16 @@ def begin(service: Service, plan: CalibrationPlan, request: RequestMark) -> Ids:
     CalibrationInputError, StateError
         A plan that would be refused before anything moves.
     BusyError
-        Somebody has the cameras.
+        A job or another client has the cameras.
     StorageError
         ``storage_full``.
     """
     service.require_room()
     if service.config.calibration.moves == "free":
         raise CalibrationInputError(
-            'The rig file declares moves = "free": no stage position tells where the target is.',
+            'The rig file declares moves = "free": no stage position gives the position of the target.',
             code="moves_undeclared",
-            remedy="POST /calibrations:guide (`stereorig guide`), or declare what the stage moves.",
+            remedy="POST /calibrations:guide (`stereorig guide`), or declare the part that the stage moves.",
         )
     check_plan(plan)
     targets_of(service, plan)
@@ -155,7 +157,7 @@ def take_views(service: Service, job: Job, calibration_id: str, plan: Calibratio
                 "position_mm": moved[axis].position_mm,
                 "frames": captured.frames,
                 "full_scale": (2 ** captured.bit_depth[cam] - 1) * captured.scale,
-                "skew_ms": captured.skew_ms,
+                **captured.skew,
             }
             views.append(view | service.calibrations.put_view(calibration_id, index, cam, captured.pixels[cam]))
     service.calibrations.put_views_done(calibration_id, views)
@@ -164,7 +166,7 @@ def take_views(service: Service, job: Job, calibration_id: str, plan: Calibratio
 
 
 def look_first(service: Service, job: Job, calibration_id: str, plan: CalibrationPlan) -> None:
-    """Look for the target where the stage stands, before anything moves.
+    """Look for the target at the stage's present position, before anything moves.
 
     Raises
     ------
@@ -193,7 +195,7 @@ def look_first(service: Service, job: Job, calibration_id: str, plan: Calibratio
                 "position_mm": positions_mm[axis],
                 "frames": captured.frames,
                 "full_scale": full_scale[cam],
-                "skew_ms": captured.skew_ms,
+                **captured.skew,
             }
             views.append(view | service.calibrations.put_view(calibration_id, 0, cam, captured.pixels[cam]))
         service.calibrations.put_views_done(calibration_id, views)
@@ -213,18 +215,21 @@ def fit(service: Service, job: Job, calibration_id: str) -> dict[str, object]:
     made = service.calibrations.read(calibration_id)
     views = [view.plain() for view in made.taken or []]
     task = FitTask(str(service.calibrations.path(calibration_id)), made.plan.plain(), views)
-    return dict(run_task(service.worker, job, fit_calibration, task))
+    try:
+        return dict(run_task(service.worker, job, fit_calibration, task))
+    finally:  # one that is rejected is kept too
+        service.calibrations.take_over(calibration_id)
 
 
 def way_back(service: Service) -> dict[str, object] | None:
-    """Return where the stage was left and the request that takes it back; None where it stands at dZ = 0."""
+    """Return the stage's position and the request that moves it back to dZ = 0; None if it is there or unknown."""
     rig = service.rig
-    if rig.fault is not None:
+    if not rig.is_open or service.config.stage is None:
         return None
     try:
         positions = rig.positions_mm()
         dz = {cam: rig.dz_of(cam, positions[rig.config.camera(cam).stage_axis]) for cam in CAMERAS}
-    except (StereorigError, KeyError):  # a silent stage says so itself
+    except (StereorigError, KeyError):  # a silent stage reports its own fault
         return None
     if max(abs(v) for v in dz.values()) <= OFF_ZERO_MM:
         return None
@@ -240,11 +245,24 @@ def rig_metadata(config: RigConfig) -> dict[str, Any]:
     """Entries of the rig file that the fit needs."""
     return {
         "name": config.rig.name,
+        "simulated": config.simulated,
         "target": config.target.plain(),
         **{name: getattr(config.calibration, name) for name in _SETTINGS},
+        "stage_step_sigma_mm": _step_sigma_mm(config),
         "cam1": config.cam1.model_dump(mode="json"),
         "cam2": config.cam2.model_dump(mode="json"),
     }
+
+
+def _step_sigma_mm(config: RigConfig) -> float:
+    """Return the standard deviation of a position read back: the one stated, else by the axes' coarsest resolution."""
+    stated = config.calibration.stage_step_sigma_mm
+    if stated is not None:
+        return stated
+    if config.stage is None:
+        return least_count_sigma_mm(0.0)
+    axes = [config.axis(camera.stage_axis).resolution_mm or 0.0 for camera in (config.cam1, config.cam2)]
+    return least_count_sigma_mm(max(axes))
 
 
 def plan_document(plan: CalibrationPlan, config: RigConfig) -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""A certificate as a job: read and judged beside the service, then kept."""
+"""A certificate as a job: read and judged in a process of its own, then stored."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from server.jobs.idempotency import RequestMark
-from server.jobs.job import Job, Phase
-from server.workflows.service import Service
-from server.workflows.waiting import result_of
+from stereorig.server.jobs.idempotency import RequestMark
+from stereorig.server.jobs.job import Job, Phase
+from stereorig.server.workflows.service import Service
+from stereorig.server.workflows.waiting import result_of
 
 DOCUMENT, PAGE = "certificate.json", "certificate.html"
 #: analysis' folder, plan, id and folder for both files -> the verdict
@@ -41,7 +41,7 @@ def start_certificate(
         try:
             outcome = result_of(service.exports.run(task, str(folder), plan_json, certificate_id, str(out)), job)
             document = json.loads((Path(out) / DOCUMENT).read_bytes())
-            with service.tests.still():  # nothing that it rests on is deleted meanwhile
+            with service.tests.still():  # prevents deletion of its inputs while it is stored
                 service.certificates.put(certificate_id, document, (Path(out) / PAGE).read_bytes())
         finally:
             shutil.rmtree(out, ignore_errors=True)

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict
 
-from core.errors import StateError
-from core.names import CAMERAS
-from server.base.errors import NotFoundError
-from server.jobs.idempotency import RequestMark
-from server.jobs.job import Job, Phase
-from server.results.certificate.procedure import PlannedProcedure, ProcedureStep, next_step, procedure_of
-from server.store.documents import StepMetadata
-from server.workflows.capture import commit_pair
-from server.workflows.service import Service
+from stereorig.core.errors import StateError
+from stereorig.core.names import CAMERAS
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.documents.steps import StepMetadata
+from stereorig.server.jobs.idempotency import RequestMark
+from stereorig.server.jobs.job import Job, Phase
+from stereorig.server.results.certificate.procedure import PlannedProcedure, ProcedureStep, next_step, procedure_of
+from stereorig.server.workflows.capture import commit_pair
+from stereorig.server.workflows.service import Service
 
 
 def put_procedure(service: Service, test_id: str, asked: PlannedProcedure) -> None:
@@ -47,7 +47,7 @@ def planned(service: Service, test_id: str) -> PlannedProcedure:
 
 
 def show_procedure(service: Service, test_id: str) -> dict[str, object]:
-    """Return a test's procedure: its plan, its steps with what is taken, and what comes next; no plan where none is."""
+    """Return a test's procedure: its plan, its steps with their state, and the next one; no plan if it has none."""
     if not service.tests.procedure(test_id):
         return {"plan": None, "frames": 1, "steps": [], "next": None}
     asked = planned(service, test_id)
@@ -65,15 +65,15 @@ def show_procedure(service: Service, test_id: str) -> dict[str, object]:
 
 
 def start_next(service: Service, test_id: str, *, confirmed: bool, request: RequestMark) -> Job:
-    """Begin the next step: the stage's move where there is one, then the capture; the job's result has its number.
+    """Begin the next step: the stage's move if the step has one, then the capture; the job's result has its number.
 
     Raises
     ------
     NotFoundError
         ``procedure_missing``.
     StateError
-        ``procedure_complete``; ``procedure_by_hand`` where a person has to move something, and did not say that it is
-        done.
+        ``procedure_complete``; ``procedure_by_hand`` if a person has to move something and has not confirmed that it
+        is done.
     StorageError
         ``storage_full``.
     """
@@ -114,8 +114,8 @@ def _take(service: Service, job: Job, test_id: str, step: ProcedureStep, frames:
         job.check()
         rig.move(targets)
     job.progress("capturing", 1, 2)
-    captured, positions_mm = rig.pair.capture(frames, job.check), rig.positions_mm()
-    taken = commit_pair(service, test_id, StepMetadata(label=step.label), captured, positions_mm)
+    captured, positions = rig.pair.capture(frames, job.check), rig.known_positions()
+    taken = commit_pair(service, test_id, StepMetadata(label=step.label), captured, positions)
     job.progress("capturing", 2, 2)
     return {"n": taken.n, "kind": step.kind, "quality": taken.quality_code}
 
@@ -131,7 +131,7 @@ def _stage_at_reference(service: Service, test_id: str) -> Mapping[str, float]:
     known = service.tests.steps.read(test_id, 0).document.plain().get("dz_mm")
     if not isinstance(known, dict) or not all(isinstance(known.get(cam), int | float) for cam in CAMERAS):
         raise StateError(
-            "Where the stage stood at the reference is not known: step 0 was not captured with it.",
+            "The stage's position at the reference is not known: step 0 was not captured with it.",
             code="procedure_reference",
             remedy="Begin the procedure in a new test, whose reference the service captures.",
         )

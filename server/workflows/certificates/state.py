@@ -1,4 +1,4 @@
-"""Whether a certificate still holds."""
+"""Validity of a certificate: its inputs are as they were."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import contextlib
 from datetime import UTC, datetime
 from typing import Literal
 
-from core.errors import StereorigError
-from server.store.documents import CertificateRecord
-from server.workflows.service import Service
+from stereorig.core.errors import StereorigError
+from stereorig.server.documents.made import CertificateRecord
+from stereorig.server.workflows.service import Service
 
 CertificateState = Literal["valid", "failed", "expired", "void", "withdrawn"]
 

@@ -13,7 +13,7 @@ _RECENT = 500
 class Account:
     """Counters of frames, and the latency of the last ones; every method may be called from any thread.
 
-    ``frames = measured + skipped + refused + waiting``; a wait without a frame, as of a lost camera, is counted apart.
+    ``frames = measured + skipped + refused + waiting``; a wait without a frame (a lost camera) has its own counter.
     """
 
     def __init__(self) -> None:
@@ -54,7 +54,7 @@ class Account:
             self._times.append(now_s)
 
     def counts(self) -> dict[str, int]:
-        """Return the counters by name; those of reasons are ``refused_by`` and ``without_by`` of the document."""
+        """Return the counters by name; counts by reason are ``refused_by`` and ``without_by`` of the document."""
         names = ("frames", "measured", "followed", "step", "skipped", "refused")
         with self._lock:
             return {name: self._counts[name] for name in names}

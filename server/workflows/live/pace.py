@@ -1,4 +1,4 @@
-"""Whether a pair that has waited is still to be measured, or the next one, which comes soon."""
+"""Choice between measuring a pair that has waited and waiting for the next one, which comes soon."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ _LATE = 1.25  # periods after a pair, from which on no next one is waited for
 class Pace:
     """The period in which pairs come.
 
-    A measurement that takes longer than a period finds a pair of any age when it ends. Whoever takes it has its age
-    added to the latency of every value; one that waits for the next pair, if that is the nearer, loses fewer values
-    than it gains in age.
+    A measurement that takes longer than a period finds a pair of any age when it ends. Measuring it adds its age to the
+    latency of every value; waiting for the next pair, if that is nearer, loses fewer values than it gains in age.
     """
 
     def __init__(self) -> None:

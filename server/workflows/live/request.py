@@ -1,4 +1,4 @@
-"""What a live measurement is asked for."""
+"""Request of a live measurement: gauges, region and settings."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
-from core.settings import (
+from stereorig.core.settings import (
     DEFAULT_INTERPOLATION,
     DEFAULT_REFERENCE_UPDATE,
     SPACING_PX,
@@ -21,8 +21,8 @@ from core.settings import (
     Whole,
     disagreement,
 )
-from server.base.models import Number, Request, StepNumber, Switch, given
-from server.results.gauges.request import Name
+from stereorig.server.base.models import Number, Request, StepNumber, Switch, given
+from stereorig.server.results.gauges.request import Name
 
 _MAX_GAUGES = 50
 #: of 9 points and more a millisecond is little; at the default of a stored analysis a thousand points take two frames
@@ -52,7 +52,7 @@ class LiveExtensometer(_LiveGauge):
     @model_validator(mode="after")
     def _apart(self) -> Self:
         if self.a_px == self.b_px:
-            raise disagreement("both ends of an extensometer lie at one position")
+            raise disagreement("both ends of an extensometer are at one position")
         return self
 
     def positions(self) -> list[PixelPosition]:
@@ -61,7 +61,7 @@ class LiveExtensometer(_LiveGauge):
 
 
 class LiveArea(_LiveGauge, Outline):
-    """Mean displacement and strain over a rectangle, a polygon or a circle: those of a plane through its points."""
+    """Mean displacement and strain over a rectangle, a polygon or a circle, from a plane through its points."""
 
     def outline(self) -> Outline:
         """Return its outline."""
@@ -92,7 +92,7 @@ class LiveSettings(Request):
         default_factory=list, description="Virtual extensometers.", max_length=_MAX_GAUGES
     )
     areas: list[LiveArea] = Field(default_factory=list, description="Areas.", max_length=_MAX_GAUGES)
-    region: LiveRegion | None = Field(None, description="Where points may lie; about the gauges if left out.")
+    region: LiveRegion | None = Field(None, description="Area of the points; about the gauges if left out.")
     field: Switch = Field(False, description="Measure and hand out all points of the region, as a coarse field.")
     subset_px: SubsetPx = _SUBSET_PX
     spacing_px: SpacingPx = SPACING_PX.default

@@ -1,8 +1,8 @@
 """One live measurement: a thread takes the newest pair, a thread has it measured, a third watches for silence.
 
-Between the first two lies one slot: a pair that is not measured when the next one comes is skipped, and one that has
-waited there for long, while the next is near. The computation is a process of its own, so that analyses and captures go
-on beside it.
+Between the first two is one slot: a pair that is not measured when the next one comes is skipped, and so is a pair that
+has waited there for long while the next is near. The computation is a process of its own, so that analyses and captures
+continue at the same time.
 """
 
 from __future__ import annotations
@@ -11,28 +11,28 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from core.errors import StereorigError
-from core.live.gauges import UNITS
-from core.names import CAMERAS
-from drivers.acquisition.pairing import Pair
-from server.base.models import utc_text
-from server.base.problem import JobProblem, problem_of
-from server.config.rig_file import ChannelSection
-from server.jobs.events import EventHub
-from server.rig import Rig
-from server.rig.cameras import PairMark
-from server.worker.embedded import make_worker
-from server.worker.executor import WorkerDiedError
-from server.worker.shared_images import SharedImages
-from server.worker.tasks import LiveTask, Plain, begin_live, measure_live
-from server.workflows.live.account import Account
-from server.workflows.live.pace import Pace
-from server.workflows.live.read_channels import ReadChannels
-from server.workflows.live.series import LiveSeries, Moment
+from stereorig.core.errors import StereorigError
+from stereorig.core.live.gauges import UNITS
+from stereorig.core.names import CAMERAS
+from stereorig.drivers.acquisition.pairing import Pair
+from stereorig.server.base.models import utc_text
+from stereorig.server.base.problem import JobProblem, problem_of
+from stereorig.server.compute.functions import begin_live, measure_live, warm_up
+from stereorig.server.compute.tasks import LiveTask, Plain
+from stereorig.server.jobs.events import EventHub
+from stereorig.server.rig.cameras import PairMark
+from stereorig.server.rig.rig import Rig
+from stereorig.server.worker.embedded import ComputeWorker
+from stereorig.server.worker.executor import WorkerDiedError
+from stereorig.server.worker.shared_images import SharedImages
+from stereorig.server.workflows.channels.reading import ReadChannels
+from stereorig.server.workflows.live.account import Account
+from stereorig.server.workflows.live.pace import Pace
+from stereorig.server.workflows.live.series import LiveSeries, Moment
 
 _log = logging.getLogger("stereorig.live")
 
@@ -55,9 +55,9 @@ class LiveRun:
     test_id
         The test.
     task
-        What is measured.
+        The gauges' points, images and settings to measure with.
     settings
-        As they were asked for, for the state.
+        The request's settings, for the state.
     rig
         Gives the pairs.
     threads
@@ -65,7 +65,7 @@ class LiveRun:
     silence_s
         Values older than this are no longer valid.
     channels
-        Channels that are read beside it.
+        Channels that the service reads.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class LiveRun:
         *,
         threads: int | None,
         silence_s: float,
-        channels: Sequence[ChannelSection] = (),
+        channels: ReadChannels,
     ) -> None:
         self.test_id, self.settings, self.silence_s = test_id, settings, silence_s
         self._task, self._rig = task, rig
@@ -86,14 +86,15 @@ class LiveRun:
         self.hub = EventHub(keep=_KEPT_EVENTS)
         self.account = Account()
         self.series = LiveSeries()
-        self.lines = ReadChannels(channels, self.series)
+        self.lines = channels
+        self._unheard = channels.listen(self.series.put)
         self.state = "starting"
         self.problem: JobProblem | None = None
         self.begun: Plain = {}
         self.field: tuple[int, Any] | None = None
         """Number of the newest frame with a field, and its displacements (r, c, 3), mm."""
         self.since_utc = utc_text(datetime.now(UTC))
-        self._worker = make_worker(threads, lowered=False)
+        self._worker = ComputeWorker(threads=threads, warm_up=warm_up, lowered=False)  # its answers are waited for
         self._shared = SharedImages()
         self._newest: Plain = {"number": 0, "valid": False, "reason": "starting", "gauges": {}}
         self._spoke = time.monotonic()
@@ -102,7 +103,7 @@ class LiveRun:
         self._slot: Pair | None = None
         self._pace: Pace | None = None  # of cameras that run free; others are fired as pairs are wanted
         self._fault: str | None = None
-        self._gone: str | None = None  # why no pairs come; None where they do
+        self._gone: str | None = None  # reason why no pairs come; None while they come
         self._number = 0
         self._clock = _HostClock()
         self._threads = [
@@ -113,7 +114,6 @@ class LiveRun:
     def start(self) -> None:
         """Begin; the reference is measured first, in the background."""
         self._worker.start()
-        self.lines.start()
         self._threads[1].start()
 
     def stop(self) -> None:
@@ -122,7 +122,7 @@ class LiveRun:
         for thread in self._threads:
             if thread.ident is not None and thread is not threading.current_thread():
                 thread.join(timeout=5.0)
-        self.lines.stop()
+        self._unheard()
         self._worker.shutdown()
         self._shared.close()
         if self.state != "failed":
@@ -142,7 +142,7 @@ class LiveRun:
         return self.state in ("starting", "running")
 
     def newest(self) -> Plain:
-        """Return the newest values; not valid where they are older than they may be."""
+        """Return the newest values; marked not valid if they are older than allowed."""
         with self._changed:
             newest, spoke = self._newest, self._spoke
         if newest["valid"] and time.monotonic() - spoke > self.silence_s:
@@ -219,7 +219,7 @@ class LiveRun:
             _log.warning("the live measurement of test %s ended: %s", self.test_id, error.cause)
             self._ending.set()
             self._publish_invalid(error.code)
-        except Exception as error:  # noqa: BLE001 - the state says it
+        except Exception as error:  # noqa: BLE001 - the state reports it
             self.problem, self.state = problem_of(error), "failed"
             _log.exception("the live measurement of test %s failed", self.test_id)
             self._ending.set()
@@ -244,12 +244,12 @@ class LiveRun:
         """Return how long the slot is to be watched before the pair in it is taken."""
         if self._slot is None:
             return _WATCH_S * 10
-        pace = self._pace  # the thread that takes pairs may end it meanwhile
+        pace = self._pace  # the thread that takes pairs may end it at any moment
         return 0.0 if pace is None else pace.wait_s(_arrived_s(self._slot), time.monotonic())
 
     def _measure_one(self, pair: Pair) -> None:
         pixels, frame = self._shared.put([pair[cam].pixels for cam in CAMERAS]), pair.cam1
-        exposed_ns = frame.host_ns if frame.exposed_ns is None else frame.exposed_ns
+        exposed_ns = frame.begun_ns
         found = self._result(_FRAME_S, measure_live, pixels, exposed_ns / 1e9)
         self._number += 1
         latency_ms = 1e3 * (time.monotonic() - _arrived_s(pair))
@@ -267,6 +267,8 @@ class LiveRun:
                 "device_time_s": frame.device_ns / 1e9,
                 "exposed_utc": self._clock.utc(exposed_ns),
                 "skew_ms": pair.skew_ms,
+                "skew_uncertainty_ms": pair.skew_uncertainty_ms,
+                "skew_source": pair.skew_source,
                 "how": found["how"],
                 "points": found["points"],
                 "status": found["status"],
@@ -290,7 +292,7 @@ class LiveRun:
             return found
 
     def _watch(self) -> None:
-        """Say so where no value comes."""
+        """Publish invalid values if no value has come for too long."""
         while not self._ending.wait(_WATCH_S):
             if self._newest["valid"] and time.monotonic() - self._spoke > self.silence_s:
                 self._publish_invalid(self._fault or "silence")

@@ -5,19 +5,19 @@ from __future__ import annotations
 import threading
 from typing import Any
 
-from core.errors import InputError, StateError
-from core.field.region.outlines import corners_px
-from core.settings import NoiseRecord, Region, StoredSettings
-from server.base.errors import NotFoundError
-from server.formats.images import read_image
-from server.formats.noise_json import load_noise
-from server.worker.tasks import LiveTask
-from server.workflows.analysis.start import calibration_of, check_region
-from server.workflows.analysis.tasks import images_of
-from server.workflows.camera_identity import check_same_cameras
-from server.workflows.live.request import LiveSettings
-from server.workflows.live.run import LiveRun
-from server.workflows.service import Service
+from stereorig.core.errors import InputError, StateError
+from stereorig.core.field.region.outlines import corners_px
+from stereorig.core.settings import NoiseRecord, Region, StoredSettings
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.compute.tasks import LiveTask
+from stereorig.server.formats.images import read_image
+from stereorig.server.formats.noise_json import load_noise
+from stereorig.server.workflows.analysis.start import calibration_of, check_region
+from stereorig.server.workflows.analysis.tasks import images_of
+from stereorig.server.workflows.camera_identity import check_same_cameras
+from stereorig.server.workflows.live.request import LiveSettings
+from stereorig.server.workflows.live.run import LiveRun
+from stereorig.server.workflows.service import Service
 
 
 class LiveRuns:
@@ -31,7 +31,7 @@ class LiveRuns:
 
     @property
     def current(self) -> LiveRun | None:
-        """The run that goes on, or ended last; None before any."""
+        """The current run, or the one that ended last; None before any."""
         return self._run
 
     def begin(self, test_id: str, asked: LiveSettings) -> LiveRun:
@@ -40,7 +40,7 @@ class LiveRuns:
         Raises
         ------
         StateError
-            ``live_running`` if one goes on; ``not_calibrated``, ``no_steps``.
+            ``live_running`` if one is running; ``not_calibrated``, ``no_steps``.
         RegionError, ImageError, InputError
             The region or a gauge cannot be used.
         """
@@ -48,7 +48,7 @@ class LiveRuns:
         with self._lock:
             if self._run is not None and self._run.active:
                 raise StateError(
-                    f"A live measurement of test {self._run.test_id} goes on.",
+                    f"A live measurement of test {self._run.test_id} is running.",
                     code="live_running",
                     remedy="End it by POST /tests/{id}/live:stop first.",
                     test_id=self._run.test_id,
@@ -89,9 +89,10 @@ class LiveRuns:
                 service.rig,
                 threads=service.config.service.kernel_threads,
                 silence_s=asked.silence_ms / 1e3,
-                channels=service.config.live.channels,
+                channels=service.channels,
             )
             self._run = run
+            service.channels.attend(test_id)
             service.live_account = lambda: (run.account.counts(), run.active)
             run.start()
         return run
@@ -112,18 +113,18 @@ class LiveRuns:
         return run
 
     def stop(self, test_id: str) -> LiveRun:
-        """End the live measurement of a test; nothing where it has ended already."""
+        """End the live measurement of a test; does nothing if it has ended already."""
         run = self.of(test_id)
         run.stop()
         return run
 
     def end(self) -> None:
-        """End whatever goes on, without waiting for it: a signal's handler waits for nothing."""
+        """End the current run without waiting for it: a signal's handler must not wait."""
         if self._run is not None:
             self._run.end()
 
     def close(self) -> None:
-        """End whatever goes on, and wait for it."""
+        """End the current run, and wait for it."""
         if self._run is not None:
             self._run.stop()
 

@@ -1,4 +1,4 @@
-"""What a live measurement keeps in memory: its last values, readings of channels, and the offset of their clocks."""
+"""Memory of a live measurement: its last values, readings of channels, and the offset of their clocks."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from core.errors import InputError
-from core.live.clocks import ClockOffset, clock_offset, value_at
+from stereorig.core.errors import InputError
+from stereorig.core.live.clocks import ClockOffset, clock_offset, value_at
 
 #: frames and readings kept: some two minutes at 50 Hz, 20 s of a channel at 1 kHz
 KEPT_FRAMES, KEPT_READINGS = 6000, 20_000
@@ -39,7 +39,7 @@ class _Channel:
 
     @property
     def gap_s(self) -> float:
-        """Readings further apart are not joined: three times their mean distance."""
+        """Largest distance of readings that are joined, s: three times their mean distance."""
         if len(self.time_s) < 2:
             return 0.0
         return _GAPS * (self.time_s[-1] - self.time_s[0]) / (len(self.time_s) - 1)

@@ -1,1 +1,1 @@
-"""Measuring an analysis again from what is stored, and comparing."""
+"""Measuring an analysis again from its stored inputs, and comparing the results."""

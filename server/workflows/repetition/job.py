@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import shutil
 
-from server.jobs.job import Job, Phase
-from server.worker.tasks import StepTask, measure_step
-from server.workflows.repetition.repeat import repeat
-from server.workflows.service import Service
-from server.workflows.waiting import run_task
+from stereorig.server.compute.functions import measure_step
+from stereorig.server.compute.tasks import StepTask
+from stereorig.server.jobs.job import Job, Phase
+from stereorig.server.workflows.repetition.repeat import repeat
+from stereorig.server.workflows.service import Service
+from stereorig.server.workflows.waiting import run_task
 
 
 def start_repetition(service: Service, test_id: str, analysis_id: str) -> Job:
-    """Begin to measure an analysis again; what was found is the job's result, and nothing else is kept.
+    """Begin to measure an analysis again; the job's result is the comparison, and nothing else is kept.
 
     Raises
     ------

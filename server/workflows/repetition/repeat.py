@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from core.errors import Cancelled, FileFormatError, StateError, StereorigError, StorageError
-from server.formats.environment import Change
-from server.formats.files import sha256_of
-from server.results.repeated import WITHIN_U, StepRepetition, Verdict, changes_of, compare_results
-from server.store.documents import AnalysisRecord
-from server.store.tests.steps import StepFiles
-from server.store.tests.tests import TestStore
-from server.worker.dask_cluster import ClusterError
-from server.worker.executor import WorkerDiedError
-from server.worker.tasks import StepTask
-from server.workflows.analysis.tasks import is_independent, task_of
+from stereorig.core.errors import Cancelled, FileFormatError, StateError, StereorigError, StorageError
+from stereorig.server.compute.tasks import StepTask
+from stereorig.server.documents.tests import AnalysisRecord
+from stereorig.server.formats.environment import Change
+from stereorig.server.formats.files import sha256_of
+from stereorig.server.formats.manifest import checked_bytes, is_there
+from stereorig.server.results.repeated import WITHIN_U, StepRepetition, Verdict, changes_of, compare_results
+from stereorig.server.store.tests.steps import StepFiles
+from stereorig.server.store.tests.tests import TestStore
+from stereorig.server.worker.dask_cluster import ClusterError
+from stereorig.server.worker.executor import WorkerDiedError
+from stereorig.server.workflows.analysis.tasks import is_independent, task_of
 
 Measure = Callable[[StepTask], object]
 
@@ -26,18 +26,18 @@ _ORDER: tuple[Verdict, ...] = ("equal", "within", "differs")
 
 @dataclass(frozen=True)
 class Repetition:
-    """An analysis beside its repetition.
+    """The comparison of an analysis with its repetition.
 
     Attributes
     ----------
     verdict
-        The worst of its steps, see :class:`server.results.repeated.StepRepetition`.
+        The worst of its steps, see :class:`stereorig.server.results.repeated.StepRepetition`.
     steps
         Those that were compared.
     not_measured
         Steps that the analysis has not measured; they are not repeated.
     changes
-        What is different since in program, libraries and processor.
+        Differences since then in program, libraries and processor.
     """
 
     test_id: str
@@ -106,8 +106,8 @@ def repeat(
     StateError
         ``analysis_unmeasured`` if no step of it was measured.
     FileFormatError
-        ``checksum_mismatch``, ``step_changed``, ``calibration_changed``: what it was measured from is not there any
-        more, so that nothing can be repeated.
+        ``checksum_mismatch``, ``step_changed``, ``calibration_changed``: an input of the analysis has changed or is
+        gone, so that nothing can be repeated.
     """
     document = tests.analyses.read(test_id, analysis_id)
     finished, failed = tests.analyses.finished_steps(test_id, analysis_id), _failed(tests, test_id, analysis_id)
@@ -175,8 +175,8 @@ def _failed(tests: TestStore, test_id: str, analysis_id: str) -> dict[int, str]:
 def _copy_inputs(analysis: Path, document: AnalysisRecord, folder: Path) -> None:
     """Put mask and noise models, which the analysis has for itself, where its repetition finds them."""
     for name in ("mask.png", "noise.json"):
-        if (analysis / name).is_file():
-            shutil.copyfile(analysis / name, folder / name)
+        if is_there(analysis / name):
+            (folder / name).write_bytes(checked_bytes(analysis / name))
     recorded = document.plain().get("mask_sha256")
     if recorded is not None and (not (folder / "mask.png").is_file() or sha256_of(folder / "mask.png") != recorded):
         raise FileFormatError(

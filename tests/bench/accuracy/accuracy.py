@@ -1,8 +1,8 @@
-"""Measure every figure of docs/explanation/accuracy and write those pages with their plots: ``make accuracy``.
+"""Measure the figures of docs/explanation/accuracy.md and write its tables and plots: ``make accuracy``.
 
 Truth comes from the simulated rigs' formulas; images carry noise of 2 of 255 unless a row says noise-free.
-Options: ``--only NAME[,NAME]`` measures some sections and writes nothing, ``--write`` puts these into their pages all
-the same, ``--list`` names them.
+Options: ``--only NAME[,NAME]`` measures some sections and writes nothing, ``--write`` puts these into their tables
+nevertheless, ``--list`` names them.
 """
 
 from __future__ import annotations

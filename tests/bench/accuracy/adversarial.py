@@ -12,17 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from core.arrays import Float
-from core.cameras.lens import SeidelLens
-from core.cameras.stereo import StereoPair
-from core.errors import StereorigError
-from core.field.checks.epipolar_offset import check_epipolar
-from core.field.checks.validity import ValidityOptions
-from core.field.points.result import Field
-from core.field.region.region import PointGrid
-from core.measure import MeasureOptions, ReferencePair, measure_motion
-from sim.scene import Scene
-from sim.texture import dots
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.lens import SeidelLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import StereorigError
+from stereorig.core.field.checks.epipolar_offset import check_epipolar
+from stereorig.core.field.checks.validity import ValidityOptions
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureOptions, ReferencePair, measure_motion
+from stereorig.core.settings import SINGLE_MAX_SIGMA_PX
+from stereorig.sim.scene import Scene
+from stereorig.sim.texture import dots
 from tests.bench.accuracy.adversarial_scenes import Case, Pictures
 from tests.bench.accuracy.paper_rig import Rig, plane_scene, true_points, turn
 from tests.bench.accuracy.table import Row, Section
@@ -161,7 +162,7 @@ def adversarial(figures: Path) -> Section:
                 right = 0 if outcome.field is None else int((outcome.field.valid & outcome.clean).sum())
                 share = 100.0 * right / int(outcome.clean.sum())
                 sigma_px = _sigma_px(scene, case) if share < KEPT_PERCENT else 0.0
-                allowed = sigma_px < ValidityOptions().max_sigma_px
+                allowed = sigma_px < SINGLE_MAX_SIGMA_PX
                 what = "the same: valid where every image shows the subset"
                 rows.append(Row(what, share, "%", KEPT_PERCENT if allowed else None, at_least=True))
                 if sigma_px > 0.0:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
+from stereorig.core.arrays import Float
 
 Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -121,6 +121,24 @@ class Pictures:
         """Both images at t with more noise."""
         rng = np.random.default_rng(self.seed)
         return self._everywhere(lambda p: p + rng.normal(0.0, sd, p.shape), matchable=True)
+
+    def dead_pixels(self, share: float) -> Case:
+        """Dead and hot pixels, at their own places in each camera and in both its images."""
+        changed = {}
+        for camera in (0, 1):
+            rng = np.random.default_rng(self.seed + camera)
+            dead, value = rng.random(self._shape) < share, np.where(rng.random(self._shape) < 0.5, 0, 255)
+            changed |= {k: np.where(dead, value, self.clean[k]).astype(np.uint8) for k in (camera, camera + 2)}
+        return self._case(changed, {})
+
+    def fixed_pattern(self, columns: float, pixels: float) -> Case:
+        """Columns and pixels that each camera adds to both its images."""
+        changed = {}
+        for camera in (0, 1):
+            rng = np.random.default_rng(self.seed + camera)
+            fixed = columns * rng.standard_normal(self._shape[1]) + pixels * rng.standard_normal(self._shape)
+            changed |= {k: _grey(self.clean[k] + fixed) for k in (camera, camera + 2)}
+        return self._case(changed, {})
 
     def overexposed(self, gain: float) -> Case:
         """Both images at t exposed so long that the bright half saturates."""

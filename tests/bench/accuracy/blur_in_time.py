@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
-from core.settings import PATCH_SETTINGS, PatchSetting
+from stereorig.core.settings import PATCH_SETTINGS, PatchSetting
 from tests.bench.accuracy.table import Row, Section
 from tests.support.blurred_in_time import Beside, BlurredPlate
 from tests.support.relief_rig import Texture

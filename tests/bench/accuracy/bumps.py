@@ -9,9 +9,9 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from core.errors import CalibrationError
-from core.orientation import changes_between, judge_offsets
-from core.orientation.matched import MatchedPoints
+from stereorig.core.errors import CalibrationError
+from stereorig.core.orientation import changes_between, judge_offsets
+from stereorig.core.orientation.matched import MatchedPoints
 from tests.bench.accuracy.table import Row, Section
 from tests.support.bumped_rig import CAM1, CAM2, SUBSET_PX, core_pair, false_strain, grid, pose_points, repaired, turned
 from tests.support.independent_rig import PlainCamera

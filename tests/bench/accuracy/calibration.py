@@ -8,19 +8,19 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from core.calibration.aspect import measure_aspect
-from core.calibration.from_images import CalibrationFromImages, ImageOfTarget, calibrate_views
-from core.calibration.inputs import CalibrationOptions, NominalCamera
-from core.cameras.camera import Camera, RigidTransform, rotation_from_angles
-from core.cameras.lens import SeidelLens
-from core.cameras.stereo import StereoPair
-from core.grid import Localiser, detect_grid
-from core.names import CAMERAS
-from core.target import GridTarget
-from sim.catalog import make_scene
-from sim.render import RenderOptions, render
-from sim.rig import SimRig
-from sim.world import SimWorld
+from stereorig.core.calibration.aspect import measure_aspect
+from stereorig.core.calibration.from_images import CalibrationFromImages, ImageOfTarget, calibrate_views
+from stereorig.core.calibration.inputs import CalibrationOptions, NominalValues
+from stereorig.core.cameras.camera import Camera, RigidTransform, rotation_from_angles
+from stereorig.core.cameras.lens import SeidelLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.grid import Localiser, detect_grid
+from stereorig.core.names import CAMERAS
+from stereorig.core.target import GridTarget
+from stereorig.sim.catalog import make_scene
+from stereorig.sim.render import RenderOptions, render
+from stereorig.sim.rig import SimRig
+from stereorig.sim.world import SimWorld
 from tests.bench.accuracy.paper_rig import ROOT
 from tests.bench.accuracy.table import Row, Section
 
@@ -28,8 +28,8 @@ POSITIONS = (0.0, 5.0, 2.0, 4.0)
 HELD_OUT = (2.0, 4.0)
 NODE_SEEDS = (11, 12, 13)
 NOMINALS = (
-    NominalCamera((512, 480), 12300.0, 404.0, -30.0, 0.9617),
-    NominalCamera((512, 480), 12300.0, 404.0, 30.0, 0.9617),
+    NominalValues((512, 480), 12300.0, 404.0, -30.0, 0.9617),
+    NominalValues((512, 480), 12300.0, 404.0, 30.0, 0.9617),
 )
 RIG = SimRig.from_toml(ROOT / "config" / "sim_paper.toml")
 

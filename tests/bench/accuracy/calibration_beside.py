@@ -8,7 +8,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from core.calibration import CalibrationOptions, NominalCamera, calibrate
+from stereorig.core.calibration import CalibrationOptions, NominalValues, calibrate
 from tests.bench.accuracy.table import Row, Section
 from tests.support.calibration_rigs import (
     LENSES,
@@ -74,7 +74,7 @@ def compare(case: Case, seed: int, *, mrcal: bool = True) -> Compared:
     points = made(board.points_mm(), rng, tolerance_mm=case.tolerance_mm, bow_mm=case.bow_mm)
     poses = hand_held(rng, cameras, points, POSES)
     views = views_of_poses(cameras, points, poses, rng, NOISE_PX)
-    nominal = NominalCamera(size, 1.1 * cameras[0].K[0, 0])
+    nominal = NominalValues(size, 1.1 * cameras[0].K[0, 0])
     ours = calibrate(views, board, (nominal, nominal), CalibrationOptions(moves="free"))
     opencv = stereo_calibrate(views, board.points_mm(), size)
     nan = float("nan")

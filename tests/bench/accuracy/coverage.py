@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from core.calibration import CalibrationOptions, CalibrationResult, CalibrationView, NominalCamera, calibrate
-from core.cameras.stereo import StereoPair
-from core.common.factor import ParameterCovariance, common_factor
-from core.names import CAMERAS
-from core.target import GridTarget
+from stereorig.core.calibration import CalibrationOptions, CalibrationResult, CalibrationView, NominalValues, calibrate
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.common.factor import ParameterCovariance, common_factor
+from stereorig.core.names import CAMERAS
+from stereorig.core.target import GridTarget
 from tests.bench.accuracy.table import Row, Section
 from tests.support.calibration_rigs import LENSES, Array, TrueCamera, made, observed, ordinary_pair
 
@@ -84,7 +84,7 @@ def replicate(stratum: Stratum, seed: int, *, declared: Stratum | None = None) -
         for dz in POSITIONS:
             travel = dz * (1.0 + scale) + stratum.step_sigma_mm * rng.standard_normal()
             views.append(CalibrationView(CAMERAS[c], dz, observed(camera.moved(travel * along), points, rng, NOISE_PX)))
-    one, two = (NominalCamera(cameras[0].size_px, 3535.0, 357.0, a) for a in (-12.5, 12.5))
+    one, two = (NominalValues(cameras[0].size_px, 3535.0, 357.0, a) for a in (-12.5, 12.5))
     options = CalibrationOptions(
         lens="paper",
         stage_scale_sigma=declared.scale_sigma,

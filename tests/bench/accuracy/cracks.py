@@ -9,19 +9,19 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.cameras.camera import Camera
-from core.cameras.lens import SeidelLens
-from core.cameras.stereo import StereoPair
-from core.field.points.result import Field
-from core.field.region.region import PointGrid
-from core.measure import MeasureOptions, ReferencePair
-from sim.catalog import make_scene
-from sim.panel import CrackedPanel
-from sim.render import RenderOptions, render
-from sim.rig import SimRig
-from sim.scene import Scene
-from sim.truth import truth_at
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.cameras.lens import SeidelLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureOptions, ReferencePair
+from stereorig.sim.catalog import make_scene
+from stereorig.sim.panel import CrackedPanel
+from stereorig.sim.render import RenderOptions, render
+from stereorig.sim.rig import SimRig
+from stereorig.sim.scene import Scene
+from stereorig.sim.truth import truth_at
 from tests.bench.accuracy.paper_rig import ROOT
 from tests.bench.accuracy.table import Row, Section
 

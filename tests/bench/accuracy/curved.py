@@ -9,16 +9,16 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.camera import RigidTransform
-from core.field.points.result import Field
-from core.field.region.region import PointGrid
-from core.measure import MeasureOptions, ReferencePair
-from core.settings import PatchSetting
-from sim.catalog import make_scene
-from sim.rig import SimRig
-from sim.scene import UPRIGHT, Scene
-from sim.surface import Surface, flat, sphere
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import RigidTransform
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureOptions, ReferencePair
+from stereorig.core.settings import PatchSetting
+from stereorig.sim.catalog import make_scene
+from stereorig.sim.rig import SimRig
+from stereorig.sim.scene import UPRIGHT, Scene
+from stereorig.sim.surface import Surface, flat, sphere
 from tests.bench.accuracy.paper_rig import ROOT, Rig, load_rig, plane_scene, true_points
 from tests.bench.accuracy.table import Row, Section
 

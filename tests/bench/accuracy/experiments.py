@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import xarray
 
-from core.robust import MAD_TO_SIGMA
+from stereorig.core.robust import MAD_TO_SIGMA
 from tests.bench.accuracy.paper_rig import ROOT
 from tests.bench.accuracy.table import Row, Section
 
@@ -24,7 +24,9 @@ def _demo(name: str, figures: Path) -> Section:
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
         subprocess.run(
-            [sys.executable, "-m", "server.cli", "demo", "--experiment", name, "--out", folder], check=False, cwd=ROOT
+            [sys.executable, "-m", "stereorig.server.cli", "demo", "--experiment", name, "--out", folder],
+            check=False,
+            cwd=ROOT,
         )
         seconds = time.perf_counter() - start
         report = json.loads((Path(folder) / "report.json").read_text())
@@ -42,7 +44,7 @@ def _demo(name: str, figures: Path) -> Section:
         f"`stereorig demo --experiment {name}`: the service on the simulated rig, calibrated from its own grid pictures with a "
         "4 um grid, everything over HTTP. Columns show the error against the truth."
     )
-    printed = "\n".join(["What the demo prints:", "", "```", *report["table"], "```"])
+    printed = "\n".join(["Printed by the demo:", *report["table"]])
     return Section(titles[name], how, rows, pictures, [printed])
 
 
@@ -83,7 +85,7 @@ def specimen(figures: Path) -> Section:
         command = [
             sys.executable,
             "-m",
-            "server.cli",
+            "stereorig.server.cli",
             "measure",
             "--cam1",
             str(data / "000*_0.tif"),

@@ -12,9 +12,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
-from core.field.region.region import PointGrid
-from core.measure import MeasureOptions, measure_shape
-from core.status import PointStatus
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureOptions, measure_shape
+from stereorig.core.status import PointStatus
 from tests.bench.accuracy.reliefs import SIZE, SPACING_PX, draw_row, placements, wedges
 from tests.bench.accuracy.table import Row, Section
 from tests.support.relief_rig import Body, two_cameras

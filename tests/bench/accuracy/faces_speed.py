@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from core.names import CAMERAS
+from stereorig.core.names import CAMERAS
 from tests.bench.accuracy.faces_before import COMMIT
 from tests.bench.accuracy.table import Row, Section
 from tests.bench.speed.scene import SequenceFiles, sequence_files
@@ -31,7 +31,7 @@ _CHILD = """
 import json, os, shutil, sys, time
 os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:int(sys.argv[1])])
 out, arguments = sys.argv[2], sys.argv[3:]
-from server.cli import main
+from stereorig.server.cli import main
 times = []
 for _ in range(4):
     shutil.rmtree(out, ignore_errors=True)

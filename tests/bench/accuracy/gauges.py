@@ -8,17 +8,17 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.camera import RigidTransform
-from core.field.points.images import MeasureImage
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels
-from core.field.region.region import PointGrid
-from core.gauge.area import area_statistics, points_within
-from core.gauge.extensometer import extensometer
-from core.gauge.reading import Reading
-from core.gauge.rigid import rigid_motion
-from core.measure import MeasureOptions, ReferencePair
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import RigidTransform
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.gauge.area import area_statistics, points_within
+from stereorig.core.gauge.extensometer import extensometer
+from stereorig.core.gauge.reading import Reading
+from stereorig.core.gauge.rigid import rigid_motion
+from stereorig.core.measure import MeasureOptions, ReferencePair
 from tests.bench.accuracy.paper_rig import load_rig, plane_scene, turn
 from tests.bench.accuracy.table import Row, Section
 

@@ -8,10 +8,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.cameras.camera import RigidTransform
-from core.field.region.region import PointGrid
-from core.measure import MeasureOptions, ReferencePair
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import RigidTransform
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureOptions, ReferencePair
 from tests.bench.accuracy.paper_rig import plane_scene, true_points, turn
 from tests.bench.accuracy.table import Row, Section
 from tests.bench.speed.scene import rig_of_size

@@ -10,9 +10,9 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from core.calibration import CalibrationOptions, CalibrationResult, CalibrationView, NominalCamera, calibrate
-from core.names import CAMERAS
-from core.target import GridTarget
+from stereorig.core.calibration import CalibrationOptions, CalibrationResult, CalibrationView, NominalValues, calibrate
+from stereorig.core.names import CAMERAS
+from stereorig.core.target import GridTarget
 from tests.bench.accuracy.table import Row, Section
 from tests.support.calibration_rigs import (
     LENSES,
@@ -96,7 +96,7 @@ def replicate(lens: str, motion: str, seed: int, told: Told | None = None, *, as
         views = [replace(v, sigma_px=None) for v in views]
     size = cameras[0].size_px
     nominals = [
-        NominalCamera(size, 3535.0, 357.0 if moves != "free" else None, a if moves != "free" else None)
+        NominalValues(size, 3535.0, 357.0 if moves != "free" else None, a if moves != "free" else None)
         for a in (-12.5, 12.5)
     ]
     options = CalibrationOptions(

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from core.calibration import COVARIANCE_NAMES, CalibrationOptions, CalibrationView, NominalCamera, calibrate
-from core.grid import GridOptions, GridView, detect_grid
-from core.names import CAMERAS
-from core.target import GridTarget
+from stereorig.core.calibration import COVARIANCE_NAMES, CalibrationOptions, CalibrationView, NominalValues, calibrate
+from stereorig.core.grid import GridOptions, GridView, detect_grid
+from stereorig.core.names import CAMERAS
+from stereorig.core.target import GridTarget
 from tests.bench.accuracy.table import Row, Section
 from tests.support import line_noise
 from tests.support.calibration_rigs import Array
@@ -32,8 +32,8 @@ PAIR = tuple(
     )
 )
 NOMINALS = (
-    NominalCamera((512, 480), 12000.0, 400.0, -30.0, 0.9617),
-    NominalCamera((512, 480), 12000.0, 400.0, 30.0, 0.9617),
+    NominalValues((512, 480), 12000.0, 400.0, -30.0, 0.9617),
+    NominalValues((512, 480), 12000.0, 400.0, 30.0, 0.9617),
 )
 OPTIONS = CalibrationOptions(lens="paper", axis_tilt_sigma_rad=0.0)
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.camera import Camera, RigidTransform
-from core.cameras.lens import SeidelLens
-from core.cameras.stereo import StereoPair
-from core.field.points.result import Field
-from core.field.region.region import PointGrid
-from core.measure import MeasureOptions, measure_motion, measure_shape
-from sim.scene import Scene
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.core.cameras.lens import SeidelLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureOptions, measure_motion, measure_shape
+from stereorig.sim.scene import Scene
 from tests.bench.accuracy.paper_rig import Rig, load_rig, plane_scene, true_points, turn
 from tests.bench.accuracy.table import Row, Section
 

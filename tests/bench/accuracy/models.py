@@ -9,11 +9,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy.stats import binomtest
 
-from core.model.compare import compare_with_model
-from core.model.placement import place_given
-from core.model.result import Comparison
-from core.model.surface import ModelSurface
-from core.strain.options import StrainOptions
+from stereorig.core.model.compare import compare_with_model
+from stereorig.core.model.placement import place_given
+from stereorig.core.model.result import ModelComparison
+from stereorig.core.model.surface import ModelSurface
+from stereorig.core.strain.options import StrainOptions
 from tests.bench.accuracy.table import Row, Section
 from tests.support.model_bench import SUBSET_PX, Array, Bench, bench, clamped_plate, kirsch, mesh
 
@@ -35,7 +35,7 @@ def _hole(stiffness: float) -> Callable[[Array], Array]:
 CASES = (("clamped plate", _plate, 0.0), ("plate with a hole", _hole, HOLE_MM))
 
 
-def _compared(one: Bench, model: ModelSurface, rng: np.random.Generator, *, strain: bool) -> Comparison:
+def _compared(one: Bench, model: ModelSurface, rng: np.random.Generator, *, strain: bool) -> ModelComparison:
     field = one.replicate(rng)
     placed = place_given(np.eye(3), np.zeros(3), field)
     window = StrainOptions(window=7) if strain else None
@@ -93,7 +93,7 @@ def models(figures: Path) -> Section:
     )
 
 
-def _draw(shown: list[tuple[str, list[float], Comparison]], path: Path) -> None:
+def _draw(shown: list[tuple[str, list[float], ModelComparison]], path: Path) -> None:
     fig, axes = plt.subplots(1, 3, figsize=(11.0, 3.6))
     for name, p, _ in shown:
         axes[0].plot((np.arange(len(p)) + 0.5) / len(p), np.sort(p), ".-", label=name)

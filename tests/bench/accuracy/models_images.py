@@ -17,14 +17,14 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from scipy.stats import binomtest
 
-from core.cameras.camera import Camera
-from core.field.points.images import MeasureImage
-from core.field.points.result import Field
-from core.field.region.region import PointGrid
-from core.measure import MeasureOptions, ReferencePair
-from core.model.compare import compare_with_model
-from core.model.placement import place_given
-from core.model.result import Comparison
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureOptions, ReferencePair
+from stereorig.core.model.compare import compare_with_model
+from stereorig.core.model.placement import place_given
+from stereorig.core.model.result import ModelComparison
 from tests.bench.accuracy.models import CASES, STIFFNESS
 from tests.bench.accuracy.paper_rig import BRIGHT, DARK, Rig, load_rig
 from tests.bench.accuracy.table import Row, Section
@@ -107,7 +107,7 @@ def _measured(rig: Rig, clean: list[Array], grid: PointGrid, rng: np.random.Gene
 
 def _case(
     rig: Rig, of: Callable[[float], Callable[[Array], Array]], hole_mm: float, rng: np.random.Generator
-) -> tuple[list[Comparison], list[Comparison]]:
+) -> tuple[list[ModelComparison], list[ModelComparison]]:
     """Replicates against the right model, and the same against the wrong one."""
     cameras = (rig.pair.cam1, rig.pair.cam2)
     states = [_state(camera, rig.size_px, motion) for motion in (None, of(1.0)) for camera in cameras]
@@ -172,7 +172,7 @@ def models_images(figures: Path) -> Section:
     )
 
 
-def _draw(shown: list[tuple[str, list[Comparison], list[Comparison]]], path: Path) -> None:
+def _draw(shown: list[tuple[str, list[ModelComparison], list[ModelComparison]]], path: Path) -> None:
     fig, axes = plt.subplots(1, 1 + len(shown), figsize=(11.0, 3.6))
     for k, (_, right, wrong) in enumerate(shown):
         for found, label, colour in ((right, "right", "C0"), (wrong, "2 % too stiff", "C3")):

@@ -8,11 +8,11 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from core.arrays import Float
-from core.matching import MatchOptions, fit_motion, fit_shape, prepare
-from core.matching.image import ImageData
-from core.noise import NoiseModel, measure_noise
-from sim.sensor import Sensor
+from stereorig.core.arrays import Float
+from stereorig.core.matching import MatchOptions, fit_motion, fit_shape, prepare
+from stereorig.core.matching.image import ImageData
+from stereorig.core.noise import NoiseModel, measure_noise
+from stereorig.sim.sensor import Sensor
 from tests.bench.accuracy.noise_bound import bound, displacement_bound, height_bound
 from tests.bench.accuracy.noise_scenes import APPEARANCES, Window, digitise
 from tests.bench.accuracy.table import Row, Section

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import map_coordinates, spline_filter
 
-from core.arrays import Float
+from stereorig.core.arrays import Float
 from tests.bench.accuracy.noise_scenes import Window
 
 _STEPS = np.array([1e-7, 1e-5, 1e-5, 1e-3, *[1e-6] * 9])  # of w (1/mm), the epipolar offset (px), G

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.cameras.camera import Camera, RigidTransform
-from core.cameras.lens import SeidelLens
-from core.cameras.stereo import StereoPair
-from sim.render import RenderOptions, render
-from sim.texture import speckle
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.core.cameras.lens import SeidelLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.sim.render import RenderOptions, render
+from stereorig.sim.texture import speckle
 from tests.bench.accuracy.paper_rig import BRIGHT, DARK, load_rig, plane_scene
 
 RIGS = {"paper": "sim_paper", "modern": "sim_modern"}

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.cameras.camera import ELEVEN_PARAMETER_NAMES, Camera, RigidTransform
-from core.cameras.stereo import StereoPair
-from sim.render import RenderOptions, material_points, render
-from sim.scene import UPRIGHT, Scene
-from sim.surface import flat
-from sim.texture import Texture, speckle
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import ELEVEN_PARAMETER_NAMES, Camera, RigidTransform
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.sim.render import RenderOptions, material_points, render
+from stereorig.sim.scene import UPRIGHT, Scene
+from stereorig.sim.surface import flat
+from stereorig.sim.texture import Texture, speckle
 from tests.support.requirements import ROOT
 
 DARK, BRIGHT = 20.0, 235.0  # grey levels of brightness 0 and 1, of 255

@@ -7,11 +7,11 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from core.arrays import Float
-from core.matching import prepare
-from core.matching.blur import Blur
-from core.matching.image import ImageData
-from core.noise import NoiseModel
+from stereorig.core.arrays import Float
+from stereorig.core.matching import prepare
+from stereorig.core.matching.blur import Blur
+from stereorig.core.matching.image import ImageData
+from stereorig.core.noise import NoiseModel
 from tests.bench.accuracy.noise import SHIFT_PX, Sample, measure, phase_error_px
 from tests.bench.accuracy.noise_scenes import APPEARANCES, Window, digitise
 from tests.bench.accuracy.table import Row, Section

@@ -12,8 +12,8 @@ from math import comb
 import numpy as np
 from scipy.signal import fftconvolve
 
-from core.arrays import Float
-from core.field.points.shared_pixels import SharedPixels
+from stereorig.core.arrays import Float
+from stereorig.core.field.points.shared_pixels import SharedPixels
 
 ORDER = 4
 

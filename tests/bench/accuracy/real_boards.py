@@ -11,11 +11,11 @@ import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 
-from core.boards import BoardTarget
-from core.boards.detect import detect_board
-from core.calibration import CalibrationOptions, CalibrationView, NominalCamera, calibrate
-from core.cameras.stereo import StereoPair
-from core.names import CAMERAS
+from stereorig.core.boards import BoardTarget
+from stereorig.core.boards.detect import detect_board
+from stereorig.core.calibration import CalibrationOptions, CalibrationView, NominalValues, calibrate
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.names import CAMERAS
 from tests.bench.accuracy.paper_rig import ROOT
 from tests.bench.accuracy.table import Row, Section
 from tests.support.calibration_rigs import Array, rms, stereo_calibrate
@@ -121,7 +121,7 @@ def split(views: Sequence[CalibrationView], fold: int) -> tuple[list[Calibration
 
 def ours(fit: Sequence[CalibrationView]) -> StereoPair:
     """The product's calibration of some of the views."""
-    nominal = NominalCamera(SIZE, 600.0)
+    nominal = NominalValues(SIZE, 600.0)
     return calibrate(list(fit), BOARD, (nominal, nominal), CalibrationOptions(moves="free")).pair
 
 

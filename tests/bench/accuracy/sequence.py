@@ -9,14 +9,14 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from core.arrays import Float
-from core.errors import MeasurementError
-from core.field.points.images import MeasureImage
-from core.field.points.result import Field
-from core.field.region.region import PointGrid
-from core.measure import MeasureOptions, PreviousStep, ReferencePair
-from core.settings import REFERENCE_UPDATES, ReferenceUpdate
-from sim.scene import Scene
+from stereorig.core.arrays import Float
+from stereorig.core.errors import MeasurementError
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureOptions, PreviousStep, ReferencePair
+from stereorig.core.settings import REFERENCE_UPDATES, ReferenceUpdate
+from stereorig.sim.scene import Scene
 from tests.bench.accuracy.paper_rig import BRIGHT, DARK, Rig, plane_scene, true_points, turn
 from tests.bench.accuracy.table import Row, Section
 from tests.bench.speed.scene import rig_of_size

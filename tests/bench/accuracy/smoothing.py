@@ -8,10 +8,10 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from core.arrays import Float
-from core.field.points.result import Field
-from core.field.smoothed import smoothed_displacement
-from core.strain import StrainOptions, surface_strain
+from stereorig.core.arrays import Float
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.smoothed import smoothed_displacement
+from stereorig.core.strain import StrainOptions, surface_strain
 from tests.bench.accuracy.paper_rig import load_rig
 from tests.bench.accuracy.strain import SUBSET, moved_fields
 from tests.bench.accuracy.table import Row, Section

@@ -13,12 +13,12 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from core.arrays import Float
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels
-from core.strain import StrainField, StrainOptions, surface_strain
-from server.formats.results.reading import read_field
-from server.formats.results.strain import read_strain
+from stereorig.core.arrays import Float
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.strain import StrainField, StrainOptions, surface_strain
+from stereorig.server.formats.results.reading import read_field
+from stereorig.server.formats.results.strain import read_strain
 from tests.bench.accuracy.experiments import specimen_folder
 from tests.bench.accuracy.paper_rig import ROOT
 from tests.bench.accuracy.rapid_noise import observed_over_reported, window_slope
@@ -45,7 +45,9 @@ CENTRE = (950.0, 560.0)
 
 
 def _run(*arguments: str) -> None:
-    subprocess.run([sys.executable, "-m", "server.cli", *arguments], check=True, cwd=ROOT, capture_output=True)
+    subprocess.run(
+        [sys.executable, "-m", "stereorig.server.cli", *arguments], check=True, cwd=ROOT, capture_output=True
+    )
 
 
 def _gauges(folder: str) -> list[dict[str, Any]]:

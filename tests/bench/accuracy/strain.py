@@ -8,13 +8,13 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.camera import RigidTransform
-from core.field.points.result import Field
-from core.field.region.region import PointGrid
-from core.measure import MeasureOptions, ReferencePair
-from core.strain import StrainField, StrainOptions, surface_strain
-from sim.scene import UPRIGHT, Scene
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import RigidTransform
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureOptions, ReferencePair
+from stereorig.core.strain import StrainField, StrainOptions, surface_strain
+from stereorig.sim.scene import UPRIGHT, Scene
 from tests.bench.accuracy.paper_rig import Rig, load_rig, plane_scene, turn
 from tests.bench.accuracy.table import Row, Section
 

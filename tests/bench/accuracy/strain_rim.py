@@ -11,19 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
-from core.arrays import Bool, Float
-from core.cameras.stereo import StereoPair
-from core.field.points.result import Field
-from core.field.region.region import PointGrid
-from core.measure import MeasureOptions, ReferencePair
-from core.settings import StrainOrder
-from core.strain import StrainOptions, surface_strain
-from sim.catalog import make_scene
-from sim.panel import CrackedPanel
-from sim.render import RenderOptions, render
-from sim.rig import SimRig
-from sim.scene import Scene
-from sim.truth import truth_at
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureOptions, ReferencePair
+from stereorig.core.settings import StrainOrder
+from stereorig.core.strain import StrainOptions, surface_strain
+from stereorig.sim.catalog import make_scene
+from stereorig.sim.panel import CrackedPanel
+from stereorig.sim.render import RenderOptions, render
+from stereorig.sim.rig import SimRig
+from stereorig.sim.scene import Scene
+from stereorig.sim.truth import truth_at
 from tests.bench.accuracy import cracks
 from tests.bench.accuracy.paper_rig import ROOT
 from tests.bench.accuracy.table import Row, Section

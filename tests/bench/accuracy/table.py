@@ -1,4 +1,4 @@
-"""Rows and sections of the accuracy page."""
+"""Rows and sections of the tables on accuracy."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Row:
 
     @property
     def met(self) -> bool:
-        """True where the limit is kept, or there is none."""
+        """True if the limit is kept, or there is none."""
         if self.limit is None:
             return True
         # written so that NaN does not pass
@@ -26,27 +26,22 @@ class Row:
     def _limit(self) -> str:
         if self.limit is None:
             return ""
-        return f"{'>= ' if self.at_least else ''}{self.limit:g}"
+        return f"{'>=' if self.at_least else '<='} {self.limit:g}"
 
-    @staticmethod
-    def header() -> str:
-        """Head of the table."""
-        return "| what | measured | at most | unit | met |\n| --- | --- | --- | --- | --- |"
-
-    def markdown(self) -> str:
-        """One row of the table."""
-        met = "" if self.limit is None else ("yes" if self.met else "**no**")
-        return f"| {self.what} | {self.measured:.4g} | {self._limit()} | {self.unit} | {met} |"
+    def cells(self) -> tuple[str, str, str, str, str]:
+        """Return name, measured value, limit, unit and verdict as a table has them."""
+        met = "" if self.limit is None else ("yes" if self.met else "no")
+        return self.what, f"{self.measured:.4g}", self._limit(), self.unit, met
 
     def text(self) -> str:
         """One line for the terminal."""
         flag = "" if self.met else "   <-- MISSED"
-        return f"{self.what:70s} {self.measured:10.4g} {self.unit:6s} limit {self._limit():8s}{flag}"
+        return f"{self.what:70s} {self.measured:10.4g} {self.unit:6s} limit {self._limit():11s}{flag}"
 
 
 @dataclass(frozen=True)
 class Section:
-    """One part of the page."""
+    """One section of a table: its title, the conditions of its figures, rows, plots (file, caption) and notes."""
 
     title: str
     how: str

@@ -17,9 +17,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.boards import BoardTarget, BoardView, detect_board, dot_centre_offset_px
-from core.boards.view import steps_px
+from stereorig.core.arrays import Float
+from stereorig.core.boards import BoardTarget, BoardView, detect_board, dot_centre_offset_px
+from stereorig.core.boards.view import steps_px
 from tests.bench.accuracy.table import Row, Section
 from tests.support.board_images import BoardCamera, exposed, render_board
 

@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 import psutil
 
-from server.worker.executor import TaskExecutor, TaskFuture
-from server.worker.tasks import StepTask
-from server.workflows.analysis.block import Ask
-from server.workflows.analysis.blocks import Blocks
+from stereorig.server.compute.tasks import StepTask
+from stereorig.server.worker.executor import TaskExecutor, TaskFuture
+from stereorig.server.workflows.analysis.block import BlockStep
+from stereorig.server.workflows.analysis.blocks import Blocks
 from tests.bench.cluster.page import write_page
 from tests.bench.cluster.scheduler import Overhead, Simulated, dask_overhead, simulate
 from tests.support import sequence_bench as scenes
@@ -101,13 +101,13 @@ class Watched:
         self._ask, self._ended = Blocks.ask, Blocks.ended
 
     def __enter__(self) -> Watched:
-        def ask(plan: Blocks) -> Ask | None:
+        def ask(plan: Blocks) -> BlockStep | None:
             found = self._ask(plan)
             if found is not None:
                 self._begun[id(found)] = time.monotonic()
             return found
 
-        def ended(plan: Blocks, found: Ask, outcome: Any) -> None:
+        def ended(plan: Blocks, found: BlockStep, outcome: Any) -> None:
             self.tasks[found.kind].append(time.monotonic() - self._begun.pop(id(found)))
             self._ended(plan, found, outcome)
 

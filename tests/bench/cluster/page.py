@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
 
-from tests.bench.cluster.region_page import section_in, with_section
 from tests.bench.cluster.scheduler import Simulated, longest_block
 from tests.bench.documents.prose import wrapped
 
@@ -98,8 +97,7 @@ def write_page(figures: Figures, times: dict[str, float]) -> None:
             "part of the simulation."
         ),
     ]
-    kept = section_in(PAGE.read_text(encoding="utf-8")) if PAGE.exists() else ""  # of another script
-    PAGE.write_text(with_section("\n\n".join(sections), kept), encoding="utf-8")
+    PAGE.write_text("\n\n".join(sections) + "\n", encoding="utf-8")
 
 
 def _compared(figures: Figures) -> str:

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from core.errors import SeedError
-from server.workflows.analysis.block import Ask
-from server.workflows.analysis.blocks import LONGEST, Blocks
+from stereorig.core.errors import SeedError
+from stereorig.server.workflows.analysis.block import BlockStep
+from stereorig.server.workflows.analysis.blocks import LONGEST, Blocks
 
 _TASKS_A_WORKER = 6
 
@@ -128,7 +128,7 @@ def simulate(
     plan = Blocks(order, previous=0, reference=0, first=0, width=workers)
     serial = service_s + overhead.serial_s
     now, free_at, busy, besides, coordinator = 0.0, 0.0, 0.0, 0.0, 0.0
-    running: list[tuple[float, int, Ask]] = []
+    running: list[tuple[float, int, BlockStep]] = []
     files: dict[int, int] = {0: 0}
     count = 0
     while not plan.through:
@@ -147,7 +147,7 @@ def simulate(
     )
 
 
-def _outcome(ask: Ask, reach: int, files: dict[int, int]) -> Any:
+def _outcome(ask: BlockStep, reach: int, files: dict[int, int]) -> Any:
     """A reference serves for ``reach`` steps."""
     if ask.kind == "head":
         assert ask.against is not None

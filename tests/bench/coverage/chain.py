@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import tifffile
 
-from server.cli.main import main
+from stereorig.server.cli.main import main
 from tests.bench.coverage.draw import (
     CORNERS,
     FOCAL_PX,
@@ -96,14 +96,16 @@ def run(replicate: Replicate, folder: Path) -> Run:
         *("--out", folder / "calibration.json"),
     )
     steps = [(np.eye(3), np.zeros(3)), *((A, b) for _, A, b in replicate.motions)]
+    noise = (s.noise, s.noise if s.noise_2 is None else s.noise_2)
+    fixed = [_pattern(s, camera.size, rng) for camera in replicate.cameras]
     for k, (A, b) in enumerate(steps):
         light = Light(blur_px=LIGHT.blur_px + s.blur_in_time * (k > 0))
         for c, camera in enumerate(replicate.cameras):
-            grey = speckled(camera, replicate.sheet.moved(A, b), light)
-            _write(images / f"cam{c + 1}_{k:04d}.tif", exposed(grey, s.noise, rng, correlated_px=s.noise_px))
+            grey = speckled(camera, replicate.sheet.moved(A, b, s.neck_mm if k else (0.0, 1.0)), light) + fixed[c]
+            _write(images / f"cam{c + 1}_{k:04d}.tif", exposed(grey, noise[c], rng, correlated_px=s.noise_px))
             if k == 0 and s.declare_white:
                 for n in range(6):
-                    frame = exposed(grey, s.noise, rng, correlated_px=s.noise_px)
+                    frame = exposed(grey, noise[c], rng, correlated_px=s.noise_px)
                     _write(folder / f"frame_cam{c + 1}_{n}.tif", frame)
     more: list[str | Path] = []
     if s.declare_white:
@@ -134,6 +136,14 @@ def run(replicate: Replicate, folder: Path) -> Run:
         json.loads((folder / "rigid.json").read_text(encoding="utf-8")),
         said,
     )
+
+
+def _pattern(s: Stratum, size: tuple[int, int], rng: np.random.Generator) -> Any:
+    """What a sensor adds to each image; nothing is drawn where there is none."""
+    if not (s.columns or s.pixels):
+        return 0.0
+    width, height = size
+    return s.columns * rng.standard_normal(width)[None] + s.pixels * rng.standard_normal((height, width))
 
 
 def _list(numbers: Sequence[int]) -> str:

@@ -88,8 +88,8 @@ def _grid(
     for c, camera in enumerate(cameras):
         tilt = stratum.tilt_rad * rng.standard_normal(2)
         along = np.array([*tilt, np.sqrt(1.0 - tilt @ tilt)])
-        scale = stratum.scale * rng.standard_normal()
-        for dz in POSITIONS_MM:
+        scale = stratum.stage_off + stratum.scale * rng.standard_normal()
+        for dz in (stratum.travel * p for p in POSITIONS_MM):
             # positions are read against the first one, which defines the system's frame
             travel = dz * (1.0 + scale) + stratum.step_mm * rng.standard_normal()
             views.append(View(f"cam{c + 1}_{dz:+.3f}mm.tif", replace(camera, t=camera.t + travel * along)))

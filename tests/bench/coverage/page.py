@@ -1,8 +1,8 @@
-"""The page on coverage: the asked limits beside what was measured, by stratum, motion and quantity, with a plot."""
+"""The table on coverage: measured figures and their limits by stratum, motion and quantity, with a plot."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -13,8 +13,7 @@ from tests.bench.accuracy.pages import FIGURES, write_part
 from tests.bench.coverage.coverage import MAIN_REPLICATES, OUT, file_of, kept
 from tests.bench.coverage.figures import Figures, Kept, Share, alarms_of, figures_of, read_figures, write_figures
 from tests.bench.coverage.score import MEAN
-from tests.bench.coverage.strata import CONTROLS, MAIN, OTHERS, STRATA, Stratum
-from tests.bench.documents.prose import wrapped
+from tests.bench.coverage.strata import CONTROLS, LATER, MAIN, OTHERS, STRATA, Stratum
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
@@ -24,6 +23,9 @@ FIGURE = "coverage_by_motion.png"
 LEAST = 10
 """Replicates of a stratum below which its cells say nothing over all: what points share is one draw a replicate."""
 Named = tuple[str, Figures]
+Cells = tuple[str, str, str, str, str]
+REST = (*OTHERS, *(stratum for stratum in LATER if stratum.must != "fail"))
+REFUSED = tuple(stratum for stratum in LATER if stratum.must == "fail")
 _HOW = """Each replicate draws a target with errors of its nodes, pitch and stage, two cameras, a texture and its phase, image noise
 and the signs of the motions. Its views of the target are rendered and calibrated by `stereorig calibrate`, a tilted plane (a
 curved one where the stratum says so) and seven motions of it are rendered and measured by `stereorig measure`, lengths of 10 mm,
@@ -59,7 +61,7 @@ def drawn_now() -> Kept:
 
 
 def write_page() -> Path:
-    """Write the section and its figure: strata that were drawn here stand in place of the kept ones, which are kept."""
+    """Write the section and its figure: strata that were drawn here replace the kept ones, and are kept."""
     drawn, shown = drawn_now(), read_figures()
     if not drawn.strata:
         raise SystemExit(f"no replicates in {OUT}")
@@ -71,50 +73,55 @@ def write_page() -> Path:
 
 def write_from(shown: Kept) -> Path:
     """Write the section and its figure from figures."""
-    _plot(_of(shown, (*MAIN, *OTHERS)), FIGURES / FIGURE)
-    return write_part("coverage", TITLE, wrapped(text(shown)))
+    _plot(_of(shown, (*MAIN, *REST)), FIGURES / FIGURE)
+    return write_part("coverage", TITLE, notes(shown), rows(shown))
 
 
 def _of(shown: Kept, strata: Sequence[Stratum]) -> list[Named]:
     return [(s.name, shown.strata[s.name]) for s in strata if s.name in shown.strata]
 
 
-def text(shown: Kept) -> str:
-    """The section's text."""
-    main, others = _of(shown, MAIN), _of(shown, OTHERS)
+def notes(shown: Kept) -> list[str]:
+    """Return the conditions of the figures, and the days on which the strata were drawn."""
+    main, others = _of(shown, MAIN), _of(shown, REST)
+    lines = [*(" ".join(paragraph.split()) for paragraph in (_HOW, _CHOSEN)), f"plot: docs/figures/{FIGURE}"]
+    least = min((f.replicates for _, f in main), default=0)
+    if least < MAIN_REPLICATES:
+        lines.append(f"A main stratum has at least {least} of {MAIN_REPLICATES} replicates here.")
+    days: dict[str, list[str]] = {}
+    for name, f in (*main, *others, *_of(shown, (*CONTROLS, *REFUSED))):
+        days.setdefault(f.drawn, []).append(name)
+    lines += [f"Drawn on {day}, with the program of that day: {'; '.join(days[day])}." for day in sorted(days)]
+    lines += [
+        f"No camera moves in these replicates; of those drawn on {day}, {moved} of {of} have a step that reports a motion."
+        for day, (moved, of) in sorted(shown.alarms.items())
+    ]
+    return lines
+
+
+def rows(shown: Kept) -> list[Cells]:
+    """Return the rows: asked figures, main strata by motion and by quantity, other strata, negative controls."""
+    main, others = _of(shown, MAIN), _of(shown, REST)
     cover = {s.name for s in STRATA if s.must == "cover"}
     covering = [(n, f) for n, f in (*main, *others) if n in cover and f.replicates >= LEAST]
-    least = min(f.replicates for _, f in main) if main else 0
-    lines = [f"## {TITLE}", "", " ".join(_HOW.split()), ""]
-    for paragraph in _CHOSEN.split("\n\n"):
-        lines += [" ".join(paragraph.split()), ""]
-    if least < MAIN_REPLICATES:
-        lines += [f"A main stratum has at least {least} of {MAIN_REPLICATES} replicates here.", ""]
-    lines += _days([*main, *others, *_of(shown, CONTROLS)])
-    lines += _asked(main, covering) if covering else []
-    lines += ["", f"![Coverage by motion](../../figures/{FIGURE})", "", *_by_motion(main), "", *_by_quantity(main)]
-    lines += ["", *_others(others), "", *_controls(shown), "", *_not_covered(others), *_alarms(shown.alarms)]
-    return "\n".join(lines).rstrip() + "\n"
+    found = _asked(main, covering) if covering else []
+    for name, f in main:
+        found.append((f"{name}: replicates", str(f.replicates), "", "", ""))
+        for part, share in (*f.motions.items(), *((f"all motions, {q}", s) for q, s in f.quantities.items())):
+            found += _share(f"{name}: {part}", share)
+    for name, f in others:
+        found += _other(name, f)
+    return found + _controls(shown)
 
 
-def _days(every: Sequence[Named]) -> list[str]:
-    """Which stratum was drawn when: what was drawn earlier is of an earlier state of the program."""
-    days: dict[str, list[str]] = {}
-    for name, f in every:
-        days.setdefault(f.drawn, []).append(name)
-    if len(days) < 2:
-        return []
-    newest, *older = sorted(days, reverse=True)
-    parts = [f"drawn on {newest}: {'; '.join(days[newest])}"]
-    parts += [f"drawn on {day}, with the program of that day: {'; '.join(days[day])}" for day in older]
-    return [f"Strata {'. Strata '.join(parts)}. Figures of earlier days are kept to the digits shown.", ""]
+def _row(what: str, value: float, limits: tuple[float, float] | None = None, unit: str = "", digits: int = 1) -> Cells:
+    limit, met = "", ""
+    if limits is not None:
+        limit, met = f"{limits[0]:g} to {limits[1]:g}", "yes" if limits[0] <= value <= limits[1] else "no"
+    return what, f"{value:.{digits}f}", limit, unit, met
 
 
-def _between(low: float, value: float, high: float) -> str:
-    return "yes" if low <= value <= high else "**no**"
-
-
-def _asked(main: Sequence[Named], covering: Sequence[Named]) -> list[str]:
+def _asked(main: Sequence[Named], covering: Sequence[Named]) -> list[Cells]:
     shares = [(f.whole, f.cells) for _, f in covering if f.whole is not None]
     cells = sum(count for _, count in shares)
     total = 100.0 * sum(share.coverage * count for share, count in shares) / cells
@@ -124,115 +131,68 @@ def _asked(main: Sequence[Named], covering: Sequence[Named]) -> list[str]:
     squared = [(share.nees, name, m) for share, name, m in motions if share.nees is not None]
     narrow, wide = min(squared), max(squared)
     sharp = [(f.sharpness, f.cells) for _, f in covering if f.sharpness is not None]
-    lines = [
-        "| what | measured | asked | met |",
-        "| --- | --- | --- | --- |",
-        f"| coverage of 95 % intervals, mean of all {cells} cells of {len(covering)} strata | {total:.1f} % | "
-        f"94 to 96 % | {_between(94.0, total, 96.0)} |",
+    found = [
+        _row("coverage of 95 % intervals, mean of all cells", total, (94, 96), "%"),
+        _row("cells in that mean", cells, digits=0),
+        _row("strata in that mean", len(covering), digits=0),
     ]
-    for what, (share, name, motion) in (("lowest motion of a main stratum", low), ("highest", high)):
-        value, spread = 100.0 * share.coverage, "" if share.spread is None else f"; +- {100 * share.spread:.1f}"
-        lines.append(
-            f"| {what} ({name}: {motion}{spread}) | {value:.1f} % | 92 to 98 % | {_between(92.0, value, 98.0)} |"
+    found += [
+        _row(f"coverage, {which} motion of a main stratum ({name}: {motion})", 100.0 * share.coverage, (92, 98), "%")
+        for which, (share, name, motion) in (("lowest", low), ("highest", high))
+    ]
+    found.append(_row("squared error over variance, mean of all cells", every, (0.95, 1.05), digits=3))
+    found += [
+        _row(
+            f"squared error over variance, {which} motion of a main stratum ({name}: {m})", nees, (0.85, 1.2), digits=2
         )
-    lines += [
-        f"| squared error over variance, mean of all cells | {every:.3f} | 0.95 to 1.05 | {_between(0.95, every, 1.05)} |",
-        f"| the same, lowest motion of a main stratum ({narrow[1]}: {narrow[2]}) | {narrow[0]:.2f} | 0.85 to 1.2 | "
-        f"{_between(0.85, narrow[0], 1.2)} |",
-        f"| the same, highest ({wide[1]}: {wide[2]}) | {wide[0]:.2f} | 0.85 to 1.2 | {_between(0.85, wide[0], 1.2)} |",
+        for which, (nees, name, m) in (("lowest", narrow), ("highest", wide))
     ]
     if sharp:
         mean = float(np.exp(np.average(np.log([s for s, _ in sharp]), weights=[count for _, count in sharp])))
-        lines.append(
-            f"| reported over true rms, geometric mean of the cells of {len(sharp)} strata | {mean:.3f} | "
-            f"0.95 to 1.10 | {_between(0.95, mean, 1.10)} |"
-        )
-    return lines
+        what = f"reported over true rms, geometric mean of the cells of {len(sharp)} strata"
+        found.append(_row(what, mean, (0.95, 1.1), digits=3))
+    return found
 
 
-def _shown(share: Share | None) -> str:
-    if share is None:
-        return ""
-    spread = "" if share.spread is None else f" +- {100 * share.spread:.1f}"
-    squared = "" if share.nees is None else f" ({share.nees:.2f})"
-    return f"{100 * share.coverage:.1f}{spread}{squared}"
+def _share(what: str, share: Share, limits: tuple[float, float] | None = None) -> list[Cells]:
+    """Return coverage in per cent, its standard error between replicates, and squared error over variance."""
+    found = [_row(f"{what}, within 95 %", 100.0 * share.coverage, limits, "%")]
+    if share.spread is not None:
+        found.append(_row(f"{what}, standard error", 100.0 * share.spread, None, "%"))
+    if share.nees is not None:
+        found.append(_row(f"{what}, squared error over variance", share.nees, digits=2))
+    return found
 
 
-def _by_motion(main: Sequence[Named]) -> list[str]:
-    names = [f"{name} ({f.replicates})" for name, f in main]
-    lines = [
-        "Coverage in per cent by motion, its standard error between replicates, and squared error over variance:",
-        "",
-    ]
-    lines += [f"| motion | {' | '.join(names)} |", "| --- |" + " --- |" * len(main)]
-    for motion in dict.fromkeys(m for _, f in main for m in f.motions):
-        lines.append(f"| {motion} | {' | '.join(_shown(f.motions.get(motion)) for _, f in main)} |")
-    return lines
+def _other(name: str, f: Figures) -> list[Cells]:
+    found: list[Cells] = [(f"{name}: replicates", str(f.replicates), "", "", "")]
+    if f.refused:
+        found.append((f"{name}: refused", str(f.refused), "", "", ""))
+    if f.whole is None or f.sharpness is None:
+        return found
+    found += _share(f"{name}: all motions", f.whole, (92, 98) if f.replicates >= LEAST else None)
+    found.append(_row(f"{name}: reported over true rms", f.sharpness, digits=2))
+    motion, share = min(f.motions.items(), key=lambda item: item[1].coverage)
+    found.append(_row(f"{name}: lowest motion ({motion}), within 95 %", 100.0 * share.coverage, None, "%"))
+    if f.structure:
+        found.append((f"{name}: calibrations that name a structure", str(f.structure), "", "", ""))
+    return found
 
 
-def _by_quantity(main: Sequence[Named]) -> list[str]:
-    lines = ["The same by quantity, over all motions:", ""]
-    lines += [f"| quantity | {' | '.join(name for name, _ in main)} |", "| --- |" + " --- |" * len(main)]
-    for quantity in dict.fromkeys(q for _, f in main for q in f.quantities):
-        lines.append(f"| {quantity} | {' | '.join(_shown(f.quantities.get(quantity)) for _, f in main)} |")
-    return lines
-
-
-def _others(others: Sequence[Named]) -> list[str]:
-    lines = [
-        f"Other strata, replicates in brackets; fewer than {LEAST} say nothing of coverage:",
-        "",
-        "| stratum | coverage, % (squared error over variance) | reported over true rms | lowest motion | calibration |",
-        "| --- | --- | --- | --- | --- |",
-    ]
-    for name, f in others:
-        if f.whole is None or f.sharpness is None:
-            lines.append(f"| {name} ({f.replicates}) | | | | refused {f.refused} |")
-            continue
-        motion, share = min(f.motions.items(), key=lambda item: item[1].coverage)
-        lines.append(
-            f"| {name} ({f.replicates}) | {_shown(f.whole)} | {f.sharpness:.2f} | "
-            f"{motion}: {100 * share.coverage:.1f} % | {_verdict(f)} |"
-        )
-    return lines
-
-
-def _verdict(f: Figures) -> str:
-    parts = [f"refused {f.refused}"] if f.refused else []
-    return ", ".join(parts + ([f"structure named in {f.structure}"] if f.structure else []))
-
-
-def _controls(shown: Kept) -> list[str]:
-    lines = [
-        "Negative controls, which must fail:",
-        "",
-        "| control | coverage, % (squared error over variance) |",
-        "| --- | --- |",
-    ]
+def _controls(shown: Kept) -> list[Cells]:
+    found: list[Cells] = []
     for name, f in _of(shown, MAIN[1:3]):
-        lines += [f"| {name}, calibration's part off: {q} | {_shown(share)} |" for q, share in f.off.items()]
+        for q, share in f.off.items():
+            found += _share(f"must fail, {name}, calibration's part off: {q}", share)
     for name, f in _of(shown, MAIN[:1]):
-        lines.append(f"| {name}, frozen noise of the reference declared white in time: {MEAN} | {_shown(f.white)} |")
+        if f.white is not None:
+            found += _share(f"must fail, {name}, frozen noise of the reference declared white in time: {MEAN}", f.white)
     for name, f in _of(shown, CONTROLS):
-        lines += [f"| {name}: {', '.join(reversed(k.split('|')))} | {_shown(share)} |" for k, share in f.tilted.items()]
-    return lines
-
-
-def _not_covered(others: Sequence[Named]) -> list[str]:
-    named = [
-        (name, f.whole)
-        for name, f in others
-        if f.whole is not None and f.replicates >= LEAST and not 0.92 <= f.whole.coverage <= 0.98
-    ]
-    if not named:
-        return []
-    shown = "; ".join(f"{name}: {_shown(share)}" for name, share in named)
-    return [f"Not covered, in per cent with squared error over variance: {shown}.", ""]
-
-
-def _alarms(alarms: Mapping[str, tuple[int, int]]) -> list[str]:
-    parts = [f"{moved} of {of} drawn on {day}" for day, (moved, of) in sorted(alarms.items())]
-    return [f"No camera moves in these replicates; a step said that one did in {' and in '.join(parts)}.", ""]
+        for k, share in f.tilted.items():
+            found += _share(f"must fail, {name}: {', '.join(reversed(k.split('|')))}", share)
+    for name, f in _of(shown, REFUSED):
+        found.append((f"must fail, {name}: refused of {f.replicates + f.refused}", str(f.refused), "", "", ""))
+    return found
 
 
 def _plot(shown: Sequence[Named], path: Path) -> None:

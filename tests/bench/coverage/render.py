@@ -34,6 +34,8 @@ class Sheet:
         Distance of the spline's knots, or of the discs.
     A, b
         The motion, system frame.
+    neck_mm
+        Before it each point has gone along x, on a plane, by the first times tanh(x over the second).
     """
 
     slope: tuple[float, float]
@@ -42,10 +44,16 @@ class Sheet:
     knot_mm: float
     A: Array = field(default_factory=lambda: np.eye(3))
     b: Array = field(default_factory=lambda: np.zeros(3))
+    neck_mm: tuple[float, float] = (0.0, 1.0)
 
-    def moved(self, A: Array, b: Array) -> Sheet:
+    def moved(self, A: Array, b: Array, neck_mm: tuple[float, float] = (0.0, 1.0)) -> Sheet:
         """The sheet after a motion from where it lies at the reference."""
-        return replace(self, A=A, b=b)
+        return replace(self, A=A, b=b, neck_mm=neck_mm)
+
+    def necked(self, points_mm: Array, neck_mm: tuple[float, float]) -> Array:
+        """Points (n, 3) of the plane sheet after the neck alone."""
+        along = neck_mm[0] * np.tanh(points_mm[:, 0] / neck_mm[1])
+        return np.asarray(points_mm + along[:, None] * np.array([1.0, 0.0, self.slope[0]]))
 
     @property
     def surface(self) -> Array:
@@ -117,6 +125,7 @@ def speckled(camera: ReliefCamera, sheet: Sheet, light: Light) -> Array:
         sheet.texture,
         sheet.knot_mm,
         sharp,
+        np.array(sheet.neck_mm),
     )
     return np.asarray(_lit(light.low + (light.high - light.low) * cover))
 
@@ -206,7 +215,22 @@ def _disc(x, y, table):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _speckled(w, h, place, weight, camera, o, turn, surface, table, knot, sharp):  # type: ignore[no-untyped-def]
+def _material(x, neck):  # type: ignore[no-untyped-def]
+    """Where a point at x of a neck was: Newton's steps on X + amplitude tanh(X / width) = x, which rises everywhere."""
+    if neck[0] == 0.0:
+        return x
+    start = x - neck[0] * np.tanh(x / neck[1])
+    for _ in range(30):
+        th = np.tanh(start / neck[1])
+        step = (x - start - neck[0] * th) / (1.0 + neck[0] / neck[1] * (1.0 - th * th))
+        start += step
+        if abs(step) < 1e-10:
+            break
+    return start
+
+
+@njit(cache=True)
+def _speckled(w, h, place, weight, camera, o, turn, surface, table, knot, sharp, neck):  # type: ignore[no-untyped-def]
     out = np.empty((h, w))
     sa, sb, k = surface[0], surface[1], surface[2]
     C = o[2] - sa * o[0] - sb * o[1] - 0.5 * k * (o[0] ** 2 + o[1] ** 2)
@@ -223,7 +247,7 @@ def _speckled(w, h, place, weight, camera, o, turn, surface, table, knot, sharp)
                     B = dz - sa * dx - sb * dy - k * (o[0] * dx + o[1] * dy)
                     A = -0.5 * k * (dx * dx + dy * dy)
                     t = -2.0 * C / (B + np.sqrt(max(B * B - 4.0 * A * C, 0.0)))
-                    x, y = (o[0] + t * dx) / knot, (o[1] + t * dy) / knot
+                    x, y = _material(o[0] + t * dx, neck) / knot, (o[1] + t * dy) / knot
                     total += weight[p] * weight[q] * (_disc(x, y, table) if sharp else _spline(x, y, table))
             out[row, col] = total
     return out

@@ -71,17 +71,19 @@ def scored(replicate: Replicate, run: Run) -> dict[str, list[float]]:
     _shape_gauges(tally, run, px, frame.point(world))
     steps: list[Step] = []
     for k, (name, A, b) in enumerate(replicate.motions, start=1):
-        moved = frame.way(world @ (A - np.eye(3)).T + b)
+        neck = replicate.stratum.neck_mm
+        moved = frame.way(replicate.sheet.necked(world, neck) @ A.T + b - world)
         with Dataset(run.folder / "results" / f"step_{k:04d}.nc") as data:
             _motion(tally, name, data, moved)
             step = _step(data, moved)
             if steps and step is not None:
                 _difference(tally, name, steps[0], step)
             steps += [step] if step is not None else []
-            if "exx" in data.variables:
+            if "exx" in data.variables and not neck[0]:
                 _strain(tally, name, data, _true_strain(replicate, frame, world, A))
         _gauges(tally, name, run.gauges["steps"][k], px, frame.point(world), moved)
-        _rigid(tally, name, run.moved, k, frame, world, A, b)
+        if not neck[0]:
+            _rigid(tally, name, run.moved, k, frame, world, A, b)
     if len(steps) == len(replicate.motions):
         _mean(tally, steps)
     return tally.cells

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.dense.field import dense_motion, dense_shape
-from core.field.points.images import MeasureImage
-from core.field.region.region import PointGrid
-from core.measure import MeasureOptions, ReferencePair
-from core.settings import INTERPOLATIONS, Interpolation
-from core.threads import available_threads, set_threads
+from stereorig.core.dense.field import dense_motion, dense_shape
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureOptions, ReferencePair
+from stereorig.core.settings import INTERPOLATIONS, Interpolation
+from stereorig.core.threads import available_threads, set_threads
 from tests.bench.accuracy.table import Row
 from tests.bench.speed.layout import table, thousands
 from tests.bench.speed.scene import capture, rig_of_size

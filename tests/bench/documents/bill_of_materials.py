@@ -2,7 +2,7 @@
 
 ::
 
-    python -m tests.bench.documents.bill_of_materials dist/stereorig-0.2.0-py3-none-any.whl
+    python -m tests.bench.documents.bill_of_materials dist/stereorig-0.3.0-py3-none-any.whl
 
 Versions and licences are those of the environment that runs it; extras and tests are not counted. In the wheel it lies where
 PEP 770 wants it, in ``.dist-info/sboms``.

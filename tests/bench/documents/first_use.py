@@ -66,7 +66,7 @@ def section() -> list[str]:
         "",
         "A service has kernels compiled in processes beside its worker: those that find a grid first, while the stages move, a shape's before a",
         "displacement's. A calibration waits for the first, each step for those that it needs, and says so. Compiled kernels hold for one Python, one numba and one",
-        "kind of processor, so the wheel brings none ([why](decisions/0035-kernels-compiled-aside.md)); the container image has them.",
+        "kind of processor, so the wheel brings none ([why](decisions/0035-kernels-compiled-locally.md)); the container image has them.",
         "",
     ]
 
@@ -80,7 +80,9 @@ def _install(folder: Path) -> Path:
     copy = folder / "sources"
     copy.mkdir()
     files = subprocess.run(["git", "ls-files", "-z", *_SOURCES], cwd=ROOT, capture_output=True, check=True).stdout
-    subprocess.run(["xargs", "-0", "cp", "--parents", "-t", str(copy)], cwd=ROOT, input=files, check=True)
+    subprocess.run(
+        ["xargs", "-0", "cp", "--parents", "--no-dereference", "-t", str(copy)], cwd=ROOT, input=files, check=True
+    )
     pip = ["-m", "pip", "--quiet", "--disable-pip-version-check"]
     subprocess.run([sys.executable, *pip, "wheel", "--no-deps", "-w", str(folder), str(copy)], check=True)
     subprocess.run([sys.executable, "-m", "venv", str(folder / "venv")], check=True)

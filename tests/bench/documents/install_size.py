@@ -98,7 +98,7 @@ def text(first_use: list[str]) -> str:
             *rows,
             "",
             "The client alone would need httpx and pydantic; it is part of the one package, since its models are the service's own. Extras: `xarray`",
-            "(data sets; with pandas), `progress` (bars), `aravis`, `dask`.",
+            "(data sets; with pandas), `progress` (bars), `aravis`, `pylon`, `dask`.",
             "",
             "What weighs most, questioned. LLVM comes with the compiler: without it kernels would have to be built for each processor, Python and system",
             "beforehand, or run without the vector units of the processor at hand. OpenCV's wheel has video codecs and neural networks that nothing here",

@@ -17,16 +17,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import core.errors
-import server.base.errors
-from server.api.protocol.problems import status_of_class
+import stereorig.core.errors
+import stereorig.server.base.errors
+from stereorig.server.api.protocol.problems import status_of_class
 from tests.support.requirements import ROOT
 
 LIST = ROOT / "server" / "static" / "problems.json"
 PACKAGES = ("core", "drivers", "server", "sim")
 _WORD = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
 #: answers that are made without an error of the tree: name, then the argument indices of status, code, cause, remedy
-_MAKERS = {"problem_response": (0, 1, 2, 3), "_unknown": (None, 0, 1, None)}
+_MAKERS = {"problem_response": (0, 1, 2, 3), "problem_answer": (0, 1, 2, 3), "_unknown": (None, 0, 1, None)}
 #: found in no sentence of the source: made of the web framework's own errors, or of several sentences
 _MORE = {
     "http_error": (400, "The request is not one that this service answers."),
@@ -51,8 +51,10 @@ class Kind:
     def __init__(self, name: str, base: Kind | None, node: ast.ClassDef) -> None:
         self.name, self.base = name, base
         #: what the status goes by: the class itself, or the nearest one above it that is public
-        self.known: type[core.errors.StereorigError] = (
-            getattr(core.errors, name, None) or getattr(server.base.errors, name, None) or base.known  # type: ignore[union-attr]
+        self.known: type[stereorig.core.errors.StereorigError] = (
+            getattr(stereorig.core.errors, name, None)
+            or getattr(stereorig.server.base.errors, name, None)
+            or base.known  # type: ignore[union-attr]
         )
         own = {
             statement.targets[0].id: statement.value.value
@@ -160,7 +162,7 @@ class Found:
 
     def __init__(self) -> None:
         self.statuses: set[int] = set()
-        self.kinds: set[type[core.errors.StereorigError]] = set()
+        self.kinds: set[type[stereorig.core.errors.StereorigError]] = set()
         self.causes: list[str] = []
         self.remedies: list[str] = []
 
@@ -168,8 +170,12 @@ class Found:
     def kind(self) -> str:
         """The class of the tree that its errors have in common: what a client raises."""
         lines = [kind.__mro__ for kind in sorted(self.kinds, key=lambda kind: kind.__name__)]
-        common = [c for c in lines[0] if all(c in line for line in lines)] if lines else [core.errors.StereorigError]
-        return next(c.__name__ for c in common if c.__module__ == core.errors.__name__)
+        common = (
+            [c for c in lines[0] if all(c in line for line in lines)]
+            if lines
+            else [stereorig.core.errors.StereorigError]
+        )
+        return next(c.__name__ for c in common if c.__module__ == stereorig.core.errors.__name__)
 
     def add(self, status: int | None, cause: str | None, remedy: str | None, *, kind: Kind | None = None) -> None:
         """Note one call that raises it."""
@@ -211,7 +217,7 @@ def scan() -> dict[str, dict[str, Any]]:
                 _error(found, classes[name], call, names)
             elif name in _RAISERS:
                 _raised_for(found, classes, name, call, names)
-            elif name in _MAKERS and path.is_relative_to(ROOT / "server" / "api"):
+            elif name in _MAKERS and path.relative_to(ROOT).parts[:2] in (("server", "api"), ("server", "front")):
                 _answer(found, name, call, names)
         for node in module.body:  # what controllers' own errors are called
             target = node.targets[0] if isinstance(node, ast.Assign) else None

@@ -9,9 +9,13 @@ back. A client in a process of its own reads the values from the WebSocket; anot
 from __future__ import annotations
 
 import argparse
+import asyncio
 import json
 import multiprocessing
 import os
+import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,15 +29,15 @@ import httpx
 import numpy as np
 import psutil
 
-from core.names import CAMERAS
-from server.config.rig_file import parse_config
-from server.worker.death import resident_mib
-from server.workflows.service import Service
-from sim.world import SimWorld
+from stereorig.core.names import CAMERAS
+from stereorig.server.http.supervisor import ServePlan, Supervisor
+from stereorig.server.worker.death import resident_mib
+from stereorig.sim.world import SimWorld
 from tests.bench.live.page import write_page
 from tests.bench.live.socket_client import ValueSocket
 from tests.bench.speed.scene import Rig, capture, rig_of_size
-from tests.support.service_rig import new_test, served, wait_for_rig
+from tests.support.requirements import ROOT
+from tests.support.service_rig import new_test, wait_for_rig
 from tests.support.tiny_rig import tiny_rig
 
 SIZE = (512, 480)
@@ -49,6 +53,8 @@ FASTER: tuple[dict[str, Any], ...] = (
     {"interpolation": "cubic", "subset_px": 15},
 )
 API = "/api/v1"
+#: variable with the file that lets the cameras play
+START = "STEREORIG_BENCH_START"
 RIG = tiny_rig(
     image_size_px="image_size_px = [512, 480]",
     name='name = "live bench"\ntrigger = "free"\nframe_rate_hz = 50.0',
@@ -86,17 +92,21 @@ class Run:
 
 
 class Playback:
-    """Takes the place of what the simulated world shows: the reference at rest, later pictures when it plays."""
+    """Takes the place of what the simulated world shows: the reference at rest, later pictures when it plays.
 
-    def __init__(self, rig: Rig) -> None:
+    It is in the rig process (`tests.bench.live.rig_host`), and plays once a file is there.
+    """
+
+    def __init__(self, rig: Rig, start: Path) -> None:
         self.pictures = [capture(rig, 0.3 * k) for k in range(PICTURES + 1)]
-        self.plays = False
+        self._start, self._plays = start, False
         self._began = time.monotonic()
 
     def expose(self, _world: SimWorld, cam: str, **_: object) -> np.ndarray:
         """Return the picture of this moment."""
         k = 0
-        if self.plays:
+        self._plays = self._plays or self._start.exists()
+        if self._plays:
             turn = int((time.monotonic() - self._began) * RATE_HZ) % (2 * PICTURES - 2)
             k = 1 + (turn if turn < PICTURES else 2 * PICTURES - 2 - turn)
         return np.asarray(self.pictures[k][CAMERAS.index(cam)])  # type: ignore[arg-type]
@@ -122,24 +132,46 @@ def read_values(port: int, path: str, out: Connection, seconds: float) -> None:
     out.send(found)
 
 
+def serve(folder: Path) -> int:
+    """Serve as ``stereorig serve`` does, on cameras that play."""
+    listener = socket.socket()
+    listener.bind(("127.0.0.1", 0))
+    url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+    data, config = str(folder / "data"), str(folder / "rig.toml")
+    log: dict[str, Any] = {"log_level": "warning", "log_format": "text"}
+    web = {"config": config, "data": data, "record": None, "host": "127.0.0.1", **log}
+    plan = ServePlan(Path(data), web, scheme="http", rig_module="tests.bench.live.rig_host", **log)
+    return asyncio.run(Supervisor(plan, listener, announce=lambda *_: print(url, flush=True)).run())
+
+
 @contextmanager
-def serving(playback: Playback) -> Iterator[tuple[Service, httpx.Client, str]]:
+def serving() -> Iterator[tuple[httpx.Client, str]]:
     """A service whose cameras play, and a test with its reference."""
-    SimWorld.expose = lambda world, cam, **more: playback.expose(world, cam, **more)  # type: ignore[method-assign,misc,assignment]
     rig = rig_of_size(SIZE)
     known = dict(zip(CAMERAS, (rig.pair.cam1, rig.pair.cam2), strict=True))
     cameras = {cam: camera.paper_parameters() for cam, camera in known.items()}
-    with (
-        TemporaryDirectory() as folder,
-        Service(parse_config(RIG), Path(folder) / "data") as service,
-        served(service) as client,
-    ):
-        wait_for_rig(client)
-        sent = client.post(f"{API}/calibrations:import", files={"file": ("c.json", json.dumps(cameras))})
-        test_id = new_test(client, calibration_id=str(sent.raise_for_status().json()["id"]))
-        client.post(f"{API}/tests/{test_id}/steps", json={"label": "reference"}).raise_for_status()
-        playback.plays = True
-        yield service, client, test_id
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "rig.toml").write_text(RIG)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "tests.bench.live.live", "--serve", name],
+            cwd=ROOT,
+            env={**os.environ, START: str(folder / "start")},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            assert process.stdout is not None
+            with httpx.Client(base_url=process.stdout.readline().strip(), timeout=60.0, trust_env=False) as client:
+                wait_for_rig(client, 300.0)
+                sent = client.post(f"{API}/calibrations:import", files={"file": ("c.json", json.dumps(cameras))})
+                test_id = new_test(client, calibration_id=str(sent.raise_for_status().json()["id"]))
+                client.post(f"{API}/tests/{test_id}/steps", json={"label": "reference"}).raise_for_status()
+                (folder / "start").touch()
+                yield client, test_id
+        finally:
+            process.terminate()
+            process.wait(60.0)
 
 
 def measure(
@@ -163,7 +195,7 @@ def measure(
             raise RuntimeError(f"it does not measure: {live['problem']}, {live['values']['reason']}")
         time.sleep(0.1)
     port = int(client.base_url.port or 0)
-    worker = _live_worker()
+    web, worker = _web_process(), _live_worker()
     ours, theirs = multiprocessing.Pipe()
     context = multiprocessing.get_context("spawn")
     reader = context.Process(target=read_values, args=(port, f"{API}/tests/{test_id}/live/ws", theirs, seconds))
@@ -174,7 +206,7 @@ def measure(
     while time.monotonic() < began + seconds + 0.5:
         if captures:
             run.captures += client.post(f"{API}/tests/{test_id}/steps", json={"label": "beside"}).status_code == 201
-        held = [resident_mib(os.getpid()) or 0.0, resident_mib(worker) or 0.0 if worker else 0.0]
+        held = [resident_mib(web) or 0.0, resident_mib(worker) or 0.0 if worker else 0.0]
         run.memory_mib.append((held[0], held[1]))
         loads.append(os.getloadavg()[0])
         time.sleep(max(0.0, 1.0 - (time.monotonic() - began) % 1.0))
@@ -194,14 +226,22 @@ def _busy_s(worker: int | None) -> float:
     return float("nan") if times is None else times.user + times.system
 
 
+def _web_process() -> int:
+    """Return the web process' id."""
+    for one in psutil.Process().children(recursive=True):
+        if "stereorig.server.cli.web" in one.cmdline():
+            return int(one.pid)
+    raise RuntimeError("there is no web process")
+
+
 def _live_worker() -> int | None:
-    """Process of the live measurement: of this one's, the busiest over its life, as long as no reader runs."""
+    """Process of the live measurement: of the web process', the busiest over its life."""
 
     def share(one: psutil.Process) -> float:
         times = one.cpu_times()
         return float((times.user + times.system) / max(time.time() - one.create_time(), 0.1))
 
-    children = psutil.Process().children(recursive=True)
+    children = psutil.Process(_web_process()).children(recursive=True)
     return int(max(children, key=share).pid) if children else None
 
 
@@ -211,10 +251,12 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=10.0, help="of the run at 1,024 points (default: 10)")
     parser.add_argument("--seconds", type=float, default=15.0, help="of each other number of points (default: 15)")
     parser.add_argument("--page", action="store_true", help="write docs/explanation/live_speed.md")
+    parser.add_argument("--serve", type=Path, metavar="FOLDER", help=argparse.SUPPRESS)
     args = parser.parse_args()
-    playback = Playback(rig_of_size(SIZE))
+    if args.serve is not None:
+        return serve(args.serve)
     runs, faster = [], []
-    with serving(playback) as (_, client, test_id):
+    with serving() as (client, test_id):
         main_run = measure(client, test_id, MAIN_POINTS, 60.0 * args.minutes, captures=True)
         print("with a stored step a second:", _line(main_run), flush=True)
         for points in FIELDS:

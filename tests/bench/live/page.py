@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import NullFormatter
 
-from server.workflows.live.series import KEPT_FRAMES
+from stereorig.server.workflows.live.series import KEPT_FRAMES
 from tests.bench.documents.prose import wrapped
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ import numpy as np
 from PIL import Image
 from playwright.sync_api import Browser, Page
 
-from server.demo.process import running_service
+from stereorig.server.demo.process import running_service
 from tests.bench.page.browser import browser, fresh_page
 from tests.bench.page.speed import wait_for_rig
 from tests.bench.speed.scaling import RIG, ROOT
@@ -178,7 +178,16 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, browser() as made:
         demo = arguments.data or Path(folder) / "demo"
         if arguments.data is None:
-            command = [sys.executable, "-m", "server.cli", "demo", "--experiment", "plate", "--out", str(demo)]
+            command = [
+                sys.executable,
+                "-m",
+                "stereorig.server.cli",
+                "demo",
+                "--experiment",
+                "plate",
+                "--out",
+                str(demo),
+            ]
             subprocess.run(command, check=True, cwd=ROOT)
         with running_service(RIG, demo / "data", Path(folder) / "service.log") as url:
             wait_for_rig(url)

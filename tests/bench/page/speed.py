@@ -24,7 +24,7 @@ import httpx
 import psutil
 from playwright.sync_api import Browser, Page
 
-from server.demo.process import running_service
+from stereorig.server.demo.process import running_service
 from tests.bench.documents.prose import wrapped
 from tests.bench.page.browser import browser, fresh_page
 from tests.bench.speed.scaling import RIG, ROOT, TEST, write_test
@@ -142,7 +142,7 @@ def _is_service(process: psutil.Process) -> bool:
         line = [*process.cmdline(), *(part for parent in process.parents() for part in parent.cmdline())]
     except psutil.Error:
         return False
-    return "server.cli" in line
+    return "stereorig.server.cli" in line
 
 
 def processor_s() -> float:

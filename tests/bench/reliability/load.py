@@ -30,7 +30,7 @@ from urllib.parse import urlsplit
 import httpx
 import numpy as np
 
-from sim.controllers.esp301 import SimESP301
+from stereorig.sim.controllers.esp301 import SimESP301
 from tests.bench.reliability.stage_stop import TEST_ID, analysed, busy_s, homed_bench, set_priority
 from tests.support.requirements import ROOT
 
@@ -183,7 +183,7 @@ class Script:
         time.sleep(self._dice.uniform(0.0, 0.03))
         known = len(self._controller.received)
         asked = time.monotonic()
-        self._client.post(f"{API}/stage/stop").raise_for_status()
+        self._client.post(f"{API}/stage:stop").raise_for_status()
         while not (came := [entry.at_s for entry in self._controller.received[known:] if entry.text == "ST"]):
             if time.monotonic() > deadline:
                 raise RuntimeError("a stop never reached the wire")

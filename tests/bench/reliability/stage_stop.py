@@ -28,13 +28,13 @@ from typing import Any
 import httpx
 import numpy as np
 
-from server.config.rig_file import parse_config
-from server.demo.process import running_service
-from server.formats.images import encode_tiff
-from sim.controllers.esp301 import SimESP301
-from sim.controllers.server import ControllerServer
-from sim.rig import SimRig
-from sim.world import SimWorld
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.demo.process import running_service
+from stereorig.server.formats.images import encode_tiff
+from stereorig.sim.controllers.esp301 import SimESP301
+from stereorig.sim.controllers.server import ControllerServer
+from stereorig.sim.rig import SimRig
+from stereorig.sim.world import SimWorld
 from tests.support.requirements import ROOT
 
 API = "/api/v1"
@@ -254,7 +254,7 @@ def time_stops(client: httpx.Client, controller: SimESP301, stops: int) -> list[
         time.sleep(dice.uniform(0.0, 0.03))
         known = len(controller.received)
         asked = time.monotonic()
-        client.post(f"{API}/stage/stop").raise_for_status()
+        client.post(f"{API}/stage:stop").raise_for_status()
         while not (arrived := [entry.at_s for entry in controller.received[known:] if entry.text == "ST"]):
             if time.monotonic() > asked + 5.0:
                 raise RuntimeError("a stop never reached the wire")

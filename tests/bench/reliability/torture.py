@@ -30,8 +30,9 @@ from typing import Any
 
 import httpx
 
-from server.formats.version import software_version
+from stereorig.server.formats.version import software_version
 from tests.bench.reliability.torture_lab import RIG, Lab, Pictures
+from tests.support.patience import Deadline
 from tests.support.requirements import ROOT
 
 KILLS_IN_A_FOLDER = 25
@@ -64,8 +65,8 @@ class Running:
 
     def url(self) -> str:
         """Wait until it prints where it serves."""
-        deadline = time.monotonic() + _WAIT_S
-        while time.monotonic() < deadline:
+        deadline = Deadline(_WAIT_S)
+        while deadline.left:
             line = self.out.read_text() if self.out.exists() else ""
             if line.endswith("\n"):
                 return next(word for word in line.split() if word.startswith("http://"))
@@ -78,10 +79,10 @@ class Running:
         """Send a signal and wait until the process is gone; return the processes of its own that were there."""
         children = children_of(self.pid)
         os.kill(self.pid, number)
-        deadline = time.monotonic() + _WAIT_S
+        deadline = Deadline(_WAIT_S)
         if self.process is not None:
-            self.process.wait(_WAIT_S)
-        while is_there(self.pid) and time.monotonic() < deadline:
+            self.process.wait(4 * _WAIT_S)
+        while is_there(self.pid) and deadline.left:
             time.sleep(0.002)
         return children
 
@@ -123,7 +124,7 @@ class Starter:
         if cold:
             with out.open("wb") as stdout, err.open("wb") as stderr:
                 process = subprocess.Popen(
-                    [*(FIRST if self.first else ()), sys.executable, "-m", "server.cli", *argv],
+                    [*(FIRST if self.first else ()), sys.executable, "-m", "stereorig.server.cli", *argv],
                     cwd=ROOT,
                     stdout=stdout,
                     stderr=stderr,
@@ -221,12 +222,12 @@ def bring_up(running: Running, outcome: Outcome, *, cold: bool, first: bool = Fa
     url = running.url()
     times = {"answers_s": time.monotonic() - running.began}
     with httpx.Client(base_url=url, timeout=30.0, trust_env=False, verify=False) as client:
-        deadline = time.monotonic() + _WAIT_S
+        deadline = Deadline(_WAIT_S)
         while (answer := client.get("/readyz")).status_code != 200:
             reasons = {reason["code"] for reason in answer.json()["reasons"]}
             if "captures_s" not in times and reasons <= {"worker_starting"}:
                 times["captures_s"] = time.monotonic() - running.began
-            if time.monotonic() > deadline:
+            if deadline.is_over:
                 raise RuntimeError(f"the service is not ready: {answer.text}\n{running.err.read_text()[-3000:]}")
             time.sleep(0.02)
     times["ready_s"] = time.monotonic() - running.began
@@ -259,8 +260,8 @@ def torture_folder(starter: Starter, lab: Lab, outcome: Outcome, kills: int, rng
             break
         threads = lab.begin(act, url)
         if act in JOBS:  # by how far the job is, and not by the clock: on a busy machine none would ever get far
-            goal, deadline = rng.uniform(0.0, 1.1), time.monotonic() + MAX_JOB_S
-            while lab.progress < min(goal, 1.0) and time.monotonic() < deadline:
+            goal, deadline = rng.uniform(0.0, 1.1), Deadline(MAX_JOB_S)
+            while lab.progress < min(goal, 1.0) and deadline.left:
                 time.sleep(0.002)
         time.sleep(rng.uniform(0.0, ACTS[act][1]))
         lab.killed.set()  # what fails from now on fails for that
@@ -279,9 +280,9 @@ def outcome_starts(outcome: Outcome) -> int:
 
 def _kill(running: Running, act: str, outcome: Outcome) -> None:
     children = running.end(signal.SIGKILL)
-    dead = time.monotonic()
+    dead, deadline = time.monotonic(), Deadline(10.0)
     while any(is_there(pid) for pid in children):
-        if time.monotonic() > dead + 10.0:
+        if deadline.is_over:
             outcome.wrong.append(f"a process of a killed service is still there after 10 s ({act})")
             break
         time.sleep(0.002)

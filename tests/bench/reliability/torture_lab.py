@@ -21,11 +21,11 @@ from typing import Any
 import httpx
 import numpy as np
 
-from server.config.rig_file import parse_config
-from server.formats.images import encode_tiff
-from server.store.verify import verify
-from sim.rig import SimRig
-from sim.world import SimWorld
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.formats.images import encode_tiff
+from stereorig.server.store.verify import verify
+from stereorig.sim.rig import SimRig
+from stereorig.sim.world import SimWorld
 from tests.support.tiny_rig import tiny_rig
 
 FINAL = ("succeeded", "failed", "cancelled", "interrupted")
@@ -282,7 +282,7 @@ class Lab:
             self.counts["deleted"] += 1
             if self.random.random() < 0.5:
                 where.add("there")
-                client.post(f"/trash/{entry['id']}/restore").raise_for_status()
+                client.post(f"/trash/{entry['id']}:restore").raise_for_status()
                 where.discard("trash")
 
     # what must be after the next start -------------------------------------------------------------------------

@@ -19,8 +19,8 @@ import time
 import types
 from typing import Any
 
-from server.base.priority import end_with_parent
-from server.worker.process import pin_threads
+from stereorig.server.base.priority import end_with_parent
+from stereorig.server.worker.process import pin_threads
 
 
 def load() -> None:
@@ -31,30 +31,29 @@ def load() -> None:
     cv2.setNumThreads(1)
     import uvicorn  # noqa: F401
 
-    import server.api.app
-    import server.cli.operation.serve
-    import server.compute.calibration.fit
-    import server.compute.measurement
-    import server.compute.noise_fit
+    import stereorig.server.api.app
+    import stereorig.server.cli.operation.serve
+    import stereorig.server.compute.calibration.fit
+    import stereorig.server.compute.measurement
+    import stereorig.server.compute.noise_fit
 
-    server.compute.measurement.compile_here(1)
+    stereorig.server.compute.measurement.compile_here(1)
 
 
 def fork_workers() -> None:
     """Let the services of this process fork their workers too, before they have threads and locks of their own."""
-    import server.worker.embedded
+    import stereorig.server.worker.embedded
 
     fork = multiprocessing.get_context("fork")
-    server.worker.embedded.multiprocessing = types.SimpleNamespace(get_context=lambda _: fork)  # type: ignore[attr-defined]
-    start = server.worker.embedded.start_worker
+    stereorig.server.worker.embedded.multiprocessing = types.SimpleNamespace(get_context=lambda _: fork)  # type: ignore[attr-defined]
+    start = stereorig.server.worker.embedded.ComputeWorker.start
 
-    def started(*arguments: Any, **more: Any) -> server.worker.embedded.ComputeWorker:
-        worker = start(*arguments, **more)
+    def started(worker: stereorig.server.worker.embedded.ComputeWorker) -> None:
+        start(worker)
         while worker.pid is None:
             time.sleep(0.001)
-        return worker
 
-    server.worker.embedded.start_worker = started
+    stereorig.server.worker.embedded.ComputeWorker.start = started  # type: ignore[method-assign]
 
 
 def serve(order: dict[str, Any]) -> None:
@@ -67,7 +66,7 @@ def serve(order: dict[str, Any]) -> None:
         for fd, path in ((1, order["out"]), (2, order["err"])):
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644), fd)
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-        from server.cli.main import main
+        from stereorig.server.cli.main import main
 
         status = main(order["argv"])
     except BaseException:  # noqa: BLE001 - a client of the service finds it there

@@ -110,7 +110,7 @@ def assemblies() -> dict[str, str]:
     """Compile the loops over pixels for the processor that numba was given, and return their assembly."""
     from numba import float32, float64, int64, njit, void
 
-    from core.matching.kernels.loops import compare_cubic, compare_quintic
+    from stereorig.core.matching.kernels.loops import compare_cubic, compare_quintic
 
     signature = void(float32[::1], int64, int64, float32[::1], float32[:, ::1], int64, float64[::1])
 

@@ -17,7 +17,7 @@ import matplotlib as mpl
 
 mpl.use("Agg")
 
-from core.threads import available_threads, set_threads
+from stereorig.core.threads import available_threads, set_threads
 from tests.bench.dense import speed as bench_dense
 from tests.bench.speed import assembly
 from tests.bench.speed import kernel as bench_kernel

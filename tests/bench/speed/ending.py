@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from core.matching import MatchOptions, fit_motion, prepare
-from core.settings import Interpolation
+from stereorig.core.matching import MatchOptions, fit_motion, prepare
+from stereorig.core.settings import Interpolation
 from tests.bench.accuracy.noise import SHIFT_PX, Sample
 from tests.bench.accuracy.noise_bound import bound, displacement_bound
 from tests.bench.accuracy.noise_scenes import Window, digitise
@@ -18,7 +18,7 @@ NOISE = 2.0
 FULL_PX = 1e-6  # what full iteration may leave unmade
 HOW = """A fit stops where little is left to move, and mostly after one step from the step before. What that costs is in the table of targets: motions
 from starts some 0.05 px away on {repeats} sets of images of the paper's rig with noise 2 of 255, beside the same fits iterated until 1e-6 px is left.
-The bound is that of [the noise page](accuracy/noise.md); bias is the mean difference of the two, the worst of u, v and w."""
+Accuracy defines [the bound](accuracy.md#random-error-and-its-bound); bias is the mean difference of the two, the worst of u, v and w."""
 
 
 @dataclass(frozen=True)

@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from core.arrays import Float
-from core.cameras.camera import RigidTransform
-from core.cameras.stereo import StereoPair
-from core.field.region.region import PointGrid
-from core.matching.fit import fit_motion, fit_shape
-from core.matching.image import ImageData, prepare
-from core.matching.options import MatchOptions
-from core.settings import Interpolation
-from core.threads import set_threads
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import RigidTransform
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.matching.fit import fit_motion, fit_shape
+from stereorig.core.matching.image import ImageData, prepare
+from stereorig.core.matching.options import MatchOptions
+from stereorig.core.settings import Interpolation
+from stereorig.core.threads import set_threads
 from tests.bench.accuracy.paper_rig import load_rig, plane_scene
 
 KINDS: tuple[Interpolation, ...] = ("cubic", "quintic")

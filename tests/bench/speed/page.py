@@ -1,9 +1,10 @@
-"""Writes ``docs/explanation/performance.md`` and its plots from what the bench measured."""
+"""Writes the figures of ``docs/explanation/performance.md``, its tables and its plots."""
 
 from __future__ import annotations
 
 import os
 import platform
+import re
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.bench.accuracy.table import Row
-from tests.bench.documents.prose import wrapped
+from tests.bench.documents.prose import marked, wrapped, write_tables
 from tests.bench.speed import layout
 from tests.bench.speed.assembly import HERE, LoopCount
 from tests.bench.speed.ceilings import Ceilings
@@ -344,31 +345,41 @@ ASSEMBLY_HOW = """Instructions of one turn of the innermost loop (eight pixels o
 it was run elsewhere. `haswell` and `znver3` have AVX2, the other two AVX-512. {gathers}; taps come as rows of four (`vmovups` and `vinsertf128`; a quintic's
 fifth and sixth taps as pairs). An instruction counts in one class; those with a place on the stack are counted besides."""
 
-HEAD = """# Performance
-
-Everything on this page was measured by `make bench` in one run, which writes the page anew; nothing is typed in. Timings are those of this machine at that hour;
-ratios within the page travel better than figures.
-"""
-
 
 def write_page(report: Report) -> Path:
-    """Write the page and its plots; returns its path."""
-    rows = [target_line(row) for row in targets(report)]
+    """Write tables and plots, and the figures of the page; returns the page."""
     sections: list[tuple[str, list[str]]] = [
-        ("Machine", [*(f"- {line}" for line in machine())]),
-        ("Targets", [table(["what", "measured", "unit", "asked", "met"], rows)]),
-        (peers_page.title(), peers_page.text(report.ours, report.peers) if report.ours else []),
+        ("Peers", peers_page.text(report.ours, report.peers) if report.ours else []),
         ("One point", kernel_text(report) if report.rates else []),
-        ("The machine's limits", machine_text(report) if report.ceilings else []),
+        ("Limits of the machine", machine_text(report) if report.ceilings else []),
         ("Generated code", assembly_text(report)),
         *((title, [text]) for title, text in report.more),
     ]
-    page = [HEAD]
-    for title, parts in sections:
-        if parts:
-            glue = "\n" if title == "Machine" else "\n\n"
-            page += [f"## {title}\n", glue.join(parts) + "\n"]
-    path = layout.DOCS / "explanation" / "performance.md"
-    path.parent.mkdir(exist_ok=True)
-    path.write_text(wrapped("\n".join(page)).rstrip() + "\n")
-    return path
+    texts = [(title, "\n\n".join(parts)) for title, parts in sections if parts]
+    return write_sections(machine(), [target_line(row) for row in targets(report)], texts)
+
+
+def write_sections(about: list[str], rows: list[list[str]], sections: list[tuple[str, str]]) -> Path:
+    """Write a table for each section, and between the page's marks the machine, headline rows and sections without tables."""
+    page = layout.DOCS / "explanation" / "performance.md"
+    folder = page.with_suffix("")
+    head = ["what", "measured", "unit", "asked", "met"]
+    write_tables("\n\n".join(["\n".join(f"- {line}" for line in about), table(head, rows)]), folder, "targets")
+    asked = [row for row in rows if row[3]]
+    missed = [row for row in asked if row[4] != "yes"]
+    shown = [row for row in asked if row in missed or not any(word in row[0] for word in _VARIANTS)]
+    parts = [
+        "\n".join(f"- {line}" for line in about),
+        table(head, shown),
+        f"Missed: {len(missed)} of the {len(asked)} figures that have a limit.",
+    ]
+    for title, text in sections:
+        if not write_tables(text, folder, "_".join(re.findall("[a-z0-9]+", title.lower()))):
+            parts += [f"### {title}", text]
+    text = wrapped("\n\n".join(parts))
+    page.write_text(marked(page.read_text(encoding="utf-8"), "measured", text), encoding="utf-8")
+    return page
+
+
+#: rows of these are not shown on the page unless they miss their limit
+_VARIANTS = ("+strain", "quintic s", "points lost")

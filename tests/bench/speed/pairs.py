@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import tifffile
 
-from core.arrays import Float
-from core.cameras.camera import Camera, RigidTransform
-from core.cameras.lens import OpenCVLens, SeidelLens
-from core.cameras.stereo import StereoPair
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.core.cameras.lens import OpenCVLens, SeidelLens
+from stereorig.core.cameras.stereo import StereoPair
 from tests.bench.accuracy.paper_rig import Rig, load_rig, plane_scene, true_points, turn
 
 NOISE = 2.0  # of 255

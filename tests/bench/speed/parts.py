@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from core.matching.arguments import reference_of
-from core.matching.image import PAD
-from core.matching.kernels.linear import covariance_of_last, solve
-from core.matching.kernels.loops import LANES, compare_cubic, compare_quintic, sum_reference
-from core.matching.kernels.point import make_point
-from core.matching.kernels.warp import lens_jacobian, set_up_warp
-from core.matching.options import SPLINE_ORDER
-from core.settings import Interpolation
+from stereorig.core.matching.arguments import reference_of
+from stereorig.core.matching.image import PAD
+from stereorig.core.matching.kernels.linear import covariance_of_last, solve
+from stereorig.core.matching.kernels.loops import LANES, compare_cubic, compare_quintic, sum_reference
+from stereorig.core.matching.kernels.point import make_point
+from stereorig.core.matching.kernels.warp import lens_jacobian, set_up_warp
+from stereorig.core.matching.options import SPLINE_ORDER
+from stereorig.core.settings import Interpolation
 from tests.bench.speed.kernel import KernelScene
 
 DEGREE = 1  # plane patches

@@ -28,11 +28,11 @@ import netCDF4
 import numpy as np
 import psutil
 
-from server.config.rig_file import load_config
-from server.demo.process import running_service
-from server.formats.images import encode_tiff
-from sim.rig import SimRig
-from sim.world import SimWorld
+from stereorig.server.config.rig_file import load_config
+from stereorig.server.demo.process import running_service
+from stereorig.server.formats.images import encode_tiff
+from stereorig.sim.rig import SimRig
+from stereorig.sim.world import SimWorld
 from tests.bench.documents.prose import wrapped
 from tests.support.requirements import ROOT
 

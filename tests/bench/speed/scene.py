@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from core.calibration import CalibrationOptions, NominalCamera
-from core.calibration.expect import expect
-from core.cameras.camera import Camera
-from core.cameras.lens import SeidelLens
-from core.cameras.stereo import StereoPair
-from core.names import CAMERAS
-from core.target import GridTarget
-from server.formats.images import encode_tiff
-from sim.scene import Scene
+from stereorig.core.calibration import CalibrationOptions, NominalValues
+from stereorig.core.calibration.expect import expect
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.cameras.lens import SeidelLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.names import CAMERAS
+from stereorig.core.target import GridTarget
+from stereorig.server.formats.images import encode_tiff
+from stereorig.sim.scene import Scene
 from tests.bench.accuracy.paper_rig import Rig, load_rig, plane_scene, turn
 
 SEQUENCE_SIZE = (1200, 1100)
@@ -143,7 +143,7 @@ def _covariances(rig: Rig) -> dict[str, Any]:
     pitch_mm = 3.0 * min(rig.size_px) / min(SEQUENCE_SIZE)  # it fills the same share of a smaller image
     target = GridTarget(pitch_mm=pitch_mm, lines=(11, 11), line_width_mm=0.05 * pitch_mm, node_tolerance_mm=0.002)
     one, two = (
-        NominalCamera(
+        NominalValues(
             rig.size_px,
             phd_px=float(camera.paper_parameters()["phd_px"]),
             standoff_mm=float(camera.paper_parameters()["z0_mm"]),

@@ -23,13 +23,13 @@ from typing import Any
 
 import numpy as np
 
-from core.field.growth.seed import match_seeds
-from core.field.growth.state import begin, prepare
-from core.field.points.result import Field
-from core.field.region.region import PointGrid
-from core.measure import MeasureImage, MeasureOptions, ReferencePair
-from core.threads import available_threads, set_threads
-from server.formats.images import read_image
+from stereorig.core.field.growth.seed import match_seeds
+from stereorig.core.field.growth.state import begin, prepare
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureImage, MeasureOptions, ReferencePair
+from stereorig.core.threads import available_threads, set_threads
+from stereorig.server.formats.images import read_image
 from tests.bench.accuracy.paper_rig import ROOT
 from tests.bench.speed.scene import SEQUENCE_SIZE, SequenceFiles, sequence_files
 
@@ -41,20 +41,20 @@ SEED_SIZE = (2448, 2048)
 LARGE_SIZE, LARGE_POINTS = (6000, 4000), 250_000
 STAGES = (
     # what, where it is looked up (module, or module:class), under which name
-    ("read and decode", "server.compute.sequence", "read_image"),
-    ("splines", "core.field.points.images", "prepare"),
-    ("fit", "core.field.points.fitter", "fit_motion"),
-    ("checks", "core.field.growth.check", "apply_validity_checks"),
-    ("assemble", "core.field.growth.field", "assemble"),
-    ("parts of subsets", "core.field.growth.check", "reject_straddling"),
-    ("cameras' offsets", "server.compute.camera_watch:CameraWatch", "judge"),
-    ("systematic", "server.compute.beside", "terms_of"),
-    ("common factor", "core.field.common:CommonParts", "of"),
-    ("strain", "server.compute.sequence", "strain_of_step"),
-    ("window's bias", "server.compute.sequence", "with_strain"),
-    ("summary", "server.compute.sequence", "summarise"),
-    ("strain's summary", "server.compute.sequence", "summarise_strain"),
-    ("write", "server.compute.sequence", "write_field"),
+    ("read and decode", "stereorig.server.compute.sequence", "read_image"),
+    ("splines", "stereorig.core.field.points.images", "prepare"),
+    ("fit", "stereorig.core.field.points.fitter", "fit_motion"),
+    ("checks", "stereorig.core.field.growth.check", "apply_validity_checks"),
+    ("assemble", "stereorig.core.field.growth.field", "assemble"),
+    ("parts of subsets", "stereorig.core.field.growth.check", "reject_straddling"),
+    ("cameras' offsets", "stereorig.server.compute.camera_watch:CameraWatch", "judge"),
+    ("systematic", "stereorig.server.compute.beside", "terms_of"),
+    ("common factor", "stereorig.core.field.common:CommonParts", "of"),
+    ("strain", "stereorig.server.compute.sequence", "strain_of_step"),
+    ("window's bias", "stereorig.server.compute.sequence", "with_strain"),
+    ("summary", "stereorig.server.compute.sequence", "summarise"),
+    ("strain's summary", "stereorig.server.compute.sequence", "summarise_strain"),
+    ("write", "stereorig.server.compute.sequence", "write_field"),
 )
 #: on threads of their own
 BESIDE = (
@@ -194,7 +194,7 @@ def timed_stages() -> Iterator[list[tuple[str, float, float, float]]]:
 
 def child_sequence(job: dict[str, Any]) -> dict[str, Any]:
     """In a process of its own: one ``stereorig measure`` over a sequence, and when each file was there."""
-    from server.cli.main import main
+    from stereorig.server.cli.main import main
 
     out = Path(job["out"])
     warm = [*job["arguments"][: job["arguments"].index("--out")], "--out", str(out / "warm")]
@@ -256,7 +256,7 @@ def first_field(folder: Path, *, steps: int, interpolation: str = "cubic", cache
     out = folder / f"first_{steps}"
     shutil.rmtree(out, ignore_errors=True)
     arguments = files.arguments(ROI, out, "--interpolation", interpolation)
-    return run_child(["-m", "server.cli", *arguments], cache=cache)
+    return run_child(["-m", "stereorig.server.cli", *arguments], cache=cache)
 
 
 def cold_compile(folder: Path, interpolation: str = "cubic") -> tuple[Used, Used]:
@@ -355,7 +355,7 @@ def memory_of_large_pair(folder: Path, *, steps: int = 0) -> Used:
     step = int((width * height / LARGE_POINTS) ** 0.5)  # whole pixels: some more points rather than fewer
     roi = f"60,60,{60 + width},{60 + height}"
     more = ["--interpolation", "cubic", "--step", str(step)]
-    return run_child(["-m", "server.cli", *files.arguments(roi, out, *more)])
+    return run_child(["-m", "stereorig.server.cli", *files.arguments(roi, out, *more)])
 
 
 def memory_of_sequence(folder: Path, steps: int) -> Used:
@@ -363,7 +363,7 @@ def memory_of_sequence(folder: Path, steps: int) -> Used:
     files = sequence_files(folder, steps=steps)
     out = folder / f"memory_{steps}"
     shutil.rmtree(out, ignore_errors=True)
-    return run_child(["-m", "server.cli", *files.arguments(ROI, out, "--interpolation", "cubic")])
+    return run_child(["-m", "stereorig.server.cli", *files.arguments(ROI, out, "--interpolation", "cubic")])
 
 
 _ME = ["-m", "tests.bench.speed.sequence"]

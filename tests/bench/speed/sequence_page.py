@@ -10,7 +10,7 @@ import matplotlib as mpl
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
-from core.threads import available_threads
+from stereorig.core.threads import available_threads
 from tests.bench.accuracy.table import Row
 from tests.bench.speed import sequence as bench
 from tests.bench.speed.layout import of_threads, save, table, thousands

@@ -18,11 +18,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from core.boards import BoardTarget, detect_target, find_target
-from core.names import CAMERAS
-from core.target import GridTarget
-from server.formats.calibrations.from_folder import calibrate_folder
-from server.formats.images import read_image
+from stereorig.core.boards import BoardTarget, detect_target, find_target
+from stereorig.core.names import CAMERAS
+from stereorig.core.target import GridTarget
+from stereorig.server.formats.calibrations.from_folder import calibrate_folder
+from stereorig.server.formats.images import read_image
 from tests.support.board_views import camera_pair, hand_poses, render_views, sim_target, write_views
 
 SIZE_PX = (4096, 3000)

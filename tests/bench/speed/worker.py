@@ -17,7 +17,7 @@ from tests.bench.speed.peers.job import measure_runs, read_job
 
 def measure(job: dict[str, Any], run: dict[str, Any], out: Path) -> None:
     """One call of ``stereorig measure`` for a run of the job."""
-    from server.cli.main import main
+    from stereorig.server.cli.main import main
 
     last = run["steps"] + 1
     options = {"strain": "off", **run["options"]}  # peers make none
@@ -48,7 +48,7 @@ def measure(job: dict[str, Any], run: dict[str, Any], out: Path) -> None:
 
 def read_fields(out: Path, steps: int) -> dict[str, Any]:
     """Results (N, 3) and (steps, N, 3) as files hold them, in the calibration's system frame, which is camera 1's here."""
-    from server.formats.results.reading import read_field
+    from stereorig.server.formats.results.reading import read_field
 
     fields = [read_field(out / f"step_{n:04d}.nc") for n in range(steps + 1)]
     first = fields[0]
@@ -67,7 +67,7 @@ def read_fields(out: Path, steps: int) -> dict[str, Any]:
 def main() -> int:
     """Run the job."""
     job = read_job()
-    from server.formats.version import software_version
+    from stereorig.server.formats.version import software_version
 
     measure_runs(
         job,

@@ -36,7 +36,8 @@ class TrueTest:
         path = self.path.parent / test_id
         (path / "steps").mkdir(parents=True)
         (path / "analyses").mkdir()
-        others = [one.name for one in self.path.iterdir() if one.is_file() and one.name != "test.json"]
+        others = [one.name for one in self.path.iterdir() if one.is_file() and one.suffix != ".json"]
+        others += [one.name for one in self.path.glob("calibration*.json")]
         for name in others:
             shutil.copyfile(self.path / name, path / name)
         self.add_steps(path, range(steps))

@@ -27,7 +27,7 @@ from typing import Any
 import httpx
 import psutil
 
-from server.workflows.service import Service
+from stereorig.server.workflows.service import Service
 from tests.bench.years.folder import multiply
 from tests.support.requirements import ROOT
 from tests.support.service_rig import served, tiny_config, true_cameras, wait_for_rig
@@ -87,7 +87,18 @@ def running(folder: Path) -> Iterator[tuple[psutil.Process, httpx.Client, float]
     rig = folder / "rig.toml"
     rig.write_text(tiny_rig())
     began = time.monotonic()
-    command = [sys.executable, "-m", "server.cli", "serve", "--config", rig, "--data", folder / "data", "--port", "0"]
+    command = [
+        sys.executable,
+        "-m",
+        "stereorig.server.cli",
+        "serve",
+        "--config",
+        rig,
+        "--data",
+        folder / "data",
+        "--port",
+        "0",
+    ]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None

@@ -9,7 +9,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from server.formats.version import software_version
+from stereorig.server.formats.version import software_version
 from tests.bench.documents.prose import wrapped
 from tests.bench.years.measure import Cost
 from tests.bench.years.soak import MACHINE, Soak, verdicts

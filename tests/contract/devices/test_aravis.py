@@ -12,10 +12,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from core.errors import CameraError
-from drivers.cameras.protocol import CameraOptions, CameraSettings, Frame, FrameGrabber, FrameStatus
-from drivers.registry import discover_cameras, make_camera
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.protocol import CameraOptions, CameraSettings, Frame, FrameGrabber, FrameStatus
+from stereorig.drivers.registry import discover_cameras, make_camera
 from tests.support.fake_gige import FakeCamera, small_sensor_xml, strict_xml, what_is_missing
+from tests.support.patience import busy
 from tests.support.requirements import missing
 
 RETURN_S = 3.0
@@ -152,7 +153,7 @@ def test_an_address_where_nobody_answers_fails_soon(plain: FakeCamera, make: Mak
     grabber = make(plain.address.removesuffix(".2") + ".77", opened=False)
     begin = time.monotonic()
     assert _refused(grabber.open).code == "camera_lost"
-    assert time.monotonic() - begin < 2.0
+    assert time.monotonic() - begin < 2.0 * busy()
 
 
 @pytest.mark.fault(21)
@@ -163,7 +164,7 @@ def test_a_held_camera_is_busy_at_once_and_free_after_its_holder(plain: FakeCame
     error = _refused(second.open)
     assert error.code == "camera_busy"
     assert "controls" in error.cause
-    assert time.monotonic() - begin < 1.0
+    assert time.monotonic() - begin < 1.0 * busy()
     holder.close()
     second.open()
     assert second.describe().serial == plain.serial
@@ -500,7 +501,7 @@ def test_waiting_for_a_frame_does_not_hold_up_other_threads(plain: FakeCamera, m
     begin = time.monotonic()
     for _ in range(100):
         time.sleep(0.001)  # each must get the interpreter back from the waiting thread, which checks every 20 ms
-    assert time.monotonic() - begin < 1.0
+    assert time.monotonic() - begin < 1.0 * busy()
     grabber.close()
     thread.join(2.0)
     assert not thread.is_alive()
@@ -536,13 +537,13 @@ def test_a_camera_that_waits_for_a_trigger_is_missed_within_a_second(plain: Fake
     seconds = time.monotonic() - lost
     print(f"{how}: idle camera missed after {seconds * 1e3:.0f} ms")
     assert error.code == "camera_lost"
-    assert seconds < 1.0
+    assert seconds < 1.0 * busy()
     # nothing that the service calls often waits for it
     begin = time.monotonic()
     grabber.statistics()
     grabber.describe()
     grabber.close()
-    assert time.monotonic() - begin < 0.7
+    assert time.monotonic() - begin < 0.7 * busy()
 
 
 @pytest.mark.fault(11)
@@ -555,7 +556,7 @@ def test_disarming_does_not_wait_for_a_camera_that_is_gone(plain: FakeCamera, ma
     grabber.disarm()
     assert _refused(lambda: grabber.next_frame(0.1)).code == "camera_lost"
     grabber.close()
-    assert time.monotonic() - begin < 1.5
+    assert time.monotonic() - begin < 1.5 * busy()
 
 
 @pytest.mark.fault(11)
@@ -586,7 +587,7 @@ def test_it_works_again_soon_after_a_long_absence(plain: FakeCamera, make: Make,
     assert kept.code == "camera_lost"
     begin = time.monotonic()
     grabber.close()
-    assert time.monotonic() - begin < 0.7
+    assert time.monotonic() - begin < 0.7 * busy()
     end = begin + 4.0
     while time.monotonic() < end:  # as the service does: it tries all the time
         assert _refused(grabber.open).code == "camera_lost"
@@ -625,7 +626,7 @@ def test_closing_while_it_is_being_opened_leaves_it_closed_and_free(plain: FakeC
     time.sleep(0.1)
     begin = time.monotonic()
     grabber.close()
-    assert time.monotonic() - begin < 0.7
+    assert time.monotonic() - begin < 0.7 * busy()
     plain.resume()
     thread.join(10.0)
     assert ended == ["camera_lost"]

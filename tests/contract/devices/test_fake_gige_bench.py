@@ -16,9 +16,9 @@ from pathlib import Path
 import httpx
 import pytest
 
-from server.cli import main
-from server.doctor import Check, Report
-from server.rig.devices import DeviceListing
+from stereorig.server.cli import main
+from stereorig.server.doctor import AllChecks, Check
+from stereorig.server.rig.devices import DeviceListing
 from tests.support.requirements import ROOT, missing
 
 CONFIG = ROOT / "config" / "bench_fake_gige.toml"
@@ -34,7 +34,7 @@ ip addr add 127.0.0.2/8 dev lo
 setpriv --pdeathsig KILL arv-fake-gv-camera-0.8 -i 127.0.0.1 -s BENCH1 &
 CAM1=$!
 setpriv --pdeathsig KILL arv-fake-gv-camera-0.8 -i 127.0.0.2 -s BENCH2 &
-setpriv --pdeathsig KILL "$PYTHON" -c 'from server.cli import main; main(["simstage", "--port", "5301"])' &
+setpriv --pdeathsig KILL "$PYTHON" -c 'from stereorig.server.cli import main; main(["simstage", "--port", "5301"])' &
 "$PYTHON" -m tests.contract.devices.test_fake_gige_bench $CAM1
 """
 
@@ -61,7 +61,7 @@ def examine_all(out: Path, cam1: int) -> None:
     run(out / "free.json", *doctor, "2", "--config", str(free))
     assert run(out / "pulses.json", *doctor, "1", "--config", str(pulses)) == 1
     serve = ["serve", "--config", str(CONFIG), "--data", str(out / "data"), "--port", "8000"]
-    code = "import sys; from server.cli import main; main(sys.argv[1:])"
+    code = "import sys; from stereorig.server.cli import main; main(sys.argv[1:])"
     with subprocess.Popen(["setpriv", "--pdeathsig", "KILL", sys.executable, "-c", code, *serve]) as service:
         ask(str(out / "held.json"))
         run(out / "taken.json", "devices")
@@ -116,7 +116,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def checks(path: Path) -> dict[tuple[str, str], Check]:
-    report = Report.model_validate_json(path.read_text())
+    report = AllChecks.model_validate_json(path.read_text())
     return {(check.part, check.name): check for check in report.checks}
 
 

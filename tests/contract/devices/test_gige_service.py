@@ -20,8 +20,8 @@ import httpx
 import numpy as np
 import pytest
 
-from server.config.rig_file import parse_config
-from sim.rig import SimRig
+from stereorig.server.config.rig_file import parse_config
+from stereorig.sim.rig import SimRig
 from tests.support.namespace import Namespace, NamespaceTransport, namespaces_missing
 from tests.support.requirements import ROOT, missing
 from tests.support.service_rig import SMALL, TINY, new_test, wait_for_job
@@ -67,7 +67,9 @@ def bench_file(path: Path, text: str, devices: tuple[str, str], rig: str, size: 
 @contextlib.contextmanager
 def service(network: Namespace, config: Path, data: Path) -> Iterator[httpx.Client]:
     """`stereorig serve` inside the namespace; yields a client once its stage is homed."""
-    command = network.command(sys.executable, "-m", "server.cli", "serve", "--config", str(config), "--port", "0")
+    command = network.command(
+        sys.executable, "-m", "stereorig.server.cli", "serve", "--config", str(config), "--port", "0"
+    )
     with (data.parent / "serve.log").open("w+") as log:
         process = subprocess.Popen(
             [*command, "--data", str(data)], cwd=ROOT, stdout=subprocess.PIPE, stderr=log, text=True

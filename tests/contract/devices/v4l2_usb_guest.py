@@ -13,13 +13,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.errors import CameraError
-from drivers.acquisition.frame_counter import SequenceReader
-from drivers.acquisition.reader import CameraReader
-from drivers.acquisition.unit import CameraUnit
-from drivers.cameras.protocol import CameraOptions, CameraSettings, FrameGrabber, FrameStatus
-from drivers.cameras.v4l2 import discover, make
+from stereorig.core.errors import CameraError
+from stereorig.core.names import CAMERAS
+from stereorig.drivers.acquisition.frame_counter import SequenceReader
+from stereorig.drivers.acquisition.reader import CameraReader
+from stereorig.drivers.acquisition.unit import CameraUnit
+from stereorig.drivers.cameras.protocol import CameraOptions, CameraSettings, FrameGrabber, FrameStatus
+from stereorig.drivers.cameras.v4l2 import discover, make
+from stereorig.server.config.rig_file import load_config
+from stereorig.server.rig import build
 from tests.support.camera_bench import frames_of, seconds_until
+from tests.support.requirements import ROOT
 from tests.support.usb_camera import UsbCamera
 
 
@@ -304,3 +308,26 @@ def test_the_rig_s_camera_comes_back_with_its_settings_within_three_seconds(tmp_
         unit.release()
         camera.unplug()
         fresh.unplug()
+
+
+@pytest.mark.fault(62)
+def test_both_cameras_of_the_laboratorys_rig_file_take_its_settings() -> None:
+    config = load_config(ROOT / "config" / "lab_v4l2_smc100.toml")
+    webcams = {cam: UsbCamera(port, cam, sizes=((320, 180), (1280, 960))) for port, cam in enumerate(CAMERAS)}
+    try:
+        for cam, webcam in webcams.items():
+            own = config.model_copy(update={cam: config.camera(cam).model_copy(update={"device": webcam.plug()})})
+            unit = build.make_unit(own, cam)
+            try:
+                unit.open(build.first_settings(own, cam))
+                taken = unit.settings
+                assert (taken.pixel_format, taken.region_px, taken.exposure_ms) == ("GREY", (0, 0, 1280, 960), 10.0)
+                assert taken.frame_rate_hz == pytest.approx(20.0)
+                assert webcam.shape == ("GREY", 1280, 960)
+                dials = (webcam.mode, webcam.exposure, webcam.gain, webcam.gamma, webcam.sharpness)
+                assert [dial.value for dial in dials] == [1, 100, 16, 100, 0]
+            finally:
+                unit.release()
+    finally:
+        for webcam in webcams.values():
+            webcam.unplug()

@@ -18,11 +18,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.errors import CameraError
-from drivers.acquisition.frame_counter import SequenceReader
-from drivers.acquisition.reader import CameraReader
-from drivers.cameras.protocol import CameraOptions, CameraSettings, Frame, FrameGrabber, FrameStatus
-from drivers.cameras.v4l2 import discover, make
+from stereorig.core.errors import CameraError
+from stereorig.drivers.acquisition.frame_counter import SequenceReader
+from stereorig.drivers.acquisition.reader import CameraReader
+from stereorig.drivers.cameras.protocol import CameraOptions, CameraSettings, Frame, FrameGrabber, FrameStatus
+from stereorig.drivers.cameras.v4l2 import discover, make
 from tests.support.camera_bench import frames_of
 from tests.support.v4l2_bench import calm, controls_of, put
 from tests.support.v4l2_pixels import BYTES, packed

@@ -1,5 +1,5 @@
 // Which reply, body and query belong to an address of the API, from its OpenAPI description (openapi.d.ts, which
-// api_types.js writes from docs/openapi.json), and the further fields of stored documents.
+// api_types.js writes), and the further fields of stored documents.
 import type { components, paths } from "./openapi";
 
 type Schemas = components["schemas"];
@@ -27,7 +27,7 @@ interface Unnamed {
 }
 
 /** A problem as documents and events carry it. */
-export type Trouble = { cause?: string; code?: string; remedy?: string; detail?: string; title?: string; errors?: unknown[] };
+export type Trouble = { code?: string; remedy?: string; detail?: string; title?: string; errors?: unknown[] };
 export type StepSummary = {
   n: number; valid: number; points: number; epipolar_offset_rms_px?: number; wall_s?: number; zncc_median?: { [pair: string]: number };
   epipolar_check?: { level: string; reason: string }; sigma_median_mm?: Numbers; sigma_calibration_median_mm?: Numbers | null; strain?: { noise_floor_microstrain?: Numbers }; patch?: { patch?: string; reason?: string };

@@ -4,8 +4,22 @@ import { test } from "node:test";
 import { distanceMm, resampled } from "../../../server/static/lib/along.js";
 
 test("the distance runs along the surface, and is unknown beyond a missing point", () => {
-  assert.deepEqual(distanceMm([[0, 3, 3], [0, 4, 4], [0, 0, 12]]), [0, 5, 17]);
-  assert.equal(distanceMm([[0, null, 3], [0, 4, 4], [0, 0, 12]]), null);
+  assert.deepEqual(
+    distanceMm([
+      [0, 3, 3],
+      [0, 4, 4],
+      [0, 0, 12],
+    ]),
+    [0, 5, 17],
+  );
+  assert.equal(
+    distanceMm([
+      [0, null, 3],
+      [0, 4, 4],
+      [0, 0, 12],
+    ]),
+    null,
+  );
 });
 
 test("values between two positions lie on a straight line, and none is invented", () => {

@@ -55,7 +55,16 @@ test("a column has one unit: that of its largest number", () => {
 });
 
 test("durations and how often are as people say them", () => {
-  const said = [[0.04, "0 s"], [0.44, "0.4 s"], [9.96, "10 s"], [59.6, "1 min"], [1771.5, "29 min 32 s"], [3600, "1 h"], [11100, "3 h 5 min"], [187200, "2 d 4 h"]];
+  const said = [
+    [0.04, "0 s"],
+    [0.44, "0.4 s"],
+    [9.96, "10 s"],
+    [59.6, "1 min"],
+    [1771.5, "29 min 32 s"],
+    [3600, "1 h"],
+    [11100, "3 h 5 min"],
+    [187200, "2 d 4 h"],
+  ];
   for (const [seconds, text] of said) assert.equal(plain(duration(seconds)), text);
   assert.equal(duration(null), "–");
   assert.deepEqual([1, 2, 3, null].map(times), ["once", "twice", "3 times", "–"]);

@@ -11,16 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from core.calibration import CalibrationOptions, NominalCamera, from_images
-from core.calibration.from_images import ImageOfTarget, calibrate_views
-from core.cameras.stereo import StereoPair
-from core.errors import Cancelled
-from core.grid import GridView, detect_grid
-from core.progress import Cancel
-from core.target import GridTarget
-from server.cli.main import main
-from server.formats.calibrations.recognise import load_calibration
-from server.formats.images import GrayImage, write_image
+from stereorig.core.calibration import CalibrationOptions, NominalValues, from_images
+from stereorig.core.calibration.from_images import ImageOfTarget, calibrate_views
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import Cancelled, InputError
+from stereorig.core.grid import GridView, detect_grid
+from stereorig.core.progress import Cancel
+from stereorig.core.target import GridTarget
+from stereorig.server.cli.main import main
+from stereorig.server.cli.measurement import calibrate as command_line
+from stereorig.server.formats.calibrations.recognise import load_calibration
+from stereorig.server.formats.images import GrayImage, write_image
 from tests.support.grid_images import PAPER_TARGET, Exposure, expose, node_positions, paper_camera, render_cover
 
 FOUND: dict[Any, GridView] = {}
@@ -114,8 +115,8 @@ def test_a_toleranced_grid_stays_within_the_band() -> None:
     images = captured(0.004, 3)
     target = dataclasses.replace(PAPER_TARGET, node_tolerance_mm=0.004)
     nominal = (
-        NominalCamera((512, 480), 12500.0, 410.0, -30.0, 0.9617),
-        NominalCamera((512, 480), 12500.0, 410.0, 30.0, 0.9617),
+        NominalValues((512, 480), 12500.0, 410.0, -30.0, 0.9617),
+        NominalValues((512, 480), 12500.0, 410.0, 30.0, 0.9617),
     )
     views = [ImageOfTarget(camera, dz, pixels) for (camera, dz), pixels in images.items()]  # type: ignore[arg-type]
     stages: list[tuple[str, int, int]] = []
@@ -243,5 +244,36 @@ def test_a_calibration_that_failed_its_check_is_not_written(
     captured = capsys.readouterr()
     assert "verdict: failed" in captured.out
     assert "Worst views: cam2_+2.000mm.tif " in captured.out
-    assert captured.err.startswith("stereorig: calibration_rejected: ")
+    rejected = captured.err.strip().splitlines()[-1]  # progress may come first on a slow machine
+    assert rejected.startswith("stereorig: calibration_rejected: ")
+    assert "cam2_+2.000mm.tif" in rejected
+    assert "within" not in rejected
     assert not (folder / "calibration.json").exists()
+
+
+@pytest.mark.fault(65)
+def test_patterns_name_the_views_of_free_poses_in_pairs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[Any] = []
+
+    def stop(views: Any, *_: Any, **__: Any) -> None:
+        given.extend(views)
+        raise InputError("enough", code="field_invalid")
+
+    monkeypatch.setattr(command_line, "calibrate_folder", stop)
+    for name in ("left01.jpg", "left02.jpg", "right01.jpg", "right02.jpg"):
+        (tmp_path / name).write_bytes(b"")
+    files = ["--target", "t", "--rig", "r", "--out", str(tmp_path / "c.json")]
+    patterns = ["--cam1", str(tmp_path / "left*.jpg"), "--cam2", str(tmp_path / "right*.jpg")]
+    assert main(["calibrate", *patterns, *files]) == 1
+    assert [(v.camera, v.frame, v.path.name) for v in given] == [
+        ("cam1", 0, "left01.jpg"),
+        ("cam1", 1, "left02.jpg"),
+        ("cam2", 0, "right01.jpg"),
+        ("cam2", 1, "right02.jpg"),
+    ]
+    (tmp_path / "right02.jpg").unlink()
+    for more, code in ((patterns, "counts_differ"), (patterns[:2], "views_missing"), ([], "views_missing")):
+        assert main(["calibrate", *more, *files]) == 1
+        assert f"stereorig: {code}: " in capsys.readouterr().err

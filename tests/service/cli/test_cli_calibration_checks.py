@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.calibration import CalibrationOptions, calibrate
-from core.names import CAMERAS
-from core.target import GridTarget
-from server.cli.main import main
-from server.formats.calibrations.native import write_calibration
-from server.formats.images import write_image
-from server.formats.results.reading import read_field, read_head
-from sim.catalog import make_scene
-from sim.render import RenderOptions, render
-from sim.rig import SimRig
-from sim.truth import truth_at
+from stereorig.core.calibration import CalibrationOptions, calibrate
+from stereorig.core.names import CAMERAS
+from stereorig.core.target import GridTarget
+from stereorig.server.cli.main import main
+from stereorig.server.formats.calibrations.native import write_calibration
+from stereorig.server.formats.images import write_image
+from stereorig.server.formats.results.reading import read_field, read_head
+from stereorig.sim.catalog import make_scene
+from stereorig.sim.render import RenderOptions, render
+from stereorig.sim.rig import SimRig
+from stereorig.sim.truth import truth_at
 from tests.support.calibration_truth import NOMINAL, PAPER, Grid, make_views, project
 from tests.support.grid_images import grid_image, paper_camera
 from tests.support.measure_command import command
@@ -38,7 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (path / "target.toml").write_text(TARGET.format(pitch=1.0))
     (path / "wrong.toml").write_text(TARGET.format(pitch=1.004))
     grid = GridTarget(pitch_mm=1.0, lines=(11, 11), line_width_mm=0.03)
-    options = CalibrationOptions(lens="paper", axis_tilt_sigma_rad=0.0)
+    options = CalibrationOptions(lens="paper", axis_tilt_sigma_rad=0.0, aspect_sigma=0.0)
     turned = [PAPER[0], {**PAPER[1], "beta": PAPER[1]["beta"] + np.radians(0.1)}]
     for name, seed, cameras in (("a", 1, PAPER), ("b", 2, PAPER), ("turned", 3, turned)):
         made = calibrate(make_views((0.0, 2.0, 4.0, 5.0), seed=seed, cameras=cameras), Grid(), NOMINAL, options)

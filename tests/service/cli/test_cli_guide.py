@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from server.cli.main import main
-from server.config.rig_file import parse_config
-from server.workflows.service import Service
+from stereorig.server.cli.main import main
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.workflows.service import Service
 from tests.support.service_rig import data_of, served, wait_for_rig
 from tests.support.small_board_rig import SMALL_BOARD
 

@@ -10,13 +10,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from core.errors import FileFormatError, ImageError, InputError, RegionError
-from core.field.seeding.seeds import Seed
-from core.settings import SPACING_PX, SUBSET_PX, Outline
-from server.cli import main
-from server.cli.measurement.image_lists import expand, pair_up, pairs_of_test_folder
-from server.cli.measurement.region import check_region, check_whole, parse_hole, parse_outline, parse_rectangle
-from server.cli.terminal import ProgressLine, duration
+from stereorig.core.errors import FileFormatError, ImageError, InputError, RegionError
+from stereorig.core.field.seeding.seeds import Seed
+from stereorig.core.settings import SPACING_PX, SUBSET_PX, Outline
+from stereorig.server.cli import main
+from stereorig.server.cli.measurement.image_lists import expand, pair_up, pairs_of_test_folder
+from stereorig.server.cli.measurement.region import (
+    check_region,
+    check_whole,
+    parse_hole,
+    parse_outline,
+    parse_rectangle,
+)
+from stereorig.server.cli.terminal import ProgressLine, duration
 
 SHAPE = (480, 512)
 
@@ -262,7 +268,7 @@ class Terminal(io.StringIO):
 
 def test_progress_estimates_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = [100.0]
-    monkeypatch.setattr("server.cli.terminal.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("stereorig.server.cli.terminal.time.monotonic", lambda: clock[0])
     stream = Terminal()
     line = ProgressLine(stream)
     clock[0] += 30.0  # loading, which has nothing to do with the pace
@@ -274,9 +280,9 @@ def test_progress_estimates_the_time_left(monkeypatch: pytest.MonkeyPatch) -> No
     assert stream.getvalue().endswith("\r")
 
 
-def test_progress_is_sparing_where_nobody_watches(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_without_a_terminal_prints_few_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = [0.0]
-    monkeypatch.setattr("server.cli.terminal.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("stereorig.server.cli.terminal.time.monotonic", lambda: clock[0])
     stream = io.StringIO()
     line = ProgressLine(stream)
     for k in range(601):

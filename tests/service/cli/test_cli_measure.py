@@ -15,18 +15,22 @@ import pytest
 import xarray as xr
 from PIL import Image
 
-from core.field.smoothed import smoothed_displacement
-from core.measure import MeasureOptions
-from core.names import CAMERAS
-from core.settings import SUBSET_PX
-from server.cli import main
-from server.cli.measurement import measure
-from server.formats.images import read_image, write_image
-from server.formats.results.reading import read_field, read_measured
-from sim.catalog import make_scene
-from sim.render import RenderOptions, render
-from sim.rig import SimRig
-from sim.truth import truth_at
+from stereorig.core.field.smoothed import smoothed_displacement
+from stereorig.core.measure import MeasureOptions
+from stereorig.core.names import CAMERAS
+from stereorig.core.settings import SUBSET_PX
+from stereorig.server.cli import main
+from stereorig.server.cli.measurement import measure
+from stereorig.server.formats.images import read_image, write_image
+from stereorig.server.formats.results.reading import read_field, read_measured
+from stereorig.server.report.source import find_source
+from stereorig.server.report.steps import read_steps
+from stereorig.server.results.warnings.analysis import analysis_warnings
+from stereorig.sim.catalog import make_scene
+from stereorig.sim.render import RenderOptions, render
+from stereorig.sim.rig import SimRig
+from stereorig.sim.truth import truth_at
+from tests.support import written_tiffs
 from tests.support.measure_command import SIZE, command
 from tests.support.measure_command import rig as rig
 
@@ -99,6 +103,56 @@ def test_the_summary_tells_what_was_done(measured: Path, originals: Path) -> Non
         assert min(step["zncc_median"].values()) > 0.95
         assert Path(step["cam1"]).name == f"cam1_{step['step']}.tif"
     assert summary["steps"][0]["plane_residual_rms_mm"] < 0.5e-3  # the block's face is flat
+
+
+@pytest.mark.parametrize("form", ["packed", "left", "right"])
+def test_twelve_bits_clipped_at_4095_are_saturated_wherever_they_lie(
+    folder: Path, tmp_path: Path, capfd: Any, monkeypatch: pytest.MonkeyPatch, form: str
+) -> None:
+    monkeypatch.setattr(written_tiffs, "LAYOUTS", {"one strip": SIZE[::-1]})
+    monkeypatch.setattr(written_tiffs, "WIDTH", SIZE[0])
+    monkeypatch.setattr(written_tiffs, "HEIGHT", SIZE[1])
+    clipped = {}
+    for name, gain in (("cam1_0", 24), ("cam2_0", 8), ("cam1_1", 24), ("cam2_1", 24)):
+        file = folder / f"{name}.tif"
+        grey = np.minimum(read_image(file).astype(np.uint16) * gain + 1, 4095).astype(np.uint16)
+        clipped[name] = float(np.mean(grey == 4095))
+        if form == "packed":
+            part = {"planar": False, "big": False, "differences": False}
+            file.write_bytes(written_tiffs.tiff(grey[..., None], 12, "one strip", "none", "<", **part))
+        else:
+            write_image(file, np.asarray(grey * 16 if form == "left" else grey, np.uint16))
+    pairs = {cam: [str(folder / f"{cam}_{n}.tif") for n in (0, 1)] for cam in CAMERAS}
+    assert main(command(folder, tmp_path / "out", **pairs)) == 0
+    assert clipped["cam1_0"] > 0.03
+    steps = json.loads((tmp_path / "out" / "summary.json").read_text())["steps"]
+    for step in steps:
+        assert step["quality"]["code"] == "saturated"
+        for cam in CAMERAS:
+            assert step["quality"][cam]["saturated_share"] == pytest.approx(clipped[f"{cam}_{step['n']}"], abs=1e-5)
+    said = capfd.readouterr().err
+    assert f"warning: step 0: cam1: {clipped['cam1_0']:.1%} of its pixels are at full scale" in said
+    assert (said.count("step 0: cam2: "), said.count("step 1: cam1: "), said.count("step 1: cam2: ")) == (0, 0, 1)
+    assert [one.code for one in analysis_warnings(tmp_path / "out")] == ["image_quality"]
+
+
+@pytest.mark.fault(66)
+def test_interlaced_images_are_warned_of_in_the_summary_and_in_a_report_made_later(
+    folder: Path, tmp_path: Path
+) -> None:
+    for name in CAMERAS:
+        file = folder / f"{name}_1.tif"
+        image = read_image(file).copy()
+        image[1::2] = np.roll(image[1::2], 1, axis=1)
+        write_image(file, image)
+    pairs = {cam: [str(folder / f"{cam}_{n}.tif") for n in (0, 1)] for cam in CAMERAS}
+    assert main(command(folder, tmp_path / "out", subset="25", **pairs)) == 0
+    measured = json.loads((tmp_path / "out" / "summary.json").read_text())["steps"]
+    reported = [one.summary.epipolar_check for one in read_steps(find_source(tmp_path / "out")).steps]
+    for n, (kept, later) in enumerate(zip(measured, reported, strict=True)):
+        assert later is not None
+        assert ("interlaced images" in later.reason) == (n == 1)
+        assert (later.level, later.reason) == (kept["epipolar_check"]["level"], kept["epipolar_check"]["reason"])
 
 
 def test_a_crack_and_a_hole_from_the_command_line(folder: Path, tmp_path: Path) -> None:
@@ -373,7 +427,7 @@ def test_a_bad_pair_is_a_failed_step_and_the_rest_is_measured(folder: Path, tmp_
         assert [step["n"] for step in summary["steps"]] == [0, 2]
         problem = summary["steps_failed"]["1"]
         assert problem["code"] == code
-        assert word in problem["cause"]
+        assert word in problem["detail"]
         assert problem["remedy"]
         assert problem["context"]["cam2"] == str(folder / "cam2_1.tif")
         assert not (tmp_path / "out" / "step_0001.nc").exists()
@@ -383,7 +437,7 @@ def test_a_bad_pair_is_a_failed_step_and_the_rest_is_measured(folder: Path, tmp_
     )
     assert '"same_image"' in next((tmp_path / "csv").glob("*.csv")).read_text()
     assert main(["report", str(tmp_path / "out"), "--out", str(tmp_path / "report.html")]) == 0
-    assert "Step 1 could not be measured: same_image: " in (tmp_path / "report.html").read_text()
+    assert f"Step 1 could not be measured: same_image: {problem['detail']}" in (tmp_path / "report.html").read_text()
     # the step after the bad one is what it would have been without it
     with (
         xr.open_dataset(tmp_path / "alone" / "step_0001.nc") as alone,
@@ -565,8 +619,8 @@ def test_the_specimen(specimen_dir: Path, tmp_path: Path) -> None:
 
 
 def test_a_noise_file_is_used_and_recorded(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from core.noise import NoiseModel
-    from server.formats.noise_json import load_noise, noise_content, write_noise
+    from stereorig.core.noise import NoiseModel
+    from stereorig.server.formats.noise_json import load_noise, noise_content, write_noise
 
     file = tmp_path / "noise.json"
     model = NoiseModel(coefficients=(1.96, 0.0128, 0.0), frames=8)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from core.errors import FileFormatError
-from core.noise import NoiseModel
-from server.cli import main
-from server.formats.images import write_image
-from server.formats.noise_json import load_noise, noise_content, write_noise
-from sim.sensor import Sensor
+from stereorig.core.errors import FileFormatError
+from stereorig.core.noise import NoiseModel
+from stereorig.server.cli import main
+from stereorig.server.formats.images import write_image
+from stereorig.server.formats.noise_json import load_noise, noise_content, write_noise
+from stereorig.sim.sensor import Sensor
 
 SENSORS = {
     "cam1": Sensor(bit_depth=12, full_well_e=10500.0, read_noise_e=2.4),
@@ -61,6 +61,38 @@ def test_frames_of_one_camera_stand_for_both(frames: Path) -> None:
     assert one == two
     assert one is not None
     assert one.frames == 4
+
+
+def test_frames_of_an_even_field_add_a_map_of_the_sensor(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Columns of 12 and a stuck pixel, in 12 bits, under light that falls off."""
+    rng = np.random.default_rng(4)
+    columns = 12.0 * rng.normal(size=150)
+    light = 2000.0 + np.linspace(0.0, 300.0, 160)[:, None]
+    for k in range(12):
+        grey = light + columns + rng.normal(0.0, 10.0, (160, 150))
+        grey[40, 70] = 4095.0 if k else 4000.0
+        write_image(frames / f"even_{k}.tif", np.rint(grey).astype(np.uint16))
+    out = frames / "noise.json"
+    even = ["--even1", str(frames / "even_*.tif"), "-o", str(out)]
+    assert main(["noise", "--cam1", str(frames / "cam1_*.tif"), *even]) == 0
+    assert "cam1: fixed pattern" in capsys.readouterr().out
+    model, other = load_noise(out).models
+    assert other is None
+    assert model is not None
+    assert model.sensor is not None
+    assert model.sensor.defects.tolist() == [40 * 150 + 70]
+    assert np.abs(model.sensor.pattern.mean(axis=0) - columns + columns.mean()).max() < 4.0
+    content = json.loads(out.read_text())
+    content["cam1"]["sensor"]["shape"] = [160, 151]
+    out.write_text(json.dumps(content))
+    with pytest.raises(FileFormatError) as raised:
+        load_noise(out)
+    assert raised.value.code == "noise_unreadable"
+    assert main(["noise", "--cam2", str(frames / "cam2_*.tif"), *even]) == 1
+    assert capsys.readouterr().err.startswith("stereorig: option_missing: ")
+    still = ["--even1", str(frames / "cam1_*.tif"), "-o", str(out)]
+    assert main(["noise", "--cam1", str(frames / "cam1_*.tif"), *still]) == 1
+    assert capsys.readouterr().err.startswith("stereorig: frames_not_even: ")
 
 
 @pytest.mark.parametrize(

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from core.names import CAMERAS
-from server.cli import main
-from server.formats.images import write_image
-from server.formats.results.reading import read_field
-from sim.catalog import make_scene
-from sim.render import RenderOptions, render
-from sim.rig import SimRig
-from sim.scene import UPRIGHT, Scene
-from sim.surface import sphere
-from sim.truth import truth_at
+from stereorig.core.names import CAMERAS
+from stereorig.server.cli import main
+from stereorig.server.formats.images import write_image
+from stereorig.server.formats.results.reading import read_field
+from stereorig.sim.catalog import make_scene
+from stereorig.sim.render import RenderOptions, render
+from stereorig.sim.rig import SimRig
+from stereorig.sim.scene import UPRIGHT, Scene
+from stereorig.sim.surface import sphere
+from stereorig.sim.truth import truth_at
 from tests.support.measure_command import command, small_rig
 
 # a sphere of 30 mm; it moves as a block; then its skin straightens to 90 mm and goes back

@@ -18,21 +18,21 @@ import httpx
 import numpy as np
 import pytest
 
-from core.errors import MeasurementError, StateError
-from core.field.region.cuts import Cuts
-from server.cli import main
-from server.cli.operation import demo
-from server.demo.calibration import ViewResiduals
-from server.demo.client import ServiceClient
-from server.demo.compare import compare_motion, compare_shape, heights_mm, pixel_mm
-from server.demo.drawing import fields as pictures
-from server.demo.experiments.plate import centre_deflection_um, fit_plate
-from server.demo.process import free_port, running_service
-from server.demo.session import Check, Outcome, table
-from server.exports.mesh import triangles_of
-from server.formats.images import read_image
-from sim.plate import CircularPlate
-from sim.rig import SimRig
+from stereorig.core.errors import MeasurementError, StateError
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.server.cli import main
+from stereorig.server.cli.operation import demo
+from stereorig.server.demo.calibration import ViewIntersections
+from stereorig.server.demo.client import ServiceClient
+from stereorig.server.demo.compare import compare_motion, compare_shape, heights_mm, pixel_mm
+from stereorig.server.demo.drawing import fields as pictures
+from stereorig.server.demo.experiments.plate import centre_deflection_um, fit_plate
+from stereorig.server.demo.process import free_port, running_service
+from stereorig.server.demo.session import DemoCheck, Outcome, table
+from stereorig.server.exports.mesh import triangles_of
+from stereorig.server.formats.images import read_image
+from stereorig.sim.plate import CircularPlate
+from stereorig.sim.rig import SimRig
 from tests.support.demo_field import field_of
 from tests.support.requirements import ROOT
 
@@ -109,7 +109,7 @@ def test_pictures_are_drawn_for_fields_with_holes(tmp_path: Path) -> None:
     found |= pictures.panel(tmp_path, image, (46, 30, 466, 450), [one], [comparison], [1.0])
     heights = heights_mm(one.xyz_mm, one.valid)
     found |= pictures.steel(tmp_path, image, (46, 30, 466, 450), one, heights, heights)
-    view = ViewResiduals("cam1", True, np.ones((3, 2)), np.ones((3, 2)))
+    view = ViewIntersections("cam1", True, np.ones((3, 2)), np.ones((3, 2)))
     found |= pictures.calibration(tmp_path, [view])
     assert len(found) == 9
     for name in found:
@@ -118,12 +118,12 @@ def test_pictures_are_drawn_for_fields_with_holes(tmp_path: Path) -> None:
 
 def test_a_missed_limit_fails_the_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     outcome = Outcome(
-        checks=[Check("a", "um", 1.0, 1.2, -0.2, 0.5)], lines=["the table"], pictures={"a.png": "a picture"}
+        checks=[DemoCheck("a", "um", 1.0, 1.2, -0.2, 0.5)], lines=["the table"], pictures={"a.png": "a picture"}
     )
     assert demo._finish(tmp_path, "plate", "title", outcome, 1.0) == 0
     assert json.loads((tmp_path / "report.json").read_text())["passed"] is True
     for error in (0.6, float("nan")):
-        outcome.checks = [Check("centre", "um", 1.0, 1.6, error, 0.5)]
+        outcome.checks = [DemoCheck("centre", "um", 1.0, 1.6, error, 0.5)]
         assert demo._finish(tmp_path, "plate", "title", outcome, 1.0) == 1
         err = capsys.readouterr().err
         assert err.startswith("stereorig: limit_missed: centre: ")
@@ -176,7 +176,7 @@ def test_jobs_are_followed_to_their_end(monkeypatch: pytest.MonkeyPatch) -> None
         handle = client.analyse("t1", "profile", {"rectangle": [1, 2, 3, 4]}, subset_px=21)
     assert handle.analysis_id == "a1"
     assert seen.count("GET /jobs/j1") == 3
-    failed = {**job, "state": "failed", "problem": {"code": "not_seeded", "cause": "Nothing.", "remedy": "Look."}}
+    failed = {**job, "state": "failed", "problem": {"code": "not_seeded", "detail": "Nothing.", "remedy": "Look."}}
     with client_of({"GET /jobs/j1": failed}) as client, pytest.raises(MeasurementError) as caught:
         client.wait("j1")
     assert (caught.value.code, caught.value.remedy) == ("not_seeded", "Look.")
@@ -209,7 +209,7 @@ def test_the_service_ends_with_the_block_whatever_ends_it(tmp_path: Path) -> Non
 
 def test_ctrl_c_stops_the_service(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "server.cli", "demo", "--out", str(out)]
+    command = [sys.executable, "-m", "stereorig.server.cli", "demo", "--out", str(out)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     process = subprocess.Popen(
         command,

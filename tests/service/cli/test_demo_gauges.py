@@ -11,19 +11,26 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from core.cameras.camera import Camera
-from core.field.points.result import Field
-from core.strain import StrainField, StrainOptions, surface_strain
-from server.demo.client import AnalysisHandle
-from server.demo.compare import MotionComparison
-from server.demo.drawing import gauges as gauge_pictures
-from server.demo.drawing import strain as strain_pictures
-from server.demo.experiments import plate_strain, steel_motion
-from server.demo.experiments.panel_gauges import Opening, Slice, crests, plane_patch_error_mm, read_opening, true_panel
-from server.demo.experiments.panel_strain import panel_strain
-from server.demo.session import Outcome
-from server.demo.strain import MICRO, along, as_read, chi_limit, difference, whole_gauges
-from server.formats.gauges.readings import (
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.field.points.result import Field
+from stereorig.core.strain import StrainField, StrainOptions, surface_strain
+from stereorig.server.demo.client import AnalysisHandle
+from stereorig.server.demo.compare import MotionComparison
+from stereorig.server.demo.drawing import gauges as gauge_pictures
+from stereorig.server.demo.drawing import strain as strain_pictures
+from stereorig.server.demo.experiments import plate_strain, steel_motion
+from stereorig.server.demo.experiments.panel_gauges import (
+    Opening,
+    Slice,
+    crests,
+    plane_patch_error_mm,
+    read_opening,
+    true_panel,
+)
+from stereorig.server.demo.experiments.panel_strain import panel_strain
+from stereorig.server.demo.session import Outcome
+from stereorig.server.demo.strain import MICRO, along, as_read, chi_limit, difference, whole_gauges
+from stereorig.server.formats.gauges.readings import (
     AreaReading,
     AreaStatistics,
     ExtensometerReading,
@@ -32,10 +39,10 @@ from server.formats.gauges.readings import (
     RigidMotionReading,
     StepReadings,
 )
-from sim.panel import CrackedPanel
-from sim.plate import CircularPlate
-from sim.rig import SimRig
-from sim.truth import Truth
+from stereorig.sim.panel import CrackedPanel
+from stereorig.sim.plate import CircularPlate
+from stereorig.sim.rig import SimRig
+from stereorig.sim.truth import Truth
 from tests.support.demo_field import field_of
 from tests.support.requirements import ROOT
 

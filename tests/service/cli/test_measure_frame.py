@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray
 
-from server.cli import main
+from stereorig.server.cli import main
 from tests.support.copied_tests import write_test_folder
 
 # X along the system's Y, Y against its X, from another origin

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.cameras.stereo import StereoPair
-from core.errors import ImageError, InputError
-from server.cli.main import main
-from server.formats.object_storage import copied
-from sim.world import SimWorld
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import ImageError, InputError
+from stereorig.server.cli.main import main
+from stereorig.server.formats.object_storage import copied
+from stereorig.sim.world import SimWorld
 from tests.support.copied_tests import write_test_of
 from tests.support.measure_command import ROI, SIZE, small_rig
 from tests.support.requirements import missing

@@ -12,17 +12,18 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from server.config.rig_file import RigConfig, parse_config
-from server.store.verify import verify
-from server.workflows.service import Service
+from stereorig.server.config.rig_file import RigConfig, parse_config
+from stereorig.server.store.verify import verify
+from stereorig.server.workflows.service import Service
 from tests.support.power_loss.journal import Names
 from tests.support.power_loss.recording import Answer, Recording, ThreadWorker
 from tests.support.power_loss.states import PowerLoss, Tree
 from tests.support.tiny_rig import TINY
 
 DATA = "data"
-#: files that a running service keeps for itself; their loss costs nothing
-_OURS = ("service.lock", ".probe", ".exports")
+#: files that a running service keeps for itself; their loss costs nothing. A start goes on with manifests and the
+#: format's number; that what was acknowledged is in them is what `verify` says of the state after it
+_OURS = ("service.lock", ".probe", ".exports", "manifest.json", "manifest", "format.json")
 _READ_S = 60.0
 CATALOGS = ("as it was", "a request older", "torn", "gone")
 

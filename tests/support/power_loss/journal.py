@@ -1,8 +1,8 @@
 """What a service did to its data folder, call by call: names, contents and syncs, in the order in which they happened.
 
-The four calls of :mod:`server.formats.disk` are recorded as they return. What goes past that object is heard by an
-audit hook of the interpreter: removals are recorded too, and a file that is opened for writing anywhere else is kept in
-``past``, so that a test can say that there is none.
+The four calls of :mod:`stereorig.server.formats.disk` are recorded as they return. What goes past that object is heard
+by an audit hook of the interpreter: removals are recorded too, and a file that is opened for writing anywhere else is
+kept in ``past``, so that a test can say that there is none.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import threading
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from server.formats.disk import Disk
+from stereorig.server.formats.disk import Disk
 
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 

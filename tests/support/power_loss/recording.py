@@ -20,11 +20,11 @@ from typing import Any
 import httpx
 import numpy as np
 
-import server.formats.disk
-from server.config.rig_file import parse_config
-from server.formats.images import encode_tiff
-from server.worker.executor import TaskExecutor, TaskFuture
-from server.workflows.service import Service
+import stereorig.server.formats.disk
+from stereorig.server.config.rig_file import parse_config
+from stereorig.server.formats.images import encode_tiff
+from stereorig.server.worker.executor import TaskExecutor, TaskFuture
+from stereorig.server.workflows.service import Service
 from tests.bench.reliability.torture_lab import REGION, Pictures
 from tests.support.power_loss.journal import Journal
 from tests.support.service_rig import SMALL, served, wait_for_job, wait_for_rig
@@ -256,7 +256,7 @@ def record(top: Path, pictures: Pictures, seed: int) -> Recording:
     pictures.write_test(data / "tests" / COPIED)
     journal = Journal(top)
     recording = Recording(journal)
-    real, server.formats.disk.disk = server.formats.disk.disk, journal
+    real, stereorig.server.formats.disk.disk = stereorig.server.formats.disk.disk, journal
     try:
         service = Service(parse_config(_RIG), data, worker=ThreadWorker())  # type: ignore[arg-type] - as the service uses it
         with service, served(service) as client:
@@ -271,5 +271,5 @@ def record(top: Path, pictures: Pictures, seed: int) -> Recording:
             day.run_on()
     finally:
         journal.stop()
-        server.formats.disk.disk = real
+        stereorig.server.formats.disk.disk = real
     return recording

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.field.checks.blank_centres import reject_blank_centres
-from core.field.points.fitter import PointFits
-from core.field.points.images import MeasureImage
-from core.status import PointStatus
+from stereorig.core.field.checks.blank_centres import reject_blank_centres
+from stereorig.core.field.points.fitter import PointFits
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.status import PointStatus
 
 SUBSET_PX, SPACING_PX, COUNT, NOISE = 27, 6.0, 40, 2.0
 SHAPE = (COUNT, COUNT)

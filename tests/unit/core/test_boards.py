@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.boards import BoardTarget, detect_board
-from core.boards.kernels import CORNER, DOT, model_values
-from core.errors import StereorigError, TargetError
+from stereorig.core.arrays import Float
+from stereorig.core.boards import BoardTarget, detect_board
+from stereorig.core.boards.kernels import CORNER, DOT, model_values
+from stereorig.core.errors import StereorigError, TargetError
 
 NOISE, BLUR_PX = 2.0, 0.9
 SIZE_PX = (640, 512)

@@ -3,13 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from core.calibration import CalibrationOptions, CalibrationResult, CalibrationView, calibrate, check_known_distance
-from core.errors import CalibrationError, CalibrationInputError
+from stereorig.core.calibration import (
+    CalibrationOptions,
+    CalibrationResult,
+    CalibrationView,
+    NominalValues,
+    calibrate,
+    check_known_distance,
+)
+from stereorig.core.calibration.checks.lenses import lens_faults
+from stereorig.core.calibration.fit.lens_form import LensChoice
+from stereorig.core.cameras.lens import LensModel, OpenCVLens, SeidelLens
+from stereorig.core.errors import CalibrationError, CalibrationInputError
+from stereorig.core.names import CAMERAS
+from stereorig.core.target import GridTarget
+from tests.support.calibration_rigs import aligned_rms_um, flat, observed, ordinary_pair
 from tests.support.calibration_truth import HELD, NOISE_PX, NOMINAL, PAPER, Array, Grid, make_views, nodes, project
 
 
@@ -180,6 +196,62 @@ def test_a_quarter_turn_is_named(both: bool) -> None:
     assert caught.value.code == "image_rotated"
 
 
+def tilted(camera: dict[str, float], axis: int, degrees: float) -> dict[str, float]:
+    """The camera as it sees a target that is turned about one of its own axes in its plane."""
+    own = Rotation.from_euler("XYZ", [camera["beta"], camera["gamma"], camera["alpha"]])
+    turned = (own * Rotation.from_rotvec(np.radians(degrees) * np.eye(3)[axis])).as_euler("XYZ")
+    angles = dict(zip(("beta", "gamma", "alpha"), (float(a) for a in turned), strict=True))
+    return {**camera, **angles}
+
+
+@pytest.mark.fault(29)
+@pytest.mark.parametrize(("axis", "degrees"), [(0, 30.0), (0, -38.0), (1, -30.0), (1, 20.0)])
+def test_a_tilted_target_is_calibrated_and_its_tilt_is_named_and_no_turn_of_the_image(
+    axis: int, degrees: float
+) -> None:
+    views = make_views(cameras=[tilted(c, axis, degrees) for c in PAPER])
+    result = calibrate(views, Grid(), NOMINAL, HELD)
+    assert result.verdict.level == "good"
+    assert result.fitted.mean.rbe_px < 0.003
+    text = next(c.text for c in result.checks if c.name == "angles")
+    # the cameras stand up to 1 degree from their nominal angles
+    assert float(text.split("tilted by ")[1].split(" degrees")[0]) == pytest.approx(abs(degrees), abs=1.0)
+    exchanged = [dataclasses.replace(v, camera="cam2" if v.camera == "cam1" else "cam1") for v in views]
+    with pytest.raises(CalibrationInputError, match="swapped"):
+        calibrate(exchanged, Grid(), NOMINAL, HELD)
+
+
+def test_a_principal_point_far_off_is_found_and_named_with_its_amount() -> None:
+    # a part of the sensor's image, 1,500 px beside the optical axis: the camera looks at the grid by its rim
+    cameras = [{**c, "cx": c["cx"] + 1500.0, "x0": c["x0"] - 1500.0 * c["z0"] / c["phd"]} for c in PAPER]
+    result = calibrate(make_views(cameras=cameras), Grid(), NOMINAL, HELD)
+    assert result.verdict.level == "warning"
+    assert result.fitted.mean.rbe_px < 0.003
+    text = next(r for r in result.verdict.reasons if "images of cam2 shrink" in r)
+    assert float(text.split("point ")[1].split(" px")[0]) == pytest.approx(1500.0, rel=0.02)
+    assert "principal point of cam2" in text
+    assert result.pair.cam1.paper_parameters()["cx_px"] == pytest.approx(cameras[0]["cx"], abs=60.0)
+
+
+@pytest.mark.parametrize(
+    ("declared", "remark"),
+    [
+        ((12000.0, 9000.0), None),
+        ((9000.0, 12000.0), "are those declared of the other one"),
+        ((9300.0, 9000.0), "pinhole distance of cam1 is 1.... px, 29 % off the declared 9300 px"),
+    ],
+)
+def test_pinhole_distances_that_contradict_the_declared_ones_are_remarked(
+    declared: tuple[float, float], remark: str | None
+) -> None:
+    views = make_views(cameras=[PAPER[0], {**PAPER[1], "phd": 9000.0}])
+    nominal = tuple(dataclasses.replace(n, phd_px=p) for n, p in zip(NOMINAL, declared, strict=True))
+    reasons = calibrate(views, Grid(), (nominal[0], nominal[1]), HELD).verdict.reasons
+    found = [r for r in reasons if "inhole distance" in r]
+    assert len(found) == (remark is not None)
+    assert remark is None or re.search(remark, found[0])
+
+
 @pytest.mark.fault(29)
 def test_a_camera_at_another_angle_is_named_and_a_small_difference_is_not_held_against_it() -> None:
     off = (NOMINAL[0], dataclasses.replace(NOMINAL[1], angle_deg=5.0))
@@ -190,9 +262,154 @@ def test_a_camera_at_another_angle_is_named_and_a_small_difference_is_not_held_a
     assert calibrate(make_views(), Grid(), near).fitted.mean.rbe_px < 0.003
 
 
+def at_review_noise(**how: Any) -> list[CalibrationView]:
+    """Marks as a localiser finds them in images of 2 of 255 grey levels of noise, 0 to 5 mm."""
+    return make_views((0.0, 1.0, 2.0, 3.0, 4.0, 5.0), noise=0.0045, **how)
+
+
+def nominal_of(aspect: float) -> tuple[NominalValues, NominalValues]:
+    one, two = (dataclasses.replace(n, aspect=aspect) for n in NOMINAL)
+    return one, two
+
+
 @pytest.mark.fault(32)
-def test_a_wrong_pitch_shows_in_a_known_distance_and_nowhere_else() -> None:
-    result = calibrate(make_views(), Grid(pitch_mm=1.005), NOMINAL, HELD)
+@pytest.mark.parametrize("lens", ["auto", "opencv5"])
+@pytest.mark.parametrize(
+    ("pitch", "aspect", "long", "percent"),
+    [
+        (1.01, 0.9617, 1.0, 1.0),
+        (1.05, 0.9617, 1.0, 5.0),
+        (2.0, 0.9617, 1.0, 100.0),
+        (1.0, 0.9637, 1.0, None),
+        (1.0, 1.0, 1.0, None),
+        (1.0, 0.9617, 1.02, 2.0),
+    ],
+)
+def test_scales_that_contradict_each_other_fail_with_the_amount(
+    pitch: float, aspect: float, long: float, percent: float | None, lens: LensChoice
+) -> None:
+    views = at_review_noise(declared=lambda dz: dz / long)
+    result = calibrate(views, Grid(pitch_mm=pitch), nominal_of(aspect), CalibrationOptions(lens=lens))
+    assert result.verdict.level == "failed"
+    found = result.lens.structure[0]
+    assert any(reason == found.text and "Stage and grid disagree by" in reason for reason in result.verdict.reasons)
+    off, sigma = found.terms["stage over pitch"]
+    if percent is not None:
+        assert 100.0 * off == pytest.approx(percent, abs=300.0 * sigma)
+        assert f"disagree by {100.0 * off:.2f} +- {100.0 * sigma:.2f} %" in found.text
+    elif "aspect 1" in found.terms:
+        value, spread = found.terms["aspect 1"]
+        assert value == pytest.approx(0.9617, abs=4.0 * spread)
+
+
+@pytest.mark.fault(32)
+def test_right_scales_are_good_and_the_check_says_how_well_they_agree() -> None:
+    found = [calibrate(at_review_noise(seed=seed), Grid(), NOMINAL) for seed in range(6)]
+    assert [r.verdict.level for r in found] == ["good"] * 6
+    check = {c.name: c for c in found[0].checks}["scales"]
+    assert check.made
+    assert "% farther than it reads" in check.text
+
+
+@pytest.mark.fault(32)
+def test_a_scale_that_a_wide_lens_hides_is_no_check_made_and_its_size_is_stated() -> None:
+    # a lens of 12 mm on pixels of 3.45 um, five coefficients, OpenCV's projection: the stage reads 0.2 % too little
+    focal_px, size, pitch_mm = 12.0 / 0.00345, (2448, 2048), 8.0
+    standoff_mm = focal_px * 10.0 * pitch_mm / 1.05 / size[1]
+    cameras = ordinary_pair((-0.1, 0.08, 0.0, 0.0, 0.0), focal_px=focal_px, standoff_mm=standoff_mm)
+    at = (np.arange(11) - 5.0) * pitch_mm
+    points = flat(np.stack(np.meshgrid(at, at, indexing="ij"), axis=-1))
+    rng = np.random.default_rng(1)
+    views = []
+    for name, camera in zip(CAMERAS, cameras, strict=True):
+        for dz in np.linspace(0.0, 0.1 * standoff_mm, 6):
+            moved = camera.moved(np.array([0.0, 0.0, 1.002 * dz]))
+            views.append(CalibrationView(name, float(dz), observed(moved, points, rng, 0.02)))
+    nominal = NominalValues(size, focal_px, standoff_mm, -12.5), NominalValues(size, focal_px, standoff_mm, 12.5)
+    target = GridTarget(pitch_mm=pitch_mm, lines=(13, 13), line_width_mm=0.8)
+    result = calibrate(views, target, nominal)
+    assert result.verdict.level == "good", "no residual shows it"
+    check = {c.name: c for c in result.checks}["scales"]
+    assert not check.made
+    hidden = re.search(r"wrong by up to ([0-9.]+) % would not show", check.text)
+    assert hidden is not None
+    assert float(hidden[1]) > 0.2
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ("periodic", "um rms against the images, most of all +3.000 mm of cam1"),
+        ("slipped", "The position +3.000 mm of cam1's stage is off by +9"),
+        ("moved", "The target moved in its plane between the views: by about 20"),
+        ("tilted", "mrad off the optical axis"),
+        ("bowed", "hold structure (bow: XX_mm = 0.01"),
+    ],
+)
+def test_stage_and_target_that_err_are_named(how: str, words: str) -> None:
+    X, Y = nodes(Grid())
+    rng = np.random.default_rng(0)
+    views = []
+    for c, (name, camera) in enumerate(zip(CAMERAS, PAPER, strict=True)):
+        for k, dz in enumerate((0.0, 1.0, 2.0, 3.0, 4.0, 5.0)):
+            error = {"periodic": 0.01 * np.sin(2.0 * np.pi * dz / 1.7 + c), "slipped": 0.1 * (k == 3 and c == 0)}.get(
+                how, 0.0
+            )
+            shift = 0.02 * (how == "moved" and k >= 3)
+            bow = 0.03 * (how == "bowed") * (X**2 + Y**2) / 50.0
+            tilt = (0.02, 0.0) if how == "tilted" else (0.0, 0.0)
+            xy = project(camera, X + shift, Y, dz + error, bow, tilt=tilt)
+            views.append(CalibrationView(name, dz, xy + 0.0045 * rng.standard_normal(xy.shape)))
+    verdict = calibrate(views, Grid(), NOMINAL).verdict
+    assert verdict.level == "warning"
+    assert any(words in reason for reason in verdict.reasons), verdict.reasons
+
+
+def test_default_priors_are_in_the_covariance_and_a_zero_is_exact() -> None:
+    views = at_review_noise()
+    stated = CalibrationOptions(lens="paper", stage_scale_sigma=0.0, aspect_sigma=0.0)
+    exact = calibrate(views, Grid(), NOMINAL, stated)
+    usual = calibrate(views, Grid(), NOMINAL, CalibrationOptions(lens="paper"))
+    assert usual.sigma["cam1.aspect"] == pytest.approx(1e-4)
+    assert usual.pair.cam1.values()["aspect"] == NOMINAL[0].aspect
+    assert "cam1.aspect" not in exact.sigma
+    np.testing.assert_array_equal(exact.stage.scale_sigma, 0.0)
+    assert (usual.stage.scale_sigma > 9e-5).all()
+    # an aspect ratio off by 1e-4 both ways moves the shape by what is reported
+    off = [calibrate(views, Grid(), nominal_of(a), stated) for a in (0.9616, 0.9618)]
+    seen = [camera.project(usual.uncertainty.points_mm).xy for camera in (off[1].pair.cam1, off[1].pair.cam2)]
+    moved = off[0].pair.triangulate(*seen).xyz_mm
+    both = aligned_rms_um(moved, usual.uncertainty.points_mm) / 2.0
+    assert 0.5 * both < 1e3 * usual.uncertainty.shape_rms_mm < 2.0 * both
+    square = calibrate(views, Grid(), nominal_of(1.0), CalibrationOptions(lens="paper"))
+    assert "cam1.aspect" not in square.sigma
+    toleranced = calibrate(views, Grid(node_tolerance_mm=4e-3), NOMINAL, stated)
+    assert toleranced.pitch_scale_sigma == pytest.approx(4e-3 / np.sqrt(3.0) / 8.0, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("lens", "word"),
+    [
+        (OpenCVLens(700.0, 700.0, 319.5, 239.5, k1=-0.3, k2=0.11), None),
+        (OpenCVLens(700.0, 700.0, 319.5, 239.5, k1=-1.2), "folds"),
+        (OpenCVLens(700.0, 700.0, 319.5, 239.5, k1=-9.0, k2=40.0, k3=-30.0), "alone"),
+        (OpenCVLens(700.0, 700.0, 319.5, 239.5, p1=0.2), "decentring"),
+        (OpenCVLens(700.0, 700.0, 319.5, 239.5, k1=3.0), "border by"),
+        (SeidelLens(12000.0, 262.0, 233.0, 2.5e-9, 0.9617), None),
+    ],
+)
+def test_a_lens_that_no_lens_is_is_found(lens: LensModel, word: str | None) -> None:
+    faults, folded = lens_faults(lens, (640, 480))
+    assert folded == any("folds" in fault for fault in faults)
+    assert any(word in fault for fault in faults) if word else not faults
+
+
+@pytest.mark.fault(32)
+def test_a_pitch_wrong_as_much_as_the_stage_shows_in_a_known_distance_and_nowhere_else() -> None:
+    views = make_views(declared=lambda dz: 1.005 * dz)
+    held = dataclasses.replace(HELD, held_out_mm=(2.01, 4.02))
+    result = calibrate(views, Grid(pitch_mm=1.005), NOMINAL, held)
+    assert result.verdict.level == "good"
     assert result.held_out is not None
     assert result.held_out.mean.rbe_px < 0.0035
     made = {c.name: c.made for c in result.checks}
@@ -200,6 +417,7 @@ def test_a_wrong_pitch_shows_in_a_known_distance_and_nowhere_else() -> None:
         "held_out": True,
         "positions": True,
         "angles": True,
+        "scales": True,
         "known_distance": False,
         "stage_axis": True,  # of the 1 mrad that is assumed
         "aspect": False,
@@ -232,6 +450,16 @@ def test_residuals_are_judged_by_the_bands(noise: float, level: str) -> None:
     assert any("Held-out RBE of cam1" in r and limit in r for r in result.verdict.reasons)
 
 
+def test_what_passes_is_no_reason_of_a_calibration_that_is_refused() -> None:
+    result = calibrate(at_review_noise(), Grid(pitch_mm=1.01), NOMINAL, HELD)
+    with pytest.raises(CalibrationError) as refused:
+        result.verdict.check()
+    assert refused.value.code == "calibration_rejected"
+    assert "usable: Stage and grid disagree by 0.9" in refused.value.cause
+    assert "declare both" in refused.value.remedy
+    assert not [text for text in (refused.value.cause, *result.verdict.reasons) if "within" in text]
+
+
 def test_a_stage_that_travels_off_the_optical_axis_is_suspected() -> None:
     # 20 mrad across cam1's axis: the whole image moves in proportion to dZ, which the residuals cannot show
     shift = 12000.0 * 0.02 / 400.0
@@ -257,8 +485,24 @@ def test_the_worst_view_is_named() -> None:
     assert any("All points of cam2 at +4.000 mm are off the same way" in r for r in result.verdict.reasons)
 
 
-def test_without_held_out_positions_the_verdict_says_so() -> None:
+def test_positions_between_the_ends_are_left_out_in_turn_where_none_is_named() -> None:
     result = calibrate(make_views(), Grid(), NOMINAL)
+    assert result.held_out is not None
+    assert result.held_out.positions_mm == ((2.0, 4.0), (2.0, 4.0))
+    assert not any(view.held_out for view in result.views)
+    assert result.verdict.level == "good"
+
+    # a position in the middle that is 0.1 mm off does not pass its own check, however the fit with it looks
+    def slipped(dz: float) -> float:
+        return dz + 0.1 * (dz == 2.0)
+
+    off = calibrate(make_views(declared=slipped), Grid(), NOMINAL)
+    assert off.held_out is not None
+    assert off.held_out.mean.rbe_px > 1.5 * off.fitted.mean.rbe_px
+
+
+def test_with_two_positions_none_is_left_out_and_the_verdict_says_so() -> None:
+    result = calibrate(make_views((0.0, 5.0)), Grid(), NOMINAL)
     assert result.held_out is None
     assert result.verdict.level == "warning"
     assert "No position was held out" in result.verdict.reasons[0]
@@ -335,11 +579,11 @@ def test_a_solver_that_fails_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*_: object, **__: object) -> None:
         raise np.linalg.LinAlgError("Eigenvalues did not converge")
 
-    monkeypatch.setattr("core.calibration.choice.screening.adjust", fails)
+    monkeypatch.setattr("stereorig.core.calibration.choice.screening.adjust", fails)
     with pytest.raises(CalibrationError, match="Eigenvalues did not converge") as caught:
         calibrate(make_views(), Grid(), NOMINAL)
     assert caught.value.code == "calibration_singular"
     monkeypatch.undo()
     with pytest.raises(CalibrationError, match="did not settle in 1 iterations") as other:
-        calibrate(make_views(noise=0.5), Grid(node_tolerance_mm=0.1), NOMINAL, CalibrationOptions(max_iterations=1))
+        calibrate(make_views(noise=0.5), Grid(node_tolerance_mm=0.02), NOMINAL, CalibrationOptions(max_iterations=1))
     assert other.value.code == "calibration_not_converged"

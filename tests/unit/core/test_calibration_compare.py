@@ -10,24 +10,24 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from core.calibration import CalibrationOptions, CalibrationResult, calibrate
-from core.calibration.checks.compare import (
+from stereorig.core.calibration import CalibrationOptions, CalibrationResult, calibrate
+from stereorig.core.calibration.checks.compare import (
     CalibrationComparison,
     UncertainPair,
     common_points_mm,
     compare_calibrations,
     volume_grid_mm,
 )
-from core.calibration.volume import CalibratedVolume, calibrated_volume
-from core.cameras.camera import Camera, RigidTransform
-from core.cameras.stereo import StereoPair
-from core.errors import CalibrationInputError
+from stereorig.core.calibration.volume import CalibratedVolume, calibrated_volume
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import CalibrationInputError
 from tests.support.calibration_truth import NOMINAL, PAPER, Grid, make_views
 
 SIZES = ((512, 480), (512, 480))
 POSITIONS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
-# the views are made with axes that are exact: a prior that allows a tilt would predict more than is there
-OPTIONS = CalibrationOptions(lens="paper", axis_tilt_sigma_rad=0.0)
+# the views are made with axes and aspect ratios that are exact: a prior would predict more than is there
+OPTIONS = CalibrationOptions(lens="paper", axis_tilt_sigma_rad=0.0, aspect_sigma=0.0)
 
 
 def made(seed: int, declared: Grid | None = None, **how: Any) -> CalibrationResult:

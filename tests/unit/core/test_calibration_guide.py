@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.boards import BoardTarget
-from core.calibration import CalibrationOptions, CalibrationView, NominalCamera, calibrate
-from core.calibration.guide import Guidance, GuideOptions, at_rest, guide, most_alike
-from core.calibration.uncertainty import volume_points_mm, volume_uncertainty
-from core.names import CAMERAS
+from stereorig.core.boards import BoardTarget
+from stereorig.core.calibration import CalibrationOptions, CalibrationView, NominalValues, calibrate
+from stereorig.core.calibration.guide import Guidance, GuideOptions, at_rest, guide, most_alike
+from stereorig.core.calibration.uncertainty import volume_points_mm, volume_uncertainty
+from stereorig.core.names import CAMERAS
 
 Array = NDArray[np.float64]
 
 BOARD = BoardTarget(kind="checkerboard", size=(9, 6), pitch_mm=8.0)
 SIZE = (1224, 1024)
-NOMINALS = (NominalCamera(SIZE, 2000.0), NominalCamera(SIZE, 2000.0))
+NOMINALS = (NominalValues(SIZE, 2000.0), NominalValues(SIZE, 2000.0))
 OPTIONS = CalibrationOptions(moves="free", lens="paper")
 NOISE_PX = 0.03
 K = (

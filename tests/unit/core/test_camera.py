@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from core.arrays import Float
-from core.cameras.camera import POSE_NAMES, Camera, RigidTransform, angles_from_rotation, rotation_from_angles
-from core.cameras.lens import LensModel, OpenCVLens, SeidelLens
-from core.cameras.stereo import StereoPair
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import POSE_NAMES, Camera, RigidTransform, angles_from_rotation, rotation_from_angles
+from stereorig.core.cameras.lens import LensModel, OpenCVLens, SeidelLens
+from stereorig.core.cameras.stereo import StereoPair
 
 SEIDEL = SeidelLens(12000.0, 255.0, 241.0, 3e-8, 0.9617)
 OPENCV = OpenCVLens(6638.0, 6640.0, 981.0, 610.0, 0.4, 0.0889, -2.84, 1e-3, -2e-3, 55.9)

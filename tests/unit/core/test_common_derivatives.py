@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.cameras.camera import TEN_PARAMETER_NAMES, Camera
-from core.cameras.stereo import StereoPair
-from core.common.derivatives import measured_derivatives
-from core.matching.fit import fit_motion, fit_shape
-from core.matching.geometry import motion_geometry, shape_geometry
-from core.matching.options import MatchOptions
+from stereorig.core.cameras.camera import TEN_PARAMETER_NAMES, Camera
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.common.derivatives import measured_derivatives
+from stereorig.core.matching.fit import fit_motion, fit_shape
+from stereorig.core.matching.geometry import motion_geometry, shape_geometry
+from stereorig.core.matching.options import MatchOptions
 from tests.support import matching_scene as scene
 
 SIZE = 160

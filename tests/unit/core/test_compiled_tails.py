@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from core.common.derivatives import WEIGHTS, Estimator
-from core.field.region.window import window_offsets
-from core.matching.image import PAD, prepare
-from core.strain.reduced import window_sums
-from core.systematic.sampled import residual_shifts
+from stereorig.core.common.derivatives import WEIGHTS, Estimator
+from stereorig.core.field.region.window import window_offsets
+from stereorig.core.matching.image import PAD, prepare
+from stereorig.core.strain.reduced import window_sums
+from stereorig.core.systematic.sampled import residual_shifts
 from tests.support.matching_scene import opencv_pair, paper_pair, rational_pair
 
 
@@ -35,7 +35,7 @@ def test_the_estimator_solves_the_weighted_normal_equations(make):
     whole = np.zeros((50, 6, 8))
     whole[:, :3, :4] = seen.by_image
     whole[:, 3:, :4] = -by_match[:, :, :2] @ seen.seen
-    whole[:, 3:, :2] -= seen.beside
+    whole[:, 3:, :2] -= seen.off_ray
     whole[:, 3:, 4:] = -by_match[:, :, 2:]
     np.testing.assert_allclose(found.by_image, whole, atol=1e-9 * np.abs(whole).max())
     # and by the images themselves: a point that moves with what the cameras see of it is found where it is

@@ -8,8 +8,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from core.errors import RegionError
-from core.field.region.cuts import Cuts, as_arrays, crosses, from_arrays
+from stereorig.core.errors import RegionError
+from stereorig.core.field.region.cuts import Cuts, as_arrays, crosses, from_arrays
 
 Point = tuple[int, int]
 

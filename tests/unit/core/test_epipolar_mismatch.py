@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from core.arrays import Bool, Float
-from core.field.checks.epipolar_mismatch import EpipolarLimits, epipolar_mismatches
+from stereorig.core.arrays import Bool, Float
+from stereorig.core.field.checks.epipolar_mismatch import EpipolarLimits, epipolar_mismatches
 
 ROWS, COLS, SPACING = 60, 80, 10.0
 LIMITS = EpipolarLimits(5.0, 0.005)

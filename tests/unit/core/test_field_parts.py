@@ -8,23 +8,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from core.cameras.camera import Camera, RigidTransform
-from core.cameras.stereo import StereoPair
-from core.errors import InputError
-from core.field.checks.validity import ValidityOptions, apply_validity_checks, neighbour_disagreement
-from core.field.points.features import detect, match
-from core.field.points.fitter import PointFits
-from core.field.points.scales import plausible
-from core.field.points.starts import current_position, move_matrix, move_w
-from core.field.region.neighbours import compare_with_neighbours, sorting_network
-from core.field.seeding.epipolar_search import sweep
-from core.field.seeding.local_fit import consistent, robust_local_fits
-from core.field.seeding.predict import predict
-from core.field.seeding.scattered_matches import combine
-from core.matching.fit import no_motion
-from core.measure import MeasureOptions, ReferencePair, measure_shape
-from core.status import PointStatus
-from core.threads import available_threads, set_threads
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import InputError
+from stereorig.core.field.checks.validity import ValidityOptions, apply_validity_checks, neighbour_disagreement
+from stereorig.core.field.points.features import detect, match
+from stereorig.core.field.points.fitter import PointFits
+from stereorig.core.field.points.scales import plausible
+from stereorig.core.field.points.starts import current_position, move_matrix, move_w
+from stereorig.core.field.region.neighbours import compare_with_neighbours, sorting_network
+from stereorig.core.field.seeding.epipolar_search import sweep
+from stereorig.core.field.seeding.local_fit import consistent, robust_local_fits
+from stereorig.core.field.seeding.predict import predict
+from stereorig.core.field.seeding.scattered_matches import combine
+from stereorig.core.matching.fit import no_motion
+from stereorig.core.measure import MeasureOptions, ReferencePair, measure_shape
+from stereorig.core.status import PointStatus
+from stereorig.core.threads import available_threads, set_threads
 from tests.support.field_bench import grid, pair, scene, take, truth
 
 GRID = grid()

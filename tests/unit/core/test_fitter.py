@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.field.points.fitter import Fitter
-from core.matching import MatchOptions, prepare
-from core.matching.options import FIRST_RATE
+from stereorig.core.field.points.fitter import Fitter
+from stereorig.core.matching import MatchOptions, prepare
+from stereorig.core.matching.options import FIRST_RATE
 from tests.support.matching_scene import paper_pair
 
 

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Float
-from core.errors import InputError, MeasurementError, RegionError
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels
-from core.field.region.cuts import Cuts
-from core.gauge.align import Alignment, align_3_2_1, align_plane, aligned
-from core.gauge.area import area_statistics, points_within
-from core.gauge.extensometer import Extensometer, extensometer
-from core.gauge.line import positions_along
-from core.gauge.locate import positions_from_mm
-from core.gauge.reading import Reading
-from core.gauge.rigid import rigid_motion, without_rigid_motion
-from core.gauge.sampling import sample
+from stereorig.core.arrays import Float
+from stereorig.core.errors import InputError, MeasurementError, RegionError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.core.gauge.align import Alignment, align_3_2_1, align_plane, aligned
+from stereorig.core.gauge.area import area_statistics, points_within
+from stereorig.core.gauge.extensometer import Extensometer, extensometer
+from stereorig.core.gauge.line import positions_along
+from stereorig.core.gauge.locate import positions_from_mm
+from stereorig.core.gauge.reading import Reading
+from stereorig.core.gauge.rigid import rigid_motion, without_rigid_motion
+from stereorig.core.gauge.sampling import sample
 from tests.support.gauge_field import STEP, SUBSET, make_field, pixel_noise, surface
 
 SHARED = SharedPixels(SUBSET)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.grid import GridOptions, detect_grid
+from stereorig.core.errors import TargetError
+from stereorig.core.grid import GridOptions, detect_grid
 from tests.support.grid_images import PAPER_TARGET, grid_image, paper_camera, render_cover, truth_px
 
 
@@ -25,6 +26,21 @@ def test_every_intersection_of_the_paper_rig_is_found_within_the_localisers_erro
         assert error.shape == (9, 9, 2)
         assert np.sqrt(np.mean(error**2)) < limit, localiser
         assert np.abs(error).max() < 6.0 * limit
+
+
+@pytest.mark.parametrize("gamma_deg", [-70.0, 74.0])
+def test_a_grid_seen_at_seventy_degrees_is_found_within_its_sigma(gamma_deg: float) -> None:
+    camera = paper_camera(gamma_deg)
+    view = detect_grid(grid_image(camera), PAPER_TARGET)
+    z = (view.xy_px - truth_px(camera, PAPER_TARGET)) / view.sigma_px
+    assert np.sqrt(np.mean(z**2)) < 1.5
+    assert view.sigma_px.max() < 0.05
+
+
+def test_lines_that_a_camera_sees_too_obliquely_are_no_dirt() -> None:
+    with pytest.raises(TargetError, match=r"sees the target at about (69|70|71) degrees off its normal") as refused:
+        detect_grid(grid_image(paper_camera(-70.0, alpha_deg=0.0)), PAPER_TARGET)
+    assert refused.value.code == "target_too_small"
 
 
 def test_reported_sigma_is_the_error() -> None:

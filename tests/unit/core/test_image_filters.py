@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import correlate1d, gaussian_filter, map_coordinates, spline_filter
 
-from core.matching import prepare
-from core.matching.filters import correlate, derivative
-from core.matching.image import PAD
-from core.noise import NoiseModel
-from core.threads import available_threads, set_threads, threads
+from stereorig.core.matching import prepare
+from stereorig.core.matching.filters import correlate, derivative
+from stereorig.core.matching.image import PAD
+from stereorig.core.noise import NoiseModel
+from stereorig.core.threads import available_threads, set_threads, threads
 
 ORDER = {"cubic": 3, "quintic": 5}
 

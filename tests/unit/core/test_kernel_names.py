@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 
-from core.matching.kernels.linear import make_factor
-from core.matching.kernels.motion import make_motion
-from core.matching.kernels.point import make_compare, make_point
-from core.matching.kernels.reference import make_reference
-from core.matching.kernels.shape import make_shape
+from stereorig.core.matching.kernels.linear import make_factor
+from stereorig.core.matching.kernels.motion import make_motion
+from stereorig.core.matching.kernels.point import make_compare, make_point
+from stereorig.core.matching.kernels.reference import make_reference
+from stereorig.core.matching.kernels.shape import make_shape
 
 
 def test_every_kernel_has_a_name_of_its_own() -> None:

@@ -10,7 +10,7 @@ import pytest
 from numba import njit
 from numba.core.errors import NumbaError
 
-from core.matching.kernels.naming import inner, kernel, outer
+from stereorig.core.matching.kernels.naming import inner, kernel, outer
 
 
 def ir_of(compiled: Callable[[Any], Any]) -> str:

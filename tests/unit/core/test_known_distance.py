@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from core.boards import BoardTarget
-from core.calibration import CalibrationResult, calibrate
-from core.calibration.checks.distance import DistanceCheck, check_target_scale
-from core.cameras.camera import Camera, RigidTransform
-from core.cameras.lens import OpenCVLens
-from core.cameras.stereo import StereoPair
-from core.errors import CalibrationInputError
+from stereorig.core.boards import BoardTarget
+from stereorig.core.calibration import CalibrationResult, calibrate
+from stereorig.core.calibration.checks.distance import DistanceCheck, check_target_scale
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.core.cameras.lens import OpenCVLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import CalibrationInputError
 from tests.support.calibration_truth import HELD, NOMINAL, PAPER, Array, Grid, make_views, project
 
 # corners of a board of 7 x 5, 1.2 mm apart, tilted by 0.2 rad about Y and 0.6 mm behind the grid's plane

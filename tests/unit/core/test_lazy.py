@@ -11,7 +11,7 @@ import pytest
 from tests.support.requirements import ROOT
 
 
-@pytest.mark.parametrize("name", ["core.boards", "core.grid", "core.calibration"])
+@pytest.mark.parametrize("name", ["stereorig.core.boards", "stereorig.core.grid", "stereorig.core.calibration"])
 def test_every_name_is_found_where_it_lies(name):
     package = importlib.import_module(name)
     assert dir(package) == sorted(package.__all__)
@@ -22,7 +22,10 @@ def test_every_name_is_found_where_it_lies(name):
 
 
 def test_measuring_loads_nothing_that_finds_targets():
-    code = "import sys, server.cli.measurement.measure, server.compute.sequence; print(*sys.modules)"
+    code = (
+        "import sys, stereorig.server.cli.measurement.measure, stereorig.server.compute.sequence; print(*sys.modules)"
+    )
     loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    assert "core.boards.board" in loaded.split()
-    assert not {"core.boards.detect", "core.grid.detect", "core.calibration.solve"} & set(loaded.split())
+    assert "stereorig.core.boards.board" in loaded.split()
+    late = {"boards.detect", "grid.detect", "calibration.solve"}
+    assert not {f"stereorig.core.{name}" for name in late} & set(loaded.split())

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from core.field.checks.epipolar_offset import check_epipolar
-from core.field.points.result import Field
+from stereorig.core.field.checks.epipolar_offset import check_epipolar
+from stereorig.core.field.points.result import Field
 from tests.support.strain_fields import MM_PER_PX, make_field
 
 SHAPE = (41, 51)

@@ -8,23 +8,23 @@ from functools import cache
 import numpy as np
 import pytest
 
-from core.common.factor import ParameterCovariance
-from core.errors import ImageError, InputError, MeasurementError, RegionError
-from core.field.common import with_common_parts
-from core.field.growth.grow import fit_in_batches
-from core.field.growth.state import prepare
-from core.field.points.assemble import assemble
-from core.field.points.images import MeasureImage
-from core.field.points.result import Field
-from core.field.points.shared_pixels import SharedPixels
-from core.gauge.area import area_statistics
-from core.gauge.extensometer import extensometer
-from core.gauge.sampling import sample
-from core.live.clocks import clock_offset, value_at
-from core.live.follow import Follower
-from core.live.gauges import UNITS, GaugeSet, LiveGauge
-from core.live.measurement import LiveMeasurement, LiveOptions
-from core.measure import ReferencePair
+from stereorig.core.common.factor import ParameterCovariance
+from stereorig.core.errors import ImageError, InputError, MeasurementError, RegionError
+from stereorig.core.field.common import with_common_parts
+from stereorig.core.field.growth.grow import fit_in_batches
+from stereorig.core.field.growth.state import prepare
+from stereorig.core.field.points.assemble import assemble
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.gauge.area import area_statistics
+from stereorig.core.gauge.extensometer import extensometer
+from stereorig.core.gauge.sampling import sample
+from stereorig.core.live.clocks import clock_offset, value_at
+from stereorig.core.live.follow import Follower
+from stereorig.core.live.gauges import UNITS, GaugeSet, LiveGauge
+from stereorig.core.live.measurement import LiveMeasurement, LiveOptions
+from stereorig.core.measure import ReferencePair
 from tests.support.gauge_field import SUBSET, make_field
 from tests.support.sequence_bench import GRID, OPTIONS, capture, plate, rig
 

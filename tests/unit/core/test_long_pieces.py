@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import ndtr
 
-from core.grid.profile import OUT, fit_pieces
-from core.grid.strip import IN, INPUTS
+from stereorig.core.grid.profile import OUT, fit_pieces
+from stereorig.core.grid.strip import IN, INPUTS
 
 WIDTH_PX, BLUR_PX, NOISE, DEPTH = 17.6, 1.7, 3.0, 120.0
 LENGTH_PX, ANGLE = 200.0, 0.2

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.arrays import Bool
-from core.field.checks.lost_correlation import CorrelationLimits, lost_correlation
-from core.field.points.fitter import PointFits
-from core.status import PointStatus
+from stereorig.core.arrays import Bool
+from stereorig.core.field.checks.lost_correlation import CorrelationLimits, lost_correlation
+from stereorig.core.field.points.fitter import PointFits
+from stereorig.core.status import PointStatus
 from tests.support.field_bench import grid, pair
 from tests.unit.core.test_field_parts import plane_w
 

@@ -9,10 +9,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from core.errors import ImageError, InputError
-from core.matching import MatchOptions, fit_motion, fit_shape, prepare
-from core.matching.geometry import covariance_xyz, covariance_xyzuvw, motion_geometry, plane_from_angles, shape_geometry
-from core.threads import available_threads, run_ranges, set_threads, threads
+from stereorig.core.errors import ImageError, InputError
+from stereorig.core.matching import MatchOptions, fit_motion, fit_shape, prepare
+from stereorig.core.matching.geometry import (
+    covariance_xyz,
+    covariance_xyzuvw,
+    motion_geometry,
+    plane_from_angles,
+    shape_geometry,
+)
+from stereorig.core.threads import available_threads, run_ranges, set_threads, threads
 from tests.support.matching_scene import Plane, Texture, digitise, grid, paper_pair, render, true_g, true_w
 
 PLANES = {

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from core.matching import MatchOptions, fit_motion, fit_shape
+from stereorig.core.matching import MatchOptions, fit_motion, fit_shape
 from tests.support.matching_scene import (
     Bent,
     Texture,

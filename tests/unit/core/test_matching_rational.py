@@ -10,14 +10,15 @@ import pytest
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from core.cameras.camera import Camera
-from core.cameras.lens import MappedPoints, OpenCVLens
-from core.cameras.stereo import StereoPair
-from core.matching import MatchOptions, fit_motion, fit_shape
-from core.matching.geometry import motion_geometry, shape_geometry
-from core.matching.kernels.warp import NODES, lens_jacobian, set_up_nodes, undistort
-from sim.optics.lens import flat_lens
-from sim.optics.ray import rays
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.cameras.lens import MappedPoints, OpenCVLens
+from stereorig.core.cameras.opencv_full import OpenCVFullLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.matching import MatchOptions, fit_motion, fit_shape
+from stereorig.core.matching.geometry import motion_geometry, shape_geometry
+from stereorig.core.matching.kernels.warp import NODES, lens_jacobian, set_up_nodes, undistort
+from stereorig.sim.optics.lens import flat_lens
+from stereorig.sim.optics.ray import rays
 from tests.support.matching_scene import Plane, Texture, digitise, grid, rational_pair, render, true_g, true_w
 
 LENSES = {
@@ -25,6 +26,14 @@ LENSES = {
     "pole": OpenCVLens(820.0, 823.0, 981.0, 610.0, 0.0, 0.1, 0.0, 1e-3, -1e-3, 0.0, -0.3, 0.0, 0.0),
     "nearly cancels": OpenCVLens(900.0, 900.0, 981.0, 610.0, 0.0, 9.0, 3.0, 1e-3, -1e-3, 0.1, 9.3, 5.5, 0.6),
     "telephoto": OpenCVLens(6638.0, 6640.0, 981.0, 610.0, 0.0, 0.9, -2.8, 1e-3, -2e-3, 55.9, 0.8, -2.0, 30.0),
+}
+BENT = {"s1": 4e-3, "s2": -2e-3, "s3": -3e-3, "s4": 1e-3, "tau_x_rad": 0.06, "tau_y_rad": -0.03}
+FULL = {
+    "five terms": OpenCVFullLens(820.0, 823.0, 981.0, 610.0, 0.0, -0.21, 0.05, 1e-3, -2e-3, **BENT),
+    "all terms": OpenCVFullLens(
+        820.0, 823.0, 981.0, 610.0, 0.0, 0.62, 0.21, 1e-3, -2e-3, 0.012, 0.94, 0.38, 0.05, **BENT
+    ),
+    "telephoto": OpenCVFullLens(6638.0, 6640.0, 981.0, 610.0, s1=-0.02, s3=0.03, tau_x_rad=-0.1, tau_y_rad=0.2),
 }
 AFTER = Plane(np.array([0.02, -0.01, 0.015]), np.array([[1.01, 0.02], [-0.015, 0.995], [0.03, -0.02]]))
 
@@ -45,7 +54,8 @@ class OpenCVsOwn:
     def numbers(self) -> tuple[NDArray, NDArray]:
         a = self.lens
         K = np.array([[a.fx_px, 0.0, a.cx_px], [0.0, a.fy_px, a.cy_px], [0.0, 0.0, 1.0]])
-        return K, np.array([a.k1, a.k2, a.p1, a.p2, a.k3, a.k4, a.k5, a.k6])
+        more = list(a.prism.values()) if isinstance(a, OpenCVFullLens) else []
+        return K, np.array([a.k1, a.k2, a.p1, a.p2, a.k3, a.k4, a.k5, a.k6, *more])
 
     def image_from_normalised(self, xy_norm: ArrayLike) -> MappedPoints:
         n = np.asarray(xy_norm, dtype=np.float64)
@@ -60,7 +70,7 @@ class OpenCVsOwn:
         return MappedPoints(n.reshape(xy.shape), np.ones(xy.shape[:-1], bool))
 
 
-@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+@pytest.mark.parametrize("lens", [*LENSES.values(), *FULL.values()], ids=[*LENSES, *FULL])
 def test_kernels_and_simulated_rays_invert_what_opencv_projects(lens: OpenCVLens) -> None:
     reach = 0.13 if lens.fx_px > 5000.0 else 1.1
     x, y = np.meshgrid(np.linspace(-reach, reach, 31), np.linspace(-0.6 * reach, 0.6 * reach, 19))
@@ -70,6 +80,11 @@ def test_kernels_and_simulated_rays_invert_what_opencv_projects(lens: OpenCVLens
     back = np.empty_like(n)
     undistort_all(flat, xy, back)
     np.testing.assert_allclose(back, n, atol=1e-12)
+    if isinstance(lens, OpenCVFullLens):
+        ours = lens.normalised_from_image(xy)
+        np.testing.assert_allclose(ours.xy, n, atol=1e-12)
+        np.testing.assert_allclose(lens.image_from_normalised(n).xy, xy, atol=1e-9)
+        return
     # the simulated rig walks along rows, each ray from its neighbour's
     x0, y0 = xy.min(axis=0)
     nx, ny = np.empty((40, 60)), np.empty((40, 60))
@@ -98,7 +113,7 @@ def test_pixels_beyond_a_rational_lens_have_no_ray() -> None:
     assert np.isfinite(nx[0]).tolist() == [7.9 * i < 400.0 for i in range(101)]
 
 
-@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+@pytest.mark.parametrize("lens", [*LENSES.values(), *FULL.values()], ids=[*LENSES, *FULL])
 @pytest.mark.parametrize("half", [10.0, 30.0])
 def test_a_subsets_nodes_are_exact_through_a_rational_lens(lens: OpenCVLens, half: float) -> None:
     own, flat = OpenCVsOwn(lens), lens.kernel_parameters()
@@ -116,8 +131,9 @@ def test_a_subsets_nodes_are_exact_through_a_rational_lens(lens: OpenCVLens, hal
             np.testing.assert_allclose(slopes, (difference[0] - difference[1]) / (2 * h), rtol=1e-6, atol=1e-3)
 
 
-def test_shape_and_motion_through_rational_lenses_rendered_with_opencvs_rays() -> None:
-    pair = rational_pair()
+@pytest.mark.parametrize("bent", [{}, BENT], ids=["eight terms", "prism and tilt"])
+def test_shape_and_motion_through_rational_lenses_rendered_with_opencvs_rays(bent: dict[str, float]) -> None:
+    pair = rational_pair(**bent)
     own = StereoPair(*(Camera(OpenCVsOwn(c.lens), c.cam_from_sys) for c in (pair.cam1, pair.cam2)))
     texture, rng = Texture(blob_mm=0.11), np.random.default_rng(5)
     images = [

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.matching import MatchOptions, fit_motion, fit_shape
-from core.matching.kernels.warp import set_up_nodes, set_up_warp
+from stereorig.core.matching import MatchOptions, fit_motion, fit_shape
+from stereorig.core.matching.kernels.warp import set_up_nodes, set_up_warp
 from tests.support.matching_scene import (
     Plane,
     Texture,

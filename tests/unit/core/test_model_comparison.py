@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from core.errors import InputError
-from core.field.points.shared_pixels import SharedPixels
-from core.gauge.align import align_3_2_1
-from core.model.compare import compare_with_model
-from core.model.filtered import model_at_points
-from core.model.placement import Placement, place_by_fit, place_by_markers, place_given, place_in_frame
-from core.model.regions import holm, own_covariance_of_means, tiles_of
-from core.model.result import CompareOptions
-from core.model.surface import ModelSurface, surface_of_cloud
-from core.strain.options import StrainOptions
+from stereorig.core.errors import InputError
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.gauge.align import align_3_2_1
+from stereorig.core.model.compare import compare_with_model
+from stereorig.core.model.filtered import model_at_points
+from stereorig.core.model.placement import Placement, place_by_fit, place_by_markers, place_given, place_in_frame
+from stereorig.core.model.regions import holm, own_covariance_of_means, tiles_of
+from stereorig.core.model.result import CompareOptions
+from stereorig.core.model.surface import ModelSurface, surface_of_cloud
+from stereorig.core.strain.options import StrainOptions
 from tests.support.model_bench import MM_PER_PX, STEP_PX, SUBSET_PX, Bench, bench, clamped_plate, kirsch, mesh
 from tests.support.strain_fields import make_field, sphere
 

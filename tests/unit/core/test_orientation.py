@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, uniform_filter
 
-from core.cameras.camera import TEN_PARAMETER_NAMES, Camera
-from core.cameras.stereo import StereoPair
-from core.orientation import changed, changes_between, consequence_of, estimate_change, judge_offsets
-from core.orientation.change import ends_of
-from core.orientation.matched import MatchedPoints
-from core.orientation.offsets import StepOffsets, calibration_slopes
-from core.orientation.propagate import pose_parameters, repaired_covariance
-from core.orientation.repair import Repair
-from core.orientation.structure import structure_left_px
+from stereorig.core.cameras.camera import TEN_PARAMETER_NAMES, Camera
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.orientation import changed, changes_between, consequence_of, estimate_change, judge_offsets
+from stereorig.core.orientation.change import ends_of
+from stereorig.core.orientation.matched import MatchedPoints
+from stereorig.core.orientation.offsets import StepOffsets, calibration_slopes
+from stereorig.core.orientation.propagate import pose_parameters, repaired_covariance
+from stereorig.core.orientation.repair import RepairedPair
+from stereorig.core.orientation.structure import structure_left_px
 from tests.support.bumped_rig import SIZE, core_pair, false_strain, plain_camera, pose_points, turned
 from tests.support.independent_rig import PlainCamera
 
@@ -282,12 +282,12 @@ def test_the_repaired_parameters_covariance_is_that_of_many_repairs() -> None:
     two = turned(CAM2, (0.1, 0.15, -0.05))
     points = joined(CAM1, two, rng)
 
-    def repaired(old: StereoPair, seen: MatchedPoints) -> Repair:
+    def repaired(old: StereoPair, seen: MatchedPoints) -> RepairedPair:
         new = changed(old, estimate_change(old, seen).change)
         estimate = estimate_change(new, seen, bump_rad=0.003)
         cost = consequence_of(new, seen, estimate.change, estimate.covariance)
         assert cost is not None
-        return Repair(new, changes_between(old, new), estimate, seen, 0.0, 0.0, 0.0, 0.0, cost)
+        return RepairedPair(new, changes_between(old, new), estimate, seen, 0.0, 0.0, 0.0, 0.0, cost)
 
     steps = 1e-2 * SIGMA
     stepped = []

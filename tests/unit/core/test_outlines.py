@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from core.errors import RegionError
-from core.field.region.lay_points import lay_points
-from core.field.region.outlines import corners_px
-from core.settings import Outline, Region
-from server.api.models import Region as RegionRequest
+from stereorig.core.errors import RegionError
+from stereorig.core.field.region.lay_points import lay_points
+from stereorig.core.field.region.outlines import corners_px
+from stereorig.core.settings import Outline, Region
+from stereorig.server.api.models import Region as RegionRequest
 
 TRIANGLE = [(100, 20), (180, 20), (140, 90)]
 

@@ -8,12 +8,12 @@ import json
 import numpy as np
 import pytest
 
-from core.errors import InputError
-from core.field.checks.patch_choice import decide
-from core.field.points.patch import PatchChoice, asked_for
-from core.field.points.starts import move_matrix, move_w
-from core.matching.geometry import principal_curvatures
-from core.measure import MeasureOptions
+from stereorig.core.errors import InputError
+from stereorig.core.field.checks.patch_choice import decide
+from stereorig.core.field.points.patch import PatchChoice, asked_for
+from stereorig.core.field.points.starts import move_matrix, move_w
+from stereorig.core.matching.geometry import principal_curvatures
+from stereorig.core.measure import MeasureOptions
 from tests.support.matching_scene import Bent, opencv_pair, paper_pair, true_g6, true_w6
 
 PLANE_UM, CURVED_UM = 0.2, 0.38

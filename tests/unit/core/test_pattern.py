@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.pattern import pattern_size
-from sim.texture import Texture, speckle
+from stereorig.core.pattern import pattern_size
+from stereorig.sim.texture import Texture, speckle
 from tests.support.texture_width import two_point_width_mm
 
 _PIXEL_WIDTH = 2.355 / np.sqrt(6.0)  # of the autocorrelation of a pixel's square, as a Gaussian's

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.field.checks.patch_choice import advise, choose_patch
-from core.field.checks.plane_error import PlaneError, plane_error
-from core.field.points.fitter import PointFits
-from core.field.points.patch import asked_for
+from stereorig.core.field.checks.patch_choice import advise, choose_patch
+from stereorig.core.field.checks.plane_error import PlaneError, plane_error
+from stereorig.core.field.points.fitter import PointFits
+from stereorig.core.field.points.patch import asked_for
 from tests.support.matching_scene import Bent, paper_pair
 
 STEP, SUBSET = 7.0, 21

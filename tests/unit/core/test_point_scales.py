@@ -7,10 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from core.cameras.camera import Camera
-from core.cameras.lens import LensModel, OpenCVLens
-from core.cameras.stereo import StereoPair
-from core.field.points.scales import MAX_SHEAR, MIN_COSINE, depth_per_px, far_from_start, plausible, px_per_ray
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.cameras.lens import LensModel, OpenCVLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.field.points.scales import (
+    MAX_SHEAR,
+    MIN_COSINE,
+    depth_per_px,
+    far_from_start,
+    plausible,
+    px_per_ray,
+)
 from tests.support.field_bench import grid, pair
 
 XY = grid().xy_px.reshape(-1, 2)

@@ -9,15 +9,15 @@ from typing import cast
 import numpy as np
 import pytest
 
-from core.field.points.fitter import Fitter, PointFits
-from core.field.points.images import MeasureImage
-from core.field.points.result import Field
-from core.field.points.scales import depth_per_px
-from core.field.seeding.local_search import deeper_range, depth_range, search_shapes, steep_tilts, tilts
-from core.field.seeding.predicted import local_motion, predicted_motion, seen_elsewhere
-from core.field.sequence.still_visible import still_visible
-from core.matching import MatchOptions, prepare
-from core.status import PointStatus
+from stereorig.core.field.points.fitter import Fitter, PointFits
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.scales import depth_per_px
+from stereorig.core.field.seeding.local_search import deeper_range, depth_range, search_shapes, steep_tilts, tilts
+from stereorig.core.field.seeding.predicted import local_motion, predicted_motion, seen_elsewhere
+from stereorig.core.field.sequence.still_visible import still_visible
+from stereorig.core.matching import MatchOptions, prepare
+from stereorig.core.status import PointStatus
 from tests.support.matching_scene import Plane, Texture, digitise, grid, paper_pair, render, true_g, true_w
 
 PAIR = paper_pair()

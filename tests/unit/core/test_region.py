@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.errors import RegionError
-from core.field.region.region import PointGrid, check_region
+from stereorig.core.errors import RegionError
+from stereorig.core.field.region.region import PointGrid, check_region
 
 IMAGE = (120, 200)  # rows, columns
 

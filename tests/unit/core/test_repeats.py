@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.field.points.images import MeasureImage
-from core.field.region import repeats as module
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.region import repeats as module
 
 SUBSET_PX = 21
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.errors import SeedError
-from core.field.points.images import MeasureImage
-from core.field.seeding.diagnosis import Diagnosis, diagnose, seed_error
-from core.field.seeding.epipolar_search import nominal_depth
-from core.measure import MeasureOptions, measure_motion, measure_shape
+from stereorig.core.errors import SeedError
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.seeding.diagnosis import Diagnosis, diagnose, seed_error
+from stereorig.core.field.seeding.epipolar_search import nominal_depth
+from stereorig.core.measure import MeasureOptions, measure_motion, measure_shape
 from tests.support.field_bench import SIZE, grid, pair, take
 
 Image = NDArray[np.uint8]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, f, norm
 
-from core.significance import chi_square_tail, f_tail, two_sided_sigmas
+from stereorig.core.significance import chi_square_tail, f_tail, two_sided_sigmas
 from tests.support.requirements import ROOT
 
 DEGREES = (1, 3, 6, 41.5, 2000.0)
@@ -36,7 +36,8 @@ def test_sigmas_of_a_probability_are_scipys() -> None:
 
 def test_no_start_loads_scipys_statistics() -> None:
     # a third of a second of every start, of the service, of its compute process and of the command line
-    modules = "server.api.app, server.worker.tasks, server.compute.measurement, server.cli.measurement.image_pairs"
+    names = ("api.app", "compute.tasks", "compute.measurement", "cli.measurement.image_pairs")
+    modules = ", ".join(f"stereorig.server.{name}" for name in names)
     code = f"import sys, {modules}; print(sorted({{'scipy.stats', 'scipy.signal'}} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import correlate, correlate1d, gaussian_filter
 
-from core.matching.filters import derivative
-from core.matching.odd_filters import filter_both
-from core.matching.slopes import slope_filter
-from core.threads import available_threads, set_threads
-from core.threads import threads as numbers_of_threads
+from stereorig.core.matching.filters import derivative
+from stereorig.core.matching.odd_filters import filter_both
+from stereorig.core.matching.slopes import slope_filter
+from stereorig.core.threads import available_threads, set_threads
+from stereorig.core.threads import threads as numbers_of_threads
 
 SHAPE = (400, 420)
 

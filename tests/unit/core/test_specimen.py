@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.cameras.stereo import StereoPair
-from core.errors import ImageError, RegionError, SeedError
-from core.field.points.images import MeasureImage
-from core.field.region.textured import texture_map
-from core.field.seeding.specimen import Specimen, find_specimen
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import ImageError, RegionError, SeedError
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.region.textured import texture_map
+from stereorig.core.field.seeding.specimen import Specimen, find_specimen
 from tests.support import field_bench
 
 SUBSET = 21
@@ -176,7 +176,7 @@ def test_edges_of_one_direction_and_noise_are_no_texture() -> None:
 def test_bands_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
     image = picture("blurred")[0]
     whole = texture_map(image, 33)
-    monkeypatch.setattr("core.field.region.textured._BAND_PIXELS", 20_000)
+    monkeypatch.setattr("stereorig.core.field.region.textured._BAND_PIXELS", 20_000)
     parts = texture_map(image, 33)
     for name in ("strength", "structured", "mean"):
         # sums of a band start from its own mean: float32

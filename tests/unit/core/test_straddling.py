@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.field.parts.straddling import reject_straddling
-from core.field.points.fitter import Fitter, PointFits
-from core.matching import MatchOptions, prepare
-from core.status import PointStatus
+from stereorig.core.field.parts.straddling import reject_straddling
+from stereorig.core.field.points.fitter import Fitter, PointFits
+from stereorig.core.matching import MatchOptions, prepare
+from stereorig.core.status import PointStatus
 from tests.support.matching_scene import Plane, Texture, digitise, paper_pair, render, true_w
 
 SUBSET_PX, SPACING_PX = 21, 3.0
@@ -49,13 +49,28 @@ def sigma_px(points: PointFits) -> NDArray[np.float64]:
     return np.asarray(np.linalg.norm(far - near, axis=1))
 
 
-def test_a_point_that_a_part_makes_more_uncertain_than_asked_is_rejected(fitted: tuple[Fitter, PointFits]) -> None:
+def depth_px(points: PointFits) -> NDArray[np.float64]:
+    """Depth beyond the plane's, as px that camera 2 sees it move by."""
+    off = points.w[:, 0] - true_w(PAIR.cam1, Plane(), XY)[:, 0]
+    return np.asarray(off * sigma_px(points) / np.sqrt(points.covariance[:, 0, 0]))
+
+
+def test_a_point_that_a_part_makes_more_uncertain_than_asked_is_measured_without_it_or_rejected(
+    fitted: tuple[Fitter, PointFits],
+) -> None:
     fitter, before = fitted
     free = without_pulled(fitter, before, 10.0)
     most = 1.001 * np.nanmax(sigma_px(before))  # each match alone is within the limit
     beyond = free.ok & (sigma_px(free) > most)
     assert beyond.sum() >= 5
     limited = without_pulled(fitter, before, most)
-    assert (limited.status[beyond] == PointStatus.NEIGHBOUR_MISMATCH).all()
+    kept = beyond & limited.ok
+    assert kept.any()
+    assert (limited.status[beyond & ~kept] == PointStatus.NEIGHBOUR_MISMATCH).all()
     # no other point is lost
-    np.testing.assert_array_equal(limited.ok, free.ok & ~beyond)
+    np.testing.assert_array_equal(limited.ok, (free.ok & ~beyond) | kept)
+    # what is measured again is that of one half, not of both
+    assert np.nanmax(sigma_px(limited)) <= most
+    halves = [np.median(depth_px(before)[side]) for side in (XY[:, 0] < 60.0, XY[:, 0] > 100.0)]
+    off = np.abs(depth_px(limited)[kept, None] - halves).min(axis=1)
+    assert (off < 4.0 * sigma_px(limited)[kept]).all()

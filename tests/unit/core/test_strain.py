@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from scipy.linalg import logm, sqrtm
 
-from core.errors import InputError
-from core.field.points.shared_pixels import SharedPixels
-from core.field.region.cuts import Cuts
-from core.field.region.window import distinct_windows, window_offsets
-from core.status import PointStatus
-from core.strain import StrainField, StrainOptions, StrainStatus, surface_strain
-from core.strain.arcs import missed_slope
-from core.strain.common_part import common_part
-from core.strain.surface import surface_slopes
-from core.strain.tensors import strain_slopes
-from core.strain.window import plane_weights
+from stereorig.core.errors import InputError
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.core.field.region.window import distinct_windows, window_offsets
+from stereorig.core.status import PointStatus
+from stereorig.core.strain import StrainField, StrainOptions, StrainStatus, surface_strain
+from stereorig.core.strain.arcs import missed_slope
+from stereorig.core.strain.common_part import common_part
+from stereorig.core.strain.surface import surface_slopes
+from stereorig.core.strain.tensors import strain_slopes
+from stereorig.core.strain.window import plane_weights
 from tests.support.strain_fields import cylinder, make_field, plane, sphere, turned
 
 F_SMALL = np.array([[1.001, 0.0004, 0], [-0.0002, 0.9995, 0], [0, 0, 1]])
@@ -401,7 +401,7 @@ def test_the_common_factor_goes_through_each_windows_own_weights(order):
     assert (~lost & good).sum() > 150
 
 
-def test_windows_cut_off_alike_share_their_weights_and_no_other():
+def test_only_windows_cut_off_alike_share_their_weights():
     """Each window's rows as they were given come back from its kind, and the kinds are those that a set counts."""
     rng = np.random.default_rng(5)
     kinds = rng.random((7, 81)) < 0.6

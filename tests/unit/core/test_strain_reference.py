@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from core.field.points.result import Field
-from core.settings import StrainTensor
-from core.strain import StrainOptions, surface_strain
-from core.strain.reference import reference_share
+from stereorig.core.field.points.result import Field
+from stereorig.core.settings import StrainTensor
+from stereorig.core.strain import StrainOptions, surface_strain
+from stereorig.core.strain.reference import reference_share
 from tests.support.gauge_field import make_field
 
 OPTIONS = StrainOptions(window=5, order=1)

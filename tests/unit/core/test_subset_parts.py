@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from core.field.parts.subset_parts import Pull, pull_of_parts
-from core.field.parts.subset_residuals import SubsetResiduals
+from stereorig.core.field.parts.subset_parts import Pull, pull_of_parts
+from stereorig.core.field.points.subset_residuals import SubsetResiduals
 
 N, WIDTH, NOISE = 100, 27, 2.0
 
@@ -67,12 +67,12 @@ def test_a_wire_before_the_middle_of_a_subset_is_seen_though_it_spoils_the_match
     assert (pull.centre > 1.0).mean() > 0.8
 
 
-def test_a_part_that_is_off_beside_the_middle_is_none_of_the_middles() -> None:
+def test_a_deviating_part_at_the_side_does_not_count_for_the_middle() -> None:
     assert subsets(0.5, 5).centre.max() < 1.0
 
 
 @pytest.mark.parametrize("noise", [2.0, 30.0])
-def test_what_all_of_a_subset_loses_is_no_other_centre(noise: float) -> None:
+def test_a_loss_over_the_whole_subset_gives_no_other_centre(noise: float) -> None:
     assert subsets(0.0, 0, noise=noise).centre.max() < 1.0
 
 
@@ -90,7 +90,7 @@ def folded(rise_px: float, degrees: float) -> Pull:
         patch = np.stack([g * b for b in (np.ones_like(u), u, v, u * u, u * v, v * v)], axis=-1).reshape(-1, 6)
         one -= (patch @ np.linalg.lstsq(patch, one.ravel(), rcond=None)[0]).reshape(one.shape)
     reference = texture - texture.mean(axis=(1, 2), keepdims=True)
-    return pull_of_parts(SubsetResiduals(residual, gx, gy, reference), np.ones(texture.shape, bool), 2, folds=True)
+    return pull_of_parts(SubsetResiduals(residual, gx, gy, reference), np.ones(texture.shape, bool), 2, folds=(0,))
 
 
 @pytest.mark.parametrize("degrees", [0.0, 10.0, 67.0])

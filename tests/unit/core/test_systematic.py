@@ -8,18 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from core.field.points.images import MeasureImage
-from core.field.points.patch import PatchChoice
-from core.field.points.result import Field
-from core.field.region.region import PointGrid
-from core.field.seeding.seeds import Seed
-from core.measure import MeasureOptions, measure_shape
-from core.strain import StrainOptions, surface_strain
-from core.systematic import interpolation
-from core.systematic.interpolation import SmoothSlopes, interpolation_term
-from core.systematic.patch_order import patch_term
-from core.systematic.strain_window import window_term
-from core.systematic.term import Term
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.patch import PatchChoice
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.field.seeding.seeds import Seed
+from stereorig.core.measure import MeasureOptions, measure_shape
+from stereorig.core.strain import StrainOptions, surface_strain
+from stereorig.core.systematic import interpolation
+from stereorig.core.systematic.interpolation import SmoothSlopes, interpolation_term
+from stereorig.core.systematic.patch_order import patch_term
+from stereorig.core.systematic.strain_window import window_term
+from stereorig.core.systematic.term import Term
 from tests.support.disc_images import cameras_beside, discs
 from tests.support.matching_scene import Bent, Texture, digitise, paper_pair, render
 from tests.support.strain_fields import make_field, plane
@@ -78,10 +78,10 @@ def test_a_soft_image_of_the_same_discs_has_little_of_it() -> None:
     assert soft.figures["match_px"].below < 0.6 * sharp.figures["match_px"].rms
 
 
-def test_no_phase_tells_nothing_and_nothing_is_stated() -> None:
+def test_without_phases_no_term_is_stated() -> None:
     _, term = of_discs(1, 0.0)
     assert term.figures == {}
-    assert term.text.startswith("Not told")
+    assert term.text.startswith("Not known")
 
 
 def test_a_sphere_under_plane_patches_is_off_by_what_is_estimated() -> None:
@@ -171,7 +171,7 @@ def test_a_plane_that_stretches_shows_no_term_of_its_patches() -> None:
         assert figure.below < 1e3 * sigma
 
 
-def test_what_cannot_be_told_is_missing() -> None:
+def test_unknown_terms_are_missing() -> None:
     small = make_field(plane, lambda p: p + 0.1, shape=(5, 5))
     assert patch_term(small, paper_pair(), subset_px=33).figures == {}
     strain = surface_strain(small, StrainOptions(window=9), subset_px=33)

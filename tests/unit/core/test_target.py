@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.errors import TargetError
-from core.target import GridTarget
+from stereorig.core.errors import TargetError
+from stereorig.core.target import GridTarget
 
 
 def test_inner_points_of_the_papers_grid() -> None:

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import tomllib
+from itertools import product
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.arrays import Float
-from core.boards import BoardTarget, BoardView, detect_board, detect_target, dot_centre_offset_px, find_target
-from core.errors import TargetError
-from core.grid import GridView
-from core.target import GridTarget
+from stereorig.core.arrays import Float
+from stereorig.core.boards import BoardTarget, BoardView, detect_board, detect_target, dot_centre_offset_px, find_target
+from stereorig.core.boards.corners import any_checkerboard
+from stereorig.core.boards.pictures import Pictures
+from stereorig.core.errors import TargetError
+from stereorig.core.grid import GridView
+from stereorig.core.names import CAMERAS
+from stereorig.core.target import GridTarget
+from stereorig.sim.catalog import make_scene
+from stereorig.sim.render import RenderOptions, render
+from stereorig.sim.rig import SimRig
 from tests.bench.accuracy.targets import BOARDS, CASES, measured
 from tests.support.board_images import BoardCamera, Drawn, board_image, exposed, render_board
-from tests.support.grid_images import PAPER_TARGET, grid_image, paper_camera
+from tests.support.grid_images import PAPER_TARGET, grid_image, paper_camera, render_cover, truth_px
+from tests.support.tiny_rig import TINY
 
 TILTED = BoardCamera(turn=(0.25, -0.3, 0.1))
 KINDS = {
@@ -59,6 +69,45 @@ def test_another_target_than_the_one_declared_is_named(shown: str) -> None:
         assert error.code == "target_other"
         assert error.cause.startswith(WORDS[shown])
         assert "declared is a" in error.cause
+
+
+@pytest.mark.parametrize("number", [5, 7, 9, 11, 15])
+def test_a_line_grid_is_never_called_a_checkerboard(number: int) -> None:
+    # what crossings and cells make at 45 degrees resembles one, the more the lines are blurred and close
+    size, pitch = (179, 168), 10.0 / (number - 1)
+    named = []
+    for width, blur, bright in product((0.03, 0.1, 0.2), (0.55, 1.0, 1.6), (False, True)):
+        grid = GridTarget(pitch_mm=pitch, lines=(number, number), line_width_mm=width * pitch, dark_lines=not bright)
+        cover = render_cover(paper_camera(size_px=size, phd_px=4235.0), grid, size, blur_px=blur, samples=4)
+        grey = 40.0 + 160.0 * cover if bright else 200.0 - 160.0 * cover
+        seen = any_checkerboard(Pictures((grey + np.random.default_rng(1).normal(0.0, 2.0, grey.shape)).astype("f4")))
+        named += [] if seen is None else [(width, blur, bright, seen.shape)]
+    assert named == []
+
+
+def test_the_grid_of_the_tiny_rig_is_found_and_closer_lines_are_no_other_target() -> None:
+    tables = tomllib.loads(TINY)
+    for name in CAMERAS:
+        for pitch, number in ((1.4, 8), (1.0, 11)):
+            tables["target"] |= {"pitch_mm": pitch, "lines": [number, number]}
+            rig = SimRig.from_dict(tables)
+            camera, target = rig.camera(name), GridTarget(pitch_mm=pitch, lines=(number, number), line_width_mm=0.1)
+            seen = render(make_scene(rig, "grid"), camera.camera, camera.size_px, options=RenderOptions(threads=1))
+            image = camera.sensor.expose(camera.lighting.apply(seen), np.random.default_rng(2), exposure=1.0)
+            if number == 8:
+                view = detect_target(image, target)
+                np.testing.assert_allclose(view.xy_px, truth_px(camera.camera, target), atol=0.1)
+            else:
+                error = _refused(image, target)
+                assert error.code == "target_not_found"
+                assert "12 px apart" in error.remedy
+
+
+@pytest.mark.parametrize("spoil", [0.0, 0.7])
+def test_a_checkerboard_lit_from_the_side_is_named(spoil: float) -> None:
+    image = board_image(TILTED, KINDS["checkerboard"])
+    shaded = (image * np.linspace(1.0 - spoil, 1.0, image.shape[1])).astype(np.uint8)
+    assert _refused(shaded, PAPER_TARGET).cause.startswith(WORDS["checkerboard"])
 
 
 def test_a_line_grid_of_another_count_is_no_other_target() -> None:

@@ -7,14 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from core.errors import RegionError
-from core.field.growth.grow import Attempts
-from core.field.region.cuts import Cuts, crosses
-from core.field.region.find_visible import MARGIN_PX, with_visibility
-from core.field.region.region import PointGrid, check_region
-from core.field.region.visibility import MIN_SHARE
-from core.field.seeding.local_fit import robust_local_fits
-from core.field.seeding.seeds import as_seeds, nearest_points
+from stereorig.core.errors import RegionError
+from stereorig.core.field.growth.grow import Attempts
+from stereorig.core.field.region.cuts import Cuts, crosses
+from stereorig.core.field.region.find_visible import MARGIN_PX, with_visibility
+from stereorig.core.field.region.region import PointGrid, check_region
+from stereorig.core.field.region.visibility import MIN_SHARE
+from stereorig.core.field.seeding.local_fit import robust_local_fits
+from stereorig.core.field.seeding.seeds import as_seeds, nearest_points
 
 SUBSET = 21
 KINKED = [(12.3, 50.2), (60.1, 48.7), (75.4, 80.9)]
@@ -116,7 +116,7 @@ def test_a_point_on_the_line_sees_nothing() -> None:
     assert (visibility.share[visibility.enough.ravel()] > MIN_SHARE).all()
 
 
-def test_local_fits_hear_only_what_they_see() -> None:
+def test_local_fits_use_visible_pixels_only() -> None:
     """A step across a line: at its lips a fit of all neighbours would be wrong by up to the step."""
     rng = np.random.default_rng(8)
     points = rng.uniform(0.0, 100.0, (600, 2))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.field.points.images import MeasureImage
-from core.field.region.region import PointGrid
-from core.field.seeding.seeds import Seed
-from core.measure import MeasureOptions, ReferencePair
-from core.orientation.step import step_points
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.field.seeding.seeds import Seed
+from stereorig.core.measure import MeasureOptions, ReferencePair
+from stereorig.core.orientation.step import step_points
 from tests.support.disc_images import cameras_beside, discs
 
 SIZE, DISPARITY_PX = 200, 6.0

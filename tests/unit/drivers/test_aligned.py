@@ -6,10 +6,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from core.names import CameraName
-from drivers.acquisition.clocks import DeviceClock
-from drivers.acquisition.counter_offset import AlignedPairing
-from drivers.cameras.protocol import Frame
+from stereorig.core.names import CameraName
+from stereorig.drivers.acquisition.clocks import DeviceClock
+from stereorig.drivers.acquisition.counter_offset import AlignedPairing
+from stereorig.drivers.cameras.protocol import Frame
 
 PERIOD_NS = 50_000_000
 PIXELS = np.zeros((2, 2), np.uint8)

@@ -14,14 +14,14 @@ from itertools import pairwise
 
 import pytest
 
-from core.errors import CameraError
-from drivers.cameras.aravis.clock import ArrivalClock
-from drivers.cameras.aravis.gvcp import ControlState, control_state
-from drivers.cameras.aravis.library import aravis
-from drivers.cameras.aravis.triggers import TriggerNumbers
-from drivers.cameras.aravis.watch import Watch
-from drivers.cameras.protocol import CameraOptions, CameraSettings, FrameStatus
-from drivers.registry import discover_cameras, make_camera
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.aravis.library import aravis, repository
+from stereorig.drivers.cameras.aravis.stream import ArrivalClock
+from stereorig.drivers.cameras.genicam.gvcp import ControlState, control_state
+from stereorig.drivers.cameras.genicam.triggers import TriggerNumbers
+from stereorig.drivers.cameras.genicam.watch import Watch
+from stereorig.drivers.cameras.protocol import CameraOptions, CameraSettings, FrameStatus
+from stereorig.drivers.registry import discover_cameras, look_at_camera, make_camera
 from tests.support.requirements import missing
 
 MS = 1_000_000
@@ -254,8 +254,17 @@ def test_a_camera_that_is_not_gige_goes_the_same_way(fake_inside: str) -> None:
     assert caught.value.code == "camera_lost"
 
 
+def test_a_cameras_features_and_description_are_read_and_it_is_free_again(fake_inside: str) -> None:
+    for _ in range(2):
+        about, rows = look_at_camera(fake_inside)
+        assert (about["vendor"], about["model"]) == ("Aravis", "Fake")
+        assert about["description"].startswith("<?xml")
+        width = next(row for row in rows if row.name == "Width")
+        assert (width.kind, width.access, width.value, width.setting) == ("integer", "read and write", 512, "region_px")
+
+
 def test_without_pygobject_the_remedy_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    aravis.cache_clear()
+    repository.cache_clear()
     monkeypatch.setitem(sys.modules, "gi", None)  # as if it were not installed
     try:
         for call in (lambda: make_camera("aravis", CameraOptions(device="any")), lambda: discover_cameras("aravis")):
@@ -265,7 +274,7 @@ def test_without_pygobject_the_remedy_says_what_to_install(monkeypatch: pytest.M
             assert "gir1.2-aravis-0.8" in caught.value.remedy
             assert "stereorig[aravis]" in caught.value.remedy
     finally:
-        aravis.cache_clear()
+        repository.cache_clear()
 
 
 @pytest.mark.fault(11)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.errors import CameraError
-from drivers.cameras.protocol import Frame, FrameCounters
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.protocol import Frame, FrameCounters
 
 
 def test_twelve_significant_bits_fit_sixteen_bit_pixels() -> None:

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from core.errors import CameraError
-from drivers.cameras.pixels import BY_CODE, BY_NAME, FORMATS, PixelFormat, unpack
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.pixels import BY_CODE, BY_NAME, FORMATS, PixelFormat, unpack
 
 
 def test_codes_are_those_of_the_naming_convention() -> None:
@@ -132,7 +132,7 @@ def test_the_image_does_not_share_the_buffer(known: PixelFormat) -> None:
 
 @pytest.mark.parametrize("known", FORMATS, ids=lambda known: known.name)
 def test_what_is_unpacked_in_blocks_joins(known: PixelFormat, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers.cameras.pixels._BLOCK", 8)
+    monkeypatch.setattr("stereorig.drivers.cameras.pixels._BLOCK", 8)
     image = np.random.default_rng(5).integers(0, 2**known.bit_depth, (13, 21))
     data = np.frombuffer(_pack(image.ravel().tolist(), known), np.uint8)
     np.testing.assert_array_equal(unpack(data, known, 21, 13), image)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.acquisition.frame_counter import Arrival, SequenceReader
+from stereorig.drivers.acquisition.frame_counter import Arrival, SequenceReader
 
 
 def test_a_counter_of_sixteen_bits_goes_on_after_its_wrap() -> None:

@@ -12,12 +12,12 @@ import time
 
 import pytest
 
-from core.errors import StageError
-from drivers.registry import open_stage
-from drivers.stages.protocol import AxisOptions
-from drivers.stages.serial_line import SerialLine
-from sim.controllers.esp301 import SimESP301
-from sim.controllers.server import ControllerServer
+from stereorig.core.errors import StageError
+from stereorig.drivers.registry import open_stage
+from stereorig.drivers.stages.protocol import AxisOptions
+from stereorig.drivers.stages.serial_line import SerialLine
+from stereorig.sim.controllers.esp301 import SimESP301
+from stereorig.sim.controllers.server import ControllerServer
 from tests.support.stage_bench import CONTROLLERS, MOVE_WORD, bench
 
 
@@ -46,12 +46,12 @@ def test_a_port_that_another_program_holds_is_named_so() -> None:
 
 
 def test_an_unknown_driver_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(StageError, match="conex-cc, esp301, smc100") as caught:
-        open_stage("xps", "socket://127.0.0.1:1", {1: AxisOptions()})
+    with pytest.raises(StageError, match="conex-cc, esp301, kinesis, pi, smc100, standa, xps, zaber") as caught:
+        open_stage("agilis", "socket://127.0.0.1:1", {1: AxisOptions()})
     assert caught.value.code == "unknown_driver"
 
 
-def test_a_line_whose_other_side_went_first_is_closed_all_the_same() -> None:
+def test_a_line_is_closed_even_if_its_other_side_closed_first() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         line = SerialLine(f"socket://127.0.0.1:{listener.getsockname()[1]}", terminator=b"\r", baudrate=9600)
         line.open()
@@ -73,6 +73,21 @@ def test_a_closed_line_says_so() -> None:
             with pytest.raises(StageError, match="closed") as caught:
                 call()
             assert caught.value.code == "stage_lost"
+
+
+def test_a_port_that_another_thread_closes_in_a_read_is_a_lost_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    with bench("esp301", "socket") as stand:
+        port = stand.stage._line._port
+        assert port is not None
+
+        def closed_meanwhile(size: int) -> bytes:
+            port.close()
+            return bytes(port._socket.recv(size))  # as pyserial does: the socket is None
+
+        monkeypatch.setattr(port, "read", closed_meanwhile)
+        with pytest.raises(StageError) as caught:
+            stand.stage.position(1)
+        assert caught.value.code == "stage_lost"
 
 
 def test_noise_without_end_does_not_hold_the_line_forever() -> None:

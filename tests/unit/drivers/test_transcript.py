@@ -14,12 +14,12 @@ from pathlib import Path
 
 import pytest
 
-from core.errors import StageError
-from drivers.registry import open_stage
-from drivers.stages.protocol import AxisOptions
-from drivers.stages.transcript import Transcript
-from sim.controllers.esp301 import SimESP301
-from sim.controllers.server import ControllerServer
+from stereorig.core.errors import StageError
+from stereorig.drivers.registry import open_stage
+from stereorig.drivers.stages.protocol import AxisOptions
+from stereorig.drivers.stages.transcript import Transcript
+from stereorig.sim.controllers.esp301 import SimESP301
+from stereorig.sim.controllers.server import ControllerServer
 from tests.support.requirements import ROOT
 from tests.support.stage_bench import CONTROLLERS, bench
 
@@ -115,8 +115,8 @@ def test_a_full_disk_ends_the_transcript_and_not_the_motion() -> None:
 def test_what_went_out_before_a_kill_stands_in_the_file(tmp_path: Path) -> None:
     record = tmp_path / "wire.txt"
     program = (
-        "import sys, time; from pathlib import Path; from drivers.registry import open_stage;"
-        "from drivers.stages.protocol import AxisOptions;"
+        "import sys, time; from pathlib import Path; from stereorig.drivers.registry import open_stage;"
+        "from stereorig.drivers.stages.protocol import AxisOptions;"
         "stage = open_stage('esp301', sys.argv[1], {1: AxisOptions()}, record=Path(sys.argv[2]));"
         "stage.position(1); print('asked', flush=True); time.sleep(60)"
     )
@@ -138,7 +138,7 @@ def test_serve_refuses_a_transcript_that_cannot_be_written(tmp_path: Path) -> No
         [
             sys.executable,
             "-m",
-            "server.cli",
+            "stereorig.server.cli",
             "serve",
             "--port",
             "0",

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from core.errors import CameraError
-from drivers.cameras.protocol import CameraOptions, FrameGrabber
-from drivers.cameras.v4l2.controls import control_name
-from drivers.registry import discover_cameras, make_camera
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.protocol import CameraOptions, FrameGrabber
+from stereorig.drivers.cameras.v4l2.controls import control_name
+from stereorig.drivers.registry import discover_cameras, make_camera
+from tests.support.patience import busy
 
 
 def _refusal(device: str) -> CameraError:
@@ -41,7 +42,7 @@ def test_a_camera_that_is_not_open_says_so_at_once() -> None:
         with pytest.raises(CameraError) as caught:
             call()
         assert caught.value.code == "camera_lost"
-        assert time.monotonic() - begin < 1.0
+        assert time.monotonic() - begin < 1.0 * busy()
     grabber.disarm()
     grabber.close()
     assert set(grabber.statistics().values()) == {0}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivers.cameras.v4l2.formats import BY_CODE, GRAY_FORMATS, GrayFormat, find_format, fourcc_name
+from stereorig.drivers.cameras.v4l2.formats import BY_CODE, GRAY_FORMATS, GrayFormat, find_format, fourcc_name
 from tests.support.v4l2_pixels import BYTES, packed
 
 # "25 pixels are packed into 32 bytes, which leaves the 6 most significant bits of the last byte padded with 0"

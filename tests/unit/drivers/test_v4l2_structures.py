@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.cameras.v4l2 import structures as v
+from stereorig.drivers.cameras.v4l2 import structures as v
 from tests.support.requirements import missing
 
 # members of unnamed unions go by our name for the union

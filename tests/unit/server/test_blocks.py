@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from core.errors import MeasurementError, SeedError, StereorigError
-from server.workflows.analysis.block import Ask
-from server.workflows.analysis.blocks import LONGEST, Blocks
+from stereorig.core.errors import MeasurementError, SeedError, StereorigError
+from stereorig.server.workflows.analysis.block import BlockStep
+from stereorig.server.workflows.analysis.blocks import LONGEST, Blocks
 
 FIRST = 0
 
@@ -57,7 +57,7 @@ class World:
                 out[n] = None
         return out
 
-    def work(self, ask: Ask) -> tuple[str, Any]:
+    def work(self, ask: BlockStep) -> tuple[str, Any]:
         """Read what an ask needs when it begins; return what is to be written when it ends."""
         try:
             if ask.kind == "head":
@@ -70,7 +70,7 @@ class World:
         except StereorigError as error:
             return "", error
 
-    def end(self, ask: Ask, done: tuple[str, Any]) -> Any:
+    def end(self, ask: BlockStep, done: tuple[str, Any]) -> Any:
         name, found = done
         if isinstance(found, StereorigError):
             return found
@@ -86,7 +86,7 @@ class World:
 def run(world: World, plan: Blocks, width: int, seed: int, stop_after: int | None = None) -> list[tuple[int, Any]]:
     """Let ``width`` workers do what the plan asks for, ending in any order; return what was certain, as it came."""
     rng = np.random.default_rng(seed)
-    running: list[tuple[Ask, tuple[str, Any]]] = []
+    running: list[tuple[BlockStep, tuple[str, Any]]] = []
     certain: list[tuple[int, Any]] = []
     for count in itertools.count():
         assert count < 50 * world.steps, "it never ends"
@@ -137,14 +137,14 @@ WORLDS = {
 
 @pytest.mark.parametrize("width", [2, 5, 64])
 @pytest.mark.parametrize("name", list(WORLDS))
-def test_blocks_lead_where_one_step_after_another_leads(name: str, width: int) -> None:
+def test_blocks_give_the_same_outcomes_as_one_step_after_another(name: str, width: int) -> None:
     for seed in range(12):
         world = World(61, **WORLDS[name])  # type: ignore[arg-type]
         assert_in_order(world, run(world, plan_of(world, width), width, seed))
 
 
 @pytest.mark.parametrize("name", list(WORLDS))
-def test_a_plan_goes_on_from_what_another_one_left(name: str) -> None:
+def test_a_plan_continues_from_another_plan_s_results(name: str) -> None:
     for seed in range(12):
         world = World(61, **WORLDS[name])  # type: ignore[arg-type]
         certain = run(world, plan_of(world, 5), 5, seed, stop_after=20 + seed)

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from core.calibration import COVARIANCE_NAMES, calibrate
-from core.errors import FileFormatError, InputError
-from core.target import GridTarget
-from server.formats.calibrations.native import covariance_in, write_calibration
-from server.formats.calibrations.recognise import load_calibration
-from server.formats.calibrations.target_toml import read_rig, read_target
-from server.formats.views import find_views
+from stereorig.core.calibration import COVARIANCE_NAMES, calibrate
+from stereorig.core.errors import FileFormatError, InputError
+from stereorig.core.target import GridTarget
+from stereorig.server.formats.calibrations.native import covariance_in, write_calibration
+from stereorig.server.formats.calibrations.recognise import load_calibration
+from stereorig.server.formats.calibrations.target_toml import read_rig, read_target
+from stereorig.server.formats.views import find_views
 from tests.support.calibration_truth import HELD, NOMINAL, Grid, make_views
 from tests.support.requirements import ROOT
 
@@ -117,6 +118,19 @@ def test_an_odd_folder_of_views_is_refused(tmp_path: Path, names: list[str], cod
     assert caught.value.code == code
 
 
+@pytest.mark.fault(65)
+def test_views_may_be_of_any_image_format_and_another_ending_is_named(tmp_path: Path) -> None:
+    for name in ("cam1_000.jpg", "cam2_000.JPEG", "cam1_001.BMP", "cam2_001.Tif", "cam1_002.png"):
+        put(tmp_path, name, "")
+    assert [v.path.suffix for v in find_views(tmp_path)] == [".jpg", ".BMP", ".png", ".JPEG", ".Tif"]
+    other = tmp_path / "other"
+    other.mkdir()
+    for name in ("cam1_000.gif", "cam2_000.gif"):
+        put(other, name, "")
+    with pytest.raises(InputError, match=r"no view\. cam1_000\.gif and 1 more cannot be read by the ending"):
+        find_views(other)
+
+
 def test_a_folder_that_is_none_is_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "none", put(tmp_path, "file", "")):
         with pytest.raises(InputError) as caught:
@@ -126,7 +140,7 @@ def test_a_folder_that_is_none_is_refused(tmp_path: Path) -> None:
 
 def test_calibration_json_holds_what_its_readers_need(tmp_path: Path) -> None:
     target = GridTarget(pitch_mm=1.0, lines=(11, 11), line_width_mm=0.03)
-    result = calibrate(make_views(), target, NOMINAL, HELD)
+    result = calibrate(make_views(), target, NOMINAL, replace(HELD, aspect_sigma=0.0))
     path = tmp_path / "calibration.json"
     write_calibration(path, result, target, provenance={"localiser": "profile"})
     content = json.loads(path.read_text())

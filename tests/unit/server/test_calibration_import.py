@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 import yaml
 
-from core.cameras.camera import Camera
-from core.cameras.lens import OpenCVLens
-from core.errors import FileFormatError
-from server.formats.calibrations.programs.plausibility import check_calibration
-from server.formats.calibrations.recognise import (
+from stereorig.core.cameras.camera import Camera
+from stereorig.core.cameras.lens import OpenCVLens
+from stereorig.core.cameras.opencv_full import opencv_lens_of
+from stereorig.core.errors import CalibrationError, FileFormatError
+from stereorig.server.formats.calibrations.export import convert_calibration
+from stereorig.server.formats.calibrations.programs.plausibility import check_calibration
+from stereorig.server.formats.calibrations.recognise import (
     LoadedCalibration,
     imported_content,
     load_calibration,
@@ -127,14 +129,28 @@ def test_coefficient_vectors_of_every_length(tmp_path: Path, length: int) -> Non
 
 
 @pytest.mark.parametrize(
-    ("place", "term"), [(8, "s1"), (9, "s2"), (10, "s3"), (11, "s4"), (12, "tau_x"), (13, "tau_y")]
+    ("place", "term"), [(8, "s1"), (9, "s2"), (10, "s3"), (11, "s4"), (12, "tau_x_rad"), (13, "tau_y_rad")]
 )
-def test_thin_prism_and_tilt_are_refused_by_name(tmp_path: Path, place: int, term: str) -> None:
+def test_thin_prism_and_tilt_are_kept_in_all_forms_that_have_them(tmp_path: Path, place: int, term: str) -> None:
     d2 = np.zeros(12 if place < 12 else 14)
     d2[:5], d2[place] = D2, 0.01
-    error = refused(opencv_file(tmp_path / "a.yml", distCoeffs2=d2))
-    assert error.code == "calibration_unsupported"
-    assert f"distCoeffs2 has {term} = 0.01;" in error.cause
+    loaded = load_calibration(opencv_file(tmp_path / "a.yml", distCoeffs2=d2))
+    check_against_opencv(loaded, d2=d2)
+    assert check_calibration(loaded).volume.max_px < 1e-9
+    assert not hasattr(loaded.pair.cam1.lens, term)
+    for form in ("opencv", "json"):
+        made = convert_calibration(loaded, form, (tmp_path / "a.yml").read_bytes())
+        again = parse_calibration(made.data, name="again")
+        check_against_opencv(again, d2=d2)
+        assert made.report.exact
+        assert made.report.read_back.max_px < 1e-9
+    lens = again.pair.cam2.lens
+    own = {key: getattr(lens, key) for key in lens.parameter_names}
+    assert opencv_lens_of(own) == lens
+    for form in ("paper", "dice", "matchid", "vic3d"):
+        with pytest.raises(CalibrationError, match=f"cam2 has {term} = 0.01") as caught:
+            convert_calibration(loaded, form, b"")
+        assert caught.value.code == "lens_not_held"
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-import server.store.certificates
-from server.store.certificates import CertificateStore
-from server.store.documents import CertificateRecord
-from server.store.folder import DataFolder
+import stereorig.server.store.certificates
+from stereorig.server.documents.made import CertificateRecord
+from stereorig.server.store.certificates import CertificateStore
+from stereorig.server.store.folder import DataFolder
 
 TEST, OTHER = "t000001-aaaaaa", "t000002-bbbbbb"
 
@@ -30,13 +30,13 @@ def put(store: CertificateStore, number: int, test_id: str, *, analysis_id: str 
 def reads(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """Documents of certificates, as they are read."""
     found: list[Path] = []
-    real = server.store.certificates.read_record
+    real = stereorig.server.store.certificates.read_record
 
     def counted(model: type[CertificateRecord], path: Path) -> CertificateRecord:
         found.append(path)
         return real(model, path)
 
-    monkeypatch.setattr(server.store.certificates, "read_record", counted)
+    monkeypatch.setattr(stereorig.server.store.certificates, "read_record", counted)
     return found
 
 

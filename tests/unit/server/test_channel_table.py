@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.errors import StereorigError
-from server.formats.channel_table import read_channel_table
-from server.formats.channel_units import channel_name, unit_of
+from stereorig.core.errors import StereorigError
+from stereorig.server.formats.channel_table import read_channel_table
+from stereorig.server.formats.channel_units import channel_name, unit_of
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from server.results.warnings import checks
-from server.results.warnings.checks import checks_if_changed, checks_of, state_of
+from stereorig.server.results.warnings import checks
+from stereorig.server.results.warnings.checks import checks_if_changed, checks_of, state_of
 
 ANALYSIS, STEPS = "a000001-abcdef", 3
 
@@ -61,7 +61,7 @@ def in_place(path: Path, text: str) -> None:
     assert path.stat().st_size == before.st_size
 
 
-def test_what_stays_has_one_state_and_is_read_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unchanged_analysis_has_one_state_and_is_read_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     state, found = checks_if_changed(folder, None, None)
     assert found == checks_of(folder)
     monkeypatch.setattr(checks, "checks_of", lambda *_: pytest.fail("read again"))

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.errors import FileFormatError
-from server.formats.noise_json import write_noise
-from server.store.calibrations import CalibrationStore
-from server.store.catalog import Catalog
-from server.store.folder import DataFolder
-from server.store.indexing.build import rebuild
-from server.store.noise import NoiseStore
-from server.store.tests.tests import TestStore
-from server.store.verify import verify
+from stereorig.core.errors import FileFormatError
+from stereorig.server.formats.noise_json import write_noise
+from stereorig.server.store.calibrations import CalibrationStore
+from stereorig.server.store.catalog import Catalog
+from stereorig.server.store.folder import DataFolder
+from stereorig.server.store.indexing.build import rebuild
+from stereorig.server.store.noise import NoiseStore
+from stereorig.server.store.tests.tests import TestStore
+from stereorig.server.store.verify import verify
 
 
 def flip(path: Path, old: bytes, new: bytes) -> None:

@@ -12,13 +12,14 @@ from typing import Any
 
 import pytest
 
-from server.base.errors import NotFoundError
-from server.store.calibrations import CalibrationStore
-from server.store.catalog import Catalog
-from server.store.folder import DataFolder
-from server.store.indexing.build import Index
-from server.store.indexing.clean_stop import MARK, leave_mark, take_mark
-from server.store.tests.tests import TestStore
+from stereorig.core.errors import FileFormatError
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.store.calibrations import CalibrationStore
+from stereorig.server.store.catalog import Catalog
+from stereorig.server.store.folder import DataFolder
+from stereorig.server.store.indexing.build import Index
+from stereorig.server.store.indexing.clean_stop import MARK, leave_mark, take_mark
+from stereorig.server.store.tests.tests import TestStore
 
 LONG_AGO_NS = time.time_ns() - 3_600_000_000_000
 
@@ -147,7 +148,7 @@ def test_an_index_that_is_not_the_one_that_was_closed_is_not_believed(
     bench.stop()
 
 
-def test_a_mark_and_catalogue_of_another_folder_vouch_for_none_of_its_tests(bench: Bench, tmp_path: Path) -> None:
+def test_a_mark_and_catalogue_copied_from_another_folder_are_not_believed(bench: Bench, tmp_path: Path) -> None:
     other = Bench(tmp_path / "other")
     other.start()
     other.new_test(1)
@@ -187,8 +188,13 @@ def test_a_test_that_was_changed_by_hand_meanwhile_is_read_again_and_no_other(
     change(bench.folder.tests / one)
     changed = "t000099-abcdef" if change is _folder_copied else one
     assert bench.start()["waiting"] == {changed}
-    there = bench.tests.steps.numbers(changed)
-    assert len(bench.catalog.entries("step", changed)) == len(there)
+    if change is _folder_copied:
+        with pytest.raises(FileFormatError, match="is a copy of"):
+            bench.tests.steps.numbers(changed)
+    else:
+        assert bench.tests.steps.numbers(changed) == [0, 1, 2]  # a copy is none, and one that was lost is named
+    listed = {"t000099-abcdef": [], one: [0, 2] if change is _step_taken_away else [0, 1, 2]}[changed]
+    assert [entry["n"] for entry in bench.catalog.entries("step", changed)] == listed
     assert bench.labels(two) == ["0", "1"]
     bench.stop()
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from server.config.rig_file import ComputeSection
+from stereorig.server.config.rig_file import ComputeSection
 from tests.support.requirements import ROOT, missing
 
 PAGE = (ROOT / "docs" / "how_to" / "scale_on_dask.md").read_text(encoding="utf-8")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from server.formats.results.derived import derive, derived_names, magnitude
-from server.formats.results.layout import packed
+from stereorig.server.formats.results.derived import derive, derived_names, magnitude
+from stereorig.server.formats.results.layout import packed
 
 
 def test_the_size_of_a_displacement_scatters_as_told() -> None:

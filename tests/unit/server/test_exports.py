@@ -18,16 +18,16 @@ import scipy.io
 import xarray as xr
 from PIL import Image
 
-from core.errors import InputError, StereorigError
-from server.base.errors import NotFoundError
-from server.cli.main import main
-from server.exports.matlab import matlab_name
-from server.exports.request import ExportRequest
-from server.exports.run import export, export_packed
-from server.exports.source import find_source
-from server.formats.figures.options import FigureStyle
-from server.formats.version import software_version
-from server.results.steps import Source
+from stereorig.core.errors import InputError, StereorigError
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.cli.main import main
+from stereorig.server.exports.matlab import matlab_name
+from stereorig.server.exports.request import ExportRequest
+from stereorig.server.exports.run import export, export_packed
+from stereorig.server.exports.source import find_source
+from stereorig.server.formats.figures.options import FigureStyle
+from stereorig.server.formats.version import software_version
+from stereorig.server.results.steps import ExportSource
 from tests.support.export_results import (
     CALIBRATION,
     COLS,
@@ -57,18 +57,20 @@ def stored(results: Path) -> list[xr.Dataset]:
 
 
 @pytest.fixture(scope="module")
-def source(results: Path) -> Source:
+def source(results: Path) -> ExportSource:
     return find_source(results)
 
 
-def _made(source: Source, out: Path, form: Any, **more: Any) -> list[Path]:
+def _made(source: ExportSource, out: Path, form: Any, **more: Any) -> list[Path]:
     return list(export(source, ExportRequest(form, **more), out))
 
 
 # tables -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_table_holds_every_number_to_its_last_bit(source: Source, stored: list[xr.Dataset], tmp_path: Path) -> None:
+def test_a_table_holds_every_number_to_its_last_bit(
+    source: ExportSource, stored: list[xr.Dataset], tmp_path: Path
+) -> None:
     paths = _made(source, tmp_path, "csv")
     assert [p.name for p in paths] == [f"panel_step_{n:04d}.csv" for n in range(3)]
     for path, held in zip(paths, stored, strict=True):
@@ -86,7 +88,7 @@ def test_a_table_holds_every_number_to_its_last_bit(source: Source, stored: list
     np.testing.assert_array_equal(parts.astype("f4"), stored[1].zncc.values[..., 2])
 
 
-def test_a_tables_comments_tell_unit_and_meaning_of_each_column(source: Source, tmp_path: Path) -> None:
+def test_a_tables_comments_tell_unit_and_meaning_of_each_column(source: ExportSource, tmp_path: Path) -> None:
     text = _made(source, tmp_path, "csv", steps=[1])[0].read_text(encoding="utf-8")
     comments = [line for line in text.splitlines() if line.startswith("#")]
     header = text.splitlines()[len(comments)].split(",")
@@ -100,7 +102,7 @@ def test_a_tables_comments_tell_unit_and_meaning_of_each_column(source: Source, 
     )
 
 
-def test_chosen_variables_and_steps(source: Source, tmp_path: Path) -> None:
+def test_chosen_variables_and_steps(source: ExportSource, tmp_path: Path) -> None:
     paths = _made(source, tmp_path, "csv", steps=[2], variables=["exx"])
     assert [p.name for p in paths] == ["panel_step_0002.csv"]
     columns = list(pd.read_csv(paths[0], comment="#").columns)
@@ -111,7 +113,7 @@ def test_chosen_variables_and_steps(source: Source, tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def surfaces(source: Source, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def surfaces(source: ExportSource, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return _made(source, tmp_path_factory.mktemp("vtu"), "vtu")
 
 
@@ -198,11 +200,11 @@ def test_the_series_plays_in_time_and_begins_at_rest(surfaces: list[Path]) -> No
         assert abs(w.mean() + 0.05 * n) < 1e-9
 
 
-def test_a_mask_parts_the_surface(results: Path, source: Source, tmp_path: Path) -> None:
+def test_a_mask_parts_the_surface(results: Path, source: ExportSource, tmp_path: Path) -> None:
     mask = np.full((300, 300), 255, np.uint8)
     mask[:, 66] = 0  # between the columns at 61 and 68 px
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
-    masked = Source(source.files, "m", mask=tmp_path / "mask.png")
+    masked = ExportSource(source.files, "m", mask=tmp_path / "mask.png")
     mesh = meshio.read(_made(masked, tmp_path, "vtu", steps=[1])[0])
     x = mesh.point_data["x_px"][mesh.cells_dict["triangle"]]
     assert not ((x.min(axis=1) < 66) & (x.max(axis=1) > 66)).any()
@@ -213,7 +215,7 @@ def test_a_mask_parts_the_surface(results: Path, source: Source, tmp_path: Path)
 # MATLAB and HDF5 --------------------------------------------------------------------------------------------------
 
 
-def test_scipy_opens_the_matlab_file(source: Source, stored: list[xr.Dataset], tmp_path: Path) -> None:
+def test_scipy_opens_the_matlab_file(source: ExportSource, stored: list[xr.Dataset], tmp_path: Path) -> None:
     (path,) = _made(source, tmp_path, "mat")
     read = scipy.io.loadmat(path, simplify_cells=True)
     assert [k for k in read if k.startswith("step")] == ["step_0000", "step_0001", "step_0002"]
@@ -245,7 +247,7 @@ def test_names_that_matlab_does_not_take_are_changed() -> None:
     assert len(matlab_name("x" * 100)) == 63
 
 
-def test_h5py_opens_the_stack(source: Source, stored: list[xr.Dataset], tmp_path: Path) -> None:
+def test_h5py_opens_the_stack(source: ExportSource, stored: list[xr.Dataset], tmp_path: Path) -> None:
     (path,) = _made(source, tmp_path, "h5")
     with h5py.File(path) as file:
         np.testing.assert_array_equal(file["step"][...], [0, 1, 2])
@@ -272,7 +274,7 @@ def test_h5py_opens_the_stack(source: Source, stored: list[xr.Dataset], tmp_path
         assert opened.label.values[2] == "Stufe 2 µ"
 
 
-def test_netcdf_is_given_as_stored(source: Source, tmp_path: Path) -> None:
+def test_netcdf_is_given_as_stored(source: ExportSource, tmp_path: Path) -> None:
     paths = _made(source, tmp_path, "nc")
     assert [p.read_bytes() for p in paths] == [p.read_bytes() for p in source.files]
 
@@ -280,7 +282,7 @@ def test_netcdf_is_given_as_stored(source: Source, tmp_path: Path) -> None:
 # figures and films ------------------------------------------------------------------------------------------------
 
 
-def test_a_figure_has_the_scales_colours_units_and_origin(source: Source, tmp_path: Path) -> None:
+def test_a_figure_has_the_scales_colours_units_and_origin(source: ExportSource, tmp_path: Path) -> None:
     (path,) = _made(source, tmp_path, "png", steps=[2], variables=["u_mm"], style=FigureStyle(width_px=700))
     with Image.open(path) as opened:
         assert opened.width == 700
@@ -292,7 +294,7 @@ def test_a_figure_has_the_scales_colours_units_and_origin(source: Source, tmp_pa
         assert (np.abs(pixels.astype(int) - end).max(axis=1) <= 2).sum() > 50
 
 
-def test_an_svg_says_in_words_what_it_shows(source: Source, tmp_path: Path) -> None:
+def test_an_svg_says_in_words_what_it_shows(source: ExportSource, tmp_path: Path) -> None:
     (path,) = _made(source, tmp_path, "svg", steps=[2], variables=["exx"])
     text = path.read_text(encoding="utf-8")
     for words in (
@@ -307,7 +309,7 @@ def test_an_svg_says_in_words_what_it_shows(source: Source, tmp_path: Path) -> N
         assert words in text, words
 
 
-def test_limits_percentiles_and_states(source: Source, tmp_path: Path) -> None:
+def test_limits_percentiles_and_states(source: ExportSource, tmp_path: Path) -> None:
     given = FigureStyle(limits=(-0.2, 0.3))
     (path,) = _made(source, tmp_path, "svg", steps=[1], variables=["u_mm"], style=given)
     ticks = {float(t.replace("−", "-")) for t in re.findall(r">(−?0\.\d+)</text>", path.read_text(encoding="utf-8"))}
@@ -328,11 +330,11 @@ def test_limits_percentiles_and_states(source: Source, tmp_path: Path) -> None:
         assert caught.value.code == "figure_style_invalid"
 
 
-def test_a_map_lies_over_the_image_where_its_points_are(source: Source, tmp_path: Path) -> None:
+def test_a_map_lies_over_the_image_where_its_points_are(source: ExportSource, tmp_path: Path) -> None:
     image = np.full((260, 300), 60, np.uint8)
     image[:, 150:] = 190
     cv2.imwrite(str(tmp_path / "cam1.tif"), image)
-    over = Source(source.files, "o", image=tmp_path / "cam1.tif")
+    over = ExportSource(source.files, "o", image=tmp_path / "cam1.tif")
     style = FigureStyle(width_px=1000, opacity=1.0)
     (path,) = _made(over, tmp_path, "png", steps=[1], variables=["u_mm"], over_image=True, style=style)
     drawn = np.asarray(Image.open(path).convert("RGB")).astype(int)
@@ -350,7 +352,7 @@ def test_a_map_lies_over_the_image_where_its_points_are(source: Source, tmp_path
     assert caught.value.code == "image_missing"
 
 
-def test_films_have_a_frame_a_step_on_one_scale(source: Source, tmp_path: Path) -> None:
+def test_films_have_a_frame_a_step_on_one_scale(source: ExportSource, tmp_path: Path) -> None:
     style = FigureStyle(width_px=500)
     (gif,) = _made(source, tmp_path, "gif", style=style, fps=4.0)
     with Image.open(gif) as opened:
@@ -412,7 +414,9 @@ def _provenance(path: Path) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("form", ["csv", "vtu", "mat", "h5", "png", "svg", "gif"])
-def test_every_export_says_frame_settings_calibration_and_version(source: Source, tmp_path: Path, form: str) -> None:
+def test_every_export_says_frame_settings_calibration_and_version(
+    source: ExportSource, tmp_path: Path, form: str
+) -> None:
     provenance = _provenance(_made(source, tmp_path, form, steps=[1])[0])
     assert provenance["settings"] == SETTINGS
     assert provenance["calibration_sha256"] == CALIBRATION
@@ -422,7 +426,7 @@ def test_every_export_says_frame_settings_calibration_and_version(source: Source
     assert provenance["length_unit"] == "mm"
 
 
-def test_what_is_not_there_is_refused_by_name(source: Source, tmp_path: Path) -> None:
+def test_what_is_not_there_is_refused_by_name(source: ExportSource, tmp_path: Path) -> None:
     for more, code in (
         ({"steps": [7]}, "step_missing"),
         ({"variables": ["nix"]}, "field_missing"),
@@ -432,12 +436,12 @@ def test_what_is_not_there_is_refused_by_name(source: Source, tmp_path: Path) ->
             _made(source, tmp_path, "png", **more)
         assert caught.value.code == code
     with pytest.raises(StereorigError) as caught:
-        _made(Source([], "none"), tmp_path, "csv")
+        _made(ExportSource([], "none"), tmp_path, "csv")
     assert caught.value.code == "no_results"
     assert not list(tmp_path.iterdir())
 
 
-def test_several_files_are_packed_and_one_is_not(source: Source, tmp_path: Path) -> None:
+def test_several_files_are_packed_and_one_is_not(source: ExportSource, tmp_path: Path) -> None:
     import zipfile
 
     packed = export_packed(source, ExportRequest("csv"), tmp_path)

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from core.errors import StateError
-from server.workflows.exposure import Brightness, brightness, search_exposure
+from stereorig.core.errors import StateError
+from stereorig.server.workflows.exposure import Brightness, brightness, search_exposure
 
 FULL = 255.0
 
@@ -50,7 +50,7 @@ def test_any_response_that_grows_with_the_exposure_is_brought_to_the_level(
     assert found.pictures == len(asked) <= 17
 
 
-def test_light_that_does_not_suffice_is_refused_at_the_longest_exposure() -> None:
+def test_too_little_light_is_refused_at_the_longest_exposure() -> None:
     asked, picture = sensor(lambda ms: 1e-5 * ms)
     with pytest.raises(StateError, match=r"reach 1\.2 % of full scale; 80 % are wanted") as caught:
         search_exposure("cam2", picture, 10.0, (0.01, 1000.0), 0.8)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from server.formats.figures.axes import directions_of
-from server.formats.figures.figure import Picture, draw_pixels
-from server.formats.figures.options import FigureStyle
+from stereorig.server.formats.figures.axes import directions_of
+from stereorig.server.formats.figures.figure import FigureData, draw_pixels
+from stereorig.server.formats.figures.options import FigureStyle
 
 X_PX, Y_PX = np.meshgrid(np.arange(50.0, 200.0, 10.0), np.arange(40.0, 160.0, 10.0))
 
@@ -36,8 +36,8 @@ def test_too_few_points_have_no_axes() -> None:
 
 def test_the_triad_is_drawn_in_the_lower_left_corner_of_the_map_alone() -> None:
     x_mm, y_mm = turned(45.0)
-    plain = Picture(np.zeros_like(X_PX), X_PX, Y_PX, "w", "mm", "a test")
-    with_axes = Picture(
+    plain = FigureData(np.zeros_like(X_PX), X_PX, Y_PX, "w", "mm", "a test")
+    with_axes = FigureData(
         np.zeros_like(X_PX), X_PX, Y_PX, "w", "mm", "a test", axes=directions_of(X_PX, Y_PX, x_mm, y_mm)
     )
     style = FigureStyle(limits=(-1.0, 1.0))

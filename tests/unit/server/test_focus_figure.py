@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from server.results.images.quality import image_quality
+from stereorig.server.results.images.quality import image_quality
 
 _OVER = 4  # samples a pixel
 _BLURS_PX = (0.0, 0.7, 1.5, 2.5, 4.0)
@@ -63,3 +63,21 @@ def test_a_picture_of_nothing_but_noise_has_no_focus_figure(exposure: float) -> 
 def test_strong_defocus_is_told_although_noise_has_a_gradient_of_its_own() -> None:
     rng = np.random.default_rng(7)
     assert image_quality(_frame(rng, _speckles(rng, 6.0), 4.0, 1.0), 8).code == "blurred"
+
+
+@pytest.mark.parametrize(
+    ("bit_depth", "grey"),
+    [
+        (16, lambda share: np.minimum(share, 1.0) * 4095 // 1 * 16),  # 12 bits to the left of 16
+        (16, lambda share: np.minimum(share, 1.0) * 4095 // 1),
+        (12, lambda share: np.minimum(share, 1.0) * 4095 // 1),
+        (8, lambda share: 16 + np.minimum(share, 1.0) * 219 // 1),  # video: black is 16, white 235
+        (8, lambda share: np.minimum(share, 1.0) * 255 // 1),
+    ],
+)
+@pytest.mark.parametrize("gain", [0.7, 1.5])
+def test_saturation_is_found_wherever_the_camera_puts_its_bits(bit_depth, grey, gain):
+    share = gain * np.random.default_rng(1).uniform(0.1, 1.0, (200, 200))
+    pixels = grey(share).astype(np.uint8 if bit_depth == 8 else np.uint16)
+    found = image_quality(pixels, bit_depth).saturated_share
+    assert abs(found - np.mean(share >= 1.0)) < 0.003

@@ -12,8 +12,8 @@ import pytest
 import tifffile
 from PIL import Image
 
-from core.errors import ImageError, StorageError
-from server.formats.images import decode, decode_image, encode_tiff, read_image, read_mask, write_image
+from stereorig.core.errors import ImageError, StorageError
+from stereorig.server.formats.images import decode, decode_image, encode_tiff, read_image, read_mask, write_image
 
 RNG = np.random.default_rng(7)
 GRAY8 = RNG.integers(0, 256, (23, 31), dtype=np.uint8)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from server.jobs.events import EventHub
-from server.jobs.job import Job, Work, new_record
-from server.jobs.manager import JobManager
+from stereorig.server.jobs.events import EventHub
+from stereorig.server.jobs.job import Job, Work, new_record
+from stereorig.server.jobs.manager import JobManager
 
 
 @pytest.mark.parametrize(("kind", "figures"), [("analysis", 5), ("burst", 100)])

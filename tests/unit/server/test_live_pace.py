@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from server.workflows.live.pace import Pace
+from stereorig.server.workflows.live.pace import Pace
 
 PERIOD_S = 0.02
 
@@ -51,7 +51,7 @@ def test_values_are_younger_and_hardly_fewer_than_if_any_pair_were_taken(takes_p
     assert age(latency, rate) <= age(any_latency, any_rate) + 1e-4
 
 
-def test_every_pair_is_measured_by_who_is_faster_than_the_cameras() -> None:
+def test_every_pair_is_measured_if_measuring_is_faster_than_the_cameras() -> None:
     latency, rate = run(0.6 * PERIOD_S, waits=True)
     assert rate == pytest.approx(1.0 / PERIOD_S, rel=0.01)
     assert latency.max() == pytest.approx(0.6 * PERIOD_S)

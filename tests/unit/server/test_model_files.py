@@ -12,9 +12,9 @@ import pytest
 from pyvista import from_meshio
 from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
-from core.errors import FileFormatError, StereorigError
-from core.model.surface import ModelSurface
-from server.formats.models.read import read_model
+from stereorig.core.errors import FileFormatError, StereorigError
+from stereorig.core.model.surface import ModelSurface
+from stereorig.server.formats.models.read import read_model
 from tests.support.model_bench import kirsch, mesh, write_model
 
 TOWARDS = np.array([0.0, 0.0, 1.0])
@@ -61,7 +61,7 @@ def test_xdmf_is_read_with_its_heavy_data(form: str, surface: ModelSurface, tmp_
     same(tmp_path / "m.xdmf", surface)
     if form == "HDF":
         (tmp_path / "m.h5").unlink()
-        with pytest.raises(FileFormatError, match=r"m\.h5 are not beside it"):
+        with pytest.raises(FileFormatError, match=r"m\.h5 are not in its folder"):
             read_model(tmp_path / "m.xdmf", unit="mm")
 
 
@@ -88,7 +88,7 @@ def test_heavy_data_elsewhere_is_not_read(tmp_path: Path) -> None:
             f"{name}:/points</DataItem></Geometry></Grid></Domain></Xdmf>"
         )
         (tmp_path / "in" / "m.xdmf").write_text(text)
-        with pytest.raises(FileFormatError, match="only files beside it are read"):
+        with pytest.raises(FileFormatError, match="only files in the same folder are read"):
             read_model(tmp_path / "in" / "m.xdmf", unit="mm")
 
 
@@ -156,7 +156,10 @@ def test_a_unit_in_the_file_is_taken_and_another_refused(surface: ModelSurface, 
     [
         ("m.csv", HEAD.replace("_mm", "") + ROWS, "model_unit_missing", "no unit of length"),
         ("m.csv", HEAD.replace("x_mm", "x_m") + ROWS, "model_unreadable", "different units"),
-        ("m.csv", HEAD.replace(",w_mm", "") + ROWS, "model_unreadable", "no column w"),
+        ("m.csv", HEAD.replace(",w_mm", "") + ROWS, "model_unreadable", "6 cells under 5 titles"),
+        ("m.csv", HEAD.replace(",u_mm,v_mm", ",p,q") + ROWS, "model_unreadable", "no column u"),
+        ("m.csv", HEAD.replace("y_mm", "q") + ROWS, "model_unreadable", "no column y"),
+        ("m.csv", "x_mm,y_mm,z_mm,u_mm,v_mm\n0,0,0,1,1\n1,0,0,1,1\n0,1,2,1,1\n", "model_no_displacement", "no plane"),
         ("m.csv", HEAD + ROWS + "1,2\n", "model_unreadable", "row 5"),
         ("m.csv", HEAD, "model_unreadable", "0 rows"),
         ("m.csv", "", "model_unreadable", "no row of titles"),

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from core.errors import FileFormatError, StorageError
-from core.field.points.patch import PatchChoice
-from core.field.points.result import Field
-from core.field.points.starts import Starts
-from core.field.region.cuts import Cuts
-from core.status import PointStatus
-from server.formats.results.netcdf import NewDataset
-from server.formats.results.reading import read_field, read_head, read_measured
-from server.formats.results.starts import with_starts, write_starts
-from server.formats.results.summary import summarise, to_json
-from server.formats.results.writing import Provenance, write_field
+from stereorig.core.errors import FileFormatError, StorageError
+from stereorig.core.field.points.patch import PatchChoice
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.starts import Starts
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.core.status import PointStatus
+from stereorig.server.formats.results.netcdf import NewDataset
+from stereorig.server.formats.results.reading import read_field, read_head, read_measured
+from stereorig.server.formats.results.starts import with_starts, write_starts
+from stereorig.server.formats.results.summary import summarise, to_json
+from stereorig.server.formats.results.writing import Provenance, write_field
 
 ROWS, COLS = 4, 6
 PROVENANCE = Provenance(
@@ -231,7 +231,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         with pytest.raises(FileFormatError) as caught:
             read_field(path)
         assert caught.value.code == "file_unreadable"
-    for version, code in ((None, "file_unreadable"), (99, "format_too_new")):
+    for version, code in ((None, "file_unreadable"), (1, "format_too_old"), (99, "format_too_new")):
         with netCDF4.Dataset(str(path), "w") as dataset:
             if version:
                 dataset.format_version = version

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from server.compute.overlap import ReadAhead, WriteBehind
+from stereorig.server.compute.overlap import ReadAhead, WriteBehind
 
 
 def test_items_are_read_in_order_and_one_ahead() -> None:

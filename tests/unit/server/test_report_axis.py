@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from server.report.histories import _Axis
+from stereorig.server.report import histories
+from stereorig.server.report.histories import _against_temperature, _Axis
 
 
 def steps(w_mm: list[float], seconds: list[float | None], **recorded: list[float | None]) -> Any:
@@ -50,3 +51,22 @@ def test_else_they_are_drawn_against_time(w_mm: list[float], recorded: dict[str,
 def test_the_load_comes_before_a_temperature_that_rises_with_it() -> None:
     both: Any = {"load": [0.0, 1.0, 2.0, 3.0], "air_c": [20.0, 21.0, 22.0, 23.0]}
     assert _Axis.of(steps([0.0, 0.1, 0.2, 0.3], TIMES, **both)).label == "load, N"
+
+
+def test_the_epipolar_offset_is_drawn_against_each_cameras_temperature_where_it_is_known(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drawn: list[tuple[list[float], Any]] = []
+    monkeypatch.setattr(histories, "course", lambda x, lines, **_: drawn.append((x, lines["offset"][0])) or b"")
+    degrees = {"cam1": [30.0, None, 33.0, 35.5], "cam2": [31.0, 31.0, 31.0, 31.0]}  # camera 2's does not change
+    made: Any = [
+        SimpleNamespace(
+            n=n,
+            temperature_c=lambda cam, n=n: degrees[cam][n],
+            summary=SimpleNamespace(epipolar_offset_mean_px=0.01 * n),
+        )
+        for n in range(4)
+    ]
+    (picture,) = _against_temperature(made)
+    assert drawn == [([30.0, 33.0, 35.5], [0.0, 0.02, 0.03])]
+    assert "cam1" in picture.caption

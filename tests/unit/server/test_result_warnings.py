@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from server.results.warnings.analysis import analysis_warnings
+from stereorig.server.results.warnings.analysis import analysis_warnings
 
 FAILED = {"level": "failed", "offset_px": 0.115, "reason": "camera 2 sees the points 0.115 px off"}
 FINE = {"level": "ok", "offset_px": 0.01, "reason": "camera 2 sees the points 0.010 px off"}
@@ -71,7 +71,7 @@ def test_failed_checks_come_before_warnings(folder: Path) -> None:
     put(
         home / "steps" / "0000" / "step.json", {"n": 0, "quality": {"code": "cameras_off_zero"}, "warnings": ["cam1 x"]}
     )
-    problem = {"code": "image_blank", "cause": "The image is blank.", "remedy": "Look at it."}
+    problem = {"code": "image_blank", "detail": "The image is blank.", "remedy": "Look at it."}
     assert codes(folder, stale=["cam1 of step 1 was replaced"], failed={"2": problem}) == [
         ("cameras_off_zero", "failed"),
         ("steps_failed", "warning"),

@@ -6,15 +6,22 @@ from dataclasses import fields
 
 import pytest
 
-from core.names import CAMERAS
-from drivers.acquisition.pairing import PairingAccount
-from drivers.cameras.protocol import CameraDescription, CameraSettings, FoundDevice, FrameCounters
-from drivers.stages.protocol import AxisDynamics, AxisIdentity, AxisLimits, AxisStatus, ControllerMessage, StageIdentity
-from server.api.models.rig import FrameCounts, PairCounts
-from server.base.models import Reply, Reported
-from server.config.camera_metadata import CameraMetadata, LensMetadata
-from server.rig import description as replies
-from server.rig.devices import ListedDevice
+from stereorig.core.names import CAMERAS
+from stereorig.drivers.acquisition.pairing import PairingAccount
+from stereorig.drivers.cameras.protocol import CameraDescription, CameraSettings, FoundDevice, FrameCounters
+from stereorig.drivers.stages.protocol import (
+    AxisDynamics,
+    AxisIdentity,
+    AxisLimits,
+    AxisStatus,
+    ControllerMessage,
+    StageIdentity,
+)
+from stereorig.server.api.models.rig import FrameCounts, PairCounts
+from stereorig.server.base.models import Reply, Reported
+from stereorig.server.config.camera_metadata import CameraMetadata, LensMetadata
+from stereorig.server.rig import description as replies
+from stereorig.server.rig.devices import ListedDevice
 from tests.support.service_rig import tiny_config
 
 
@@ -42,7 +49,7 @@ def test_each_field_of_a_driver_is_replied_with_its_meaning(declared: type, repl
         assert schema["required"] == list(schema["properties"])
 
 
-def test_a_record_keeps_settings_that_were_not_had_and_no_fact_that_nobody_told() -> None:
+def test_a_record_keeps_missing_settings_as_null_and_leaves_unstated_facts_out() -> None:
     settings = CameraSettings(exposure_ms=5.0, bit_depth=8, features={"BlackLevel": 4.0})
     kept = replies.kept_camera(settings, CameraMetadata(maker="Basler", lens=LensMetadata(f_number=8.0)))
     assert kept.model_dump(exclude_unset=True) == {
@@ -56,8 +63,8 @@ def test_a_record_keeps_settings_that_were_not_had_and_no_fact_that_nobody_told(
 
 
 def test_a_rig_that_is_not_open_yet_says_so() -> None:
-    from server.jobs.hardware import HardwareHold
-    from server.rig import Rig
+    from stereorig.server.jobs.hardware import HardwareHold
+    from stereorig.server.rig.rig import Rig
 
     hardware = HardwareHold()
     rig = Rig(tiny_config(), hardware)

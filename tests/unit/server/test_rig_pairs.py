@@ -9,12 +9,19 @@ import time
 import numpy as np
 import pytest
 
-from core.errors import CameraError
-from drivers.cameras.protocol import CameraSettings
-from server.rig.cameras import CameraPair
-from server.rig.reconnect import ReconnectWatch
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.protocol import CameraSettings
+from stereorig.server.rig.cameras import CameraPair
+from stereorig.server.rig.reconnect import ReconnectWatch
 from tests.support.camera_bench import seconds_until
+from tests.support.patience import busy
 from tests.support.rig_bench import SIZE, rig_bench
+
+
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a camera be silent for long: on a busy machine the pulse generator of the bench is late."""
+    monkeypatch.setattr("stereorig.drivers.acquisition.reader._MIN_PATIENCE_S", 10.0)
 
 
 def balanced(account: dict[str, int]) -> bool:
@@ -70,6 +77,7 @@ def test_a_trigger_that_neither_camera_answered_is_dropped() -> None:
 
 
 @pytest.mark.fault(13)
+@pytest.mark.usefixtures("patient")
 @pytest.mark.parametrize("by", ["time", "frame"])
 def test_a_dropped_frame_on_a_pulse_line_leaves_its_partner_unpaired(by: str) -> None:
     with rig_bench("hardware", rate_hz=25.0, by=by, max_skew_ms=1.0) as bench, bench.pulses(25.0):
@@ -84,6 +92,7 @@ def test_a_dropped_frame_on_a_pulse_line_leaves_its_partner_unpaired(by: str) ->
 
 
 @pytest.mark.fault(13)
+@pytest.mark.usefixtures("patient")
 @pytest.mark.parametrize("by", ["time", "frame"])
 def test_a_camera_that_missed_a_pulse_never_gives_a_pair_of_two_pulses(by: str) -> None:
     # a pulse that the camera did not see is no gap in its count: by number alone every later pair would be wrong
@@ -95,13 +104,15 @@ def test_a_camera_that_missed_a_pulse_never_gives_a_pair_of_two_pulses(by: str) 
             for _ in range(6):
                 assert bench.pair.capture(1).skew_ms == 0.0
         bench.pair.close()
-        assert balanced(bench.pair.account())
+        account = bench.pair.account()
+        assert balanced(account)
+        assert account["slips"] == (by == "frame")
 
 
 def test_pulses_that_come_when_they_like_are_waited_for() -> None:
     with rig_bench("hardware", capture_timeout_s=5.0) as bench:
         time.sleep(0.5)
-        assert not bench.pair.lost()  # silence means nothing here
+        assert not bench.away  # silence means nothing here
         timer = threading.Timer(0.3, bench.line.pulse)
         timer.start()
         shot = bench.pair.capture(1)
@@ -154,7 +165,7 @@ def test_a_lost_camera_comes_back_with_its_settings(trigger: str, rate_hz: float
             with pytest.raises(CameraError) as caught:
                 shoot_on(bench.pair)
             assert caught.value.code == "camera_lost"
-            assert time.monotonic() - began < 1.0
+            assert time.monotonic() - began < 1.0 * busy()
             seconds_until(lambda: bool(bench.lost), 1.0)
             assert {cam for cam, _ in bench.lost} == {"cam2"}
             time.sleep(0.6)
@@ -164,10 +175,10 @@ def test_a_lost_camera_comes_back_with_its_settings(trigger: str, rate_hz: float
             returned = time.monotonic()
             shot = None
             while shot is None:  # one that was opened again while still silent is lost once more before it is back
-                seconds_until(lambda: not bench.pair.lost(), 3.0)
+                seconds_until(lambda: not bench.away, 3.0)
                 with contextlib.suppress(CameraError) if how == "silent" else contextlib.nullcontext():
                     shot = bench.pair.capture(1)
-                assert time.monotonic() - returned < 3.0
+                assert time.monotonic() - returned < 3.0 * busy()
             assert set(shot.pixels) == {"cam1", "cam2"}
             settings = bench.units["cam2"].settings
             assert (settings.exposure_ms, settings.gain_db) == (7.0, 3.0)
@@ -193,7 +204,7 @@ def test_a_camera_that_comes_back_without_its_settings_is_not_used(monkeypatch: 
             return grabber
 
         bench.line.faults_of("cam2").gone = True
-        seconds_until(lambda: bool(bench.pair.lost()), 1.0)
+        seconds_until(lambda: bool(bench.away), 1.0)
         bench.line.faults_of("cam2").gone = False
         bench.units["cam2"]._make = lambda: forgetful("cam2")
         with pytest.raises(CameraError) as caught:

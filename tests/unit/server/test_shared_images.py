@@ -5,7 +5,7 @@ import multiprocessing
 import numpy as np
 import pytest
 
-from server.worker.shared_images import SharedImages
+from stereorig.server.worker.shared_images import SharedImages
 
 
 def pair(seed: int, shape: tuple[int, int], kind: type) -> list[np.ndarray]:

@@ -9,11 +9,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from core.errors import StageError
-from server.rig.shared import SharedReading
+from stereorig.core.errors import StageError
+from stereorig.server.rig.shared import SharedReading
 
 
-def test_nobody_gets_a_reading_that_began_before_they_asked() -> None:
+def test_a_caller_gets_a_reading_that_began_after_the_call() -> None:
     numbers = itertools.count()
 
     def read() -> tuple[int, float]:
@@ -32,7 +32,7 @@ def test_nobody_gets_a_reading_that_began_before_they_asked() -> None:
     assert next(numbers) < 300  # shared, where one reading each would be 400
 
 
-def test_two_readings_serve_all_who_come_while_one_is_under_way() -> None:
+def test_callers_during_one_reading_share_the_next() -> None:
     begun, go_on = threading.Event(), threading.Event()
     readings = []
 
@@ -54,7 +54,7 @@ def test_two_readings_serve_all_who_come_while_one_is_under_way() -> None:
     assert readings == [0, 1]
 
 
-def test_an_error_is_everybodys_and_the_next_reading_is_free_of_it() -> None:
+def test_all_callers_get_an_error_and_the_next_reading_is_free_of_it() -> None:
     answers = iter([StageError("The controller is silent.", code="stage_lost"), 7])
 
     def read() -> int:

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from core.field.region.cuts import Cuts
-from server.exports.request import ExportRequest
-from server.exports.run import export
-from server.exports.source import find_source
-from server.formats.figures.colours import colour_map
-from server.formats.figures.options import COLOURS, FigureStyle
-from server.formats.figures.smooth import between_points
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.server.exports.request import ExportRequest
+from stereorig.server.exports.run import export
+from stereorig.server.exports.source import find_source
+from stereorig.server.formats.figures.colours import colour_map
+from stereorig.server.formats.figures.options import COLOURS, FigureStyle
+from stereorig.server.formats.figures.smooth import between_points
 from tests.support.export_results import write_results
 
 EACH = 4

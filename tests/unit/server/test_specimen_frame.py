@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from core.arrays import Float
-from core.errors import InputError, RegionError
-from core.gauge.align import align_given, aligned
-from core.strain import StrainOptions, surface_strain
-from server.formats.results.reading import read_field, read_head
-from server.formats.results.strain import read_strain
-from server.formats.results.writing import Provenance, write_field
-from server.results.gauges.framed import write_framed
-from server.results.gauges.frames import SPECIMEN, frame_asked, frame_of_test
-from server.results.gauges.readings import read_gauges
-from server.results.gauges.request import Alignment, AreaGauge, GaugeRequest, PlaneAlignment, PointGauge
-from server.workflows.analysis.framed import FramedResults
-from sim.rig import SimRig
-from sim.scene import UPRIGHT
+from stereorig.core.arrays import Float
+from stereorig.core.errors import InputError, RegionError
+from stereorig.core.gauge.align import align_given, aligned
+from stereorig.core.strain import StrainOptions, surface_strain
+from stereorig.server.formats.results.reading import read_field, read_head
+from stereorig.server.formats.results.strain import read_strain
+from stereorig.server.formats.results.writing import Provenance, write_field
+from stereorig.server.results.gauges.framed import write_framed
+from stereorig.server.results.gauges.frames import SPECIMEN, frame_asked, frame_of_test
+from stereorig.server.results.gauges.readings import read_gauges
+from stereorig.server.results.gauges.request import Alignment, AreaGauge, GaugeRequest, PlaneAlignment, PointGauge
+from stereorig.server.workflows.analysis.framed import FramedResults
+from stereorig.sim.rig import SimRig
+from stereorig.sim.scene import UPRIGHT
 from tests.support.gauge_field import SUBSET, make_field
 from tests.support.requirements import ROOT
 from tests.support.tension import LATERAL, SHIFT, SYS_FROM_IMAGE, TENSION, pulled, shape

@@ -8,13 +8,13 @@ import netCDF4
 import numpy as np
 import pytest
 
-from core.errors import FileFormatError, InputError
-from core.settings import StrainSettings
-from core.strain import StrainOptions, StrainStatus, surface_strain
-from server.compute.strain import strain_of_step, summarise_strain
-from server.formats.results.reading import read_field
-from server.formats.results.strain import read_strain
-from server.formats.results.writing import Provenance, write_field
+from stereorig.core.errors import FileFormatError, InputError
+from stereorig.core.settings import StrainSettings
+from stereorig.core.strain import StrainOptions, StrainStatus, surface_strain
+from stereorig.server.compute.strain import strain_of_step, summarise_strain
+from stereorig.server.formats.results.reading import read_field
+from stereorig.server.formats.results.strain import read_strain
+from stereorig.server.formats.results.writing import Provenance, write_field
 from tests.support.strain_fields import make_field, plane
 
 F = np.array([[1.001, 0.0004, 0], [-0.0002, 0.9995, 0], [0, 0, 1]])

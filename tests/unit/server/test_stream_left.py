@@ -10,7 +10,7 @@ import pytest
 from fastapi import FastAPI
 from fastapi.sse import EventSourceResponse
 
-from server.api.protocol.delivery import Delivery
+from stereorig.server.api.protocol.delivery import Delivery
 
 
 async def follow_and_leave(app: Any, events: int) -> list[bytes]:
@@ -60,7 +60,7 @@ def served(fails_at: int | None = None) -> Delivery:
 
 
 @pytest.mark.parametrize("events", range(1, 30))
-def test_who_leaves_while_events_come_is_no_error(events: int) -> None:
+def test_a_reader_that_leaves_a_stream_is_no_error(events: int) -> None:
     assert events <= len(asyncio.run(follow_and_leave(served(), events))) < 1000
 
 

@@ -19,25 +19,25 @@ import scipy.stats
 import xarray as xr
 from PIL import Image
 
-from core.common.factor import Causes
-from core.errors import InputError
-from core.settings import AnalysisSettings, Coverage
-from core.strain import StrainOptions, surface_strain
-from server.cli.main import main
-from server.exports.request import ExportRequest
-from server.exports.run import export
-from server.exports.source import find_source
-from server.formats.results.reading import read_field
-from server.formats.results.strain import read_strain
-from server.formats.results.summary import summarise
-from server.formats.results.uncertainty import Included, coverage_of
-from server.formats.results.writing import Provenance, write_field
-from server.results.field_forms import Part, encode, take
-from server.results.gauges.readings import read_gauges
-from server.results.gauges.request import GaugeRequest
-from server.results.reader import probe_result, read_variable
-from server.results.steps import Source
+from stereorig.core.common.factor import Causes
+from stereorig.core.errors import InputError
+from stereorig.core.settings import AnalysisSettings, Coverage
+from stereorig.core.strain import StrainOptions, surface_strain
 from stereorig.result import Result
+from stereorig.server.cli.main import main
+from stereorig.server.exports.request import ExportRequest
+from stereorig.server.exports.run import export
+from stereorig.server.exports.source import find_source
+from stereorig.server.formats.results.reading import read_field
+from stereorig.server.formats.results.strain import read_strain
+from stereorig.server.formats.results.summary import summarise
+from stereorig.server.formats.results.uncertainty import Included, coverage_of
+from stereorig.server.formats.results.writing import Provenance, write_field
+from stereorig.server.results.field_forms import Part, encode, take
+from stereorig.server.results.gauges.readings import read_gauges
+from stereorig.server.results.gauges.request import GaugeRequest
+from stereorig.server.results.reader import probe_result, read_variable
+from stereorig.server.results.steps import ExportSource
 from tests.support.export_results import CALIBRATION, COLS, ROWS, SETTINGS, write_results
 from tests.support.gauge_field import SUBSET, make_field
 
@@ -75,7 +75,7 @@ def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def made(source: Source, out: Path, form: Any, **more: Any) -> list[Path]:
+def made(source: ExportSource, out: Path, form: Any, **more: Any) -> list[Path]:
     out.mkdir(exist_ok=True)
     return list(export(source, ExportRequest(form, **more), out))
 
@@ -247,7 +247,7 @@ def test_a_probe_and_a_field_say_what_their_uncertainty_is(imported: Path, known
         assert one.budget is not None
         assert sum((part or 0.0) ** 2 for part in one.budget.values()) == pytest.approx(float(one.sigma or 0.0) ** 2)
         assert probe.values["exx"].budget is not None
-        assert (LACKING in str(probe.uncertainty["text"])) == bool(lacking)
+        assert (LACKING in probe.uncertainty.text) == bool(lacking)
     part = take("w_mm", lambda name: read_variable(path, name), Part(), "u (k = 1) includes matching")
     assert len(encode(part, "png")) > len(encode(replace(part, note=""), "png"))  # a foot of its own
     with h5py.File(io.BytesIO(encode(part, "nc"))) as file:

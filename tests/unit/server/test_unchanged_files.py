@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 from pathlib import Path
@@ -10,10 +9,9 @@ from typing import Any
 
 import pytest
 
-from server.formats import files
-from server.results.warnings import analysis
-from server.results.warnings.analysis import analysis_warnings
-from server.store.durable import UnchangedFiles, known_json, write_json
+from stereorig.server.results.warnings import analysis
+from stereorig.server.results.warnings.analysis import analysis_warnings
+from stereorig.server.store.durable import UnchangedFiles, known_json, write_json
 
 
 class Reader:
@@ -42,7 +40,7 @@ def test_a_file_is_read_once_until_it_is_touched(tmp_path: Path) -> None:
     assert read.asked == ["one"] * 4
 
 
-def test_so_many_files_are_kept_and_those_asked_for_last(tmp_path: Path) -> None:
+def test_the_files_asked_for_last_are_kept_up_to_a_number(tmp_path: Path) -> None:
     kept, read = UnchangedFiles(2), Reader()
     for name in "abc":
         (tmp_path / name).write_text(name)
@@ -90,22 +88,3 @@ def test_the_checks_of_an_analysis_read_its_newest_step_alone(tmp_path: Path, mo
     (found,) = analysis_warnings(folder)
     assert (found.level, found.steps) == ("failed", (2, 5))
     assert json.loads((folder / "step_0002.json").read_text())["valid_fraction"] == 0.4
-
-
-def test_a_checksum_is_made_once_until_a_file_is_touched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-    own = files.sha256_of
-    monkeypatch.setattr(files, "sha256_of", lambda path: asked.append(path.name) or own(path))
-    monkeypatch.setattr(files, "_hashes", {})
-    monkeypatch.setattr(files, "_MAX_HASHES", 3)
-    for n in range(3):
-        (tmp_path / f"{n}").write_text(f"content {n}")
-    for n in (0, 1, 2, 0, 1, 2):
-        content = (tmp_path / f"{n}").read_bytes()
-        assert files.known_sha256(tmp_path / f"{n}") == hashlib.sha256(content).hexdigest()
-    assert asked == ["0", "1", "2"]
-    (tmp_path / "new").write_text("content 9")  # as long
-    (tmp_path / "new").replace(tmp_path / "1")
-    assert files.known_sha256(tmp_path / "1") == hashlib.sha256(b"content 9").hexdigest()
-    assert len(files._hashes) <= 3
-    assert asked == ["0", "1", "2", "1"]

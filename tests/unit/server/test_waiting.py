@@ -8,10 +8,10 @@ from typing import Any, cast
 
 import pytest
 
-from core.errors import Cancelled
-from server.jobs.job import Job
-from server.worker.executor import TaskFuture
-from server.workflows.waiting import result_of
+from stereorig.core.errors import Cancelled
+from stereorig.server.jobs.job import Job
+from stereorig.server.worker.executor import TaskFuture
+from stereorig.server.workflows.waiting import result_of
 
 
 def job(*, cancelled: bool = False) -> Job:

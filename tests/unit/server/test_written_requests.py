@@ -6,7 +6,7 @@ import jsonschema
 import pytest
 from pydantic import BaseModel
 
-from server.results.certificate.plan import CertificatePlan, KnownLength, ReferenceExtensometer
+from stereorig.server.results.certificate.plan import CertificatePlan, KnownLength, ReferenceExtensometer
 
 ENDS = {"a_px": [60.0, 80.0], "b_px": [160.0, 80.0]}
 CHANNEL = ReferenceExtensometer.model_validate({**ENDS, "channel": "extensometer_mm"})

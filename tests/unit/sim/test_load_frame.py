@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from sim.load_frame import LoadFrame
+from stereorig.sim.load_frame import LoadFrame
 
 
 def test_the_specimen_follows_less_than_the_actuator_and_all_of_it_once_it_yields() -> None:

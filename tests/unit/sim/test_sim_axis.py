@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim.controllers.axis import SimAxis, SimClock, brake, trapezoid
+from stereorig.sim.controllers.axis import SimAxis, SimClock, brake, trapezoid
 
 
 class HandClock(SimClock):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from drivers.cameras.protocol import CameraSettings
-from drivers.registry import open_stage
-from drivers.stages.protocol import AxisOptions
-from sim.controllers.esp301 import SimESP301
-from sim.controllers.server import ControllerServer
-from sim.grabber import SimFrameGrabber
-from sim.rig import SimRig
-from sim.world import SimWorld
+from stereorig.drivers.cameras.protocol import CameraSettings
+from stereorig.drivers.registry import open_stage
+from stereorig.drivers.stages.protocol import AxisOptions
+from stereorig.sim.controllers.esp301 import SimESP301
+from stereorig.sim.controllers.server import ControllerServer
+from stereorig.sim.grabber import SimFrameGrabber
+from stereorig.sim.rig import SimRig
+from stereorig.sim.world import SimWorld
 from tests.support.requirements import ROOT
 
 CONFIG = ROOT / "config" / "sim_paper.toml"

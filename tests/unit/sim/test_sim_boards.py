@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
-from core.boards import BoardTarget
-from core.cameras.camera import Camera, RigidTransform
-from sim.boards.pattern import INK, PAPER
-from sim.boards.poses import transform_of
-from sim.boards.target import SimTarget
-from sim.optics.lens import SimLens
-from sim.render import RenderOptions, material_points, render
-from sim.scene import Scene
-from sim.truth import truth_at
+from stereorig.core.boards import BoardTarget
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.sim.boards.pattern import INK, PAPER
+from stereorig.sim.boards.poses import transform_of
+from stereorig.sim.boards.target import SimTarget
+from stereorig.sim.optics.lens import SimLens
+from stereorig.sim.render import RenderOptions, material_points, render
+from stereorig.sim.scene import Scene
+from stereorig.sim.truth import truth_at
 
 MIDDLE = 0.5 * (INK + PAPER)
 POSE = (18.0, -22.0, 9.0, 3.0, -4.0, 5.0)

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from core.errors import CameraError
-from drivers.cameras.protocol import CameraSettings, FrameGrabber, FrameStatus, Pixels
-from sim.grabber import SimFrameGrabber
+from stereorig.core.errors import CameraError
+from stereorig.drivers.cameras.protocol import CameraSettings, FrameGrabber, FrameStatus, Pixels
+from stereorig.sim.grabber import SimFrameGrabber
 
 SIZE = (24, 16)  # width, height
 

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from core.cameras.lens import OpenCVLens
-from sim.optics.lens import LENS_KEYS, SimLens, core_lens, flat_lens, normalised, warmed
-from sim.optics.ray import rays
+from stereorig.core.cameras.lens import OpenCVLens
+from stereorig.sim.optics.lens import LENS_KEYS, SimLens, core_lens, flat_lens, normalised, warmed
+from stereorig.sim.optics.ray import rays
 
 PINHOLE = {"fx_px": 2006.0, "fy_px": 1998.0, "cx_px": 611.3, "cy_px": 517.8}
 FIVE = SimLens(**PINHOLE, k1=-0.05, k2=0.02, p1=2e-4, p2=-3e-4, k3=0.01)

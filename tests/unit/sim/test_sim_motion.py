@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 import tifffile
 
-from core.boards import BoardTarget
-from core.errors import InputError
-from sim.boards.poses import hand_pose, pose_of, transform_of
-from sim.catalog import make_scene
-from sim.optics.lens import image_of
-from sim.render import RenderOptions, render
-from sim.rig import SimRig, SimStage, WarmUp
-from sim.world import SimWorld
+from stereorig.core.boards import BoardTarget
+from stereorig.core.errors import InputError
+from stereorig.sim.boards.poses import hand_pose, pose_of, transform_of
+from stereorig.sim.catalog import make_scene
+from stereorig.sim.optics.lens import image_of
+from stereorig.sim.render import RenderOptions, render
+from stereorig.sim.rig import SimRig, SimStage, WarmUp
+from stereorig.sim.world import SimWorld
 from tests.support.board_views import (
     camera_pair,
     hand_poses,

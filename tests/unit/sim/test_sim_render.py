@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.cameras.camera import Camera, RigidTransform
-from sim.render import RenderOptions, pixel_weights, render
-from sim.scene import UPRIGHT, Scene
-from sim.surface import flat
-from sim.texture import dots, line_grid, speckle
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.sim.render import RenderOptions, pixel_weights, render
+from stereorig.sim.scene import UPRIGHT, Scene
+from stereorig.sim.surface import flat
+from stereorig.sim.texture import dots, line_grid, speckle
 
 SIZE = (512, 480)
 

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
-from core.cameras.camera import Camera
-from sim.catalog import SCENE_NAMES, make_scene
-from sim.panel import PAPER_LOADS_KN, CrackedPanel
-from sim.plate import PAPER_PRESSURES_KPA, CircularPlate
-from sim.render import material_points, render
-from sim.rig import SimRig
-from sim.scene import Scene
-from sim.steel import average_roughness_mm, ground_steel
-from sim.texture import line_grid, speckle
-from sim.truth import subset_planes, truth_at
+from stereorig.core.cameras.camera import Camera
+from stereorig.sim.catalog import SCENE_NAMES, make_scene
+from stereorig.sim.panel import PAPER_LOADS_KN, CrackedPanel
+from stereorig.sim.plate import PAPER_PRESSURES_KPA, CircularPlate
+from stereorig.sim.render import material_points, render
+from stereorig.sim.rig import SimRig
+from stereorig.sim.scene import Scene
+from stereorig.sim.steel import average_roughness_mm, ground_steel
+from stereorig.sim.texture import line_grid, speckle
+from stereorig.sim.truth import subset_planes, truth_at
 from tests.support.requirements import ROOT
 
 CONFIG = ROOT / "config"

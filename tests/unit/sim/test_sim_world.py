@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.errors import InputError
-from sim.rig import SimCamera, SimRig
-from sim.sensor import Sensor
-from sim.world import SimWorld
+from stereorig.core.errors import InputError
+from stereorig.sim.rig import SimCamera, SimRig
+from stereorig.sim.sensor import Sensor
+from stereorig.sim.world import SimWorld
 from tests.support.requirements import ROOT
 
 CONFIG = ROOT / "config"

@@ -7,14 +7,14 @@ from collections.abc import Iterator
 
 import pytest
 
-from core.errors import StageError
-from drivers.stages.esp301 import ESP301Stage
-from drivers.stages.protocol import AxisOptions
-from sim.controllers.axis import SimAxis
-from sim.controllers.esp301 import SimESP301
-from sim.controllers.registry import make_controller
-from sim.controllers.server import ControllerServer
-from sim.controllers.wire import WireController
+from stereorig.core.errors import StageError
+from stereorig.drivers.stages.makers.esp301 import ESP301Stage
+from stereorig.drivers.stages.protocol import AxisOptions
+from stereorig.sim.controllers.axis import SimAxis
+from stereorig.sim.controllers.esp301 import SimESP301
+from stereorig.sim.controllers.registry import make_controller
+from stereorig.sim.controllers.server import ControllerServer
+from stereorig.sim.controllers.wire import WireController
 
 
 class Scripted(WireController):
@@ -121,7 +121,7 @@ def test_the_driver_reads_the_manuals_replies(scripted: tuple[Scripted, Controll
     stage = ESP301Stage(server.url, {1: AxisOptions(assume_homed=True)}, timeout_s=0.25)
     stage.open()
     identity = stage.identify()
-    assert (identity.model, identity.firmware) == ("ESP300", "3.01 09/17/99")
+    assert (identity.model, identity.firmware) == ("ESP300", "3.01")
     assert (identity.axes[0].model, identity.axes[0].serial) == ("TS50DC.5", "SN1263")
     assert (stage.limits(1).low_mm, stage.limits(1).high_mm) == (-25.0, 25.0)
     fake.replies["TB?"] = ["108, 451339, MOTOR NOT CONNECTED", "0, 451340, NO ERROR DETECTED"]

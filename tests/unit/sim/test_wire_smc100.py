@@ -7,11 +7,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from core.errors import StageError
-from drivers.stages.protocol import AxisOptions, AxisState
-from drivers.stages.smc100 import SMC100Stage
-from sim.controllers.server import ControllerServer
-from sim.controllers.smc100 import SimSMC100
+from stereorig.core.errors import StageError
+from stereorig.drivers.stages.makers.smc100 import SMC100Stage
+from stereorig.drivers.stages.protocol import AxisOptions, AxisState
+from stereorig.sim.controllers.server import ControllerServer
+from stereorig.sim.controllers.smc100 import SimSMC100
 
 
 @pytest.fixture

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import stereorig as dic
+from tests.support.requirements import ROOT
 
 NAMES = {
     "AnalysisSettings",
@@ -16,13 +19,17 @@ NAMES = {
     "AsyncClient",
     "Calibration",
     "Client",
+    "Evaluated",
+    "Evaluation",
     "Extensometer",
+    "GridValues",
     "Measurement",
     "Noise",
     "PointStatus",
     "Reading",
     "Region",
     "Result",
+    "Results",
     "RigidMotion",
     "StereorigError",
     "StrainSettings",
@@ -54,14 +61,25 @@ def test_importing_it_loads_neither_service_nor_kernels() -> None:
     assert shown.stdout.strip() == "[]"
 
 
+def test_a_users_own_modules_named_like_its_packages_do_no_harm(tmp_path: Path) -> None:
+    for name in ("core", "drivers", "server", "sim"):
+        (tmp_path / f"{name}.py").write_text("raise ImportError(__name__)\n")
+    code = "import stereorig; print(len([getattr(stereorig, name) for name in stereorig.__all__]))"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", code]
+    shown = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert shown.stdout.strip() == str(len(NAMES)), shown.stderr
+
+
 def test_measuring_needs_neither_web_service_nor_devices() -> None:
     code = (
         "import stereorig, sys; [getattr(stereorig, n) for n in stereorig.__all__ if 'Client' not in n];"
-        "print(sorted({m.split('.')[0] for m in sys.modules} & {'fastapi', 'uvicorn', 'serial', 'drivers', 'sim'}),"
-        "[m for m in sys.modules if m.startswith(('server.worker', 'server.rig', 'server.api'))])"
+        "print(sorted({m.split('.')[0] for m in sys.modules} & {'fastapi', 'uvicorn', 'serial'}),"
+        "[m for m in sys.modules if m.startswith(('stereorig.drivers', 'stereorig.sim'))],"
+        "[m for m in sys.modules if m.startswith(tuple(f'stereorig.server.{n}' for n in ('worker', 'rig', 'api')))])"
     )
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert shown.stdout.strip() == "[] []"
+    assert shown.stdout.strip() == "[] [] []"
 
 
 def test_parameters_are_checked_once_and_by_the_settings() -> None:

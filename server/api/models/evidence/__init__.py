@@ -1,1 +1,1 @@
-"""Documents of what an auditor asks for: certificates, models that a field is compared with."""
+"""Documents for an auditor: certificates, and models that a field is compared with."""

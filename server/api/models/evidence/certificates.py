@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StringConstraints
 
-from server.base.models import Label, Listing, Reply, Request
-from server.results.certificate.plan import CertificatePlan
+from stereorig.server.base.models import Label, Listing, Reply, Request
+from stereorig.server.results.certificate.plan import CertificatePlan
 
 Outcome = Literal["pass", "conditional", "fail"]
 
@@ -21,7 +21,7 @@ class CertificateRequest(Request):
     analysis_id: Annotated[str, StringConstraints(max_length=40)] = Field(
         description="Analysis that measured them.", examples=["a000001-77d0b3"]
     )
-    plan: CertificatePlan = Field(description="What is known of the steps, and what is asked of the system.")
+    plan: CertificatePlan = Field(description="Known values of the steps, and the requirements on the system.")
 
 
 class WithdrawRequest(Request):
@@ -43,19 +43,19 @@ class CertificateFinding(Reply):
 class CertificateReason(CertificateFinding):
     """Why a verdict is no pass."""
 
-    outcome: Outcome = Field(description="What it makes the verdict at least.")
+    outcome: Outcome = Field(description="Lowest verdict that it allows.")
 
 
 class CertificateEntry(Reply):
     """Entry of a certificate in a list."""
 
     id: str = Field(description="Id.", examples=["v000001-5d0a3f"])
-    title: str = Field(description="What is certified.")
+    title: str = Field(description="Object of the certificate.")
     outcome: Outcome = Field(description="The verdict when it was made.")
     state: Literal["valid", "failed", "expired", "void", "withdrawn"] = Field(
         description="Whether it holds now: `void` once another calibration was made after it."
     )
-    why: str = Field(description="Why it does not hold; empty where it does.")
+    why: str = Field(description="Reason why it does not hold; empty if it does.")
     created_utc: str = Field(description="Time at which it was made.")
     valid_until_utc: str | None = Field(description="Time until which it holds; null of one that failed.")
     test_id: str | None = Field(description="Its test.")
@@ -65,8 +65,8 @@ class CertificateEntry(Reply):
 class CertificateReply(CertificateEntry):
     """A certificate; its tables as further entries, as in certificate.json."""
 
-    reasons: list[CertificateReason] = Field(description="Why it is no pass; empty of a pass.")
-    suspects: list[CertificateFinding] = Field(description="What is suspect, the most probable cause first.")
+    reasons: list[CertificateReason] = Field(description="Reasons why it is no pass; empty for a pass.")
+    suspects: list[CertificateFinding] = Field(description="Suspected causes, the most probable first.")
 
 
 class CertificateList(Listing):

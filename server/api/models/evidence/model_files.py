@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from server.base.models import Listing
-from server.store.models import ModelRecord
+from stereorig.server.base.models import Listing
+from stereorig.server.store.models import ModelRecord
 
 
 class ModelList(Listing):
     """Models, oldest first."""
 
-    models: list[ModelRecord] = Field(description="Each with how it is read and where it lies.")
+    models: list[ModelRecord] = Field(description="Each with its reading options and its placement.")

@@ -6,27 +6,27 @@ from typing import Literal
 
 from pydantic import Field
 
-from server.base.models import Reply, Request
-from server.results.certificate.plan import CertificatePlan
-from server.results.certificate.procedure import By, Kind
+from stereorig.server.base.models import Reply, Request
+from stereorig.server.results.certificate.plan import CertificatePlan
+from stereorig.server.results.certificate.procedure import By, Kind
 
 
 class NextRequest(Request):
-    """Which state of the bench the next step is taken in."""
+    """Confirmation that the bench is ready for the next step."""
 
-    confirmed: bool = Field(False, description="True: what a person has to do for this step is done.")
+    confirmed: bool = Field(False, description="True: the person's part of this step is done.")
 
 
 class ProcedureStepReply(Reply):
     """One step of a procedure."""
 
     n: int = Field(description="Number that the test gives it; 0 is the reference.")
-    kind: Kind = Field(description="What it is for; `free`: the plan names nothing for it.")
-    by: By = Field(description="Who brings the specimen there: nobody, the stage, or a person, who confirms it.")
+    kind: Kind = Field(description="Its purpose; `free`: the plan names none.")
+    by: By = Field(description="Mover of the specimen: none, the stage, or a person, who confirms it.")
     what: str = Field(description="What is done.")
     label: str = Field(description="Label that the step gets.")
     stage_mm: float | None = Field(
-        None, description="Where the stage stands, along Z, from where it stood at the reference; null: where it is."
+        None, description="Stage position along Z, from its position at the reference; null: not moved."
     )
     state: Literal["taken", "missing", "to_come"] = Field(
         description="`missing`: its number was given, and the step is not there any more."

@@ -11,8 +11,8 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request
 from fastapi.concurrency import run_in_threadpool
 
-from core.errors import InputError, RegionError
-from server.api.models import (
+from stereorig.core.errors import InputError, RegionError
+from stereorig.server.api.models import (
     AnalysisAccepted,
     AnalysisList,
     AnalysisReply,
@@ -21,21 +21,21 @@ from server.api.models import (
     ContinueRequest,
     Region,
 )
-from server.api.models.recipes import WORKSPACE, recipe_in
-from server.api.protocol.attached import Wait, job_reply
-from server.api.protocol.dependencies import AnalysisId, KeyHeader, ServiceDep, TestId, mark
-from server.api.protocol.paging import FIGURES, WHOLE, PageDep
-from server.api.protocol.problems import errors
-from server.api.routes.tests.recipes import check_against_test
-from server.base.errors import NotFoundError
-from server.base.models import Ids, JobState
-from server.base.problem import JobProblem
-from server.jobs.idempotency import RequestMark
-from server.store.documents import Finished, SummaryRecord
-from server.store.tests.steps import MAX_STEPS
-from server.workflows.analysis import start as analysis_start
-from server.workflows.analysis.warnings import with_warnings
-from server.workflows.service import Service
+from stereorig.server.api.models.recipes import WORKSPACE, recipe_in
+from stereorig.server.api.protocol.attached import Wait, job_reply
+from stereorig.server.api.protocol.dependencies import AnalysisId, KeyHeader, ServiceDep, TestId, mark
+from stereorig.server.api.protocol.paging import FIGURES, WHOLE, PageDep
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.api.routes.tests.recipes import check_against_test
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.base.models import Ids, JobState
+from stereorig.server.base.problem import JobProblem
+from stereorig.server.documents.tests import Finished, SummaryRecord
+from stereorig.server.jobs.idempotency import RequestMark
+from stereorig.server.store.tests.steps import MAX_STEPS
+from stereorig.server.workflows.analysis import start as analysis_start
+from stereorig.server.workflows.analysis.warnings import with_warnings
+from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}/analyses", tags=["analyses"])
 
@@ -65,7 +65,7 @@ def _start(service: Service, test_id: str, body: AnalysisRequest, key: str | Non
 
 
 def _with_recipe(service: Service, test_id: str, body: AnalysisRequest) -> AnalysisRequest:
-    """Return a request with what its recipe gives where it says nothing.
+    """Return a request with the recipe's values for the fields that it leaves out.
 
     Raises
     ------
@@ -135,7 +135,7 @@ def mask_of(region: Region) -> bytes | None:
 
 @dataclass(frozen=True)
 class _Course:
-    """Course of an analysis: its last job, and what became of its steps."""
+    """Course of an analysis: its last job, and the state of its steps."""
 
     job_id: str | None
     state: JobState
@@ -185,12 +185,12 @@ def analysis_reply(service: Service, test_id: str, analysis_id: str) -> Analysis
         "calibration_sha256": document.inputs.calibration_sha256,
         "state": course.state,
         "job_id": course.job_id,
-        "problem": None if course.problem is None else course.problem.plain(),
+        "problem": course.problem,
         "n_steps": len(document.steps),
         "n_finished": len(finished),
         "n_failed": len(course.failed),
         "steps_finished": finished[:WHOLE],
-        "steps_failed": {n: one.plain() for n, one in _first(course.failed).items()},
+        "steps_failed": _first(course.failed),
         "summary": shown,
         "stale": bool(checks.stale),
         "stale_reasons": list(checks.stale[:WHOLE]),
@@ -228,7 +228,7 @@ def list_analysis_steps(
     figures: Annotated[bool, Query(description="With the figures of each step's field.")] = True,
     first: Annotated[int, Query(ge=0, le=MAX_STEPS, description="Number of the first step in the answer.")] = 0,
 ) -> AnalysisStepList:
-    """Return a page of the steps that an analysis measures, each with what became of it."""
+    """Return a page of the steps that an analysis measures, each with its state and figures."""
     document = service.tests.analyses.read(test_id, analysis_id)
     failed = _course(service, test_id, analysis_id).failed
     numbers = page.of(sorted(n for n in document.steps if n >= first), lambda n: f"{n:04d}")
@@ -237,7 +237,7 @@ def list_analysis_steps(
     steps = []
     for n in numbers:
         state = "finished" if n in finished else "failed" if str(n) in failed else "waiting"
-        problem = failed[str(n)].plain() if state == "failed" else None
+        problem = failed.get(str(n)) if state == "failed" else None
         own = known[n].plain() if n in known else None
         sha256 = document.inputs.steps.get(str(n))
         steps.append({"n": n, "state": state, "problem": problem, "figures": own, "sha256": sha256})
@@ -246,7 +246,7 @@ def list_analysis_steps(
 
 @router.post(
     "/{analysis_id}:continue",
-    summary="Go on with an analysis that stopped",
+    summary="Continue an analysis that stopped",
     status_code=202,
     responses=errors(404, 409, 422, 503, 507),
 )
@@ -259,7 +259,7 @@ async def continue_analysis(
     wait: Wait = 0.0,
     key: KeyHeader = None,
 ) -> AnalysisAccepted:
-    """Measure what an interrupted, cancelled or failed analysis, or one with failed steps, has not measured yet.
+    """Measure the open steps of an interrupted, cancelled or failed analysis, or of one with failed steps.
 
     Finished steps are kept, and the others are measured from them as they would have been: the results are the same as
     without the interruption. Steps that failed are tried again.

@@ -14,20 +14,27 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import FileResponse, Response, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
-from core.errors import Cancelled
-from server.api.models import Accepted
-from server.api.protocol.dependencies import AnalysisId, CoverageDep, FrameText, ServiceDep, TestId
-from server.api.protocol.problems import errors
-from server.base.errors import NotFoundError
-from server.exports.request import MEDIA_CONTENT, MEDIA_TYPES, ExportFormat, ExportRequest, media_type_of, steps_in
-from server.formats.figures.options import COLOURS, MAX_LEVELS, WIDTHS_PX, FigureStyle
-from server.formats.results.folder import dense_result, home_of
-from server.results.channels import has_more
-from server.worker.executor import TaskFuture
-from server.workflows.analysis import start as analysis_start
-from server.workflows.analysis.framed import results_in_frame
-from server.workflows.export_job import start_export
-from server.workflows.service import Service
+from stereorig.core.errors import Cancelled
+from stereorig.server.api.models import Accepted
+from stereorig.server.api.protocol.dependencies import AnalysisId, CoverageDep, FrameText, ServiceDep, TestId
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.exports.request import (
+    MEDIA_CONTENT,
+    MEDIA_TYPES,
+    ExportFormat,
+    ExportRequest,
+    media_type_of,
+    steps_in,
+)
+from stereorig.server.formats.figures.options import COLOURS, MAX_LEVELS, WIDTHS_PX, FigureStyle
+from stereorig.server.formats.results.folder import dense_result, home_of
+from stereorig.server.results.channels import has_more
+from stereorig.server.worker.executor import TaskFuture
+from stereorig.server.workflows.analysis import start as analysis_start
+from stereorig.server.workflows.analysis.framed import results_in_frame
+from stereorig.server.workflows.export_job import start_export
+from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
 _PAIR = r"^-?[0-9.]+([eE][-+]?[0-9]+)?,-?[0-9.]+([eE][-+]?[0-9]+)?$"
@@ -55,12 +62,12 @@ def _drawn(
         ),
     ] = None,
     percentiles: Annotated[
-        str, Query(max_length=40, pattern=_PAIR, description="Else the percentiles of the values where it ends.")
+        str, Query(max_length=40, pattern=_PAIR, description="Else the percentiles of the values at its ends.")
     ] = "1,99",
     colours: Annotated[str, Query(pattern=f"^({'|'.join(COLOURS)})$", description="Colour map.")] = "viridis",
     levels: Annotated[int, Query(ge=0, le=MAX_LEVELS, description="Bands of one colour; 0: smooth.")] = 0,
     reverse: Annotated[bool, Query(description="The colour map from its other end.")] = False,
-    opacity: Annotated[float, Query(gt=0.0, le=1.0, description="Of the map over the image.")] = 0.75,
+    opacity: Annotated[float, Query(gt=0.0, le=1.0, description="Opacity of the map over the image.")] = 0.75,
     width_px: Annotated[int, Query(ge=WIDTHS_PX[0], le=WIDTHS_PX[1], description="Width of the picture.")] = 900,
     over_image: Annotated[bool, Query(description="Draw over camera 1's reference image.")] = False,
     fps: Annotated[float, Query(ge=0.1, le=60.0, description="Steps a second in a film.")] = 2.0,
@@ -110,7 +117,7 @@ def _asked(
         str | None,
         Query(
             max_length=500,
-            pattern=r"^\d{1,4}(-\d{1,4})?(,\d{1,4}(-\d{1,4})?)*$",
+            pattern=r"^[0-9]{1,4}(-[0-9]{1,4})?(,[0-9]{1,4}(-[0-9]{1,4})?)*$",
             description="Several steps.",
             examples=["0,3-7"],
         ),
@@ -148,9 +155,9 @@ async def export(
 ) -> Response:
     """Answer with the file once it is made; several files are one ZIP archive.
 
-    Every form states units, frame, settings, calibration and version, and what its uncertainties include;
-    docs/reference/exports.md describes each. With k or coverage `expanded_NAME` stands beside `sigma_NAME`. The
-    header X-Stale lists what is gone or was replaced since the analysis. A client that goes away ends its export.
+    Every form states units, frame, settings, calibration and version, and the terms that its uncertainties include;
+    docs/reference/exports.md describes each. With k or coverage it also has `expanded_NAME` for every `sigma_NAME`. The
+    header X-Stale lists inputs that are gone or were replaced since the analysis. A client that leaves ends its export.
     """
     wanted, frame = asked.request, asked.frame
     files, headers = await run_in_threadpool(_prepared, service, test_id, analysis_id, asked.steps, asked.dense)
@@ -167,7 +174,7 @@ async def export(
         made = Path(await _made(request, service, home, files, wanted, folder))
         file = made.open("rb")
     finally:
-        # the opened file stays until it is sent, whatever becomes of the client or the service
+        # the opened file stays until it is sent, even if the client leaves or the service ends
         await run_in_threadpool(shutil.rmtree, folder, ignore_errors=True)
     headers |= {"Content-Disposition": f'attachment; filename="{made.name}"', "Content-Length": str(file.seek(0, 2))}
     return StreamingResponse(_chunks(file), media_type=media_type_of(made), headers=headers)
@@ -175,7 +182,7 @@ async def export(
 
 @router.post("/exports", summary="Begin an export as a job", status_code=202, responses=errors(404, 409, 422, 503, 507))
 def begin_export(service: ServiceDep, test_id: TestId, analysis_id: AnalysisId, asked: AskedDep) -> Accepted:
-    """Begin what `GET .../export` does with the same parameters, as a job with progress that can be cancelled.
+    """Begin the export of `GET .../export` with the same parameters, as a job with progress that can be cancelled.
 
     Meant for films and for many steps. `GET /jobs/{job_id}/file` answers with the file once the job has succeeded; it
     is kept until eight later exports are, or the service ends.
@@ -204,7 +211,7 @@ def _prepared(
             raise NotFoundError(
                 f"Analysis {analysis_id} has no dense field of these steps.",
                 code="dense_missing",
-                remedy="Measure with dense_step_px; the summary's `dense` says why a step has none.",
+                remedy="Measure with dense_step_px; the summary's `dense` has the reason of a step without one.",
             )
     stale = analysis_start.stale_reasons(service, test_id, document)
     return files, {"X-Stale": "; ".join(stale)} if stale else {}

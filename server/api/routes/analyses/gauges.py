@@ -10,19 +10,19 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Query
 from fastapi.responses import Response
 
-from core.errors import InputError, MeasurementError
-from server.api.models import GaugesReply
-from server.api.protocol.dependencies import AnalysisId, FrameText, ServiceDep, TestId
-from server.api.protocol.paging import Page, ShortPageDep
-from server.api.protocol.problems import errors
-from server.formats.gauges.matlab import gauges_mat
-from server.formats.gauges.table import gauges_csv
-from server.formats.results.folder import number_of
-from server.results.gauges.fields import FieldWriter
-from server.results.gauges.readings import read_gauges, steps_asked
-from server.results.gauges.request import GaugeRequest
-from server.workflows.analysis.framed import asked_of
-from server.workflows.service import Service
+from stereorig.core.errors import InputError, MeasurementError
+from stereorig.server.api.models import GaugesReply
+from stereorig.server.api.protocol.dependencies import AnalysisId, FrameText, ServiceDep, TestId
+from stereorig.server.api.protocol.paging import Page, ShortPageDep
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.formats.gauges.matlab import gauges_mat
+from stereorig.server.formats.gauges.table import gauges_csv
+from stereorig.server.formats.results.folder import number_of
+from stereorig.server.results.gauges.fields import FieldWriter
+from stereorig.server.results.gauges.readings import read_gauges, steps_asked
+from stereorig.server.results.gauges.request import GaugeRequest
+from stereorig.server.workflows.analysis.framed import asked_of
+from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
 _MATLAB = "application/x-matlab-data"
@@ -46,7 +46,7 @@ def field(
     """Answer with a result file (NetCDF-4) of the step as `align` and `remove_rigid` ask for; nothing is stored."""
     source = service.tests.analyses.result_file(test_id, analysis_id, step)
     reference = service.tests.analyses.read(test_id, analysis_id).steps[0]
-    # a frame is laid through the reference's shape
+    # the reference's shape defines a frame
     steps = {reference, step} if reference in service.tests.analyses.finished_steps(test_id, analysis_id) else {step}
     files = [service.tests.analyses.result_file(test_id, analysis_id, n) for n in sorted(steps)]
     with tempfile.TemporaryDirectory() as folder:
@@ -54,7 +54,7 @@ def field(
         readings = read_gauges(files, body.model_copy(update={"steps": None}), writer)
         problem = next(s.problem for s in readings.steps if s.n == step)
         if problem is not None:
-            raise MeasurementError(problem.cause, code=problem.code, remedy=problem.remedy)
+            raise MeasurementError(problem.detail, code=problem.code, remedy=problem.remedy)
         content = (Path(folder) / source.name).read_bytes()
     headers = {"Content-Disposition": f'attachment; filename="{test_id}_{analysis_id}_{source.name}"'}
     return Response(content, media_type="application/x-netcdf", headers=headers)
@@ -73,15 +73,15 @@ def read(
     analysis_id: AnalysisId,
     body: GaugeRequest,
     format: Annotated[  # noqa: A002
-        Literal["json", "csv", "mat"], Query(description="mat: a MATLAB file; its columns are those of the CSV table.")
+        Literal["json", "csv", "mat"], Query(description="mat: a MATLAB file with the CSV table's columns.")
     ] = "json",
     frame: FrameText = None,
     *,
     page: ShortPageDep,
 ) -> dict[str, object] | Response:
-    """Answer at once with what points, extensometers, lines and areas read in the finished steps; nothing is stored.
+    """Answer with the readings of points, extensometers, lines and areas in the finished steps; nothing is stored.
 
-    JSON holds a page of the steps, 100 unless `limit` says otherwise; `next_cursor` leads to the others. A table is a
+    JSON holds a page of the steps, 100 or `limit` of them; `next_cursor` leads to the next page. A table is a
     file with all of them.
     """
     steps = service.tests.analyses.finished_steps(test_id, analysis_id)

@@ -7,13 +7,13 @@ from typing import Annotated
 from fastapi import APIRouter, Query
 from pydantic import Field
 
-from server.api.protocol.dependencies import AnalysisId, FrameText, ServiceDep, TestId
-from server.api.protocol.paging import PageDep
-from server.api.protocol.problems import errors
-from server.api.routes.analyses.results import FieldName
-from server.base.models import Listing
-from server.results.point_history import nearest_point, point_history
-from server.workflows.analysis.framed import result_in
+from stereorig.server.api.protocol.dependencies import AnalysisId, FrameText, ServiceDep, TestId
+from stereorig.server.api.protocol.paging import PageDep
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.api.routes.analyses.results import FieldName
+from stereorig.server.base.models import Listing
+from stereorig.server.results.point_history import nearest_point, point_history
+from stereorig.server.workflows.analysis.framed import result_in
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
 
@@ -25,7 +25,7 @@ class HistoryReply(Listing):
     col: int = Field(description="Column of the point.")
     distance_px: float = Field(description="Distance of the pixel asked for from the point.")
     variable: str = Field(description="The variable.", examples=["w_mm"])
-    units: str = Field(description="Its unit; `1` of what has none.", examples=["mm"])
+    units: str = Field(description="Its unit; `1` for a pure number.", examples=["mm"])
     n: list[int] = Field(description="Numbers of the steps.")
     value: list[float | None] = Field(description="Values; null where the point failed, or the step lacks it.")
     sigma: list[float | None] = Field(description="Standard uncertainties; null where not known.")

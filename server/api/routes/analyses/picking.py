@@ -9,28 +9,29 @@ from typing import Annotated
 from fastapi import APIRouter, Query
 from pydantic import Field, StringConstraints
 
-from core.errors import InputError
-from core.field.points.images import MeasureImage
-from core.field.region.lay_points import make_grid
-from core.field.seeding.image_scale import image_scale
-from core.field.seeding.seeds import Seed
-from core.settings import SPACING_PX, SUBSET_PX, AnalysisSettings, Pixel, Real, SpacingPx, SubsetPx, Whole
-from server.api.models import Region, Reply, Request
-from server.api.protocol.dependencies import ServiceDep, StepNumber, TestId
-from server.api.protocol.problems import errors
-from server.api.routes.analyses.analyses import mask_of
-from server.api.routes.analyses.previews import step_image
-from server.compute.seeds import distances_px, epipolar_line
-from server.formats.calibrations.recognise import load_calibration
-from server.formats.images import decode_mask, read_image
-from server.formats.noise_json import load_noise
-from server.results.images.texture import speckle_quality
+from stereorig.core.errors import InputError
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.region.lay_points import make_grid
+from stereorig.core.field.seeding.image_scale import image_scale
+from stereorig.core.field.seeding.seeds import Seed
+from stereorig.core.settings import SPACING_PX, SUBSET_PX, AnalysisSettings, Pixel, Real, SpacingPx, SubsetPx, Whole
+from stereorig.server.api.models import Region, Reply, Request
+from stereorig.server.api.protocol.dependencies import ServiceDep, StepNumber, TestId
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.api.routes.analyses.analyses import mask_of
+from stereorig.server.api.routes.analyses.previews import step_image
+from stereorig.server.cell.images import mask as read_mask
+from stereorig.server.compute.seeds import distances_px, epipolar_line
+from stereorig.server.formats.calibrations.recognise import load_calibration
+from stereorig.server.formats.images import read_image
+from stereorig.server.formats.noise_json import load_noise
+from stereorig.server.results.images.texture import speckle_quality
 
 router = APIRouter(prefix="/tests/{test_id}", tags=["analyses"])
 
 
 class TextureRequest(Request):
-    """A region of camera 1's image, and the subsets that are to lie in it."""
+    """A region of camera 1's image, and the subset size and spacing to check its texture for."""
 
     region: Region = Field(description="Region of interest.")
     subset_px: SubsetPx = SUBSET_PX.default
@@ -57,7 +58,9 @@ class TextureReply(Reply):
     subset_px: int = Field(description="Width that was asked about.", examples=[33])
     subsets: int = Field(description="Subsets that were rated: the region's points.", examples=[841])
     noise_grey: float = Field(description="Noise that was taken.", examples=[2.55])
-    level: str = Field(description="`good`, `usable` or `poor`: what 95 % of the subsets reach.", examples=["good"])
+    level: str = Field(
+        description="`good`, `usable` or `poor`: the level that 95 % of the subsets reach.", examples=["good"]
+    )
     median_error_px: float | None = Field(None, description="Median of the expected error; null: no texture.")
     good_share: float = Field(description="Share of subsets with an expected error up to `good_px`.", examples=[0.99])
     usable_share: float = Field(description="Up to `usable_px`.", examples=[1.0])
@@ -120,7 +123,9 @@ def rate_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: Text
     settings = AnalysisSettings.model_validate(
         {"region": body.region, "spacing_px": body.spacing_px, "subset_px": body.subset_px}
     )
-    grid = make_grid(settings, None if mask is None else decode_mask(mask), (pixels.shape[0], pixels.shape[1]))
+    grid = make_grid(
+        settings, None if mask is None else read_mask(service.cell, mask), (pixels.shape[0], pixels.shape[1])
+    )
     noise = body.noise_grey
     if noise is None and body.noise_id is not None:
         model = load_noise(service.noise.file(body.noise_id)).models[0]

@@ -8,14 +8,14 @@ from fastapi import APIRouter, Path, Query
 from fastapi.responses import Response
 from pydantic import Field
 
-from core.errors import InputError
-from core.settings import SUBSET_PX
-from server.api.protocol.dependencies import CalibrationId, Camera, ServiceDep, StepNumber, TestId
-from server.api.protocol.problems import errors
-from server.base.models import Reply
-from server.formats.images import GrayImage, read_image
-from server.results.images.previews import MapKind, overlay, preview
-from server.workflows.service import Service
+from stereorig.core.errors import InputError
+from stereorig.core.settings import SUBSET_PX
+from stereorig.server.api.protocol.dependencies import CalibrationId, Camera, ServiceDep, StepNumber, TestId
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.base.models import Reply
+from stereorig.server.formats.images import GrayImage, read_image
+from stereorig.server.results.images.previews import MapKind, overlay, preview
+from stereorig.server.workflows.service import Service
 
 router = APIRouter(tags=["previews"])
 Kind = Annotated[MapKind, Path(description="Kind of map.")]
@@ -25,7 +25,7 @@ Subset = Annotated[
     Query(ge=SUBSET_PX.low, le=SUBSET_PX.high, description="Width of the subset that the texture is rated for, px."),
 ]
 Width = Annotated[int | None, Query(ge=16, le=8192, description="Width in px; the image's own if left out.")]
-_KEPT = "private, max-age=86400"  # what a step or a view shows never changes
+_KEPT = "private, max-age=86400"  # the images of a step or a view never change
 _JPEG: dict[int | str, dict[str, Any]] = {200: {"content": {"image/jpeg": {}}, "description": "8-bit JPEG."}}
 _PNG: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/png": {}}, "description": "RGBA PNG; its legend is in `X-Legend`."}
@@ -79,12 +79,12 @@ def get_pixel(
 
 @router.get(
     "/cameras/{cam}/maps/{kind}",
-    summary="Saturation or texture of the newest frame, to lay over it",
+    summary="Saturation or texture of the newest frame, to draw over it",
     response_class=Response,
     responses=errors(409, 422, 503) | _PNG,
 )
 def get_live_map(service: ServiceDep, cam: Camera, kind: Kind, subset_px: Subset = SUBSET_PX.default) -> Response:
-    """Return a picture of any size that covers the whole image; what its colours mean is in `X-Legend`."""
+    """Return a picture of any size that covers the whole image; `X-Legend` has the meaning of its colours."""
     frame = service.rig.pair.live(cam, max_age_s=0.2)
     return _overlay(kind, frame.pixels, float(2**frame.bit_depth - 1), subset_px)
 
@@ -135,14 +135,14 @@ def get_step_pixels(
 
 @router.get(
     "/tests/{test_id}/steps/{n}/{cam}/maps/{kind}",
-    summary="Saturation or texture of a step's image, to lay over it",
+    summary="Saturation or texture of a step's image, to draw over it",
     response_class=Response,
     responses=errors(404, 409, 422) | _PNG,
 )
 def get_step_map(
     service: ServiceDep, test_id: TestId, n: StepNumber, cam: Camera, kind: Kind, subset_px: Subset = SUBSET_PX.default
 ) -> Response:
-    """Return a picture of any size that covers the whole image; what its colours mean is in `X-Legend`."""
+    """Return a picture of any size that covers the whole image; `X-Legend` has the meaning of its colours."""
     pixels, full_scale = step_image(service, test_id, n, cam)
     return _overlay(kind, pixels, full_scale, subset_px)
 

@@ -8,22 +8,22 @@ from typing import Annotated, Self
 from fastapi import APIRouter
 from pydantic import Field, model_validator
 
-from core.field.points.images import MeasureImage
-from core.field.seeding.specimen import find_specimen
-from core.settings import SUBSET_PX, SubsetPx, Whole, require_odd
-from server.api.models import Region, Reply, Request
-from server.api.protocol.dependencies import ServiceDep, TestId
-from server.api.protocol.problems import errors
-from server.formats.calibrations.recognise import load_calibration
-from server.formats.images import encode_png, read_image
-from server.formats.results.summary import region_found
-from server.results.images.found_region import region_to_edit
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.seeding.specimen import find_specimen
+from stereorig.core.settings import SUBSET_PX, SubsetPx, Whole, require_odd
+from stereorig.server.api.models import Region, Reply, Request
+from stereorig.server.api.protocol.dependencies import ServiceDep, TestId
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.formats.calibrations.recognise import load_calibration
+from stereorig.server.formats.images import encode_png, read_image
+from stereorig.server.formats.results.summary import region_found
+from stereorig.server.results.images.found_region import region_to_edit
 
 router = APIRouter(prefix="/tests/{test_id}", tags=["analyses"])
 
 
 class FindRegionRequest(Request):
-    """A pair of images, and the subsets that are to lie on the specimen."""
+    """A pair of images, and the size of the subsets to be placed on the specimen."""
 
     reference: Annotated[Whole, Field(ge=0, le=9999)] = Field(0, description="Reference step.")
     subset_px: SubsetPx = SUBSET_PX.default
@@ -42,11 +42,11 @@ class FoundRegionReply(Reply):
     outlines_px: list[list[list[float]]] = Field(description="Corners of its parts, the largest first.")
     holes_px: list[list[list[float]]] = Field(description="Corners of the holes in them.")
     share: float = Field(description="Share of camera 1's image.", examples=[0.48])
-    matches: int = Field(description="Feature matches with camera 2 that lie on it.", examples=[2364])
+    matches: int = Field(description="Feature matches with camera 2 on it.", examples=[2364])
     text: str = Field(description="How it was found, with figures.")
 
 
-@router.post("/region:find", summary="The specimen, where no region is drawn yet", responses=errors(404, 409, 422))
+@router.post("/region:find", summary="Find the specimen, if no region is drawn yet", responses=errors(404, 409, 422))
 def find_region(service: ServiceDep, test_id: TestId, body: FindRegionRequest) -> FoundRegionReply:
     """Find the specimen by its texture: as far as camera 2 sees and matches it. Nothing is kept."""
     pair = load_calibration(service.tests.calibration_file(test_id)).pair

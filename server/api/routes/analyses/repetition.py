@@ -5,12 +5,12 @@ from __future__ import annotations
 from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 
-from server.api.models import Accepted
-from server.api.protocol.attached import Wait, job_reply
-from server.api.protocol.dependencies import AnalysisId, ServiceDep, TestId
-from server.api.protocol.problems import errors
-from server.workflows.repetition.job import start_repetition
-from server.workflows.service import Service
+from stereorig.server.api.models import Accepted
+from stereorig.server.api.protocol.attached import Wait, job_reply
+from stereorig.server.api.protocol.dependencies import AnalysisId, ServiceDep, TestId
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.workflows.repetition.job import start_repetition
+from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}/analyses", tags=["analyses"])
 
@@ -27,8 +27,8 @@ async def reproduce_analysis(
     """Measure the finished steps again from the stored images, settings and calibration, and compare.
 
     The job's result has the `verdict`: `equal` to the last bit; `within`, the same points and every difference at
-    most `within_u` of its standard uncertainty; or `differs`. `changes` lists what is different since in version,
-    libraries and processor. The results of the analysis are not touched, and those of the repetition not kept.
+    most `within_u` of its standard uncertainty; or `differs`. `changes` lists the differences since then in version,
+    libraries and processor. The results of the analysis are not touched, and the repetition's are not kept.
     """
     job_id = await run_in_threadpool(_begin, service, test_id, analysis_id)
     return Accepted.model_validate(await job_reply(request, service, job_id, wait_s=wait))

@@ -9,14 +9,14 @@ from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, Response
 from starlette.concurrency import run_in_threadpool
 
-from server.api.protocol.dependencies import AnalysisId, CoverageDep, FrameText, ServiceDep, TestId
-from server.api.protocol.problems import errors
-from server.api.routes.analyses.exports import finished
-from server.base.errors import NotFoundError
-from server.report.task import NAME, report_task
-from server.workflows.analysis import start as analysis_start
-from server.workflows.analysis.framed import asked_of, results_in_frame
-from server.workflows.service import Service
+from stereorig.server.api.protocol.dependencies import AnalysisId, CoverageDep, FrameText, ServiceDep, TestId
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.api.routes.analyses.exports import finished
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.report.task import NAME, report_task
+from stereorig.server.workflows.analysis import start as analysis_start
+from stereorig.server.workflows.analysis.framed import asked_of, results_in_frame
+from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
 
@@ -43,7 +43,7 @@ async def get_report(
 ) -> Response:
     """Answer with the report of the finished steps: rig, settings, noise floor, calibration, pictures, tables, courses.
 
-    What no device reports comes from `PUT /tests/{test_id}/metadata`; what is not stated is listed as such.
+    Facts that no device reports come from `PUT /tests/{test_id}/metadata`; missing ones are listed as not stated.
     """
     results, stale = await run_in_threadpool(_prepared, service, test_id, analysis_id)
     service.require_room()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -11,20 +10,28 @@ from fastapi import APIRouter, Path, Query, Request
 from fastapi.responses import Response
 from pydantic_core import to_json
 
-from server.api.models import FieldList, FieldReply, ProbeReply
-from server.api.protocol.conditional import etag_of, tags_in
-from server.api.protocol.dependencies import AnalysisId, Camera, CoverageDep, FrameText, ServiceDep, StepNumber, TestId
-from server.api.protocol.problems import errors
-from server.formats.files import known_sha256
-from server.formats.results.reading import read_head
-from server.formats.results.uncertainty import Statement, read_included
-from server.results.field_forms import MEDIA_TYPES, RANGE_PATTERN, FieldForm, Part, encode, nested, take
-from server.results.gauges.fields import AXES
-from server.results.gauges.frames import text_of
-from server.results.positions import image_positions
-from server.results.reader import list_variables, probe_result, read_cut_pieces
-from server.results.uncertainty import read_interval
-from server.workflows.analysis.framed import asked_of, result_in
+from stereorig.server.api.models import FieldList, FieldReply, ProbeReply
+from stereorig.server.api.protocol.conditional import etag_of, tags_in
+from stereorig.server.api.protocol.dependencies import (
+    AnalysisId,
+    Camera,
+    CoverageDep,
+    FrameText,
+    ServiceDep,
+    StepNumber,
+    TestId,
+)
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.formats.manifest import known_sha256
+from stereorig.server.formats.results.reading import read_head
+from stereorig.server.formats.results.uncertainty import Statement, read_included
+from stereorig.server.results.field_forms import MEDIA_TYPES, RANGE_PATTERN, FieldForm, Part, encode, nested, take
+from stereorig.server.results.gauges.fields import AXES
+from stereorig.server.results.gauges.frames import text_of
+from stereorig.server.results.positions import image_positions
+from stereorig.server.results.reader import list_variables, probe_result, read_cut_pieces
+from stereorig.server.results.uncertainty import read_interval
+from stereorig.server.workflows.analysis.framed import asked_of, result_in
 
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
 FieldName = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,63}$", description="Variable of the result file.")]
@@ -48,7 +55,7 @@ RangeText = Annotated[
     responses=errors(404, 409, 422)
     | {
         200: {
-            "description": "The values; the headers X-Shape, X-Units, X-Rows and X-Cols say what plain bytes do not.",
+            "description": "The values; the headers X-Shape, X-Units, X-Rows and X-Cols describe plain bytes.",
             "content": {media: {} for form, media in MEDIA_TYPES.items() if form != "json"},
         }
     },
@@ -76,10 +83,10 @@ def get_field(
     """Return values over the grid of points, or a part of it; null, NaN or nothing where a point failed.
 
     `sigma_NAME` is the standard uncertainty; with k or coverage there is `expanded_NAME` too. The header X-Uncertainty
-    says what they include.
+    states the terms that they include.
     """
     path = result_in(service, test_id, analysis_id, n, frame, name)
-    # a result never changes: what was asked for, and of which file, name the answer
+    # a result never changes: the request and the file's checksum identify the answer
     etag = etag_of([known_sha256(path), name, format, rows, cols, stride, coverage.factor])
     headers = {"ETag": etag, "Cache-Control": "private, no-cache"}
     if etag in tags_in(request.headers.get("if-none-match", "")):
@@ -121,13 +128,13 @@ def list_fields(
     coverage: CoverageDep,
     frame: FrameText = None,
 ) -> FieldList:
-    """Return name, unit, meaning and dimensions of every variable; what the values of a status mean; the cuts."""
+    """Return name, unit, meaning and dimensions of every variable; the meaning of status values; the cuts."""
     path = service.tests.analyses.result_file(test_id, analysis_id, n)
-    fields, described = [asdict(v) for v in list_variables(path)], read_head(path).frame
+    fields, described = list_variables(path), read_head(path).frame
     asked = asked_of(service, test_id, frame)
     if asked is not None:
         described = f"{text_of(asked)}; before: {described}"
-        fields = [one | {"long_name": one["long_name"].replace("_sys", AXES)} for one in fields]
+        fields = [v.model_copy(update={"long_name": v.long_name.replace("_sys", AXES)}) for v in fields]
     return FieldList.model_validate(
         {
             "fields": fields,
@@ -153,7 +160,7 @@ def get_positions(
     cam: Camera,
     format: Annotated[Literal["json", "npy"], Query(description="Form of the answer.")] = "json",  # noqa: A002
 ) -> Response:
-    """Return column and row of each point, where it is at that step, by the calibration; null where it has none."""
+    """Return column and row of each point at that step, px, from the calibration; null if the point has none."""
     result = service.tests.analyses.result_file(test_id, analysis_id, n)
     measured = service.tests.analyses.read(test_id, analysis_id).inputs.calibration_sha256
     positions = image_positions(result, service.tests.calibration_file(test_id, measured), cam)
@@ -185,4 +192,4 @@ def get_probe(
 ) -> ProbeReply:
     """Return every number of the nearest point, with its uncertainty."""
     path = result_in(service, test_id, analysis_id, step, frame)
-    return ProbeReply.model_validate({"step": step, **asdict(probe_result(path, x_px, y_px, coverage))})
+    return ProbeReply.model_validate({"step": step, **dict(probe_result(path, x_px, y_px, coverage))})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path as FilePath
 from typing import Annotated, Literal
 
@@ -11,8 +10,8 @@ from fastapi import APIRouter, File, Form, Path, Query, Request, UploadFile
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse, Response
 
-from core.errors import StateError
-from server.api.models import (
+from stereorig.core.errors import StateError
+from stereorig.server.api.models import (
     CalibrationAccepted,
     CalibrationList,
     CalibrationReply,
@@ -21,24 +20,23 @@ from server.api.models import (
     ResidualsReply,
     ViewList,
 )
-from server.api.models.calibrations import CalibrationFile
-from server.api.protocol.attached import Wait, job_reply
-from server.api.protocol.conditional import tagged
-from server.api.protocol.dependencies import CalibrationId, Camera, KeyHeader, ServiceDep, mark
-from server.api.protocol.paging import PageDep
-from server.api.protocol.problems import errors
-from server.base.errors import NotFoundError
-from server.base.json_values import without_nan
-from server.base.models import Ids
-from server.formats.calibrations.programs.plausibility import check_calibration
-from server.formats.calibrations.recognise import imported_content, parse_calibration
-from server.formats.images import read_image
-from server.results.reader import read_residuals
-from server.store.calibrations import REJECTED
-from server.store.documents import MadeState
-from server.store.indexing.entries import calibration_entry
-from server.workflows.calibration.sequence import CalibrationPlan, begin
-from server.workflows.service import Service
+from stereorig.server.api.models.calibrations import CalibrationFile
+from stereorig.server.api.protocol.attached import Wait, job_reply
+from stereorig.server.api.protocol.conditional import tagged
+from stereorig.server.api.protocol.dependencies import CalibrationId, Camera, KeyHeader, ServiceDep, mark
+from stereorig.server.api.protocol.paging import PageDep
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.base.models import Ids
+from stereorig.server.cell.tables import calibration as read_calibration
+from stereorig.server.documents.made import MadeState
+from stereorig.server.formats.images import read_image
+from stereorig.server.formats.manifest import checked_bytes, is_there
+from stereorig.server.results.reader import read_residuals
+from stereorig.server.store.calibrations import REJECTED
+from stereorig.server.store.indexing.entries import calibration_entry
+from stereorig.server.workflows.calibration.sequence import CalibrationPlan, begin
+from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 
@@ -51,7 +49,7 @@ async def create_calibration(
     wait: Wait = 0.0,
     key: KeyHeader = None,
 ) -> CalibrationAccepted:
-    """Move both cameras through the plan before the grid, then fit; the rig file gives what the body leaves out."""
+    """Move both cameras through the plan before the grid, then fit; the rig file gives the parts left out."""
     made = await run_in_threadpool(_start, service, body, key)
     reply = await job_reply(request, service, str(made["job_id"]), wait_s=wait)
     return CalibrationAccepted.model_validate({**reply, "calibration_id": made["calibration_id"]})
@@ -100,7 +98,7 @@ def list_calibrations(
 def get_calibration(service: ServiceDep, calibration_id: CalibrationId, response: Response) -> CalibrationReply:
     """Return plan, views and, once complete, all of calibration.json; the header ETag names this state of it.
 
-    One that failed its verdict has what was refused in the same fields, for inspection; `state` stays `failed`.
+    One that failed its verdict has its refused content in the same fields, for inspection; `state` stays `failed`.
     """
     return CalibrationReply.model_validate(tagged(response, service.calibrations.read(calibration_id).plain()))
 
@@ -121,6 +119,15 @@ def import_calibration(
         ),
     ],
     label: Annotated[Label, Form(description="Free text.")] = "",
+    unit: Annotated[
+        str | None,
+        Form(
+            max_length=40,
+            description="Unit of length of another program's file: um, mm, cm, m or in, or a size such as `25 mm` if "
+            "it counts squares of a board; left out: mm, and a warning in `plan.check` if no rig has such "
+            "distances.",
+        ),
+    ] = None,
     key: KeyHeader = None,
 ) -> CalibrationReply:
     """Store another program's stereo calibration, or one of another data folder, to measure imported steps with.
@@ -128,11 +135,11 @@ def import_calibration(
     `plan.check` has the epipolar residual of points in both images, and warnings.
     """
     data = file.file.read()
-    request = mark("calibrations:import", key, None, data, label.encode())
+    stated = [] if unit is None else [unit.encode()]
+    request = mark("calibrations:import", key, None, data, label.encode(), *stated)
 
     def make() -> Ids:
-        content = imported_content(data, name="The file")
-        checked = without_nan(asdict(check_calibration(parse_calibration(data, name="The file"))))
+        content, checked = read_calibration(service.cell, data, unit=unit)
         plan = {"source": "import", "label": label, "check": checked, **request.document()}
         calibration_id = service.calibrations.add_imported(plan, content)
         entry = calibration_entry(service.calibrations, calibration_id)
@@ -153,7 +160,7 @@ def complete(service: ServiceDep, calibration_id: str) -> FilePath:
         ``calibration_not_complete``.
     """
     path = service.calibrations.path(calibration_id)
-    if not (path / "calibration.json").exists():
+    if not is_there(path / "calibration.json"):
         state = service.calibrations.read(calibration_id).state
         raise StateError(
             f"Calibration {calibration_id} is {state}.",
@@ -183,12 +190,12 @@ def get_residuals(service: ServiceDep, calibration_id: CalibrationId) -> Residua
     A calibration that failed its verdict has them too, to find the cause.
     """
     path = service.calibrations.path(calibration_id)
-    if not (path / REJECTED).exists():
+    if not is_there(path / REJECTED):
         complete(service, calibration_id)
     path /= "residuals.nc"
-    if not path.is_file():
+    if not is_there(path):
         raise NotFoundError(f"Calibration {calibration_id} was imported and has no residuals.", kind="residuals")
-    return ResidualsReply.model_validate({"views": [asdict(view) for view in read_residuals(path)]})
+    return ResidualsReply(views=read_residuals(path))
 
 
 @router.get(
@@ -197,9 +204,10 @@ def get_residuals(service: ServiceDep, calibration_id: CalibrationId) -> Residua
     response_class=FileResponse,
     responses=errors(404, 409) | {200: {"model": CalibrationFile, "description": "The file"}},
 )
-def get_calibration_file(service: ServiceDep, calibration_id: CalibrationId) -> FileResponse:
+def get_calibration_file(service: ServiceDep, calibration_id: CalibrationId) -> Response:
     """Return the file, which `stereorig measure` reads."""
-    return FileResponse(complete(service, calibration_id) / "calibration.json", media_type="application/json")
+    path = complete(service, calibration_id) / "calibration.json"
+    return Response(checked_bytes(path), media_type="application/json")
 
 
 @router.get(
@@ -218,6 +226,6 @@ def get_view(
     """Return the image as stored (TIFF), or as PNG for looking at."""
     path = service.calibrations.view_file(calibration_id, index, cam)
     if format == "tiff":
-        return Response(path.read_bytes(), media_type="image/tiff")
+        return Response(checked_bytes(path), media_type="image/tiff")
     _, data = cv2.imencode(".png", read_image(path))
     return Response(data.tobytes(), media_type="image/png")

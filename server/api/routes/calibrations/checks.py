@@ -7,24 +7,25 @@ from typing import Annotated
 import numpy as np
 from fastapi import APIRouter, File, Form, Query, UploadFile
 
-from core.calibration.checks.measures import focal_lengths_px
-from core.errors import InputError
-from core.names import CAMERAS, CameraName
-from server.api.models.calibration_checks import (
+from stereorig.core.calibration.checks.measures import focal_lengths_px
+from stereorig.core.errors import InputError
+from stereorig.core.names import CAMERAS, CameraName
+from stereorig.server.api.models.calibration_checks import (
     AspectReply,
     ComparisonReply,
     DistanceReply,
     DistanceRequest,
     GeometryReply,
 )
-from server.api.protocol.dependencies import CalibrationId, ServiceDep
-from server.api.protocol.problems import errors
-from server.api.routes.calibrations.calibrations import complete
-from server.formats.calibrations.recognise import LoadedCalibration, load_calibration
-from server.formats.calibrations.target_toml import target_of
-from server.formats.images import decode_image, read_image
-from server.report.geometry import geometry_at
-from server.results.calibration_checks import (
+from stereorig.server.api.protocol.dependencies import CalibrationId, ServiceDep
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.api.routes.calibrations.calibrations import complete
+from stereorig.server.cell.images import images as read_images
+from stereorig.server.formats.calibrations.recognise import LoadedCalibration, load_calibration
+from stereorig.server.formats.calibrations.target_toml import target_of
+from stereorig.server.formats.images import read_image
+from stereorig.server.report.geometry import geometry_at
+from stereorig.server.results.calibration_checks import (
     KNOWN_DISTANCE,
     NamedImage,
     aspect_of_images,
@@ -34,7 +35,7 @@ from server.results.calibration_checks import (
     kept_distance,
     plain,
 )
-from server.workflows.service import Service
+from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 
@@ -120,12 +121,15 @@ def compare_calibration(
     service: ServiceDep,
     calibration_id: CalibrationId,
     other: Annotated[str, Query(alias="with", max_length=40, description="Id of the second calibration.")],
+    independent: Annotated[
+        bool, Query(description="Other targets, stages and cameras made them, even if both declare them alike.")
+    ] = False,
 ) -> ComparisonReply:
     """Return shape, scale and epipolar offset of the second against this one, in units of both covariances.
 
-    Points of the common volume are imaged by this one's cameras and measured with the other's.
+    Points of the common volume are imaged by the first calibration's cameras and measured with the second's.
     """
-    found = compare_loaded(_loaded(service, calibration_id), _loaded(service, other))
+    found = compare_loaded(_loaded(service, calibration_id), _loaded(service, other), independent=independent)
     return ComparisonReply.model_validate(plain(found))
 
 
@@ -134,7 +138,7 @@ def measure_aspect(
     service: ServiceDep,
     images: Annotated[
         list[UploadFile],
-        # an empty list cannot be told from a missing one in a form
+        # a form cannot distinguish an empty list from a missing one
         File(min_length=1, description="One camera's images of the line grid at 45 degrees, moved about in its plane."),
     ],
     standoff_mm: Annotated[
@@ -147,7 +151,8 @@ def measure_aspect(
     """
     target = target_of(service.config.target.plain(), "the rig file, [target]")
     read = [
-        NamedImage(name, decode_image(upload.file.read(), name=name))
+        NamedImage(name, decoded.pixels)
         for name, upload in ((u.filename or f"image {k + 1}", u) for k, u in enumerate(images))
+        for decoded in read_images(service.cell, {name: upload.file.read()}).values()
     ]
     return AspectReply.model_validate(plain(aspect_of_images(read, target, standoff_mm=standoff_mm)))

@@ -8,19 +8,20 @@ from typing import Annotated
 from fastapi import APIRouter, Query
 from fastapi.responses import Response
 
-from server.api.models import ConversionReply
-from server.api.protocol.dependencies import CalibrationId, ServiceDep
-from server.api.protocol.problems import errors
-from server.api.routes.calibrations.calibrations import complete
-from server.formats.calibrations.export import (
+from stereorig.server.api.models import ConversionReply
+from stereorig.server.api.protocol.dependencies import CalibrationId, ServiceDep
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.api.routes.calibrations.calibrations import complete
+from stereorig.server.formats.calibrations.export import (
     FILE_NAMES,
     MEDIA_TYPES,
     CalibrationForm,
     ConvertedCalibration,
     convert_calibration,
 )
-from server.formats.calibrations.recognise import parse_calibration
-from server.workflows.service import Service
+from stereorig.server.formats.calibrations.recognise import parse_calibration
+from stereorig.server.formats.manifest import checked_bytes
+from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/calibrations/{calibration_id}", tags=["calibrations"])
 _OURS = {"application/json": {"schema": {"$ref": "#/components/schemas/CalibrationFile"}}}
@@ -34,7 +35,7 @@ Form = Annotated[
 
 
 def _converted(service: Service, calibration_id: str, form: CalibrationForm) -> ConvertedCalibration:
-    data = (complete(service, calibration_id) / "calibration.json").read_bytes()
+    data = checked_bytes(complete(service, calibration_id) / "calibration.json")
     return convert_calibration(parse_calibration(data, name=f"Calibration {calibration_id}"), form, data)
 
 
@@ -66,5 +67,5 @@ def export_calibration(service: ServiceDep, calibration_id: CalibrationId, forma
     "/export/report", summary="Losses of a calibration in another program's form", responses=errors(404, 409, 422)
 )
 def report_conversion(service: ServiceDep, calibration_id: CalibrationId, format: Form) -> ConversionReply:  # noqa: A002
-    """Return the residual of each lens' fit, and what the written file makes of points that both cameras see."""
+    """Return the residual of each lens' fit, and the errors of the written file at points that both cameras see."""
     return ConversionReply.model_validate(asdict(_converted(service, calibration_id, format).report))

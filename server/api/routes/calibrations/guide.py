@@ -7,12 +7,12 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Request
 from fastapi.concurrency import run_in_threadpool
 
-from server.api.models import Accepted, CalibrationAccepted
-from server.api.models.guide import GuideReply, GuideRequest
-from server.api.protocol.attached import Wait, job_reply
-from server.api.protocol.dependencies import CalibrationId, KeyHeader, ServiceDep, mark
-from server.api.protocol.problems import errors
-from server.workflows.calibration.guided import GuidePlan, Guides
+from stereorig.server.api.models import Accepted, CalibrationAccepted
+from stereorig.server.api.models.guide import GuideReply, GuideRequest
+from stereorig.server.api.protocol.attached import Wait, job_reply
+from stereorig.server.api.protocol.dependencies import CalibrationId, KeyHeader, ServiceDep, mark
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.workflows.calibration.guided import GuidePlan, Guides
 
 router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 
@@ -30,9 +30,9 @@ GuidesDep = Annotated[Guides, Depends(get_guides)]
 def begin_guide(
     service: ServiceDep, guides: GuidesDep, body: GuideRequest | None = None, key: KeyHeader = None
 ) -> CalibrationAccepted:
-    """Hold the cameras, find the target in live pairs, and take a view whenever it stands still in a new pose.
+    """Hold the cameras, find the target in live pairs, and take a view whenever it is at rest in a new pose.
 
-    Whatever the rig file says of the stage, nothing moves: the target is shown by hand in free poses. Hold it first
+    Nothing moves, even if the rig file has a stage: the target is shown by hand in free poses. Hold it first
     where the specimen will be: that pose is the system frame.
     """
     body = body or GuideRequest.model_validate({})
@@ -54,9 +54,9 @@ def begin_guide(
 
 @router.get("/{calibration_id}/guide", summary="A guided acquisition, now", responses=errors(404, 409))
 def get_guide(guides: GuidesDep, calibration_id: CalibrationId) -> GuideReply:
-    """Return the target in the newest live pair, what the views taken cover, and the next most useful view.
+    """Return the target in the newest live pair, the cover by the views taken, and the next most useful view.
 
-    The event `guide` tells of each view taken.
+    The event `guide` reports each view taken.
     """
     return GuideReply.model_validate(guides.state(calibration_id))
 

@@ -7,19 +7,20 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Request
 from fastapi.concurrency import run_in_threadpool
-from fastapi.responses import FileResponse
+from fastapi.responses import FileResponse, Response
 
-from core.errors import FileFormatError
-from server.api.models import NoiseAccepted, NoiseList, NoiseReply, NoiseRequest
-from server.api.models.noise import NoiseFile
-from server.api.protocol.attached import Wait, job_reply
-from server.api.protocol.dependencies import KeyHeader, ServiceDep, mark
-from server.api.protocol.paging import PageDep
-from server.api.protocol.problems import errors
-from server.base.models import Ids
-from server.store.documents import MadeRecord
-from server.workflows import noise_sequence
-from server.workflows.service import Service
+from stereorig.core.errors import FileFormatError
+from stereorig.server.api.models import NoiseAccepted, NoiseList, NoiseReply, NoiseRequest
+from stereorig.server.api.models.noise import NoiseFile
+from stereorig.server.api.protocol.attached import Wait, job_reply
+from stereorig.server.api.protocol.dependencies import KeyHeader, ServiceDep, mark
+from stereorig.server.api.protocol.paging import PageDep
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.base.models import Ids
+from stereorig.server.documents.made import MadeRecord
+from stereorig.server.formats.manifest import checked_bytes
+from stereorig.server.workflows import noise_sequence
+from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/noise", tags=["noise"])
 NoiseId = Annotated[str, Path(max_length=40, description="Id of a noise measurement.")]
@@ -29,7 +30,10 @@ NoiseId = Annotated[str, Path(max_length=40, description="Id of a noise measurem
 async def create_noise(
     request: Request, service: ServiceDep, body: NoiseRequest | None = None, wait: Wait = 0.0, key: KeyHeader = None
 ) -> NoiseAccepted:
-    """Take frames of a scene at rest with the present settings; fit variance against grey level."""
+    """Take frames of a scene at rest with the present settings; fit variance against grey level.
+
+    With an even field (`even`), measure the sensors' fixed pattern and defective pixels too.
+    """
     made = await run_in_threadpool(_start, service, body, key)
     reply = await job_reply(request, service, str(made["job_id"]), wait_s=wait)
     return NoiseAccepted.model_validate({**reply, "noise_id": made["noise_id"]})
@@ -40,7 +44,7 @@ def _start(service: Service, body: NoiseRequest | None, key: str | None) -> Ids:
     request = mark("noise", key, body)
 
     def make() -> Ids:
-        return noise_sequence.begin(service, body.frames, body.label, request)
+        return noise_sequence.begin(service, body.frames, body.label, request, even=body.even)
 
     made, _ = service.once(request.scope, key, request.body_sha256, make)
     return made
@@ -68,9 +72,9 @@ def get_noise(service: ServiceDep, noise_id: NoiseId) -> NoiseReply:
     response_class=FileResponse,
     responses=errors(404, 409) | {200: {"model": NoiseFile, "description": "The file"}},
 )
-def get_noise_file(service: ServiceDep, noise_id: NoiseId) -> FileResponse:
+def get_noise_file(service: ServiceDep, noise_id: NoiseId) -> Response:
     """Return the file, which `stereorig measure --noise` reads."""
-    return FileResponse(service.noise.file(noise_id), media_type="application/json")
+    return Response(checked_bytes(service.noise.file(noise_id)), media_type="application/json")
 
 
 def _shown(made: MadeRecord) -> NoiseReply:

@@ -1,18 +1,18 @@
-"""Calibrations after a bump: the cameras' relative orientation estimated anew."""
+"""Calibrations after a bump: the cameras' relative orientation estimated again."""
 
 from __future__ import annotations
 
 from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 
-from server.api.models import CalibrationAccepted, RepairRequest
-from server.api.protocol.attached import Wait, job_reply
-from server.api.protocol.dependencies import CalibrationId, KeyHeader, ServiceDep, mark
-from server.api.protocol.problems import errors
-from server.api.routes.analyses.analyses import mask_of
-from server.base.models import Ids
-from server.workflows.calibration.repair import begin
-from server.workflows.service import Service
+from stereorig.server.api.models import CalibrationAccepted, RepairRequest
+from stereorig.server.api.protocol.attached import Wait, job_reply
+from stereorig.server.api.protocol.dependencies import CalibrationId, KeyHeader, ServiceDep, mark
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.api.routes.analyses.analyses import mask_of
+from stereorig.server.base.models import Ids
+from stereorig.server.workflows.calibration.repair import begin
+from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 
@@ -34,7 +34,7 @@ async def repair_calibration(
     """Make a new calibration: the cameras' relative orientation is estimated from the speckle of steps after the bump.
 
     The old one is kept as it is; `plan.repaired_from` of the new one names it, `repair` has the finding. The length of
-    the baseline is kept, the covariance widened. The job fails with a `repair_...` code where it does not hold.
+    the baseline is kept, the covariance widened. The job fails with a `repair_...` code if a check refuses the repair.
     """
     made = await run_in_threadpool(_start, service, calibration_id, body, key)
     reply = await job_reply(request, service, str(made["job_id"]), wait_s=wait)

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from fastapi import APIRouter, Request, Response
 
-from core.plan.settings import PlannedMeasurement, PlannedRig
-from server.api.models import CalibrationReply
-from server.api.models.calibrations import ExpectReply, ExpectRequest, ReviewRequest
-from server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
-from server.api.protocol.dependencies import CalibrationId, ServiceDep, person_name
-from server.api.protocol.problems import errors
-from server.workflows.calibration import review as calibration_review
-from server.workflows.calibration.sequence import CalibrationPlan
+from stereorig.core.plan.settings import PlannedMeasurement, PlannedRig
+from stereorig.server.api.models import CalibrationReply
+from stereorig.server.api.models.calibrations import ExpectReply, ExpectRequest, ReviewRequest
+from stereorig.server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
+from stereorig.server.api.protocol.dependencies import CalibrationId, ServiceDep, person_name
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.workflows.calibration import review as calibration_review
+from stereorig.server.workflows.calibration.sequence import CalibrationPlan
 
 router = APIRouter(prefix="/calibrations", tags=["calibrations"])
 
 
 @router.post(":expect", summary="Expected uncertainty of a plan", responses=errors(409, 422, 503))
 def expect_calibration(service: ServiceDep, body: ExpectRequest | None = None) -> ExpectReply:
-    """Predict what a calibration and a measurement will leave uncertain; nothing moves, nothing is kept.
+    """Predict the uncertainties that a calibration and a measurement will have; nothing moves, nothing is stored.
 
     The rig file's nominal cameras image the target; the adjustment's own derivatives there give the covariance. Points
-    on the target's plane, with the noise of an assumed pattern, give what a measurement will report.
+    on the target's plane, with the noise of an assumed pattern, give a measurement's uncertainties.
     """
     body = body or ExpectRequest.model_validate({})
     usual = service.config.calibration
@@ -55,7 +55,7 @@ def put_review(
 ) -> CalibrationReply:
     """Keep a decision: tests that name `latest` take the newest accepted; none can be made with a discarded one.
 
-    If-Match, with the ETag of the calibration, is refused (412) if another client decided meanwhile.
+    If-Match, with the ETag of the calibration, is refused (412) if another client decided since.
     """
     service.calibrations.path(calibration_id)
     with service.changes:  # no other decision comes between the check and this one

@@ -8,23 +8,23 @@ from fastapi import APIRouter, Path, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import HTMLResponse, Response
 
-from server.api.models.evidence.certificates import (
+from stereorig.server.api.models.evidence.certificates import (
     CertificateList,
     CertificateReply,
     CertificateRequest,
     WithdrawRequest,
 )
-from server.api.models.jobs import Accepted
-from server.api.protocol.attached import Wait, job_reply
-from server.api.protocol.dependencies import KeyHeader, ServiceDep, mark, person_name
-from server.api.protocol.paging import PageDep
-from server.api.protocol.problems import errors
-from server.base.models import Ids
-from server.report.certificate.task import certificate_task
-from server.store.documents import CertificateRecord
-from server.workflows.certificates.job import start_certificate
-from server.workflows.certificates.state import state_of
-from server.workflows.service import Service
+from stereorig.server.api.models.jobs import Accepted
+from stereorig.server.api.protocol.attached import Wait, job_reply
+from stereorig.server.api.protocol.dependencies import KeyHeader, ServiceDep, mark, person_name
+from stereorig.server.api.protocol.paging import PageDep
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.base.models import Ids
+from stereorig.server.documents.made import CertificateRecord
+from stereorig.server.report.certificate.task import certificate_task
+from stereorig.server.workflows.certificates.job import start_certificate
+from stereorig.server.workflows.certificates.state import state_of
+from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/certificates", tags=["certificates"])
 CertificateId = Annotated[str, Path(max_length=40, description="Id of a certificate.")]
@@ -35,10 +35,10 @@ _ENTRY = ("id", "title", "outcome", "created_utc", "valid_until_utc")
 async def create_certificate(
     request: Request, service: ServiceDep, body: CertificateRequest, wait: Wait = 0.0, key: KeyHeader = None
 ) -> Accepted:
-    """Judge the measuring system by the steps of an analysis and what the plan knows of them.
+    """Judge the measuring system by the steps of an analysis and the known values in the plan.
 
-    The job's result has `certificate_id` and `outcome`. What the certificate rests on cannot be deleted until it is
-    withdrawn. The job fails with a `certificate_...` code, and nothing is kept, where a step, a picture or a reading
+    The job's result has `certificate_id` and `outcome`. The certificate's inputs cannot be deleted until it is
+    withdrawn. The job fails with a `certificate_...` code, and nothing is stored, if a step, a picture or a reading
     is missing.
     """
     made = await run_in_threadpool(_begin, service, body, key)
@@ -67,7 +67,7 @@ def list_certificates(service: ServiceDep, page: PageDep) -> CertificateList:
 
 @router.get("/{certificate_id:plain_id}", summary="One certificate", responses=errors(404))
 def get_certificate(service: ServiceDep, certificate_id: CertificateId) -> CertificateReply:
-    """Return verdict, reasons, what is suspect, and every table."""
+    """Return verdict, reasons, suspected causes, and every table."""
     return _reply(service, certificate_id)
 
 
@@ -94,7 +94,7 @@ def get_certificate_report(service: ServiceDep, certificate_id: CertificateId) -
 def withdraw_certificate(
     request: Request, service: ServiceDep, certificate_id: CertificateId, body: WithdrawRequest
 ) -> CertificateReply:
-    """Withdraw a certificate: it stays, with the reason, and what it rests on can be deleted again."""
+    """Withdraw a certificate: it stays, with the reason, and its inputs can be deleted again."""
     service.certificates.withdraw(certificate_id, body.reason, person_name(request))
     service.hub.publish("certificate", {"certificate_id": certificate_id, "state": "withdrawn"})
     return _reply(service, certificate_id)

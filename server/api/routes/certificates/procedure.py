@@ -5,15 +5,15 @@ from __future__ import annotations
 from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 
-from server.api.models.evidence.procedure import NextRequest, ProcedureReply
-from server.api.models.jobs import Accepted
-from server.api.protocol.attached import Attached, Wait, job_reply
-from server.api.protocol.dependencies import KeyHeader, ServiceDep, TestId, get_service, mark
-from server.api.protocol.problems import errors
-from server.base.models import Ids
-from server.results.certificate.procedure import PlannedProcedure
-from server.workflows.certificates.procedure import put_procedure, show_procedure, start_next
-from server.workflows.service import Service
+from stereorig.server.api.models.evidence.procedure import NextRequest, ProcedureReply
+from stereorig.server.api.models.jobs import Accepted
+from stereorig.server.api.protocol.attached import Attached, Wait, job_reply
+from stereorig.server.api.protocol.dependencies import KeyHeader, ServiceDep, TestId, get_service, mark
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.base.models import Ids
+from stereorig.server.results.certificate.procedure import PlannedProcedure
+from stereorig.server.workflows.certificates.procedure import put_procedure, show_procedure, start_next
+from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}", tags=["certificates"])
 
@@ -28,7 +28,7 @@ def put_certificate_plan(service: ServiceDep, test_id: TestId, body: PlannedProc
 
 @router.get("/certificate-plan", summary="A test's verification procedure", responses=errors(404))
 def get_certificate_plan(service: ServiceDep, test_id: TestId) -> ProcedureReply:
-    """Return the plan, its steps with who does what, which of them are taken, and the next one."""
+    """Return the plan, its steps with the person or device that acts, the steps taken, and the next one."""
     service.tests.path(test_id)
     return ProcedureReply.model_validate(show_procedure(service, test_id))
 
@@ -47,10 +47,10 @@ async def take_next_step(
     wait: Wait = 0.0,
     key: KeyHeader = None,
 ) -> Accepted:
-    """Move the stage where the step is the stage's, and capture; the job's result has the step's number.
+    """Move the stage if the step needs it, and capture; the job's result has the step's number.
 
-    A step that is taken by hand is refused (`procedure_by_hand`, which says what to do) until `confirmed` says that it
-    was done.
+    A step that is taken by hand is refused (`procedure_by_hand`, with the instruction) until `confirmed` states that
+    it was done.
     """
     service = get_service(request)
     job_id = await run_in_threadpool(_begin, service, test_id, body or NextRequest(confirmed=False), key)

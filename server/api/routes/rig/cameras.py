@@ -15,10 +15,10 @@ from fastapi import APIRouter, Query, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response, StreamingResponse
 
-from core.errors import StereorigError
-from core.names import CAMERAS
-from drivers.cameras.protocol import CameraSettings, Frame
-from server.api.models import (
+from stereorig.core.errors import StereorigError
+from stereorig.core.names import CAMERAS
+from stereorig.drivers.cameras.protocol import CameraSettings, Frame
+from stereorig.server.api.models import (
     Accepted,
     CameraReply,
     CameraSet,
@@ -31,17 +31,17 @@ from server.api.models import (
     SceneRequest,
     SettingsPatch,
 )
-from server.api.protocol.attached import Wait, job_reply
-from server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
-from server.api.protocol.dependencies import Camera, KeyHeader, ServiceDep, get_service, mark
-from server.api.protocol.problems import errors
-from server.base.models import Ids
-from server.formats.images import encode_tiff
-from server.jobs.job import Job, Phase
-from server.results.images.quality import image_quality
-from server.workflows.calibration.guided import GUIDED_PURPOSE
-from server.workflows.exposure import set_exposure
-from server.workflows.service import Service
+from stereorig.server.api.protocol.attached import Wait, job_reply
+from stereorig.server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
+from stereorig.server.api.protocol.dependencies import Camera, KeyHeader, ServiceDep, get_service, mark
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.base.models import Ids
+from stereorig.server.formats.images import encode_tiff
+from stereorig.server.jobs.job import Job, Phase
+from stereorig.server.results.images.quality import image_quality
+from stereorig.server.workflows.calibration.guided import GUIDED_PURPOSE
+from stereorig.server.workflows.exposure import set_exposure
+from stereorig.server.workflows.service import Service
 
 router = APIRouter(tags=["rig"])
 _BOUNDARY = "frame"
@@ -113,7 +113,7 @@ def get_camera(service: ServiceDep, cam: Camera, response: Response) -> CameraRe
 def patch_camera(
     service: ServiceDep, cam: Camera, body: SettingsPatch, response: Response, if_match: IfMatch = None
 ) -> CameraSet:
-    """Set what is given; the answer holds every setting as read back. If-Match refuses if others changed them."""
+    """Set the given values; the answer holds every setting as read back. If-Match refuses if others changed them."""
     with service.hardware.hold(f"new settings of {cam}"):
         require_match(if_match, etag_of(service.rig.describe_camera(cam)), f"the settings of {cam}", required=False)
         taken = service.rig.configure(cam, CameraSettings(**body.model_dump()))
@@ -125,7 +125,7 @@ def patch_camera(
     "/cameras/{cam}:expose", summary="Search for a camera's exposure, and set it", responses=errors(409, 422, 503)
 )
 def expose(service: ServiceDep, cam: Camera, body: ExposureRequest | None = None) -> ExposureFound:
-    """Bring the picture's brightest parts to a level, without saturation; the old exposure stays where none does."""
+    """Bring the picture's brightest parts to a level, without saturation; the old exposure is kept if none does."""
     wanted = body or ExposureRequest()
     with service.hardware.hold(f"the search for {cam}'s exposure"):
         taken, found = set_exposure(service, cam, wanted.level, wanted.shortest_ms, wanted.longest_ms)
@@ -208,7 +208,7 @@ async def get_stream(
     service = get_service(request)
     pair = service.rig.pair
     service.streams.check("live_view")
-    # live views have few threads of their own, and can never take those of other requests
+    # live views have few threads of their own, and can never take threads of other requests
     limiter: CapacityLimiter = request.app.state.view_limiter
 
     def newer(last: int | None) -> tuple[int, bytes | None]:
@@ -225,17 +225,17 @@ async def get_stream(
                         newer, last, limiter=limiter, abandon_on_cancel=True
                     )
                 except StereorigError as error:
-                    if error.code == "camera_busy":  # a capture goes on, and nothing older is there to show
+                    if error.code == "camera_busy":  # a capture is running, and there is no older frame to show
                         continue
                     return  # the stream ends; GET /rig gives the reason
-                # by a timetable, since pauses are each a little too long; where there is no frame yet, it is not waited
-                # for a whole period, which would halve the rate
+                # by a timetable, since pauses are each a little too long; before the first frame the wait is a
+                # quarter of the period, since a whole one would halve the rate
                 due += (0.25 if data is None else 1.0) / rate_hz
                 if data is not None:
                     last = sequence
                     head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
                     yield head.encode() + data + b"\r\n"
-                due = max(due, anyio.current_time())  # what was missed is not made up for
+                due = max(due, anyio.current_time())  # missed frames are not made up for
                 await anyio.sleep_until(due)
 
     return StreamingResponse(

@@ -7,9 +7,9 @@ from dataclasses import asdict
 from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 
-from server.api.models import LiveCheckReply
-from server.api.protocol.problems import errors
-from server.workflows.live_check import LiveChecks
+from stereorig.server.api.models import LiveCheckReply
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.workflows.live_check import LiveChecks
 
 router = APIRouter(tags=["rig"])
 
@@ -22,7 +22,7 @@ router = APIRouter(tags=["rig"])
 async def check_calibration(request: Request) -> LiveCheckReply:
     """Match the live pair, and hold its points against the newest accepted calibration's epipolar lines.
 
-    It takes a second or more, and is not made while a job runs or a stage stands off the calibrated place.
+    It takes a second or more, and is not made while a job runs or a stage is off the calibrated place.
     """
     checks: LiveChecks = request.app.state.live_checks
     found = await run_in_threadpool(checks)

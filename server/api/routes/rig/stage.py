@@ -1,8 +1,9 @@
-"""The stage: where it is, moves, homing, stop."""
+"""The stage: position, moves, homing, stop."""
 
 from __future__ import annotations
 
 import asyncio
+import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,8 +12,8 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
-from drivers.stages.refusals import configuration_state
-from server.api.models import (
+from stereorig.drivers.stages.refusals import configuration_state
+from stereorig.server.api.models import (
     Accepted,
     AxesRequest,
     DynamicsPatch,
@@ -24,14 +25,14 @@ from server.api.models import (
     StageReply,
     StopReply,
 )
-from server.api.protocol.attached import Attached, Wait, job_reply
-from server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
-from server.api.protocol.dependencies import KeyHeader, ServiceDep, get_service, mark
-from server.api.protocol.problems import errors
-from server.base.models import Ids
-from server.jobs.idempotency import RequestMark
-from server.jobs.job import Job, Phase
-from server.workflows.service import Service
+from stereorig.server.api.protocol.attached import Attached, Wait, job_reply
+from stereorig.server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
+from stereorig.server.api.protocol.dependencies import KeyHeader, ServiceDep, get_service, mark
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.base.models import Ids
+from stereorig.server.jobs.idempotency import RequestMark
+from stereorig.server.jobs.job import Job, Phase
+from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/stage", tags=["stage"])
 Run = Callable[[Job], Mapping[str, object]]
@@ -142,16 +143,27 @@ def _motion(
     service: Service, sent: RequestMark, kind: str, purpose: str, subject: Mapping[str, object], run: Run
 ) -> str:
     job = service.jobs.submit(
-        kind, purpose, subject, [Phase("hardware", run)], on_cancel=service.stop_job, request=sent
+        kind,
+        purpose,
+        subject,
+        [Phase("hardware", run)],
+        on_cancel=service.stop_job,
+        request=sent,
+        without_disk=True,  # a stage that cannot be moved out of the way is a worse loss than its job's record
     )
     return job.id
+
+
+#: sent by the front process, which has put the stop on the wire: its number and the time that it took, ms
+_HALTED = "stereorig-halted"
+_HALT_KNOWN_S = 0.1
 
 
 @router.post(":stop", summary="Stop every axis, always", responses=errors(503))
 async def stop(request: Request) -> StopReply:
     """Stop at once: waits for no job and no lock, and cancels the hardware job if one runs."""
     service = get_service(request)
-    answer = await _halt(service, service.stop_thread, service.rig.stop)
+    answer = await _halt(request, service.stop_thread, service.rig.stop)
     service.metrics.stop_s.observe(answer.elapsed_ms / 1e3)
     return answer
 
@@ -161,17 +173,23 @@ async def abort(request: Request) -> StopReply:
     """Stop as in an emergency: as `/stage:stop`, with the controller's emergency stop, and without power afterwards."""
     service = get_service(request)
     # it waits until the motors are off, behind which no stop must wait
-    return await _halt(service, service.abort_thread, service.rig.controls.abort)
+    return await _halt(request, service.abort_thread, service.rig.controls.abort)
 
 
-async def _halt(service: Service, thread: ThreadPoolExecutor, halt: Callable[[], None]) -> StopReply:
+async def _halt(request: Request, thread: ThreadPoolExecutor, halt: Callable[[], None]) -> StopReply:
+    service, loop = get_service(request), asyncio.get_running_loop()
+    halted = request.headers.get(_HALTED)
+    if halted is not None and service.rig.is_remote:
+        number, _, took_ms = halted.partition(";")
+        find = functools.partial(service.halts.cancelled_job, int(number), _HALT_KNOWN_S)
+        return StopReply(
+            stopped=True, elapsed_ms=round(float(took_ms), 3), cancelled_job=await loop.run_in_executor(thread, find)
+        )
     arrived = time.perf_counter()
     cancelled = service.jobs.cancel_hardware()
-    await asyncio.get_running_loop().run_in_executor(thread, halt)
+    await loop.run_in_executor(thread, halt)
     elapsed_ms = (time.perf_counter() - arrived) * 1e3
-    if cancelled is not None:
-        service.stop_until_released(cancelled)
-    service.hub.publish("stage", {"stopped": True, "cancelled_job": cancelled})
+    service.note_stop(cancelled)
     return StopReply(stopped=True, elapsed_ms=round(elapsed_ms, 3), cancelled_job=cancelled)
 
 
@@ -210,7 +228,7 @@ def get_axis(service: ServiceDep, axis: AxisNumber, response: Response) -> Dynam
 def patch_axis(
     service: ServiceDep, axis: AxisNumber, body: DynamicsPatch, response: Response, if_match: IfMatch = None
 ) -> DynamicsReply:
-    """Set what is given; the answer is what the controller took. It lasts until the service ends.
+    """Set the given values; the answer has the controller's values. They last until the service ends.
 
     If-Match, with the ETag of GET, refuses if others changed them.
     """

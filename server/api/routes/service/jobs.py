@@ -10,17 +10,17 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
-from server.api.models import JobList, JobReply, JobStepList
-from server.api.protocol.attached import Wait, waited
-from server.api.protocol.dependencies import JobId, ServiceDep
-from server.api.protocol.paging import WHOLE, PageDep, ShortPageDep
-from server.api.protocol.problems import errors
-from server.api.routes.service.system import EventStream, LastEventId
-from server.base.errors import NotFoundError
-from server.exports.request import MEDIA_CONTENT, media_type_of
-from server.jobs.events import Event
-from server.jobs.job import FINAL
-from server.store.documents import JobRecord
+from stereorig.server.api.models import JobList, JobReply, JobStepList
+from stereorig.server.api.protocol.attached import Wait, waited
+from stereorig.server.api.protocol.dependencies import JobId, ServiceDep
+from stereorig.server.api.protocol.paging import WHOLE, PageDep, ShortPageDep
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.api.routes.service.system import EventStream, LastEventId
+from stereorig.server.base.errors import NotFoundError
+from stereorig.server.documents.jobs import JobRecord
+from stereorig.server.exports.request import MEDIA_CONTENT, media_type_of
+from stereorig.server.jobs.events import Event
+from stereorig.server.jobs.job import FINAL
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 #: of each list in the result of a job that is listed with others
@@ -50,7 +50,7 @@ async def get_job(request: Request, service: ServiceDep, job_id: JobId, wait: Wa
 def job_steps(service: ServiceDep, job_id: JobId, page: PageDep) -> JobStepList:
     """Return the steps in a job's `result`, in order of their numbers; the job's document holds the first 100.
 
-    An analysis has its steps, with what became of each, at `GET /tests/{id}/analyses/{analysis_id}/steps`.
+    An analysis lists its steps with their states at `GET /tests/{id}/analyses/{analysis_id}/steps`.
     """
     result = service.jobs.document(job_id).result or {}
     found = result.get("steps")
@@ -61,7 +61,7 @@ def job_steps(service: ServiceDep, job_id: JobId, page: PageDep) -> JobStepList:
 
 @router.post("/{job_id}:cancel", summary="Cancel a job", status_code=202, responses=errors(404, 409, 422))
 async def cancel_job(request: Request, service: ServiceDep, job_id: JobId, wait: Wait = 0.0) -> JobReply:
-    """Ask the job to stop; it does within a second, and keeps what was finished."""
+    """Ask the job to stop; it does within a second, and keeps its finished results."""
     cancelled = await run_in_threadpool(service.jobs.cancel, job_id)
     if wait:
         await waited(request, service, job_id, wait)
@@ -71,7 +71,7 @@ async def cancel_job(request: Request, service: ServiceDep, job_id: JobId, wait:
 
 @router.get(
     "/{job_id}/file",
-    summary="What an export made",
+    summary="File that an export made",
     response_class=FileResponse,
     responses=errors(404, 422) | {200: {"description": "The file.", "content": MEDIA_CONTENT}},
 )
@@ -98,13 +98,13 @@ async def job_events(
 ) -> AsyncIterator[ServerSentEvent]:
     """Follow a job; the stream ends with the job. It begins with the job as it is, or resumes after `Last-Event-ID`.
 
-    What came after that event is sent again. Where it is no longer kept, the job as it is now is sent instead.
+    Later events are sent again. If some are no longer kept, the job as it is now is sent instead.
     """
     hub, job_id = service.hub, job.id
     after = hub.last_number if last_event_id is None else last_event_id
 
     def shown() -> ServerSentEvent:
-        # the number first: what happens meanwhile is sent twice rather than not at all
+        # the number first: an event in between is sent twice rather than not at all
         number = hub.last_number
         return ServerSentEvent(data=service.jobs.document(job_id).bounded(WHOLE).plain(), event="job", id=str(number))
 
@@ -134,7 +134,7 @@ async def job_events(
 
 
 def _of_job(event: Event, job_id: str) -> bool:
-    """Return True if an event is the job's own, or names what it made."""
+    """Return True if an event is the job's own, or names the job's result."""
     return bool(event.data.get("id" if event.name == "job" else "job_id") == job_id)
 
 

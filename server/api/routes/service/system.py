@@ -11,16 +11,16 @@ from fastapi.responses import PlainTextResponse, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import BaseModel, Field
 
-from server.api.protocol.dependencies import ServiceDep
-from server.api.protocol.problems import RETRY_AFTER_S, errors, problem_response
-from server.base.metrics import CONTENT_TYPE
-from server.formats.version import software_version
-from server.workflows.metrics_state import metrics_text
+from stereorig.server.api.protocol.dependencies import ServiceDep
+from stereorig.server.api.protocol.problems import RETRY_AFTER_S, errors, problem_response
+from stereorig.server.base.metrics import CONTENT_TYPE
+from stereorig.server.formats.version import software_version
+from stereorig.server.workflows.metrics_state import metrics_text
 
 router = APIRouter(tags=["system"])
 LastEventId = Annotated[
     int | None,
-    Header(alias="Last-Event-ID", ge=0, description="Number of the last event seen; what came after it is sent again."),
+    Header(alias="Last-Event-ID", ge=0, description="Number of the last event seen; later ones are sent again."),
 ]
 
 
@@ -50,7 +50,7 @@ class HealthReply(BaseModel):
 
 @router.get("/healthz", summary="Liveness")
 def healthz(request: Request, service: ServiceDep) -> HealthReply:
-    """Answer quickly, whatever else is going on, with the parts that are not well."""
+    """Answer quickly, even while jobs run, with the parts that are not well."""
     live = request.app.state.live_runs.current
     return HealthReply.model_validate(
         {
@@ -107,8 +107,10 @@ EventStream = Depends(_event_stream)
 async def events(service: ServiceDep, last_event_id: LastEventId = None) -> AsyncIterator[ServerSentEvent]:
     """Follow jobs, steps, results, scene and stage; resumes after `Last-Event-ID`, also over a restart.
 
-    Where events are lost to the reader, because it was away for long, too slow, or the service was started again, an
-    event `gap` comes first: `next` is the first number that is available. What the reader shows must be asked anew.
+    `camera` and `stage` have a `state` when a camera, or a stage's controller, is `lost` or `connected`.
+
+    If events are lost to the reader, because it was away for long, too slow, or the service was started again, an
+    event `gap` comes first: `next` is the first number that is available. The reader must request its data again.
     """
     after = service.hub.last_number if last_event_id is None else last_event_id
     with service.streams.counted("events"):

@@ -5,12 +5,12 @@ from __future__ import annotations
 from fastapi import APIRouter
 from pydantic import Field
 
-from server.api.protocol.dependencies import ServiceDep, TestId
-from server.api.protocol.problems import errors
-from server.base.models import Reply, Request
-from server.results.gauges.frames import frame_of_test, text_of
-from server.results.gauges.request import Alignment
-from server.workflows.service import Service
+from stereorig.server.api.protocol.dependencies import ServiceDep, TestId
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.base.models import Reply, Request
+from stereorig.server.results.gauges.frames import frame_of_test, text_of
+from stereorig.server.results.gauges.request import Alignment
+from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}/frame", tags=["tests"])
 
@@ -18,14 +18,14 @@ router = APIRouter(prefix="/tests/{test_id}/frame", tags=["tests"])
 class FrameRequest(Request):
     """Frame of a specimen."""
 
-    frame: Alignment = Field(description="How it is laid through the reference shape.")
+    frame: Alignment = Field(description="Its definition by the reference shape.")
 
 
 class FrameReply(Reply):
     """Frame of a specimen."""
 
-    frame: Alignment = Field(description="How it is laid through the reference shape.")
-    chosen: bool = Field(description="False: nobody chose it; the best plane, X along camera 1's image rows.")
+    frame: Alignment = Field(description="Its definition by the reference shape.")
+    chosen: bool = Field(description="False: it is the default, the best plane, X along camera 1's image rows.")
     text: str = Field(description="The same in words.", examples=["aligned by plane, X along camera 1's image rows"])
 
 
@@ -43,7 +43,7 @@ def get_test_frame(service: ServiceDep, test_id: TestId) -> FrameReply:
 
 @router.put("", summary="Choose the frame of a specimen", responses=errors(404, 422, 507))
 def put_test_frame(service: ServiceDep, test_id: TestId, body: FrameRequest) -> FrameReply:
-    """Keep a frame with the test. Stored results stay in the system frame; nothing is measured anew."""
+    """Store a frame with the test. Results stay in the system frame; nothing is measured again."""
     service.tests.update(test_id, {"frame": body.frame.model_dump(mode="json")})
     return _reply(service, test_id)
 

@@ -1,4 +1,4 @@
-"""Live measurement: begin and end, newest values and their streams, channels beside it."""
+"""Live measurement: begin and end, newest values and their streams, channels read at the same time."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from numpy.typing import NDArray
 
-from core.errors import StateError, StereorigError
-from server.api.models.live import (
+from stereorig.core.errors import StateError, StereorigError
+from stereorig.server.api.models.live import (
     AlignReply,
     AlignRequest,
     LiveField,
@@ -25,14 +25,14 @@ from server.api.models.live import (
     LiveReadingsReply,
     LiveReply,
 )
-from server.api.protocol.dependencies import KeyHeader, ServiceDep, TestId, mark
-from server.api.protocol.problems import errors
-from server.api.routes.service.system import EventStream
-from server.base.models import Ids
-from server.workflows.live.request import LiveSettings
-from server.workflows.live.run import LiveRun
-from server.workflows.live.runs import LiveRuns
-from server.workflows.service import Service
+from stereorig.server.api.protocol.dependencies import KeyHeader, ServiceDep, TestId, mark
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.api.routes.service.system import EventStream
+from stereorig.server.base.models import Ids
+from stereorig.server.workflows.live.request import LiveSettings
+from stereorig.server.workflows.live.run import LiveRun
+from stereorig.server.workflows.live.runs import LiveRuns
+from stereorig.server.workflows.service import Service
 
 _MAX_FRAMES = 6000
 _MAX_FIELDS_HZ = 20.0
@@ -101,8 +101,8 @@ def begin_live(
 ) -> LiveReply:
     """Measure each frame pair as it comes against a stored step, until it is ended; frames are not stored.
 
-    The newest pair counts: what comes while one is measured is skipped, and counted. Captures, calibrations and
-    analyses go on beside it. There is one live measurement at a time; it ends with the service.
+    The newest pair counts: pairs that come while one is measured are skipped, and counted. Captures, calibrations and
+    analyses continue. There is one live measurement at a time; it ends with the service.
     """
     service.tests.path(test_id)
     sent = mark(f"tests/{test_id}/live", key, body)
@@ -136,7 +136,7 @@ def stop_live(request: Request, runs: RunsDep, test_id: TestId) -> LiveReply:
 async def live_events(service: ServiceDep, run: RunDep) -> AsyncIterator[ServerSentEvent]:
     """Follow the values: an event `values` for each measured frame, and for each loss; it begins with the newest.
 
-    A reader that is too slow gets an event `gap` in place of what it missed. The same values, as text messages of JSON,
+    A reader that is too slow gets an event `gap` in place of the missed events. The same values, as JSON text messages,
     come by the WebSocket `/tests/{test_id}/live/ws`.
     """
     with service.streams.counted("events"):
@@ -148,7 +148,7 @@ async def live_events(service: ServiceDep, run: RunDep) -> AsyncIterator[ServerS
 
 @router.websocket("/live/ws")
 async def live_socket(socket: WebSocket, test_id: str) -> None:
-    """Send the values of each frame as JSON; what the client sends is not read."""
+    """Send the values of each frame as JSON; messages of the client are ignored."""
     service: Service = socket.app.state.service
     runs: LiveRuns = socket.app.state.live_runs
     try:
@@ -193,7 +193,7 @@ def live_history(
 
 @router.get("/live/field", summary="The newest displacements of all points", responses=errors(404, 409))
 def live_field(run: RunDep) -> LiveField:
-    """Return the coarse field; 409 `no_results` where it was not asked for, or no frame was measured yet."""
+    """Return the coarse field; 409 `no_results` if it was not asked for, or no frame was measured yet."""
     newest, grid = run.field, run.begun.get("field")
     if newest is None or grid is None:
         raise StateError(
@@ -241,7 +241,7 @@ def _with_gaps(values: NDArray[np.float32]) -> list[list[float | None]]:
     return rows
 
 
-@router.post("/live/channels", summary="Readings of channels beside it", responses=errors(404, 422))
+@router.post("/live/channels", summary="Post readings of channels", responses=errors(404, 422))
 def post_live_channels(run: RunDep, body: LiveReadings) -> LiveReadingsReply:
     """Take readings; between them a channel is known at each frame's exposure. All or none are taken.
 

@@ -6,23 +6,21 @@ from typing import Annotated
 
 from fastapi import APIRouter, Header, Response
 
-from core.errors import StateError
-from server.api.protocol.conditional import etag_of, tagged
-from server.api.protocol.dependencies import ServiceDep, TestId
-from server.api.protocol.problems import errors
-from server.results.metadata import TestMetadata
+from stereorig.core.errors import StateError
+from stereorig.server.api.protocol.conditional import etag_of, tagged
+from stereorig.server.api.protocol.dependencies import ServiceDep, TestId
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.results.metadata import TestMetadata
 
 router = APIRouter(prefix="/tests/{test_id}", tags=["tests"])
 
 
-@router.get("/facts", include_in_schema=False, response_model_exclude_none=True)  # its earlier address
 @router.get("/metadata", summary="Metadata of a test", response_model_exclude_none=True, responses=errors(404))
 def get_metadata(service: ServiceDep, test_id: TestId, response: Response) -> TestMetadata:
-    """Return the metadata, empty where nothing was stated; the header ETag names this state of them."""
+    """Return the metadata, empty if none were stated; the header ETag names this state of them."""
     return TestMetadata.model_validate(tagged(response, service.tests.metadata(test_id)))
 
 
-@router.put("/facts", include_in_schema=False, response_model_exclude_none=True)  # its earlier address
 @router.put(
     "/metadata",
     summary="State the metadata of a test",

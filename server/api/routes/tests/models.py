@@ -6,21 +6,20 @@ import shutil
 from pathlib import Path as FilePath
 from typing import Annotated
 
-from fastapi import APIRouter, File, Form, Path, Request, UploadFile
+from fastapi import APIRouter, File, Form, Path, UploadFile
 from starlette.concurrency import run_in_threadpool
 
-from core.errors import InputError
-from server.api.models.evidence.model_files import ModelList
-from server.api.protocol.dependencies import KeyHeader, ServiceDep, TestId, mark
-from server.api.protocol.paging import PageDep
-from server.api.protocol.problems import errors
-from server.api.routes.analyses.exports import finished
-from server.base.models import FormNumber, Ids, one_line
-from server.exports.comparison import check_model_task
-from server.formats.files import sha256_of
-from server.formats.models.read import SUFFIXES, Unit, ending_of
-from server.results.models.request import ModelReading, placement_in
-from server.store.models import ModelRecord, check_file_name
+from stereorig.core.errors import InputError
+from stereorig.server.api.models.evidence.model_files import ModelList
+from stereorig.server.api.protocol.dependencies import KeyHeader, ServiceDep, TestId, mark
+from stereorig.server.api.protocol.paging import PageDep
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.base.models import FormNumber, Ids, one_line
+from stereorig.server.cell.models import described
+from stereorig.server.formats.files import sha256_of
+from stereorig.server.formats.models.read import SUFFIXES, Unit, ending_of
+from stereorig.server.results.models.request import ModelReading, placement_in
+from stereorig.server.store.models import ModelRecord, check_file_name
 
 router = APIRouter(prefix="/tests/{test_id}/models", tags=["tests"])
 ModelId = Annotated[str, Path(max_length=40, description="Id of a model.")]
@@ -32,23 +31,24 @@ _HEAD = 1000
     "", summary="Keep a finite element result with a test", status_code=201, responses=errors(404, 409, 413, 422, 507)
 )
 async def create_model(
-    request: Request,
     service: ServiceDep,
     test_id: TestId,
-    file: Annotated[UploadFile, File(description="VTU, XDMF or CSV, told by its name's ending or its first bytes.")],
+    file: Annotated[
+        UploadFile, File(description="VTU, XDMF or CSV, recognised by its name's ending or its first bytes.")
+    ],
     heavy: Annotated[
-        UploadFile | None, File(description="HDF5 file of an XDMF, under the name that stands in that.")
+        UploadFile | None, File(description="HDF5 file of an XDMF, under the name that the XDMF has for it.")
     ] = None,
     unit: Annotated[Unit | None, Form(description="Unit of length, where the file states none.")] = None,
     displacement: Annotated[
-        str | None, Form(max_length=_NAME, description="Array of the nodes' displacement, or three: `ux,uy,uz`.")
+        str | None, Form(max_length=_NAME, description="Array of the nodes' displacement, or components: `ux,uy,uz`.")
     ] = None,
     time: Annotated[FormNumber | None, Form(description="Time of the state to take from a series; the last.")] = None,
     align: Annotated[
         str | None,
         Form(
             max_length=100_000,
-            description="Where the model lies, in JSON; in the system frame if left out. Kinds: `given`, `3-2-1`, "
+            description="Placement of the model, in JSON; in the system frame if left out. Kinds: `given`, `3-2-1`, "
             "`markers`, `best-fit`.",
             examples=['{"kind": "best-fit"}'],
             json_schema_extra={"contentMediaType": "application/json"},
@@ -80,8 +80,8 @@ async def create_model(
             beside = check_file_name(FilePath(heavy.filename or "").name)
             held[beside] = folder / beside
             await run_in_threadpool(_put, heavy, held[beside])
-        task = service.exports.run(check_model_task, str(folder / f"model{ending}"), reading)
-        about = await finished(request, task)
+        how = reading.model_dump(include={"unit", "displacement", "time"})
+        about = await run_in_threadpool(described, service.cell, held, f"model{ending}", how)
         parts = [sha256_of(path).encode() for path in held.values()]
         stated = reading.model_dump_json().encode()
         marked = mark(f"tests/{test_id}/models", key, None, *parts, stated)

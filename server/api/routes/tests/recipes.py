@@ -6,29 +6,29 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Response
 
-from core.errors import StereorigError
-from server.api.models.recipes import Recipe, RecipeList, RecipePatch, RecipeReply, RecipeRequest
-from server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
-from server.api.protocol.dependencies import KeyHeader, ServiceDep, mark
-from server.api.protocol.paging import PageDep
-from server.api.protocol.problems import errors
-from server.base.models import Ids
-from server.formats.images import read_image
-from server.workflows.service import Service
+from stereorig.core.errors import StereorigError
+from stereorig.server.api.models.recipes import Recipe, RecipeList, RecipePatch, RecipeReply, RecipeRequest
+from stereorig.server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
+from stereorig.server.api.protocol.dependencies import KeyHeader, ServiceDep, mark
+from stereorig.server.api.protocol.paging import PageDep
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.base.models import Ids
+from stereorig.server.formats.images import read_image
+from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/recipes", tags=["tests"])
 RecipeId = Annotated[str, Path(max_length=40, description="Id of a recipe.")]
 
 
 def reference_size_px(service: Service, test_id: str, n: int = 0) -> tuple[int, int] | None:
-    """Return width and height of camera 1's image of a step; None where it cannot be read."""
+    """Return width and height of camera 1's image of a step; None if it cannot be read."""
     try:
         step = service.tests.steps.read(test_id, n)
         known = step.document.image_size_px.get("cam1")
         if known is None:
             rows, cols = read_image(step.cam1).shape
             return cols, rows
-        return known[0], known[1]
+        return known
     except StereorigError:
         return None
 
@@ -82,7 +82,7 @@ def get_recipe(service: ServiceDep, recipe_id: RecipeId, response: Response) -> 
 def patch_recipe(
     service: ServiceDep, recipe_id: RecipeId, body: RecipePatch, response: Response, if_match: IfMatch = None
 ) -> RecipeReply:
-    """Change what is given; If-Match names which state was meant. Tests that took the recipe keep what they have."""
+    """Change the given parts; If-Match names the state that was meant. Tests that took the recipe stay as they are."""
     changes: dict[str, object] = {} if body.name is None else {"name": body.name}
     if body.recipe is not None:
         changes["recipe"] = body.recipe.document()
@@ -94,5 +94,5 @@ def patch_recipe(
 
 @router.delete("/{recipe_id:plain_id}", summary="Delete a recipe", status_code=204, responses=errors(404, 507))
 def delete_recipe(service: ServiceDep, recipe_id: RecipeId) -> None:
-    """Delete a recipe; tests and analyses that took it keep what they have."""
+    """Delete a recipe; tests and analyses that took it stay as they are."""
     service.recipes.remove(recipe_id)

@@ -10,12 +10,14 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse, Response
 from pydantic import TypeAdapter, ValidationError
 
-from core.errors import InputError
-from server.api.models import (
+from stereorig.core.errors import InputError
+from stereorig.server.api.models import (
     BurstAccepted,
     Channels,
     Label,
     ReadingRequest,
+    RecordAccepted,
+    RecordRequest,
     StepList,
     StepPatch,
     StepReply,
@@ -27,22 +29,31 @@ from server.api.models import (
     Timestamp,
     utc_text,
 )
-from server.api.protocol.attached import Attached, Wait, job_reply
-from server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
-from server.api.protocol.dependencies import Camera, KeyHeader, ServiceDep, StepNumber, TestId, get_service, mark
-from server.api.protocol.paging import WHOLE, PageDep, cursor_of
-from server.api.protocol.problems import errors
-from server.base.models import FormNumber, Ids
-from server.formats.images import read_image
-from server.jobs.idempotency import RequestMark
-from server.store.documents import StepMetadata
-from server.store.indexing.entries import step_entry, test_entry
-from server.wording import problems_in
-from server.workflows.analysis.warnings import with_warnings
-from server.workflows.burst import start_burst
-from server.workflows.capture import capture_step, import_step
-from server.workflows.service import Service
-from server.workflows.test_start import create, give_calibration
+from stereorig.server.api.protocol.attached import Attached, Wait, job_reply
+from stereorig.server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
+from stereorig.server.api.protocol.dependencies import (
+    Camera,
+    KeyHeader,
+    ServiceDep,
+    StepNumber,
+    TestId,
+    get_service,
+    mark,
+)
+from stereorig.server.api.protocol.paging import WHOLE, PageDep, cursor_of
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.base.models import FormNumber, Ids
+from stereorig.server.documents.steps import StepMetadata
+from stereorig.server.formats.images import read_image
+from stereorig.server.formats.manifest import checked_bytes
+from stereorig.server.jobs.idempotency import RequestMark
+from stereorig.server.store.indexing.entries import step_entry, test_entry
+from stereorig.server.wording import problems_in
+from stereorig.server.workflows.analysis.warnings import with_warnings
+from stereorig.server.workflows.burst import start_burst
+from stereorig.server.workflows.capture import capture_step, import_step
+from stereorig.server.workflows.service import Service
+from stereorig.server.workflows.test_start import create, give_calibration
 
 router = APIRouter(prefix="/tests", tags=["tests"])
 _CHANNELS: TypeAdapter[dict[str, float]] = TypeAdapter(Channels)
@@ -90,7 +101,7 @@ def list_tests(service: ServiceDep, page: PageDep) -> TestList:
 def get_test(service: ServiceDep, test_id: TestId, response: Response) -> TestReply:
     """Return a test with its analyses and its first 100 steps; the header ETag names this state of it.
 
-    `n_steps` says how many there are; the others come from `GET /tests/{id}/steps`, beginning with `steps_next_cursor`.
+    `n_steps` is their number; the others come from `GET /tests/{id}/steps`, beginning with `steps_next_cursor`.
     """
     return _shown(service, test_id, tagged(response, _reply(service, test_id)))
 
@@ -103,9 +114,9 @@ def get_test(service: ServiceDep, test_id: TestId, response: Response) -> TestRe
 def patch_test(
     service: ServiceDep, test_id: TestId, body: TestPatch, response: Response, if_match: IfMatch = None
 ) -> TestReply:
-    """Change what is given; If-Match names which state of the test was meant.
+    """Change the given parts; If-Match names the state of the test that was meant.
 
-    With another calibration new analyses are measured; those that there are keep the one that they were made with.
+    New analyses are measured with the new calibration; earlier analyses keep the one that they were made with.
     """
     service.tests.path(test_id)
     changes = {k: v for k, v in body.model_dump(exclude_unset=True).items() if v is not None}
@@ -142,7 +153,7 @@ async def create_step(
 
     With `count` above 1 the answer is 202 and a job, which takes a step every `interval_ms`. Its `result` lists each
     step once it is durable, with number, checksums and quality code; a pair that is refused is listed under `failures`
-    and the burst goes on. `attached=true` answers when the burst has ended.
+    and the burst continues. `attached=true` answers when the burst has ended.
     """
     service = get_service(request)
     if body.count > 1:
@@ -150,6 +161,48 @@ async def create_step(
         reply = await job_reply(request, service, job_id, attached, wait)
         return JSONResponse(BurstAccepted.model_validate(reply).model_dump(mode="json"), status_code=202)
     return await run_in_threadpool(_capture, service, test_id, body, key)
+
+
+@router.post(
+    "/{test_id}/record",
+    summary="Record both cameras, and keep steps by a trigger",
+    status_code=202,
+    responses=errors(404, 409, 422, 503, 507),
+)
+async def record(
+    request: Request,
+    test_id: TestId,
+    body: RecordRequest,
+    attached: Attached = False,
+    wait: Wait = 0.0,
+    key: KeyHeader = None,
+) -> RecordAccepted:
+    """Take pairs at the cameras' full rate into memory; keep as steps those around a trigger, or at a channel's cycles.
+
+    The answer is a job that holds the cameras; `limits` of its `result` are the rate, times, pairs and memory that it
+    keeps to. A ring that does not fit is refused (`recording_too_large`). Steps are made behind the recording, several
+    at once; one is acknowledged when `result` or an event `step` lists it, and is on disk by then: a kill loses those
+    that are not. `account` of the result has every pair: kept, not chosen, or dropped with its cause.
+    """
+    service, recordings = get_service(request), request.app.state.recordings
+    service.tests.path(test_id)
+    sent = mark(f"tests/{test_id}/record", key, body)
+    metadata = StepMetadata.model_validate({"label": body.label, **sent.document()})
+
+    def make() -> Ids:
+        return {"job_id": recordings.start(test_id, metadata, body, sent)}
+
+    made, _ = await run_in_threadpool(service.once, sent.scope, key, sent.body_sha256, make)
+    return RecordAccepted.model_validate(await job_reply(request, service, str(made["job_id"]), attached, wait))
+
+
+@router.post("/{test_id}/record:trigger", summary="Trigger a recording now", responses=errors(404, 409))
+async def trigger_record(request: Request, service: ServiceDep, test_id: TestId) -> RecordAccepted:
+    """Trigger the recording of this test before its own trigger; a recording of cycles ends."""
+    service.tests.path(test_id)
+    return RecordAccepted.model_validate(
+        await job_reply(request, service, request.app.state.recordings.trigger(test_id))
+    )
 
 
 def step_metadata(body: StepRequest | ReadingRequest, sent: RequestMark) -> StepMetadata:
@@ -191,11 +244,11 @@ def _start_burst(service: Service, test_id: str, body: StepRequest, key: str | N
 
 
 def _readings(text: str | None) -> dict[str, float] | None:
-    """Read the channels of a form; a description of forms cannot say what is in a text."""
+    """Read the channels of a form: JSON in a text field, which the description of a form cannot specify."""
     try:
         return None if text is None else _CHANNELS.validate_json(text)
     except ValidationError as error:
-        first = problems_in(error, Channels)[0]
+        first = problems_in(error)[0]
         raise InputError(
             f"channels{first.field and '.'}{first.field}: {first.problem}.",
             code="channels_unreadable",
@@ -232,7 +285,7 @@ def import_images(
 ) -> StepReply:
     """Store two images as a step. File names are not used.
 
-    Grey levels are kept to the bit; of colour images the luminance is stored, and `grey_from` says so.
+    Grey levels are kept to the bit; a colour image is stored as its luminance, and `grey_from` states so.
     """
     service.tests.path(test_id)
     data = {"cam1": cam1.file.read(), "cam2": cam2.file.read()}
@@ -281,7 +334,7 @@ def get_step(service: ServiceDep, test_id: TestId, n: StepNumber, response: Resp
 def patch_step(
     service: ServiceDep, test_id: TestId, n: StepNumber, body: StepPatch, response: Response, if_match: IfMatch = None
 ) -> StepReply:
-    """Change the label; what was taken stays as it is. If-Match names which state of the step was meant."""
+    """Change the label; all else stays as it is. If-Match names the state of the step that was meant."""
     service.tests.steps.read(test_id, n)
     with service.changes:
         require_match(if_match, etag_of(step_reply(service, test_id, n)), f"step {n} of test {test_id}")
@@ -309,6 +362,6 @@ def get_step_image(
     step = service.tests.steps.verified(test_id, n)
     path = step.cam1 if cam == "cam1" else step.cam2
     if format == "tiff":
-        return Response(path.read_bytes(), media_type="image/tiff")
+        return Response(checked_bytes(path), media_type="image/tiff")
     _, data = cv2.imencode(".png", read_image(path))
     return Response(data.tobytes(), media_type="image/png")

@@ -1,4 +1,4 @@
-"""Deleting into the trash, the trash, and the acknowledgement that a copy lies elsewhere."""
+"""Deleting into the trash, the trash, and the acknowledgement that a copy exists elsewhere."""
 
 from __future__ import annotations
 
@@ -6,16 +6,23 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Request, Response
 
-from server.api.models.trash import ExportedReply, ExportedRequest, TrashList
-from server.api.protocol.dependencies import AnalysisId, CalibrationId, ServiceDep, StepNumber, TestId, person_name
-from server.api.protocol.paging import PageDep
-from server.api.protocol.problems import errors
-from server.api.routes.calibrations.noise import NoiseId
-from server.store.copies import acknowledge_export
-from server.store.documents import TrashEntry
-from server.store.trash import Kind
-from server.workflows.deletion import delete, restore
-from server.workflows.service import Service
+from stereorig.server.api.models.trash import ExportedReply, ExportedRequest, TrashList
+from stereorig.server.api.protocol.dependencies import (
+    AnalysisId,
+    CalibrationId,
+    ServiceDep,
+    StepNumber,
+    TestId,
+    person_name,
+)
+from stereorig.server.api.protocol.paging import PageDep
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.api.routes.calibrations.noise import NoiseId
+from stereorig.server.documents.made import TrashEntry
+from stereorig.server.store.copies import acknowledge_export
+from stereorig.server.store.trash import Kind
+from stereorig.server.workflows.deletion import delete, restore
+from stereorig.server.workflows.service import Service
 
 router = APIRouter(tags=["trash"])
 TrashId = Annotated[str, Path(max_length=40, description="Id in the trash.")]
@@ -58,14 +65,14 @@ def delete_noise(service: ServiceDep, request: Request, noise_id: NoiseId) -> Tr
 
 @router.get("/trash", summary="Contents of the trash, oldest first", responses=errors(422))
 def list_trash(service: ServiceDep, page: PageDep) -> TrashList:
-    """Return what lies in the trash, with the room that it takes."""
+    """Return the entries of the trash, with the room that it takes."""
     trash = page.of(sorted(service.trash.entries(), key=lambda entry: entry.id), lambda entry: entry.id)
     return TrashList(trash=trash, next_cursor=page.next_cursor)
 
 
 @router.post("/trash/{trash_id}:restore", summary="Restore from the trash", responses=_ERRORS)
 def restore_trash(service: ServiceDep, trash_id: TrashId) -> TrashEntry:
-    """Move it back to where it was; refused if something lies there by now, or its test is in the trash too."""
+    """Move it back to its place; refused if that place is taken by now, or its test is in the trash too."""
     return restore(service, trash_id)
 
 
@@ -83,15 +90,15 @@ def remove_trash(service: ServiceDep, trash_id: TrashId) -> None:
 
 @router.post(
     "/tests/{test_id}:acknowledge-export",
-    summary="Acknowledge that a copy lies elsewhere",
+    summary="Acknowledge that a copy exists elsewhere",
     responses=errors(404, 409, 422, 507),
 )
 def acknowledge_exported(
     service: ServiceDep, request: Request, test_id: TestId, body: ExportedRequest
 ) -> ExportedReply:
-    """Say that all of the test was copied elsewhere; the test shows it as `exported`, and nothing is deleted.
+    """Record that all of the test was copied elsewhere; the test shows it as `exported`, and nothing is deleted.
 
-    What the copy holds is compared with what is there: a test that has grown meanwhile is refused.
+    The copy's contents are compared with the test's: a test that has grown since is refused.
     """
     return ExportedReply.model_validate(
         acknowledge_export(service.tests, test_id, steps=body.steps, results=body.results, by=person_name(request))

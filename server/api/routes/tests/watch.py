@@ -1,4 +1,4 @@
-"""Watch mode: what is watched, and the readings that are posted."""
+"""Watch mode: the watched channel, and the readings that are posted."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Request, Response
 from fastapi.responses import JSONResponse
 
-from server.api.models import ReadingReply, ReadingRequest, WatchReply, WatchRequest
-from server.api.protocol.conditional import IfMatch, PreconditionFailedError, etag_of, require_match, tagged
-from server.api.protocol.dependencies import KeyHeader, ServiceDep, TestId, mark
-from server.api.protocol.problems import errors
-from server.api.routes.tests.tests import step_metadata
-from server.base.models import Ids
-from server.store.documents import WatchRecord
-from server.workflows.watch import Watches
+from stereorig.server.api.models import ReadingReply, ReadingRequest, WatchRequest
+from stereorig.server.api.protocol.conditional import IfMatch, PreconditionFailedError, etag_of, require_match, tagged
+from stereorig.server.api.protocol.dependencies import KeyHeader, ServiceDep, TestId, mark
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.api.routes.tests.tests import step_metadata
+from stereorig.server.base.models import Ids
+from stereorig.server.documents.steps import WatchRecord
+from stereorig.server.workflows.watch import Watches
 
 
 def get_watches(request: Request) -> Watches:
@@ -35,35 +35,33 @@ def put_watch(
     body: WatchRequest,
     response: Response,
     if_match: IfMatch = None,
-) -> WatchReply:
-    """Watch a channel of the readings posted to `/tests/{id}/channels`, in place of what was watched before.
+) -> WatchRecord:
+    """Watch a channel of the readings posted to `/tests/{id}/channels`, in place of the one watched before.
 
-    A reading takes a step when the channel differs from its value in the newest step that bears it by `threshold` or
+    A reading takes a step when the channel differs from its value in the newest step that has it by `threshold` or
     more; the first reading always does. The watch outlives a restart of the service. If-Match, with the ETag of GET,
-    refuses if it was changed meanwhile, or a step was taken.
+    refuses if it was changed since, or a step was taken.
     """
     service.tests.path(test_id)
 
     def allow(now: WatchRecord | None) -> None:
         if now is None and if_match is not None:  # `*` too means something that is there
             raise PreconditionFailedError(f"Nothing is watched in test {test_id}.")
-        require_match(
-            if_match, etag_of(None if now is None else now.plain()), f"the watch of test {test_id}", required=False
-        )
+        require_match(if_match, etag_of(now), f"the watch of test {test_id}", required=False)
 
-    return WatchReply.model_validate(tagged(response, watches.begin(test_id, body.model_dump(), allow).plain()))
+    return tagged(response, watches.begin(test_id, body.model_dump(), allow))
 
 
 @router.get("/watch", summary="The watch on a channel", responses=errors(404))
-def get_watch(watches: WatchesDep, test_id: TestId, response: Response) -> WatchReply:
+def get_watch(watches: WatchesDep, test_id: TestId, response: Response) -> WatchRecord:
     """Return channel and threshold, and the value that the next reading is compared with; ETag names this state."""
-    return WatchReply.model_validate(tagged(response, watches.read(test_id).plain()))
+    return tagged(response, watches.read(test_id))
 
 
 @router.post("/watch:end", summary="End the watch", responses=errors(404, 507))
-def end_watch(watches: WatchesDep, test_id: TestId) -> WatchReply:
+def end_watch(watches: WatchesDep, test_id: TestId) -> WatchRecord:
     """Take no further steps; readings are refused from now on. Harmless when it has ended already."""
-    return WatchReply.model_validate(watches.end(test_id).plain())
+    return watches.end(test_id)
 
 
 @router.post(

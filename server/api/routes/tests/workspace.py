@@ -1,4 +1,4 @@
-"""What is drawn and set for a test: kept as it is drawn, read and replaced as a whole."""
+"""Drawing and settings of a test: stored as they are drawn, read and replaced as a whole."""
 
 from __future__ import annotations
 
@@ -6,20 +6,21 @@ import base64
 
 from fastapi import APIRouter, Response
 
-from server.api.models.recipes import Recipe, RecipeSettings, Workspace
-from server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
-from server.api.protocol.dependencies import AnalysisId, ServiceDep, TestId
-from server.api.protocol.problems import errors
-from server.api.routes.tests.recipes import check_against_test, reference_size_px
-from server.formats.results.settings import stored_settings
-from server.workflows.service import Service
+from stereorig.server.api.models.recipes import Recipe, RecipeSettings, Workspace
+from stereorig.server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
+from stereorig.server.api.protocol.dependencies import AnalysisId, ServiceDep, TestId
+from stereorig.server.api.protocol.problems import errors
+from stereorig.server.api.routes.tests.recipes import check_against_test, reference_size_px
+from stereorig.server.formats.manifest import checked_bytes, is_there
+from stereorig.server.formats.results.layout import stored_settings
+from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}", tags=["tests"])
 
 
 @router.get(
     "/workspace",
-    summary="What is drawn and set for a test",
+    summary="Drawing and settings of a test",
     response_model_exclude_unset=True,
     responses=errors(404, 422),
 )
@@ -30,14 +31,14 @@ def get_workspace(service: ServiceDep, test_id: TestId, response: Response) -> W
 
 @router.put(
     "/workspace",
-    summary="Keep what is drawn and set for a test",
+    summary="Store the drawing and settings of a test",
     response_model_exclude_unset=True,
     responses=errors(404, 412, 422, 507),
 )
 def put_workspace(
     service: ServiceDep, test_id: TestId, body: Workspace, response: Response, if_match: IfMatch = None
 ) -> Workspace:
-    """Replace it; durable when this answers. If-Match, with the ETag of GET, refuses if another window drew meanwhile.
+    """Replace it; durable when this answers. If-Match, with the ETag of GET, refuses if another window drew since.
 
     A new analysis is not begun, and nothing that was measured changes. A report shows its gauges where the metadata
     name none.
@@ -72,8 +73,8 @@ def _recipe_of(service: Service, test_id: str, analysis_id: str) -> dict[str, ob
     kept |= {"kind": made.kind or "displacement", "noise_id": None if stored.noise is None else stored.noise.noise_id}
     region = {k: v for k, v in stored.region.model_dump(mode="json", exclude={"mask"}).items() if v is not None}
     mask = service.tests.analyses.path(test_id, analysis_id) / "mask.png"
-    if mask.is_file():
-        region["mask_png_base64"] = base64.b64encode(mask.read_bytes()).decode()
+    if is_there(mask):
+        region["mask_png_base64"] = base64.b64encode(checked_bytes(mask)).decode()
     drawn = {k: v for k, v in service.tests.workspace(test_id).items() if k in ("gauges", "display")}
     size = reference_size_px(service, test_id, stored.reference)
     return {"image_size_px": size, "region": region, "settings": kept, **drawn}

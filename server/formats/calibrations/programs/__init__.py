@@ -1,1 +1,1 @@
-"""Calibrations of other programs: a reader a format, and what all of them must hold."""
+"""Calibrations of other programs: one reader a format, and the requirements on every one of them."""

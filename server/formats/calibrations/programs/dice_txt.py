@@ -1,4 +1,4 @@
-"""DICe's text camera files: one number a line, what follows a ``#`` is a comment.
+"""DICe's text camera files: one number a line, a ``#`` begins a comment.
 
 ``cx cy fx fy fs k1 k2 k3`` of camera 0, then of camera 1, pixels; then ``alpha beta gamma`` in degrees with
 R = Rz(gamma) Ry(beta) Rx(alpha), or ``R11 R12 ... R33`` by rows; then ``tx ty tz`` of ``X_cam1 = R X_cam0 + T``; newer
@@ -17,9 +17,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.cameras.lens import OpenCVLens
-from core.cameras.stereo import StereoPair
-from server.formats.calibrations.programs.imported_pair import (
+from stereorig.core.cameras.lens import OpenCVLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.server.formats.calibrations.programs.imported_pair import (
+    MAX_SIDE_PX,
     ImageSize,
     euler_zyx,
     invalid,
@@ -46,8 +47,8 @@ _LAYOUTS = {
     for size in ((), _SIZE)
     for names in [(*_LENS, *_LENS, *rotation, *_SHIFT, *size)]
 }
-_LINE = re.compile(r"\s*([^\s#]+)\s*(?:#\s*(\w*).*)?")
-_FEWEST = 8  # of the 22 and more numbers, so that a file cut short is named as what it was
+_WORD = re.compile(r"[A-Za-z0-9_]*")
+_FEWEST = 8  # of the 22 and more numbers, so that a truncated file is still recognised as DICe's
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ def parse_dice_txt(data: bytes, *, name: str) -> tuple[StereoPair, ImageSize, tu
     Returns
     -------
     tuple
-        The pair, both images' size (width, height), None where the file has none, and notes on what was assumed.
+        The pair, both images' size (width, height), None if the file has none, and notes on the assumptions made.
 
     Raises
     ------
@@ -98,7 +99,7 @@ def parse_dice_txt(data: bytes, *, name: str) -> tuple[StereoPair, ImageSize, tu
     else:
         rotation = euler_zyx(*(rest[key] for key in _ANGLES))
     size: ImageSize = None
-    if "width" in rest and rest["width"] > 0 and rest["height"] > 0:
+    if "width" in rest and 0 < rest["width"] <= MAX_SIDE_PX and 0 < rest["height"] <= MAX_SIDE_PX:
         size = (int(rest["width"]), int(rest["height"]))
     bent = any(any((lens.k1, lens.k2, lens.k3, lens.k6)) for lens in lenses)
     pair = pair_of(name, lenses[0], lenses[1], rotation, [rest[key] for key in _SHIFT])
@@ -111,10 +112,11 @@ def _entries(data: bytes) -> list[_Entry] | None:
     for number, line in enumerate(data.decode("utf-8-sig", "replace").splitlines(), 1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        match = _LINE.fullmatch(line)
-        if match is None:
+        text, _, comment = line.partition("#")
+        words, word = text.split(), _WORD.match(comment.lstrip())
+        if len(words) != 1:
             return None
-        found.append(_Entry(number, match[1], (match[2] or "").lower()))
+        found.append(_Entry(number, words[0], word[0].lower() if word else ""))
     return found
 
 
@@ -123,7 +125,7 @@ def _is_number(text: str) -> bool:
         float(text)
     except ValueError:
         return False
-    return True
+    return text.isascii()
 
 
 def _value(name: str, entry: _Entry, expected: str) -> float:

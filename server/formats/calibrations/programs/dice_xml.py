@@ -2,27 +2,26 @@
 
 DICe counts cameras from 0: its camera 0 is camera 1 here. With ``extrinsics_relative_camera_to_camera`` the second
 camera's matrix and TX TY TZ are ``X_cam1 = R X_cam0 + T``, else each camera's are ``X_cam = R X_world + T``. Euler
-angles are degrees with R = Rz(gamma) Ry(beta) Rx(alpha) (the comment that DICe writes beside a matrix has them in
+angles are degrees with R = Rz(gamma) Ry(beta) Rx(alpha) (the comment that DICe writes next to a matrix has them in
 radians).
 
-Of the lens models OpenCV's is taken, none, and ``K1R3_K2R5_K3R7``, the same as OpenCV's k1 k2 k3. A system of type
+Three lens models are read: OpenCV's, none, and ``K1R3_K2R5_K3R7``, the same as OpenCV's k1 k2 k3. A system of type
 VIC3D holds VIC-3D's numbers: its lens is read as VIC-3D's own files are, with the skew in pixels; DICe itself only
-guesses that polynomial. What the other models and FS mean elsewhere in pixels is not written in the file.
+guesses that polynomial. The file does not define the other models, nor FS in pixels outside these models.
 """
 
 from __future__ import annotations
 
-from xml.etree.ElementTree import Element, ParseError
+from xml.etree.ElementTree import Element
 
-import defusedxml.ElementTree
 import numpy as np
-from defusedxml.common import DefusedXmlException
 from numpy.typing import NDArray
 
-from core.cameras.camera import RigidTransform
-from core.cameras.lens import OpenCVLens
-from core.cameras.stereo import StereoPair
-from server.formats.calibrations.programs.imported_pair import (
+from stereorig.core.cameras.camera import RigidTransform
+from stereorig.core.cameras.lens import OpenCVLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.server.formats.calibrations.programs.imported_pair import (
+    MAX_SIDE_PX,
     ImageSize,
     euler_zyx,
     invalid,
@@ -32,6 +31,7 @@ from server.formats.calibrations.programs.imported_pair import (
     unreadable,
     unsupported,
 )
+from stereorig.server.formats.xml_tree import read_xml
 
 VIC3D_NOTE = (
     "the lens was taken as VIC-3D's, 1 + k1 r^2 + k2 r^4 + k3 r^6, from which its numbers come; DICe itself reads them "
@@ -128,7 +128,7 @@ def _camera(name: str, camera: Element, system: str) -> tuple[OpenCVLens, RigidT
     size: ImageSize = None
     if "IMAGE_HEIGHT_WIDTH" in values:
         height, width = _row(name, f"IMAGE_HEIGHT_WIDTH of {where}", values["IMAGE_HEIGHT_WIDTH"], 2)
-        if width > 0 and height > 0:  # DICe writes -1 for "not known"
+        if 0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX:  # DICe writes -1 for "not known"
             size = (int(width), int(height))
     return opencv_lens(name, where, {**numbers, **distortion}), pose, size
 
@@ -139,8 +139,8 @@ def parse_dice_xml(data: bytes, *, name: str) -> tuple[StereoPair, ImageSize, Im
     Returns
     -------
     tuple
-        The pair (system frame = its camera 0), both image sizes (width, height), None where the file has none, and
-        notes on what was assumed.
+        The pair (system frame = its camera 0), both image sizes (width, height), None if the file has none, and
+        notes on the assumptions made.
 
     Raises
     ------
@@ -149,9 +149,9 @@ def parse_dice_xml(data: bytes, *, name: str) -> tuple[StereoPair, ImageSize, Im
         ``calibration_invalid`` (numbers that describe no cameras).
     """
     try:
-        root = defusedxml.ElementTree.fromstring(data)
-    except (ParseError, DefusedXmlException, ValueError) as error:
-        raise unreadable(name, f"damaged XML, {type(error).__name__} {error}") from error
+        root = read_xml(data)
+    except ValueError as error:
+        raise unreadable(name, f"damaged XML, {error}") from error
     top = _parameters(name, "the file", root)
     if root.tag != "ParameterList" or top.get("xml_file_format") != "DICe_xml_camera_system_file":
         raise unreadable(name, "it is XML, but no DICe_xml_camera_system_file")

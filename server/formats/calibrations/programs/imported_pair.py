@@ -1,33 +1,64 @@
 """A stereo pair from another program's numbers, after they were checked.
 
-Imported rigs keep their own lens model (OpenCV's k1 k2 p1 p2 k3 k4 k5 k6); the system frame is camera 1's own frame.
+Imported rigs keep their own lens model (OpenCV's fourteen coefficients); the system frame is camera 1's own frame.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.cameras.camera import Camera, RigidTransform
-from core.cameras.lens import OpenCVLens
-from core.cameras.stereo import StereoPair
-from core.errors import FileFormatError
+from stereorig.core.cameras.camera import Camera, RigidTransform
+from stereorig.core.cameras.lens import OpenCVLens
+from stereorig.core.cameras.opencv_full import PRISM_TERMS, opencv_lens_of
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import FileFormatError, InputError
 
 ImageSize = tuple[int, int] | None
 """Columns and rows, where a program's file states them."""
 
+LENGTHS_MM = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3, "in": 25.4}
+"""Units of length in millimetres."""
+
+_SIZE = re.compile(r"([0-9.eE+-]{1,20}) ?(um|mm|cm|m|in)")
+MAX_SIDE_PX = 1 << 20  # of an image size that a file states
 _MIN_BASELINE_MM = 1e-9  # two equal poses, composed, leave the digits' end
 _ROTATION_TOLERANCE = 1e-4  # files carry six digits and more; a wrong axis order is off by far more
 
 
-def unreadable(name: str, why: str) -> FileFormatError:
+def unit_mm(unit: str) -> float:
+    """Return the millimetres of a unit of length: ``m``, or a size such as ``25 mm``, as of a board's square.
+
+    Raises
+    ------
+    InputError
+        ``calibration_unit_unknown``.
+    """
+    named = LENGTHS_MM.get(unit.strip())
+    found = _SIZE.fullmatch(unit.strip())
+    try:
+        size = named or (0.0 if found is None else float(found[1]) * LENGTHS_MM[found[2]])
+    except ValueError:
+        size = 0.0
+    if not 1e-6 < size < 1e6:  # NaN too
+        raise InputError(
+            f"The unit {unit[:40]!r} is no length.",
+            code="calibration_unit_unknown",
+            remedy=f"Give one of {', '.join(LENGTHS_MM)}, or a size, as '25 mm' where T counts a board's squares.",
+        )
+    return size
+
+
+def unreadable(name: str, why: str, *, remedy: str | None = None) -> FileFormatError:
     """Return the error for a file that is no calibration of its kind."""
     return FileFormatError(
         f"{name} cannot be read as a calibration: {why}.",
         code="calibration_unreadable",
-        remedy="Give a calibration.json, a DICe XML camera system or text camera file, an OpenCV YAML stereo "
+        remedy=remedy
+        or "Give a calibration.json, a DICe XML camera system or text camera file, an OpenCV YAML stereo "
         "calibration, a MatchID caldat, a VIC-3D file or a pyvale text.",
     )
 
@@ -37,7 +68,7 @@ def unsupported(name: str, why: str) -> FileFormatError:
     return FileFormatError(
         f"The calibration {name} cannot be carried over exactly: {why}.",
         code="calibration_unsupported",
-        remedy="Calibrate again with OpenCV's k1 k2 p1 p2 k3 model, with k4 k5 k6 or without, or with this program.",
+        remedy="Calibrate again with OpenCV's model, or with this program.",
     )
 
 
@@ -65,21 +96,16 @@ def proper_rotation(name: str, entry: str, values: ArrayLike) -> NDArray[np.floa
 
 
 def opencv_lens(name: str, which: str, values: Mapping[str, float]) -> OpenCVLens:
-    """Build one lens from ``fx fy cx cy`` and, where given, ``skew k1 k2 p1 p2 k3 k4 k5 k6``."""
+    """Build one lens from ``fx fy cx cy`` and, where given, ``skew``, ``k1`` to ``k6``, ``s1`` to ``s4`` and tau."""
     for key, value in values.items():
         if not np.isfinite(value):
             raise invalid(name, f"{key} of {which} is {value}")
     for key in ("fx", "fy"):
         if not values[key] > 0.0:
             raise invalid(name, f"{key} of {which} is {values[key]:g}, not positive")
-    return OpenCVLens(
-        values["fx"],
-        values["fy"],
-        values["cx"],
-        values["cy"],
-        values.get("skew", 0.0),
-        *(values.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
-    )
+    names = {k: f"{k}_px" for k in ("fx", "fy", "cx", "cy", "skew")} | {k: f"{k}_rad" for k in ("tau_x", "tau_y")}
+    names |= {k: k for k in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", *PRISM_TERMS)}
+    return opencv_lens_of({names[k]: value for k, value in values.items() if k in names})
 
 
 def pair_of(

@@ -13,16 +13,16 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from core.cameras.lens import OpenCVLens
-from core.cameras.stereo import StereoPair
-from server.formats.calibrations.programs.imported_pair import (
+from stereorig.core.cameras.lens import OpenCVLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.server.formats.calibrations.programs.imported_pair import (
     euler_zyx,
     euler_zyx_deg,
     opencv_lens,
     pair_of,
     unreadable,
 )
-from server.formats.calibrations.programs.named_numbers import named_numbers
+from stereorig.server.formats.calibrations.programs.named_numbers import has_line, named_numbers
 
 _CAMERA = {
     "fx": "Fx [pixels]",
@@ -39,12 +39,14 @@ _CAMERA = {
 _ATTRIBUTES = {"fx": "fx_px", "fy": "fy_px", "skew": "skew_px", "cx": "cx_px", "cy": "cy_px"}
 _NEEDED = ("fx", "fy", "cx", "cy")
 _POSE = ("Tx [mm]", "Ty [mm]", "Tz [mm]", "Theta [deg]", "Phi [deg]", "Psi [deg]")
-_LINE = re.compile(r"\s*([^;=:]+?)\s*[;=:]\s*(\S+)\s*")
+_BEGIN = re.compile(rb"cam[0-9]_f[xy]\b", re.IGNORECASE)
+_CAMERA_KEY = re.compile(r"cam[0-9]_")
+_UNIT = re.compile(r"\[[^\[\]]*\]|\s+")
 
 
 def is_caldat(data: bytes) -> bool:
     """Return True if the bytes are lines of MatchID's kind."""
-    return re.search(rb"^\s*Cam\d_F[xy]\b", data[:65536], re.MULTILINE | re.IGNORECASE) is not None
+    return has_line(data, _BEGIN)
 
 
 def parse_caldat(data: bytes, *, name: str) -> StereoPair:
@@ -55,8 +57,8 @@ def parse_caldat(data: bytes, *, name: str) -> StereoPair:
     FileFormatError
         ``calibration_unreadable`` or ``calibration_invalid``.
     """
-    values = named_numbers(data, name=name, line_form=_LINE, key_of=_key, is_remark=_is_remark)
-    prefixes = sorted({key.split("_", 1)[0] for key in values if re.match(r"cam\d_", key)})
+    values = named_numbers(data, name=name, parted=_parted, key_of=_key, is_remark=_is_remark)
+    prefixes = sorted({key.split("_", 1)[0] for key in values if _CAMERA_KEY.match(key)})
     if len(prefixes) != 2:
         raise unreadable(name, f"it names the cameras {', '.join(prefixes) or 'none'}; a pair has two")
     lens1, lens2 = (_lens(values, prefix, name) for prefix in prefixes)
@@ -69,11 +71,17 @@ def parse_caldat(data: bytes, *, name: str) -> StereoPair:
 
 def _key(text: str) -> str:
     """A name without unit, blanks and case: programs differ in these."""
-    return re.sub(r"\[[^\]]*\]|\s+", "", text).lower()
+    return _UNIT.sub("", text).lower()
+
+
+def _parted(line: str) -> tuple[str, str]:
+    at = min((k for k in map(line.find, ";=:") if k >= 0), default=len(line))
+    words = line[at + 1 :].split()
+    return line[:at].strip(), words[0] if len(words) == 1 else ""
 
 
 def _is_remark(key: str) -> bool:
-    return re.match(r"cam\d_", key) is None and key not in {_key(k) for k in _POSE}
+    return _CAMERA_KEY.match(key) is None and key not in {_key(k) for k in _POSE}
 
 
 def _lens(values: Mapping[str, float], prefix: str, name: str) -> OpenCVLens:

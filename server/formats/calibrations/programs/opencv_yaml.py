@@ -1,93 +1,134 @@
 """OpenCV stereo calibrations: ``cameraMatrix1/2, distCoeffs1/2, R, T, imageSize`` in YAML, JSON or XML.
 
 As ``cv2.stereoCalibrate`` returns them: ``X_cam2 = R X_cam1 + T``. Matrices may be OpenCV's own (``!!opencv-matrix``)
-or plain nested lists. The lens model here ends at k6: longer coefficient vectors are taken if thin prism and tilt are
-zero.
+or plain nested lists. OpenCV's own sample writes ``M1 D1 M2 D2`` and ``R T`` into two files, other programs ``K1`` or
+``mtx_left``. A text may hold several documents, which count as one.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
+import re
 from typing import Any
+from xml.etree.ElementTree import Element
 
-import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from core.cameras.lens import OpenCVLens
-from core.cameras.stereo import StereoPair
-from server.formats.calibrations.programs.imported_pair import (
+from stereorig.core.cameras.lens import OpenCVLens
+from stereorig.core.cameras.opencv_full import OpenCVFullLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import FileFormatError
+from stereorig.server.formats.calibrations.programs.imported_pair import (
+    MAX_SIDE_PX,
     ImageSize,
     invalid,
     opencv_lens,
     pair_of,
     unreadable,
-    unsupported,
 )
+from stereorig.server.formats.xml_tree import read_side_by_side
 
-KEYS = ("cameraMatrix1", "cameraMatrix2", "distCoeffs1", "distCoeffs2", "R", "T")
 _LENGTHS = (4, 5, 8, 12, 14)
 _ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
-_CARRIED = {5: _ORDER[:5], 8: _ORDER[:8]}
 _MAX_NUMBERS = 100
 _MAX_BYTES = 1 << 20  # a calibration is some kilobytes
+_LENSES, _POSE = ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2"), ("R", "T")
+#: without marks and capitals, but for single letters: k1 is a lens term, K1 a matrix
+_MATRIX = ("M", "K", "cameramatrix", "intrinsicmatrix", "intrinsics", "mtx")
+_BENT = ("D", "distcoeffs", "distcoeff", "distortioncoefficients", "distortion", "dist")
+_SIDES = (("1", "L", "l", "left"), ("2", "R", "r", "right"))
+_NAMES = {"rotation": "R", "rotationmatrix": "R", "translation": "T", "translationvector": "T", "t": "T"}
+_NAMES |= {"imagesize": "imageSize", "imgsize": "imageSize", "imagewidth": "width", "imageheight": "height"}
+for (_name, _stems), (_k, _sides) in itertools.product(
+    (("cameraMatrix", _MATRIX), ("distCoeffs", _BENT)), enumerate(_SIDES, 1)
+):
+    _NAMES |= {
+        spelled: f"{_name}{_k}"
+        for stem, side in itertools.product(_stems, _sides)
+        for spelled in (stem + side, side + stem)
+    }
+_ENTRY = re.compile(rb"\b([A-Za-z][A-Za-z0-9_-]{0,40})[\"'>]?\s{0,9}[:>]")
 
 
 def is_opencv(data: bytes) -> bool:
-    """Return True if the bytes name OpenCV's stereo parameters."""
-    return b"cameraMatrix1" in data[:_MAX_BYTES]
+    """Return True if the bytes name OpenCV's stereo parameters, or half of them in its own notation."""
+    named = {_plain_name(entry.decode()) for entry in _ENTRY.findall(data[:_MAX_BYTES])}
+    return "cameraMatrix1" in named or (b"opencv" in data[:_MAX_BYTES] and named >= {*_POSE})
 
 
-class _Loader(yaml.SafeLoader):
-    """Plain YAML, and OpenCV's matrices as the mappings they are."""
+def joined(data: bytes, other: bytes) -> bytes:
+    """Return the text of both halves."""
+    return data + (b"\n" if data.lstrip()[:1] == b"<" else b"\n---\n") + other
 
 
-def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
-    return loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else None
+def is_half(data: bytes) -> bool:
+    """Return True if the bytes are OpenCV's lenses without the pose between them, or the pose alone."""
+    if not is_opencv(data):
+        return False
+    try:
+        content = _load("", data.decode("utf-8-sig"))
+    except (UnicodeDecodeError, FileFormatError):
+        return False
+    return _lacking(content) != ""
 
 
-for _tag in ("opencv-matrix", "opencv-nd-matrix"):
-    _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", _matrix)
+def _lacking(content: dict[str, object]) -> str:
+    """Return the half that a text does not have at all: ``M1 D1 M2 D2`` or ``R T``; empty for both or neither."""
+    lenses, pose = ({*names} & content.keys() for names in (_LENSES, _POSE))
+    return "" if bool(lenses) == bool(pose) else "R T" if lenses else "M1 D1 M2 D2"
+
+
+def _plain_name(name: str) -> str:
+    """Return OpenCV's documented name of an entry, for one that is known under another; else the name."""
+    plain = re.sub(r"[-_ ]", "", name)
+    return _NAMES.get(plain) or _NAMES.get(plain.lower() if len(plain) > 2 else "", name)
 
 
 def _load(name: str, text: str) -> dict[str, object]:
-    """Read YAML, JSON or XML text to plain lists, mappings and numbers."""
+    """Read YAML, JSON or XML text to plain lists, mappings and texts, by OpenCV's documented names."""
     try:
         if text.lstrip().startswith("<"):
-            return _load_xml(text)
-        # OpenCV's own first line, %YAML:1.0, is not the directive of YAML
-        lines = [line for line in text.splitlines(keepends=True) if not line.startswith("%YAML")]
-        content = yaml.load("".join(lines), Loader=_Loader)
-    except (yaml.YAMLError, cv2.error, SystemError, ValueError, RecursionError) as error:
+            stored = read_side_by_side(text.encode())
+            pairs = [(child.tag, _plain(child)) for part in stored for child in part]
+        else:
+            # OpenCV's own first line, %YAML:1.0, is not the directive of YAML
+            lines = [line for line in text.splitlines(keepends=True) if not line.startswith("%YAML")]
+            # every scalar stays a text, every tag unknown: nothing is made of them but lists, mappings and texts
+            documents = [one for one in yaml.load_all("".join(lines), Loader=yaml.BaseLoader) if one]
+            if not all(isinstance(one, dict) for one in documents):
+                raise unreadable(name, "it names no values")
+            pairs = [pair for one in documents for pair in one.items()]
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise unreadable(name, f"it is damaged ({type(error).__name__})") from error
-    if not isinstance(content, dict):
-        raise unreadable(name, "it names no values")
+    stated: dict[str, object] = {key: value for key, value in pairs if isinstance(key, str)}
+    content = dict(stated)
+    for key, value in stated.items():
+        plain = _plain_name(key)
+        if content.setdefault(plain, value) != value and plain not in stated:
+            raise unreadable(name, f"it has two values of {plain}, one of them {key}")
     return content
 
 
-def _load_xml(text: str) -> dict[str, object]:
-    storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-    try:
-        nodes = {key: storage.getNode(key) for key in (*KEYS, "imageSize")}
-        return {key: _plain(node) for key, node in nodes.items() if not node.isNone()}
-    finally:
-        storage.release()
-
-
-def _plain(node: Any) -> Any:
-    if node.isReal() or node.isInt():
-        return node.real()
-    if node.isSeq():
-        return [_plain(node.at(i)) for i in range(node.size())]
-    return node.mat().tolist() if node.isMap() else node.string()
+def _plain(element: Element) -> Any:
+    """Return an element of OpenCV's XML as YAML would give it: a matrix, a mapping, a list or a number."""
+    if not len(element):
+        words = (element.text or "").split()
+        return words[0] if len(words) == 1 else words
+    if all(child.tag == "_" for child in element):
+        return [_plain(child) for child in element]
+    found = {child.tag: _plain(child) for child in element}
+    if found.get("dt") == "f":  # OpenCV keeps these numbers in 32 bit
+        found["data"] = [float(np.float32(_number(number))) for number in found.get("data", [])]
+    return found
 
 
 def _number(value: Any) -> float:
-    if isinstance(value, bool) or value is None:
+    if not isinstance(value, str | float) or not str(value).isascii():  # other scripts' digits are no notation here
         raise ValueError("not a number")
-    if isinstance(value, str):  # YAML 1.1 takes 1e-5 and .Nan for text
-        value = value.strip().lower().replace(".nan", "nan").replace(".inf", "inf")
-    return float(value)
+    return float(str(value).strip().lower().replace(".nan", "nan").replace(".inf", "inf"))
 
 
 def _flat(value: Any, depth: int = 0) -> list[float]:
@@ -104,13 +145,16 @@ def _array(name: str, content: dict[str, object], key: str) -> NDArray[np.float6
     value = content[key]
     try:
         if isinstance(value, dict):
-            shape = value["sizes"] if "sizes" in value else [value["rows"], value["cols"]]
-            array = np.reshape(_flat(value["data"]), [int(n) for n in shape])
+            sizes = _flat(value["sizes"] if "sizes" in value else [value["rows"], value["cols"]])
+            numbers = _flat(value["data"])
+            if math.prod(sizes) != len(numbers) or min(sizes) < 1 or any(size % 1 for size in sizes):
+                raise ValueError("numbers and sizes disagree")
+            array = np.reshape(numbers, [int(size) for size in sizes])
         else:
             rows = len(value) if isinstance(value, list) and value and isinstance(value[0], list) else None
             array = np.array(_flat(value))
             array = array if rows is None else array.reshape(rows, -1)
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, KeyError) as error:
         raise unreadable(name, f"{key} is not a matrix of numbers") from error
     if not np.isfinite(array).all():
         raise invalid(name, f"{key} holds a number that is not finite")
@@ -126,13 +170,8 @@ def _lens(name: str, content: dict[str, object], which: int) -> OpenCVLens:
     d = _array(name, content, f"distCoeffs{which}").ravel()
     if d.size not in _LENGTHS:
         raise unreadable(name, f"distCoeffs{which} has {d.size} values; OpenCV has {_LENGTHS}")
-    other = [f"{term} = {value:g}" for term, value in zip(_ORDER[8:], d[8:], strict=False) if value != 0.0]
-    if other:
-        raise unsupported(
-            name, f"distCoeffs{which} has {', '.join(other)}; thin prism (s1 to s4) and tilt (tau) are not known here"
-        )
     values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "skew": K[0, 1]}
-    values.update(zip(_CARRIED[8], d[:8], strict=False))
+    values.update(zip(_ORDER, d, strict=False))
     return opencv_lens(name, f"camera {which}", {k: float(v) for k, v in values.items()})
 
 
@@ -147,7 +186,7 @@ def parse_opencv(data: bytes, *, name: str) -> tuple[StereoPair, ImageSize]:
     Raises
     ------
     FileFormatError
-        ``calibration_unreadable``, ``calibration_unsupported`` or ``calibration_invalid``.
+        ``calibration_unreadable`` or ``calibration_invalid``.
     """
     if len(data) > _MAX_BYTES:
         raise unreadable(name, f"it has {len(data)} bytes, far more than a calibration")
@@ -156,12 +195,23 @@ def parse_opencv(data: bytes, *, name: str) -> tuple[StereoPair, ImageSize]:
     except UnicodeDecodeError as error:
         raise unreadable(name, "it is not text") from error
     content = _load(name, text)
+    lacks = _lacking(content)
+    if lacks:
+        has = "M1 D1 M2 D2" if lacks == "R T" else "R T"
+        raise unreadable(
+            name,
+            f"it is the one of OpenCV's two files that has {has}; {lacks} are in the other",
+            remedy="Append the other file's text to this one, and give that; a command also finds the other file if "
+            "both are in one folder as intrinsics.yml and extrinsics.yml.",
+        )
     lens1, lens2 = _lens(name, content, 1), _lens(name, content, 2)
     pair = pair_of(name, lens1, lens2, _array(name, content, "R"), _array(name, content, "T"))
+    if {"width", "height"} <= content.keys():
+        content.setdefault("imageSize", [content["width"], content["height"]])
     if content.get("imageSize") is None:
         return pair, None
     size = _array(name, content, "imageSize").ravel()
-    if size.size != 2 or size.min() < 1 or np.any(size % 1):
+    if size.size != 2 or size.min() < 1 or size.max() > MAX_SIDE_PX or np.any(size % 1):
         raise invalid(name, f"imageSize is {size.tolist()}, not (width, height)")
     return pair, (int(size[0]), int(size[1]))
 
@@ -176,7 +226,7 @@ def opencv_text(
     """Return a stereo calibration as ``cv2.FileStorage`` reads it; the skew, which OpenCV does not have, must be 0.
 
     The image size is given where both cameras share one. A lens has five coefficients, eight where k4, k5 or k6 is not
-    zero.
+    zero, twelve with a thin prism, fourteen on a tilted sensor.
     """
     pose = pair.cam2_from_cam1
     lines = ["%YAML:1.0", "---", f"# {comment}"]
@@ -185,8 +235,10 @@ def opencv_text(
     for k, lens in enumerate((lens1, lens2), 1):
         matrix = [[lens.fx_px, lens.skew_px, lens.cx_px], [0.0, lens.fy_px, lens.cy_px], [0.0, 0.0, 1.0]]
         lines += _text_of(f"cameraMatrix{k}", np.array(matrix))
-        terms = _CARRIED[8 if lens.is_rational else 5]
-        lines += _text_of(f"distCoeffs{k}", np.array([[getattr(lens, term) for term in terms]]))
+        values = [lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, lens.k4, lens.k5, lens.k6]
+        values += lens.prism.values() if isinstance(lens, OpenCVFullLens) else []
+        n = next(n for n in _LENGTHS[1:] if not any(values[n:]))
+        lines += _text_of(f"distCoeffs{k}", np.array([values[:n]]))
     lines += _text_of("R", pose.rotation) + _text_of("T", pose.translation_mm.reshape(3, 1))
     return "\n".join(lines) + "\n"
 

@@ -8,18 +8,25 @@ from typing import Any
 import cv2
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.conversion import image_positions
-from core.cameras.lens import OpenCVLens, SeidelLens
-from core.cameras.stereo import StereoPair
-from core.errors import FileFormatError
-from server.formats.calibrations.recognise import LoadedCalibration
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.conversion import image_positions
+from stereorig.core.cameras.lens import OpenCVLens, SeidelLens
+from stereorig.core.cameras.opencv_full import OpenCVFullLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.core.errors import FileFormatError
+from stereorig.server.formats.calibrations.recognise import LoadedCalibration
 
 MAX_RESIDUAL_PX = 1e-3  # of a carried-over model against an independent projection; rounding is 1e-9
 _ACROSS = (13, 11)
 _DEPTHS = np.geomspace(0.3, 300.0, 61)  # of the baseline
 _THICKNESS = (0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
 _MIN_POINTS = 20
+#: baselines and stand-offs that two cameras can have: no lens is nearer to another, no specimen farther away
+_SHORTEST_MM, _LONGEST_MM = 1.0, 1e5
+#: stand-off, and baseline of cameras whose axes do not meet, below which a unit is asked for: less is in front of
+#: hardly any lens, while boards' squares, centimetres and inches bring a usual rig there
+_NEAR_MM, _NARROW_MM = 30.0, 10.0
+_PARALLEL = 50.0  # baselines: axes that meet further away are parallel but for an error, and meet by chance
 
 
 @dataclass(frozen=True)
@@ -32,7 +39,7 @@ class Residual:
 
     @staticmethod
     def of(values: Float) -> Residual:
-        """Summarise; unknown where there is no point."""
+        """Summarise the finite values; the root mean square and the largest are None if there is no point."""
         finite = values[np.isfinite(values)]
         if finite.size == 0:
             return Residual(0, None, None)
@@ -80,7 +87,7 @@ def _twice(centre_px: float) -> int:
 def middle_depth_mm(pair: StereoPair, size1: tuple[int, int], size2: tuple[int, int]) -> float | None:
     """Return the depth in camera 1 at which the cameras' views overlap best: where the images' middles meet.
 
-    Of cameras whose axes do not meet, the depth at which the images share most; None where they share nothing.
+    If the cameras' axes do not meet, the depth at which the images share most; None if they share nothing.
     """
     middles = [np.array([(n - 1) / 2 for n in size]) for size in (size1, size2)]
     met = pair.triangulate(*middles)
@@ -95,11 +102,38 @@ def middle_depth_mm(pair: StereoPair, size1: tuple[int, int], size2: tuple[int, 
     return float(np.exp(np.log(depths[counts == counts.max()]).mean()))
 
 
+def length_warning(loaded: LoadedCalibration) -> str | None:
+    """Return the question to the user if another program's lengths are likely in another unit than millimetres."""
+    if not loaded.imported or loaded.unit is not None:
+        return None
+    size1, size2, _ = image_sizes(loaded)
+    with np.errstate(all="ignore"):  # a file may hold numbers of any size
+        met = loaded.pair.triangulate(*(np.array([(n - 1) / 2 for n in size]) for size in (size1, size2)))
+    baseline = loaded.pair.baseline_mm
+    depth = float(loaded.pair.cam1.cam_from_sys.apply(met.xyz_mm)[2]) if bool(met.valid) else None
+    if depth is not None and not 0.0 < depth < _PARALLEL * baseline:
+        depth = None
+    lengths = [baseline] if depth is None else [baseline, depth]
+    if max(lengths) > _LONGEST_MM:
+        likely = "It seems to be in micrometres."
+    elif min(lengths) < _SHORTEST_MM:
+        likely = "It seems to be in metres."
+    elif depth < _NEAR_MM if depth is not None else baseline < _NARROW_MM:
+        likely = "Is it in squares of the board, centimetres, inches or metres?"
+    else:
+        return None
+    met_at = "" if depth is None else f", and axes that meet at {depth:.3g} mm"
+    return (
+        f"the unit of T is not stated: a baseline of {baseline:.3g} mm{met_at}? {likely} "
+        "State it (--unit, unit of the import): m, or '25 mm' of a board's squares"
+    )
+
+
 def shared_points(pair: StereoPair, size1: tuple[int, int], size2: tuple[int, int]) -> Float:
     """Return points (n, 3) of the system frame that both cameras see: a grid at three depths about the middle.
 
     The outer depths are those at which both images share nearly half as much as in the middle, 5 % off at most. Empty
-    where they share nothing.
+    if they share nothing.
     """
     depth = middle_depth_mm(pair, size1, size2)
     if depth is None:
@@ -129,7 +163,8 @@ def independent_projection(camera: Any, points_mm: Float) -> Float:
     p = points_mm @ camera.cam_from_sys.rotation.T + camera.cam_from_sys.translation_mm
     lens = camera.lens
     if isinstance(lens, OpenCVLens):
-        bent = np.array([lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, lens.k4, lens.k5, lens.k6])
+        more = lens.prism.values() if isinstance(lens, OpenCVFullLens) else ()
+        bent = np.array([lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, lens.k4, lens.k5, lens.k6, *more])
         zero = np.zeros(3)
         distorted = cv2.projectPoints(p.reshape(-1, 1, 3), zero, zero, np.eye(3), bent)[0].reshape(-1, 2)
         x, y = distorted[:, 0], distorted[:, 1]
@@ -161,7 +196,8 @@ def check_calibration(loaded: LoadedCalibration) -> CalibrationCheck:
 def _checked(loaded: LoadedCalibration) -> CalibrationCheck:
     size1, size2, known = image_sizes(loaded)
     points = shared_points(loaded.pair, size1, size2)
-    warnings = list(loaded.notes)
+    asked = length_warning(loaded)
+    warnings = [*([] if asked is None else [asked]), *loaded.notes]
     residual = Residual(0, None, None)
     if len(points):
         xy1 = independent_projection(loaded.pair.cam1, points)
@@ -171,7 +207,7 @@ def _checked(loaded: LoadedCalibration) -> CalibrationCheck:
         warnings.append("both cameras see hardly any point in common: the poses or the image sizes may be wrong")
     elif residual.max_px is not None and residual.max_px > MAX_RESIDUAL_PX:
         raise FileFormatError(
-            f"The calibration does not agree with its own numbers: points that both cameras see lie up to "
+            f"The calibration does not agree with its own numbers: points that both cameras see are up to "
             f"{residual.max_px:.3g} px off their epipolar lines.",
             code="calibration_inconsistent",
             remedy="Check the lens terms: the polynomial may fold back inside the image.",

@@ -10,21 +10,22 @@ from __future__ import annotations
 
 import re
 
-from core.cameras.lens import OpenCVLens
-from core.cameras.stereo import StereoPair
-from server.formats.calibrations.programs.imported_pair import euler_zyx, opencv_lens, pair_of, unreadable
-from server.formats.calibrations.programs.named_numbers import named_numbers
+from stereorig.core.cameras.lens import OpenCVLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.server.formats.calibrations.programs.imported_pair import euler_zyx, opencv_lens, pair_of, unreadable
+from stereorig.server.formats.calibrations.programs.named_numbers import has_line, named_numbers
 
 _PIXELS = ("fx", "fy", "fs", "cx", "cy")
 _BENT = ("k1", "k2", "p1", "p2", "k3")
 _SHIFT = ("tx_mm", "ty_mm", "tz_mm")
 _ANGLES = ("theta_deg", "phi_deg", "psi_deg")
-_LINE = re.compile(r"\s*(\w+)\s*(?:[,;\t]|\s)\s*([^\s,;]+)\s*[,;]?\s*")
+_BEGIN = re.compile(rb"cam[0-9]_f[xy]_px\b")
+_MARKS = str.maketrans(",;", "  ")
 
 
 def is_pyvale(data: bytes) -> bool:
     """Return True if the bytes are lines of pyvale's kind."""
-    return re.search(rb"^\s*cam\d_f[xy]_px\b", data[:65536], re.MULTILINE) is not None
+    return has_line(data, _BEGIN)
 
 
 def parse_pyvale(data: bytes, *, name: str) -> StereoPair:
@@ -35,7 +36,7 @@ def parse_pyvale(data: bytes, *, name: str) -> StereoPair:
     FileFormatError
         ``calibration_unreadable`` or ``calibration_invalid``.
     """
-    values = named_numbers(data, name=name, line_form=_LINE, key_of=str, is_remark=lambda _: False)
+    values = named_numbers(data, name=name, parted=_parted, key_of=str, is_remark=lambda _: False)
     needed = [f"cam{k}_{key}_px" for k in (0, 1) for key in _PIXELS]
     needed += [f"cam{k}_{key}" for k in (0, 1) for key in _BENT]
     missing = [key for key in (*needed, *_SHIFT, *_ANGLES) if key not in values]
@@ -43,6 +44,11 @@ def parse_pyvale(data: bytes, *, name: str) -> StereoPair:
         raise unreadable(name, f"it lacks {', '.join(missing)}")
     lens1, lens2 = (_lens(values, f"cam{k}", name) for k in (0, 1))
     return pair_of(name, lens1, lens2, euler_zyx(*(values[key] for key in _ANGLES)), [values[key] for key in _SHIFT])
+
+
+def _parted(line: str) -> tuple[str, str]:
+    words = line.translate(_MARKS).split()
+    return (words[0], words[1]) if len(words) == 2 else ("", "")
 
 
 def _lens(values: dict[str, float], camera: str, name: str) -> OpenCVLens:

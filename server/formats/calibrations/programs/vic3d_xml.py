@@ -10,17 +10,16 @@ coordinates, undistorted to distorted, as its authors' book has the radial terms
 
 from __future__ import annotations
 
-from xml.etree.ElementTree import Element, ParseError
+import re
+from xml.etree.ElementTree import Element
 
-import defusedxml.ElementTree
 import numpy as np
-from defusedxml.common import DefusedXmlException
 
-from core.arrays import Float
-from core.cameras.camera import RigidTransform
-from core.cameras.lens import OpenCVLens
-from core.cameras.stereo import StereoPair
-from server.formats.calibrations.programs.imported_pair import (
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.camera import RigidTransform
+from stereorig.core.cameras.lens import OpenCVLens
+from stereorig.core.cameras.stereo import StereoPair
+from stereorig.server.formats.calibrations.programs.imported_pair import (
     ImageSize,
     euler_zyx,
     euler_zyx_deg,
@@ -30,8 +29,10 @@ from server.formats.calibrations.programs.imported_pair import (
     unreadable,
     unsupported,
 )
+from stereorig.server.formats.xml_tree import read_side_by_side
 
 _INTRINSICS = ("cx", "cy", "fx", "fy", "skew")
+_SIZE = re.compile(r"0*[1-9][0-9]{0,5}")
 _DISTORTION = ("k1", "k2", "k3")
 
 
@@ -46,8 +47,8 @@ def parse_vic3d(data: bytes, *, name: str) -> tuple[StereoPair, ImageSize]:
     Returns
     -------
     tuple
-        The pair (system frame = its camera 0) and the image size (width, height) of a project's area of interest; None
-        where there is none.
+        The pair (system frame = its camera 0) and the image size (width, height) of a project's area of interest, None
+        if the file has none.
 
     Raises
     ------
@@ -55,10 +56,10 @@ def parse_vic3d(data: bytes, *, name: str) -> tuple[StereoPair, ImageSize]:
         ``calibration_unreadable``, ``calibration_unsupported``, ``calibration_invalid``.
     """
     try:
-        root = defusedxml.ElementTree.fromstring(data)
-    except (ParseError, DefusedXmlException, ValueError, LookupError) as error:
-        raise unreadable(name, f"damaged XML, {type(error).__name__} {error}") from error
-    parts = [root] if root.tag == "calibration" else list(root.iter("calibration"))
+        root = read_side_by_side(data)  # some of its versions write the mask after the calibration
+    except ValueError as error:
+        raise unreadable(name, f"damaged XML, {error}") from error
+    parts = list(root.iter("calibration"))
     if len(parts) != 1:
         raise unreadable(name, f"it has {len(parts)} calibrations")
     cameras = parts[0].findall("camera")
@@ -110,7 +111,7 @@ def _image_size(root: Element) -> ImageSize:
     sizes = set()
     for mask in root.iter("polygonmask"):
         width, height = mask.get("width", ""), mask.get("height", "")
-        if width.isdigit() and height.isdigit() and int(width) > 0 and int(height) > 0:
+        if _SIZE.fullmatch(width) and _SIZE.fullmatch(height):
             sizes.add((int(width), int(height)))
     return sizes.pop() if len(sizes) == 1 else None
 

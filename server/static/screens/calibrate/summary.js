@@ -1,4 +1,4 @@
-// What a calibration is, in one badge and one row of figures: state, verdict and decision are one fact to its user.
+// A calibration in one badge and one row of figures: state, verdict and decision are one fact to its user.
 import * as api from "../../lib/api.js";
 import { h, badge, definitions, quantity } from "../../lib/dom.js";
 
@@ -36,16 +36,27 @@ export async function geometryOf(document_) {
   try {
     found = await api.get(`/calibrations/${/** @type {"{calibration_id}"} */ (document_.id)}/geometry`);
   } catch {
-    return null; // a broken file says so where it is used
+    return null; // a broken file shows its error at its use
   }
   const { cam1, cam2 } = found.cameras ?? {};
   const both = (/** @type {string | null} */ one, /** @type {string | null} */ two) => (one === two ? one : `${one ?? "–"}; ${two ?? "–"}`);
   const size = (/** @type {readonly number[] | null | undefined} */ mm) => (mm ? `${quantity(mm[0], "", 3)} × ${quantity(mm[1], "mm", 3)}` : null);
   /** @type {[string, import("#dom").Part][]} */
-  const rows = [["stereo angle", quantity(found.stereo_angle_deg, "°", 4)], ["baseline", quantity(found.baseline_mm, "mm", 4)]];
+  const rows = [
+    ["stereo angle", quantity(found.stereo_angle_deg, "°", 4)],
+    ["baseline", quantity(found.baseline_mm, "mm", 4)],
+  ];
   if (cam1 && cam2) {
-    rows.push(["field of view", both(size(cam1.field_of_view_mm), size(cam2.field_of_view_mm))], ["stand-off", both(quantity(cam1.standoff_mm, "mm", 4), quantity(cam2.standoff_mm, "mm", 4))]);
-    rows.push(["focal length", cam1.focal_length_mm === null && cam2.focal_length_mm === null ? h("span.quiet", "not known: the rig file does not state pixel_um") : both(quantity(cam1.focal_length_mm, "mm", 4), quantity(cam2.focal_length_mm, "mm", 4))]);
+    rows.push(
+      ["field of view", both(size(cam1.field_of_view_mm), size(cam2.field_of_view_mm))],
+      ["stand-off", both(quantity(cam1.standoff_mm, "mm", 4), quantity(cam2.standoff_mm, "mm", 4))],
+    );
+    rows.push([
+      "focal length",
+      cam1.focal_length_mm === null && cam2.focal_length_mm === null
+        ? h("span.quiet", "not known: the rig file does not state pixel_um")
+        : both(quantity(cam1.focal_length_mm, "mm", 4), quantity(cam2.focal_length_mm, "mm", 4)),
+    ]);
   }
   return definitions(rows);
 }

@@ -9,19 +9,13 @@ import { axesOf } from "../../widgets/triad.js";
  *   flags: Record<string, string> | null, signed?: boolean }} Shown a field of a step */
 
 const MAX_BYTES = 300e6;
-const STRAIN = /^(sigma_)?(exx|eyy|exy|e1|e2|max_shear|von_mises)(_patch)?$/;
-const ANGLE = /^(sigma_)?strain_angle_rad$/;
-/** @type {Record<string, string>} */
-const NAMES = {
-  d_mm: "|d|, size of the displacement", x_mm: "X", y_mm: "Y", z_mm: "Z", u_mm: "U", v_mm: "V", w_mm: "W", exx: "exx", eyy: "eyy", exy: "exy", e1: "e1, larger principal", e2: "e2, smaller principal",
-  max_shear: "max. shear", von_mises: "von Mises strain", strain_angle_rad: "direction of e1", epipolar_px: "epipolar offset", noise_grey: "image noise",
-  status: "status", strain_status: "status of the strain", iterations: "iterations", theta_rad: "theta", phi_rad: "phi", zp_mm: "zp",
-};
-/** @type {[name: string, variables: RegExp][]} */
-const GROUPS = [
-  ["Displacement", /^[uvwd]_mm$/], ["Strain", /^(exx|eyy|exy|e1|e2|max_shear|von_mises|strain_angle_rad)$/], ["Shape", /^[xyz]_mm$/],
-  ["Quality", /^(zncc|epipolar_px|noise_grey|status$|strain_status)/], ["Standard uncertainty", /^sigma_/], ["Internals", /./],
-];
+/** @type {{ [kind: string]: { unit: string, factor: number } }} */
+const UNITS = { strain: { unit: "µm/m", factor: 1e6 }, angle: { unit: "°", factor: 180 / Math.PI } };
+export const INTERNALS = "Internals";
+const UNCERTAINTY = "Standard uncertainty";
+const GROUPS = ["Displacement", "Strain", "Shape", "Quality", UNCERTAINTY, INTERNALS];
+/** @type {Map<string, Model<"FieldVariable">>} variables of the steps that were read, by name */
+const known = new Map();
 
 /**
  * Display unit of a variable, and the factor from its stored numbers.
@@ -29,31 +23,45 @@ const GROUPS = [
  * @param {string} units
  */
 export function shownUnit(name, units) {
-  if (STRAIN.test(name)) return { unit: "µm/m", factor: 1e6 };
-  if (ANGLE.test(name)) return { unit: "°", factor: 180 / Math.PI };
-  return { unit: units === "pixel" ? "px" : units === "1" ? "" : units === "count" ? "grey" : units, factor: 1 };
+  return UNITS[known.get(name)?.kind ?? ""] ?? { unit: units === "pixel" ? "px" : units === "1" ? "" : units === "count" ? "grey" : units, factor: 1 };
 }
 
 /**
  * Name of a variable as it is shown.
  * @param {string} name
  */
-export const pretty = (name) => NAMES[name] ?? (name.startsWith("sigma_") ? `σ of ${NAMES[name.slice(6)] ?? name.slice(6)}` : name.replace(/_/g, " "));
+export const pretty = (name) => known.get(name)?.label ?? name.replace(/_/g, " ");
 
 /**
- * Group that a variable stands in, and that group's place.
+ * True if a variable is zero at the reference by definition.
+ * @param {string} name
+ */
+export const isRelative = (name) => known.get(name)?.relative ?? false;
+
+/**
+ * True if a variable has a row of its own in a list of values: it is neither a status nor the uncertainty of another one.
+ * @param {string} name
+ */
+export const isListed = (name) => known.get(name)?.group !== UNCERTAINTY && !known.get(name)?.flags;
+
+/**
+ * Group of a variable, and the group's place.
  * @param {string} name
  */
 export function groupOf(name) {
-  const at = GROUPS.findIndex(([, pattern]) => pattern.test(name));
-  return { at, group: GROUPS[at][0] };
+  const group = known.get(name)?.group ?? INTERNALS;
+  return { at: GROUPS.indexOf(group), group };
 }
 
 /**
- * What a field is, its axes named as they are drawn.
+ * Meaning of a field, its axes named as they are drawn.
  * @param {Shown} info
  */
-export const aboutText = (info) => info.about.replace(/([XYZ])_(frame|sys)/, "$1").replace("axis 1", "X").replace("axis 2", "Y");
+export const aboutText = (info) =>
+  info.about
+    .replace(/([XYZ])_(frame|sys)/, "$1")
+    .replace("axis 1", "X")
+    .replace("axis 2", "Y");
 
 export class Result {
   /** @type {Model<"AnalysisReply"> | null} */
@@ -84,7 +92,7 @@ export class Result {
   }
 
   /**
-   * Read everything in other axes from now on; also where the same axes were laid anew.
+   * Read everything in other axes from now on; also if the same axes were defined again.
    * @param {string} frame
    */
   use(frame) {
@@ -148,7 +156,7 @@ export class Result {
   }
 
   /**
-   * Figures of a step's field, where it is finished.
+   * Figures of a step's field, if it is finished.
    * @param {number} n
    */
   async figures(n) {
@@ -171,7 +179,7 @@ export class Result {
   }
 
   /**
-   * @template {object} T `bytes` are counted where it has them
+   * @template {object} T `bytes` are counted if it has them
    * @param {string} key
    * @param {() => Promise<T>} make
    * @returns {Promise<T>}
@@ -209,19 +217,18 @@ export class Result {
       /** @type {Shown[]} */
       const shown = [];
       for (const one of fields) {
+        known.set(one.name, one);
         const { group } = groupOf(one.name);
         const { unit } = shownUnit(one.name, one.units);
         const common = { name: one.name, group, unit, about: one.long_name, flags: one.flags ?? null };
-        if (one.dimensions.join() === "row,col" && !["x_px", "y_px"].includes(one.name)) shown.push({ ...common, key: one.name, component: null, text: pretty(one.name) });
-        if (one.name === "zncc") {
-          for (let k = 0; k < one.shape[2]; k += 1) {
-            const pair = (one.comparisons?.[k] ?? String(k)).replace("__", " with ").replace(/_/g, " ");
-            shown.push({ ...common, key: `zncc:${k}`, component: k, text: `correlation ${pair}` });
-          }
+        if (one.dimensions.join() === "row,col" && !["x_px", "y_px"].includes(one.name))
+          shown.push({ ...common, key: one.name, component: null, text: pretty(one.name) });
+        for (const [k, pair] of (one.comparisons ?? []).entries()) {
+          const text = `correlation ${pair.replace("__", " with ").replace(/_/g, " ")}`;
+          shown.push({ ...common, key: `${one.name}:${k}`, component: k, text });
         }
       }
-      const order = GROUPS.map(([name]) => name);
-      shown.sort((a, b) => order.indexOf(a.group) - order.indexOf(b.group));
+      shown.sort((a, b) => GROUPS.indexOf(a.group) - GROUPS.indexOf(b.group));
       return { shown, cuts, frame, uncertainty, all: new Set(fields.map((one) => one.name)) };
     });
   }

@@ -21,6 +21,10 @@ export function camerasBadge(motion) {
 export function camerasNote(step) {
   const motion = step?.camera_motion;
   if (!motion?.camera_moved) return null;
-  return h("div.caution", { role: "status", "data-role": "camera-motion" },
-    h("p", badge("a camera moved", "warn"), ` Step ${step?.n}: ${inUnits(motion.text)}.`), h("p", REMEDY));
+  return h(
+    "div.caution",
+    { role: "status", "data-role": "camera-motion" },
+    h("p", badge("a camera moved", "warn"), ` Step ${step?.n}: ${inUnits(motion.text)}.`),
+    h("p", REMEDY),
+  );
 }

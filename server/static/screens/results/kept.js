@@ -10,9 +10,9 @@ import { Workspace } from "../../lib/workspace.js";
 
 /**
  * @param {Workspace} workspace
- * @param {Drawn} state of the gauges' panel; what was kept is put into it
+ * @param {Drawn} state of the gauges' panel; the stored gauges are put into it
  * @param {HTMLInputElement} rigid
- * @returns {() => void} keeps what is drawn now
+ * @returns {() => void} stores the present drawing
  */
 export function keptGauges(workspace, state, rigid) {
   const before = /** @type {Gauges} */ (workspace.value.gauges ?? {});
@@ -23,15 +23,22 @@ export function keptGauges(workspace, state, rigid) {
   if (line) state.line = ends(line.vertices_px);
   others.forEach((one, k) => state.kept.push({ name: one.name ?? `L${k + 1}`, ends: ends(one.vertices_px) }));
   if (area) state.area = /** @type {[number, number, number, number]} */ ([...area]);
-  for (const one of before.extensometers ?? []) if (one.a_px && one.b_px) state.extensometers.push({ name: one.name ?? `E${state.extensometers.length + 1}`, a: spot(one.a_px), b: spot(one.b_px) });
+  for (const one of before.extensometers ?? [])
+    if (one.a_px && one.b_px) state.extensometers.push({ name: one.name ?? `E${state.extensometers.length + 1}`, a: spot(one.a_px), b: spot(one.b_px) });
   state.serial = Math.max(state.serial, ...state.extensometers.map((one) => Number(/\d+$/.exec(one.name)?.[0] ?? 0)));
   rigid.checked = Boolean(before.remove_rigid);
   let last = "";
   function keep() {
     const found = {
-      lines: [...(state.line ? [{ name: line?.name ?? "l1", vertices_px: state.line }] : []), ...state.kept.map((one) => ({ name: one.name, vertices_px: one.ends }))],
+      lines: [
+        ...(state.line ? [{ name: line?.name ?? "l1", vertices_px: state.line }] : []),
+        ...state.kept.map((one) => ({ name: one.name, vertices_px: one.ends })),
+      ],
       areas: [...(state.area ? [{ name: before.areas?.[0]?.name ?? "a1", rectangle_px: state.area }] : []), ...(before.areas ?? []).slice(1)],
-      extensometers: [...state.extensometers.map((one) => ({ name: one.name, a_px: one.a, b_px: one.b })), ...(before.extensometers ?? []).filter((one) => one.ends_mm)],
+      extensometers: [
+        ...state.extensometers.map((one) => ({ name: one.name, a_px: one.a, b_px: one.b })),
+        ...(before.extensometers ?? []).filter((one) => one.ends_mm),
+      ],
     };
     const any = found.lines.length || found.areas.length || found.extensometers.length || before.points?.length;
     const { remove_rigid: _, ...others } = before;
@@ -40,7 +47,7 @@ export function keptGauges(workspace, state, rigid) {
     if (last && said !== last) workspace.change({ gauges: /** @type {Model<"GaugeRequest"> | null} */ (JSON.parse(said)) });
     last = said;
   }
-  keep(); // what it is to begin with is no change
+  keep(); // the first state is no change
   rigid.addEventListener("change", keep);
   return keep;
 }

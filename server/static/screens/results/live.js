@@ -19,7 +19,7 @@ export function nextShown(steps, shown, following) {
 }
 
 /**
- * Field to show where nobody chose one: the displacement W where the step has it, else the shape Z.
+ * Field to show if none was chosen: the displacement W if the step has it, else the shape Z.
  * @param {readonly string[]} keys of the step's fields
  */
 export function usualField(keys) {
@@ -39,16 +39,23 @@ export function live(screen, go) {
   const atNewest = () => screen.step === null || screen.step === result.steps.at(-1);
   follow.checked = atNewest();
   if (running() && analysis.job_id) {
-    const row = analysisJob({ testId: result.testId, analysisId: result.analysisId, jobId: analysis.job_id, follow: analysis.follow ?? false,
-      before: [h("label.check", { title: "Show each step as soon as it is measured" }, follow, "follow the newest step")] });
+    const row = analysisJob({
+      testId: result.testId,
+      analysisId: result.analysisId,
+      jobId: analysis.job_id,
+      follow: analysis.follow ?? false,
+      before: [h("label.check", { title: "Show each step as soon as it is measured" }, follow, "follow the newest step")],
+    });
     root.hidden = false;
     root.append(row.root);
     screen.ends.push(events.on("job", row.draw));
     api.get(`/jobs/${analysis.job_id}`).then(row.draw, notify);
   }
-  follow.addEventListener("change", () => { if (follow.checked) landed().catch(notify); });
+  follow.addEventListener("change", () => {
+    if (follow.checked) landed().catch(notify);
+  });
 
-  /** More steps are finished: the newest is shown where it is followed. */
+  /** More steps are finished: the newest is shown if it is followed. */
   async function landed() {
     const next = screen.state.playing ? null : nextShown(result.steps, screen.step, follow.checked);
     if (next !== null) await go(next);

@@ -1,21 +1,24 @@
-// How uncertainties are shown: one standard uncertainty or an interval of 95 %, and what they include.
+// Display of uncertainties: one standard uncertainty or an interval of 95 %, and the included terms.
 import * as api from "../../lib/api.js";
 import { h, replace, select, badge, notify, num } from "../../lib/dom.js";
 import { amount, uncertain } from "../../lib/units.js";
 
 /** @import { Model } from "#routes" */
 /** @import { Viewer } from "../results.js" */
-/** @typedef {Model<"Uncertainty">} Stated what an answer says about its uncertainties */
+/** @typedef {Model<"Uncertainty">} Stated an answer's statement about its uncertainties */
 /** @typedef {{ root: HTMLElement, readonly factor: number, readonly symbol: string, readonly text: string, changed: Set<() => unknown> }} Interval
  *   factor of the standard uncertainties shown; `changed` is called after it became another */
-/** @typedef {{ [cause: string]: number | null }} Budget standard uncertainty by cause; null where it is not known */
+/** @typedef {{ [cause: string]: number | null }} Budget standard uncertainty by cause; null if it is not known */
 
 export const NOT_INCLUDED = "calibration not included";
 /** @type {[value: string, text: string][]} */
-const INTERVALS = [["", "u (k = 1)"], ["0.95", "95 %"]];
+const INTERVALS = [
+  ["", "u (k = 1)"],
+  ["0.95", "95 %"],
+];
 
 /**
- * The switch of the interval, with what the step's uncertainties include; it reads its factor from the service.
+ * The switch of the interval, with the terms that the step's uncertainties include; it reads its factor from the service.
  * @param {Viewer} screen
  * @returns {Interval}
  */
@@ -30,9 +33,15 @@ export function interval(screen) {
   /** @type {Interval} */
   const made = {
     root: h("div", h("div.row", h("span", "Uncertainties"), choice), says),
-    get factor() { return now?.k ?? 1; },
-    get symbol() { return choice.value ? "U" : "u"; },
-    get text() { return now?.text ?? ""; },
+    get factor() {
+      return now?.k ?? 1;
+    },
+    get symbol() {
+      return choice.value ? "U" : "u";
+    },
+    get text() {
+      return now?.text ?? "";
+    },
     changed: new Set(),
   };
 
@@ -49,7 +58,11 @@ export function interval(screen) {
       throw error;
     }
     const lacks = now.not_included.includes("calibration");
-    replace(says, lacks ? [badge(NOT_INCLUDED, "warn"), " "] : null, h("span", { title: `Not included: ${now.not_included.join("; ")}. ${now.distribution}.` }, now.text));
+    replace(
+      says,
+      lacks ? [badge(NOT_INCLUDED, "warn"), " "] : null,
+      h("span", { title: `Not included: ${now.not_included.join("; ")}. ${now.distribution}.` }, now.text),
+    );
     map.factor = now.k;
     map.lacking = lacks ? NOT_INCLUDED : "";
     if (now.k === before) return;
@@ -72,7 +85,7 @@ export function interval(screen) {
  * @param {number | null} sigma standard uncertainty
  * @param {string} unit
  * @param {number} factor
- * @param {number} [size] of the largest number beside it: they have one unit
+ * @param {number} [size] of the largest number in its group: they have one unit
  */
 export function withUncertainty(value, sigma, unit, factor, size = 0) {
   return uncertain(value, sigma === null ? null : factor * sigma, unit, size);
@@ -83,15 +96,28 @@ export function withUncertainty(value, sigma, unit, factor, size = 0) {
  * @param {Budget | null | undefined} budget
  * @param {string} unit
  * @param {number} scale from the budget's unit to the one shown
- * @param {string} lacking what is not included, empty: nothing
+ * @param {string} lacking the missing terms; empty: none
  */
 export function budgetTable(budget, unit, scale, lacking) {
   const parts = Object.entries(budget ?? {}).filter(([, part]) => part !== null);
   if (!parts.length) return lacking ? h("p.quiet", lacking) : null;
   const whole = parts.reduce((sum, [, part]) => sum + Number(part) ** 2, 0);
-  return h("table.budget", { "data-role": "budget" }, h("caption", "Budget of u (k = 1)", lacking ? `; ${lacking}` : ""),
-    h("tbody", parts.map(([cause, part]) => h("tr", h("th", { scope: "row" }, cause), h("td.numeric", amount(scale * Number(part), unit, 2)),
-      h("td.numeric", whole > 0 ? `${num((100 * Number(part) ** 2) / whole, 2)} %` : "–")))));
+  return h(
+    "table.budget",
+    { "data-role": "budget" },
+    h("caption", "Budget of u (k = 1)", lacking ? `; ${lacking}` : ""),
+    h(
+      "tbody",
+      parts.map(([cause, part]) =>
+        h(
+          "tr",
+          h("th", { scope: "row" }, cause),
+          h("td.numeric", amount(scale * Number(part), unit, 2)),
+          h("td.numeric", whole > 0 ? `${num((100 * Number(part) ** 2) / whole, 2)} %` : "–"),
+        ),
+      ),
+    ),
+  );
 }
 
 /**
@@ -102,9 +128,10 @@ export function budgetTable(budget, unit, scale, lacking) {
 export function withBudget(text, budget) {
   if (!budget) return text;
   budget.hidden = true;
-  const button = h("button.plain", { type: "button", "aria-expanded": "false", title: "Budget: what the uncertainty is made of", onclick: () => {
+  const button = h("button.plain", { type: "button", "aria-expanded": "false", title: "Budget: what the uncertainty is made of" }, text);
+  button.addEventListener("click", () => {
     budget.hidden = !budget.hidden;
     button.setAttribute("aria-expanded", String(!budget.hidden));
-  } }, text);
+  });
   return h("span", button, budget);
 }

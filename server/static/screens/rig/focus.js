@@ -1,4 +1,4 @@
-// The recent history of a camera's focus figure: its peak is kept, and how far the figure is from it is said.
+// The recent history of a camera's focus figure: its peak is kept, and the figure's distance from it is shown.
 import { chart } from "../../widgets/plots.js";
 import { h, replace, badge, num } from "../../lib/dom.js";
 
@@ -29,7 +29,7 @@ export function focusCourse(cam) {
   let drawing = false;
   const box = h("div");
   const reading = h("div.row.reading", { "data-role": "focus" });
-  const again = h("button", { type: "button", onclick: () => { peak = null; course = []; say(null); } }, "New peak");
+  const again = h("button", { type: "button", onclick: forget }, "New peak");
   const said = h("span");
   reading.append(said, again);
 
@@ -40,7 +40,17 @@ export function focusCourse(cam) {
       return;
     }
     const share = now / peak.value;
-    replace(said, badge(share >= AT_PEAK ? "at the peak" : `back to the peak: ${Math.round(100 * share)} %`, share >= AT_PEAK ? "good" : "warn"), ` now ${num(now, 3)}, peak ${num(peak.value, 3)}`);
+    replace(
+      said,
+      badge(share >= AT_PEAK ? "at the peak" : `back to the peak: ${Math.round(100 * share)} %`, share >= AT_PEAK ? "good" : "warn"),
+      ` now ${num(now, 3)}, peak ${num(peak.value, 3)}`,
+    );
+  }
+
+  function forget() {
+    peak = null;
+    course = [];
+    say(null);
   }
 
   /**
@@ -52,7 +62,7 @@ export function focusCourse(cam) {
     if (course.length > KEPT) course.shift();
     const now = steady(course);
     if (now !== null && (peak === null || now > peak.value)) peak = { at, value: now };
-    say(value === null ? null : now ?? value);
+    say(value === null ? null : (now ?? value));
     const times = course.map(([t]) => t);
     const top = peak?.value ?? null;
     /** @type {[number[], (number | null)[], (number | null)[]]} */
@@ -60,12 +70,23 @@ export function focusCourse(cam) {
     if (plot) return plot.set(data);
     if (drawing || !box.clientWidth || course.length < 2) return undefined;
     drawing = true;
-    plot = await chart(box, { files: false,
-      x: "time (s)", y: "focus", height: 150, series: [{ label: "focus" }, { label: "peak" }], data, label: `Recent history of the focus figure of ${cam}`,
+    plot = await chart(box, {
+      files: false,
+      x: "time (s)",
+      y: "focus",
+      height: 150,
+      series: [{ label: "focus" }, { label: "peak" }],
+      data,
+      label: `Recent history of the focus figure of ${cam}`,
       range: () => [0, HEADROOM * Math.max(peak?.value ?? 0, ...course.map(([, figure]) => figure ?? 0), 0.05)], // not its own noise
     });
     return undefined;
   }
   say(null);
-  return { root: h("div", reading, box), add, forget: () => { peak = null; course = []; say(null); }, close: () => plot?.close() };
+  return {
+    root: h("div", reading, box),
+    add,
+    forget,
+    close: () => plot?.close(),
+  };
 }

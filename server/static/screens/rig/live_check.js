@@ -11,8 +11,12 @@ const PAUSE_MS = 4000;
 const NONE_MS = 10000;
 /** @type {Record<Check["level"], [text: string, kind: string]>} */
 const LEVELS = {
-  ok: ["as calibrated", "good"], warning: ["cameras may have moved", "warn"], failed: ["cameras have moved", "bad"],
-  no_texture: ["not checked", ""], off_zero: ["cameras off their calibrated position", "bad"], busy: ["waiting", "busy"],
+  ok: ["as calibrated", "good"],
+  warning: ["cameras may have moved", "warn"],
+  failed: ["cameras have moved", "bad"],
+  no_texture: ["not checked", ""],
+  off_zero: ["cameras off their calibrated position", "bad"],
+  busy: ["waiting", "busy"],
 };
 
 /** @param {Ends} ends */
@@ -27,10 +31,15 @@ export function liveCheck(ends) {
   function draw(found) {
     const [text, kind] = LEVELS[found.level];
     const own = found.own_px === null ? "" : `, the calibration's own at most ${quantity(found.own_px, "px", 2)}`;
-    const words = found.offset_px === null ? `${found.text}.` : `Points lie ${quantity(found.offset_px, "px", 2)} off their epipolar lines${own}.`;
-    replace(shown, badge(text, kind), h("span", words), found.level === "off_zero" ? backToZero() : null,
+    const words = found.offset_px === null ? `${found.text}.` : `Points are ${quantity(found.offset_px, "px", 2)} off their epipolar lines${own}.`;
+    replace(
+      shown,
+      badge(text, kind),
+      h("span", words),
+      found.level === "off_zero" ? backToZero() : null,
       found.level === "failed" || found.level === "warning" ? h("a.button", { href: "#/calibrate" }, "Calibrate again") : null,
-      h("a", { href: `#/calibrate/${found.calibration_id}` }, "The calibration"));
+      h("a", { href: `#/calibrate/${found.calibration_id}` }, "The calibration"),
+    );
   }
 
   async function ask() {
@@ -45,7 +54,8 @@ export function liveCheck(ends) {
           if (found.level !== "busy" || level !== "busy") draw(found);
           level = found.level;
         } else {
-          if (level !== "none") replace(shown, badge("no calibration", "warn"), h("span", "None has been accepted yet."), h("a.button", { href: "#/calibrate" }, "Calibrate"));
+          if (level !== "none")
+            replace(shown, badge("no calibration", "warn"), h("span", "None has been accepted yet."), h("a.button", { href: "#/calibrate" }, "Calibrate"));
           level = "none";
           pause = NONE_MS;
         }
@@ -58,6 +68,9 @@ export function liveCheck(ends) {
     timer = setTimeout(ask, pause);
   }
   ask();
-  ends.push(() => { closed = true; clearTimeout(timer); });
+  ends.push(() => {
+    closed = true;
+    clearTimeout(timer);
+  });
   return h("section.panel.strip", { "aria-label": "Calibration check" }, h("h2", "Calibration"), shown);
 }

@@ -1,13 +1,13 @@
-// What the region editor holds, as it is kept with a test and as a recipe has it.
+// Content of the region editor, as it is stored with a test and in a recipe.
 /** @import { Model } from "#routes" */
 /** @import { RegionEditor } from "../../widgets/region_editor.js" */
 /** @import { Shape, Spot, State } from "../../widgets/region/shapes.js" */
 /** @typedef {Model<"Recipe">} Recipe */
 /** @typedef {{ rectangle?: [number, number, number, number] | null, polygon?: Spot[] | null, circle?: [number, number, number] | null }} Outline */
-/** @typedef {Outline & { outlines?: Outline[], holes?: Spot[][], cracks?: Spot[][], mask_png_base64?: string | null }} Region what a schema of alternatives leaves open */
+/** @typedef {Outline & { outlines?: Outline[], holes?: Spot[][], cracks?: Spot[][], mask_png_base64?: string | null }} Region the fields that a schema of alternatives leaves open */
 
 /**
- * Draw what was kept, or a recipe's region and seeds where the drawing was not kept; one step back undoes it.
+ * Draw the stored drawing, or without one a recipe's region and seeds; one step back undoes it.
  * @param {RegionEditor} editor
  * @param {Recipe} recipe
  */
@@ -40,7 +40,21 @@ function shapesOf({ region, settings }) {
  * @returns {Shape}
  */
 function shape({ rectangle, polygon, circle }) {
-  if (rectangle) return { form: "rectangle", points: [[rectangle[0], rectangle[1]], [rectangle[2], rectangle[3]]] };
-  if (circle) return { form: "circle", points: [[circle[0], circle[1]], [circle[0] + circle[2], circle[1]]] };
+  if (rectangle)
+    return {
+      form: "rectangle",
+      points: [
+        [rectangle[0], rectangle[1]],
+        [rectangle[2], rectangle[3]],
+      ],
+    };
+  if (circle)
+    return {
+      form: "circle",
+      points: [
+        [circle[0], circle[1]],
+        [circle[0] + circle[2], circle[1]],
+      ],
+    };
   return { form: "polygon", points: polygon ?? [] };
 }

@@ -1,4 +1,4 @@
-// Both cameras live beside the capture, with what would be wrong with a pair taken now, and the way back.
+// Both cameras live next to the capture, with the faults that a pair taken now would have, and the way back.
 import * as api from "../../lib/api.js";
 import * as events from "../../lib/events.js";
 import { wayBackNote } from "../../widgets/way_back.js";
@@ -25,7 +25,10 @@ export async function livePanel(ends) {
     const image = h("img", { alt: `Live view of ${cam}`, width, height, draggable: "false" });
     const trouble = h("p.quiet", { hidden: true }, "No picture: the cameras do not answer, or are in use.");
     const state = h("span.quiet", { "data-role": `live-${cam}` });
-    const start = () => { trouble.hidden = true; image.src = api.address(`/cameras/${cam}/stream.mjpg`, { rate_hz: RATE_HZ, t: Date.now() }); };
+    const start = () => {
+      trouble.hidden = true;
+      image.src = api.address(`/cameras/${cam}/stream.mjpg`, { rate_hz: RATE_HZ, t: Date.now() });
+    };
     const end = () => image.removeAttribute("src"); // ends the stream
     image.addEventListener("error", () => {
       if (!image.getAttribute("src")) return;
@@ -34,21 +37,31 @@ export async function livePanel(ends) {
     });
     return { cam, state, start, end, root: h("div", h("div.spread", h("h3", cam), state), image, trouble) };
   });
-  const box = h("details", { open: true, "data-role": "live" }, h("summary", "Live view"), h("div.grid.two.live", views.map((one) => one.root)));
+  const box = h(
+    "details",
+    { open: true, "data-role": "live" },
+    h("summary", "Live view"),
+    h(
+      "div.grid.two.live",
+      views.map((one) => one.root),
+    ),
+  );
 
   /** @type {number | undefined} */
   let timer;
   let closed = false;
   async function ask() {
     if (!document.hidden && box.open) {
-      await Promise.all(views.map(async ({ cam, state }) => {
-        try {
-          const { quality } = await api.get(`/cameras/${cam}/stats`);
-          if (!closed) replace(state, badge(quality.code, STATE_KIND[quality.code] ?? "warn"), ` focus ${num(quality.focus, 3)}`);
-        } catch {
-          if (!closed) replace(state, "no figures");
-        }
-      }));
+      await Promise.all(
+        views.map(async ({ cam, state }) => {
+          try {
+            const { quality } = await api.get(`/cameras/${cam}/stats`);
+            if (!closed) replace(state, badge(quality.code, STATE_KIND[quality.code] ?? "warn"), ` focus ${num(quality.focus, 3)}`);
+          } catch {
+            if (!closed) replace(state, "no figures");
+          }
+        }),
+      );
     }
     if (!closed) timer = setTimeout(ask, ASK_MS);
   }
@@ -56,19 +69,36 @@ export async function livePanel(ends) {
   box.addEventListener("toggle", begin);
   ask();
   note.update();
-  ends.push(() => { closed = true; clearTimeout(timer); views.forEach((one) => one.end()); },
+  ends.push(
+    () => {
+      closed = true;
+      clearTimeout(timer);
+      views.forEach((one) => one.end());
+    },
     events.on("job", (job) => !["queued", "running", "cancelling"].includes(job.state) && note.update()),
-    events.on("stage", () => { note.update(); }), events.on("scene", begin));
+    events.on("stage", () => {
+      note.update();
+    }),
+    events.on("scene", begin),
+  );
   const load = h("div");
-  const drawLoad = (/** @type {Model<"RigReply">} */ now) => { if (!load.contains(document.activeElement)) replace(load, now.sim && now.scene ? loadOf(now.scene) : null); };
+  const drawLoad = (/** @type {Model<"RigReply">} */ now) => {
+    if (!load.contains(document.activeElement)) replace(load, now.sim && now.scene ? loadOf(now.scene) : null);
+  };
   drawLoad(rig);
-  ends.push(events.on("scene", async () => { const now = await api.get("/rig").catch(() => null); if (now && !closed) drawLoad(now); }));
+  ends.push(
+    events.on("scene", async () => {
+      const now = await api.get("/rig").catch(() => null);
+      if (now && !closed) drawLoad(now);
+    }),
+  );
   return { root: h("div", note.root, box, load), look: note.update };
 }
 
 /** @param {Model<"SceneReply">} scene of a simulated rig */
 function loadOf({ scene, load: now }) {
-  if (!LOADED.includes(scene)) return h("p.quiet", "The simulated scene has no load. Choose another one on the ", h("a", { href: "#/rig" }, "rig's screen"), ".");
+  if (!LOADED.includes(scene))
+    return h("p.quiet", "The simulated scene has no load. Choose another one on the ", h("a", { href: "#/rig" }, "rig's screen"), ".");
   const load = number(now, { "aria-label": "Simulated load" });
   const right = rule(load, numberWithin({ what: "A load" }));
   const put = action("Apply", async () => {

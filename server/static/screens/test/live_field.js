@@ -8,7 +8,11 @@ import { Scale } from "../../widgets/scale.js";
 import { View } from "../../widgets/view.js";
 
 const RATE_HZ = 10;
-const COMPONENTS = /** @type {const} */ ([["u_mm", "U"], ["v_mm", "V"], ["w_mm", "W"]]);
+const COMPONENTS = /** @type {const} */ ([
+  ["u_mm", "U"],
+  ["v_mm", "V"],
+  ["w_mm", "W"],
+]);
 const MOST_POINTS = 1000;
 const LEAST_SPACING_PX = 10;
 const ROOM = 0.1; // of the range, beyond the values, so that limits stay from picture to picture
@@ -16,7 +20,7 @@ const ROOM = 0.1; // of the range, beyond the values, so that limits stay from p
 /** @typedef {{ number: number, x_px: number[], y_px: number[] } & Record<"u_mm" | "v_mm" | "w_mm", (number | null)[][]>} Picture */
 
 /**
- * Region and spacing of a coarse field: what is drawn for the test, or the middle of the image.
+ * Region and spacing of a coarse field: the test's drawing, or the middle of the image.
  * @param {any} drawn region of the workspace
  * @param {number[]} size of the image, px
  */
@@ -47,7 +51,10 @@ export function liveField(testId) {
   view.canvas.style.opacity = "0.8";
   const scale = new Scale(() => {}, false);
   scale.legend.style.marginTop = "0.6rem";
-  const component = select(COMPONENTS.map(([key, text]) => [key, text]), "w_mm");
+  const component = select(
+    COMPONENTS.map(([key, text]) => [key, text]),
+    "w_mm",
+  );
   const root = h("div", { hidden: true }, h("div.row", field("Displacement", component)), scale.legend, view.root);
 
   /**
@@ -66,7 +73,9 @@ export function liveField(testId) {
     const [cols, count] = [picture.x_px.length, picture.x_px.length * picture.y_px.length];
     values = Float64Array.from(rows.flat(), (value) => value ?? NaN);
     grid ??= new Grid({
-      rows: picture.y_px.length, cols, status: new Uint8Array(count),
+      rows: picture.y_px.length,
+      cols,
+      status: new Uint8Array(count),
       x: Float64Array.from({ length: count }, (_, i) => picture.x_px[i % cols]),
       y: Float64Array.from({ length: count }, (_, i) => picture.y_px[Math.floor(i / cols)]),
     });
@@ -104,5 +113,12 @@ export function liveField(testId) {
     view.show(api.address(`/tests/${testId}/steps/${step}/cam1/preview`));
     listen();
   }
-  return { root, follow, close: () => { source?.close(); view.close(); } };
+  return {
+    root,
+    follow,
+    close: () => {
+      source?.close();
+      view.close();
+    },
+  };
 }

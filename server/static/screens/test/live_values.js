@@ -16,7 +16,7 @@ const CHANNELS_MS = 1000;
 const SHOWN = { extensometer: "strain", area: "eyy", point: "w_mm" };
 const UNITS = { extensometer: "1", area: "1", point: "mm" };
 const KINDS = /** @type {const} */ (["extensometer", "area", "point"]);
-/** Strain is told in µm/m. @param {string} unit */
+/** Strain is shown in µm/m. @param {string} unit */
 const plain = (unit) => (unit === "1" ? { unit: "µm/m", factor: 1e6 } : { unit, factor: 1 });
 /** @param {{ value: number, u: number | null, units: string }} number */
 const inUnits = ({ value, u, units }) => {
@@ -31,7 +31,7 @@ const WORDS = { extensometer: "extensometers: strain", area: "areas: εyy", poin
  * @returns {Body<"post", "/tests/{test_id}/live">}
  */
 export function liveGauges(drawn) {
-  // of a union of forms: what is left out is an empty list
+  // of a union of forms: a list left out is an empty one
   const gauges = /** @type {any} */ (drawn.gauges);
   /** @type {any} */
   const found = { points: [], extensometers: [], areas: [] };
@@ -45,11 +45,129 @@ export function liveGauges(drawn) {
 }
 
 /**
- * A vertical extensometer over the middle third of camera 1's image, where none is drawn.
+ * A vertical extensometer over the middle third of camera 1's image, if none is drawn.
  * @param {number[]} size
  * @returns {Body<"post", "/tests/{test_id}/live">}
  */
-const middle = ([width, height]) => ({ extensometers: [{ name: "e1", a_px: [Math.round(width / 2), Math.round(height / 3)], b_px: [Math.round(width / 2), Math.round((2 * height) / 3)] }] });
+const middle = ([width, height]) => ({
+  extensometers: [{ name: "e1", a_px: [Math.round(width / 2), Math.round(height / 3)], b_px: [Math.round(width / 2), Math.round((2 * height) / 3)] }],
+});
+
+/**
+ * Curves of the gauges against time or a channel.
+ * @param {string} testId
+ */
+function liveCurves(testId) {
+  const root = h("div", { "data-role": "live-curves" });
+  const kind = select(
+    KINDS.map((name) => [name, WORDS[name]]),
+    "extensometer",
+  );
+  const against = select([["time", "time (s)"]], "time");
+  /** @type {{ number: number, time_s: number, values: Record<string, Record<string, number>> }[]} */
+  let moments = [];
+  /** @type {Map<number, Record<string, number>>} channels at the exposure, by frame */
+  const channels = new Map();
+  /** @type {Values["gauges"]} */
+  let gauges = {};
+  /** @type {Awaited<ReturnType<typeof chart>> | null} */
+  let plot = null;
+  let plotted = "";
+  let drawing = false;
+  let asking = 0;
+
+  async function askChannels() {
+    const known = Object.keys((await api.get(`/tests/${testId}/live`)).channels);
+    if (known.length + 1 !== against.options.length) {
+      const chosen = against.value;
+      replace(
+        against,
+        ["time", ...known].map((name) => h("option", { value: name, selected: name === chosen }, name === "time" ? "time (s)" : name)),
+      );
+    }
+    if (against.value === "time") return;
+    // the last ones again: readings come after the frames that they belong to
+    const { frames } = await api.get(`/tests/${testId}/live/history`, { after: Math.max(0, (moments.at(-1)?.number ?? 0) - 500), limit: 1000 });
+    for (const frame of frames) channels.set(frame.number, frame.channels);
+  }
+
+  async function drawCurves() {
+    drawing = true;
+    try {
+      const wanted = /** @type {keyof typeof SHOWN} */ (kind.value);
+      const names = Object.entries(gauges)
+        .filter(([, gauge]) => gauge.kind === wanted)
+        .map(([name]) => name);
+      if (!names.length || !moments.length) return;
+      const zero = moments[0].time_s;
+      const at = against.value;
+      const points = moments
+        .flatMap((moment) => {
+          const x = at === "time" ? moment.time_s - zero : channels.get(moment.number)?.[at];
+          return x === undefined ? [] : [{ x, moment }];
+        })
+        .toSorted((a, b) => a.x - b.x);
+      const base = plain(UNITS[wanted]);
+      const to = shown(base.unit);
+      const scaled = (/** @type {number | undefined} */ value) => (value === undefined ? null : value * base.factor * to.factor);
+      const data = /** @type {any} */ ([
+        points.map((one) => one.x),
+        ...names.map((name) => points.map(({ moment }) => scaled(moment.values[name]?.[SHOWN[wanted]]))),
+      ]);
+      const key = JSON.stringify([wanted, names, at, to.unit]);
+      if (key === plotted && plot) {
+        plot.set(data);
+        return;
+      }
+      plot?.close();
+      plot = await chart(root, {
+        x: at === "time" ? "time (s)" : at,
+        y: `${WORDS[wanted].split(": ")[1]} (${to.unit})`,
+        height: 260,
+        data,
+        series: names.map((name) => ({ label: name })),
+        label: "Live curves of the gauges",
+      });
+      plotted = key;
+    } finally {
+      drawing = false;
+    }
+  }
+  kind.addEventListener("change", () => drawCurves().catch(notify));
+  against.addEventListener("change", () => askChannels().then(drawCurves).catch(notify));
+  return {
+    root,
+    controls: [field("Show", kind), field("Against", against)],
+    begin() {
+      moments = [];
+      channels.clear();
+      asking = window.setInterval(() => askChannels().catch(() => {}), CHANNELS_MS);
+    },
+    stop: () => clearInterval(asking),
+    /** @param {Values} now */
+    add(now) {
+      if (now.valid && typeof now.time_s === "number" && now.number > (moments.at(-1)?.number ?? 0)) {
+        moments.push({
+          number: now.number,
+          time_s: now.time_s,
+          values: Object.fromEntries(
+            Object.entries(now.gauges).map(([name, gauge]) => [
+              name,
+              Object.fromEntries(Object.entries(gauge.values).map(([quantity, number]) => [quantity, number.value])),
+            ]),
+          ),
+        });
+        if (moments.length > KEPT) channels.delete(/** @type {{ number: number }} */ (moments.shift()).number);
+      }
+    },
+    /** @param {Values["gauges"]} now */
+    draw(now) {
+      gauges = now;
+      if (!drawing) drawCurves().catch(notify);
+    },
+    close: () => plot?.close(),
+  };
+}
 
 /**
  * @param {string} testId
@@ -59,28 +177,17 @@ export async function liveValuesPanel(testId, ends) {
   const state = h("span", { role: "status", "data-role": "live-state" });
   const said = h("div");
   const values = h("div", { "data-role": "live-values" });
-  const curves = h("div", { "data-role": "live-curves" });
-  const kind = select(KINDS.map((name) => [name, WORDS[name]]), "extensometer");
-  const against = select([["time", "time (s)"]], "time");
   const start = action("Measure live", begin, { kind: "primary" });
   const stop = action("Stop", end);
   const withField = h("input", { type: "checkbox" });
   const withFieldLabel = h("label.check", withField, "with a coarse field");
   const picture = liveField(testId);
-  /** @type {{ number: number, time_s: number, values: Record<string, Record<string, number>> }[]} */
-  let moments = [];
-  /** @type {Map<number, Record<string, number>>} channels at the exposure, by frame */
-  const channels = new Map();
+  const curves = liveCurves(testId);
   /** @type {EventSource | null} */
   let source = null;
   /** @type {Values | null} */
   let newest = null;
-  /** @type {Awaited<ReturnType<typeof chart>> | null} */
-  let plot = null;
-  let plotted = "";
-  let drawing = false;
   let later = 0;
-  let asking = 0;
 
   async function begin() {
     const drawn = await api.get(`/tests/${testId}/workspace`);
@@ -102,7 +209,7 @@ export async function liveValuesPanel(testId, ends) {
     stop.hidden = !on;
     withFieldLabel.hidden = on;
     const asked = /** @type {{ field?: boolean, reference?: number }} */ (live.settings);
-    picture.follow(on && asked.field ? asked.reference ?? 0 : null);
+    picture.follow(on && asked.field ? (asked.reference ?? 0) : null);
     replace(said, live.problem ? problemText(live.problem) : null);
     newest = live.values;
     if (on && !source) follow();
@@ -112,38 +219,25 @@ export async function liveValuesPanel(testId, ends) {
   function close() {
     source?.close();
     source = null;
-    clearInterval(asking);
+    curves.stop();
     clearTimeout(later); // a value that came before the end must not draw over it
     later = 0;
   }
   function follow() {
-    moments = [];
-    channels.clear();
+    curves.begin();
     source = new EventSource(api.address(`/tests/${testId}/live/events`));
     source.addEventListener("values", (event) => {
       /** @type {Values} */
       const now = JSON.parse(event.data);
       newest = now;
-      if (now.valid && typeof now.time_s === "number" && now.number > (moments.at(-1)?.number ?? 0)) {
-        moments.push({ number: now.number, time_s: now.time_s, values: Object.fromEntries(Object.entries(now.gauges).map(([name, gauge]) =>
-          [name, Object.fromEntries(Object.entries(gauge.values).map(([quantity, number]) => [quantity, number.value]))])) });
-        if (moments.length > KEPT) channels.delete(/** @type {{ number: number }} */ (moments.shift()).number);
-      }
-      if (!later) later = window.setTimeout(() => { later = 0; draw(now.valid ? "running" : now.reason); }, DRAW_MS);
+      curves.add(now);
+      if (!later)
+        later = window.setTimeout(() => {
+          later = 0;
+          draw(now.valid ? "running" : now.reason);
+        }, DRAW_MS);
     });
     source.addEventListener("error", () => look().catch(() => {})); // it ended, or the service did
-    asking = window.setInterval(() => askChannels().catch(() => {}), CHANNELS_MS);
-  }
-  async function askChannels() {
-    const known = Object.keys((await api.get(`/tests/${testId}/live`)).channels);
-    if (known.length + 1 !== against.options.length) {
-      const chosen = against.value;
-      replace(against, ["time", ...known].map((name) => h("option", { value: name, selected: name === chosen }, name === "time" ? "time (s)" : name)));
-    }
-    if (against.value === "time") return;
-    // the last ones again: readings come after the frames that they belong to
-    const { frames } = await api.get(`/tests/${testId}/live/history`, { after: Math.max(0, (moments.at(-1)?.number ?? 0) - 500), limit: 1000 });
-    for (const frame of frames) channels.set(frame.number, frame.channels);
   }
   async function look() {
     try {
@@ -163,47 +257,39 @@ export async function liveValuesPanel(testId, ends) {
     const good = word === "running";
     replace(state, badge(good ? "live" : word, good ? "good" : word === "ended" ? "" : "warning"), newest?.number ? ` frame ${newest.number}` : "");
     const rows = Object.entries(newest?.gauges ?? {}).map(([name, gauge]) => ({ name, gauge, number: gauge.values[SHOWN[gauge.kind]] }));
-    replace(values, rows.length ? table([
-      ["Gauge", (row) => row.name], ["Quantity", (row) => WORDS[row.gauge.kind].split(": ")[1]],
-      ["Value", (row) => (row.number ? inUnits(row.number) : `not valid: ${row.gauge.reason}`)],
-    ], rows, { caption: "Newest values, ± standard uncertainty" }) : null);
-    if (!drawing) drawCurves().catch(notify);
+    replace(
+      values,
+      rows.length
+        ? table(
+            [
+              ["Gauge", (row) => row.name],
+              ["Quantity", (row) => WORDS[row.gauge.kind].split(": ")[1]],
+              ["Value", (row) => (row.number ? inUnits(row.number) : `not valid: ${row.gauge.reason}`)],
+            ],
+            rows,
+            { caption: "Newest values, ± standard uncertainty" },
+          )
+        : null,
+    );
+    curves.draw(newest?.gauges ?? {});
   }
-  async function drawCurves() {
-    drawing = true;
-    try {
-      const wanted = /** @type {keyof typeof SHOWN} */ (kind.value);
-      const names = Object.entries(newest?.gauges ?? {}).filter(([, gauge]) => gauge.kind === wanted).map(([name]) => name);
-      if (!names.length || !moments.length) return;
-      const zero = moments[0].time_s;
-      const at = against.value;
-      const points = moments.flatMap((moment) => {
-        const x = at === "time" ? moment.time_s - zero : channels.get(moment.number)?.[at];
-        return x === undefined ? [] : [{ x, moment }];
-      }).toSorted((a, b) => a.x - b.x);
-      const base = plain(UNITS[wanted]);
-      const to = shown(base.unit);
-      const scaled = (/** @type {number | undefined} */ value) => (value === undefined ? null : value * base.factor * to.factor);
-      const data = /** @type {any} */ ([points.map((one) => one.x), ...names.map((name) => points.map(({ moment }) => scaled(moment.values[name]?.[SHOWN[wanted]])))]);
-      const key = JSON.stringify([wanted, names, at, to.unit]);
-      if (key === plotted && plot) {
-        plot.set(data);
-        return;
-      }
-      plot?.close();
-      plot = await chart(curves, { x: at === "time" ? "time (s)" : at, y: `${WORDS[wanted].split(": ")[1]} (${to.unit})`, height: 260, data, series: names.map((name) => ({ label: name })), label: "Live curves of the gauges" });
-      plotted = key;
-    } finally {
-      drawing = false;
-    }
-  }
-  kind.addEventListener("change", () => drawCurves().catch(notify));
-  against.addEventListener("change", () => askChannels().then(drawCurves).catch(notify));
   // a test that is not measured live has nothing to be asked for
   if ((await api.get("/healthz")).live_test_id === testId) await look();
   else stop.hidden = true;
-  ends.push(() => { close(); clearTimeout(later); plot?.close(); picture.close(); });
-  return h("section.panel", { "aria-label": "Live values" }, h("div.spread", h("h2", "Live values"), state),
-    h("p.quiet", "Each frame is measured as it comes, and not stored; captures and analyses go on beside it."),
-    h("div.row", start, withFieldLabel, stop, field("Show", kind), field("Against", against)), said, values, curves, picture.root);
+  ends.push(() => {
+    close();
+    curves.close();
+    picture.close();
+  });
+  return h(
+    "section.panel",
+    { "aria-label": "Live values" },
+    h("div.spread", h("h2", "Live values"), state),
+    h("p.quiet", "Each frame is measured as it comes, and not stored; captures and analyses continue."),
+    h("div.row", start, withFieldLabel, stop, curves.controls),
+    said,
+    values,
+    curves.root,
+    picture.root,
+  );
 }

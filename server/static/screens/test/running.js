@@ -1,4 +1,4 @@
-// What is being measured of this test: a link at the head of its screen, one row an analysis where it was begun.
+// Running analyses of this test: a link at the head of its screen, one row an analysis at the place where it was begun.
 import * as api from "../../lib/api.js";
 import * as events from "../../lib/events.js";
 import { analysisJob, doing, ENDED } from "../../widgets/analysis_job.js";
@@ -7,6 +7,7 @@ import { h, replace, notify, problemText } from "../../lib/dom.js";
 
 /** @import { Ends } from "#dom" */
 /** @import { Job } from "../../widgets/analysis_job.js" */
+/** @typedef {ReturnType<typeof running>} Running */
 
 /**
  * @param {string} testId
@@ -20,8 +21,12 @@ export function running(testId, ends, done) {
   const known = new Map();
 
   function drawHead() {
-    replace(head, [...known.values()].filter(({ job }) => !ENDED.includes(job.state)).map(({ job, link }) =>
-      h("a.badge.busy", { href: link.getAttribute("href") ?? "" }, `measuring: ${doing(job)}`)));
+    replace(
+      head,
+      [...known.values()]
+        .filter(({ job }) => !ENDED.includes(job.state))
+        .map(({ job, link }) => h("a.badge.busy", { href: link.getAttribute("href") ?? "" }, `measuring: ${doing(job)}`)),
+    );
   }
 
   /**
@@ -32,7 +37,11 @@ export function running(testId, ends, done) {
    */
   function show(job, analysisId, follow) {
     if (known.has(job.id)) return;
-    for (const [id, one] of known) if (ENDED.includes(one.job.state)) { one.row.remove(); known.delete(id); }
+    for (const [id, one] of known)
+      if (ENDED.includes(one.job.state)) {
+        one.row.remove();
+        known.delete(id);
+      }
     const link = h("a.button", { href: `#/results/${testId}/${analysisId}` }, "Show results");
     const { root: bar, draw } = analysisJob({ testId, analysisId, jobId: job.id, follow });
     bar.append(link);
@@ -65,8 +74,15 @@ export function running(testId, ends, done) {
     await done();
   }
 
-  const ask = async () => { for (const job of (await api.get("/jobs", { limit: 100 })).jobs) await take(job); };
+  const ask = async () => {
+    for (const job of (await api.get("/jobs", { limit: 100 })).jobs) await take(job);
+  };
   ask().catch(notify);
-  ends.push(events.on("job", (job) => take(job).catch(notify)), events.on("open", () => { ask().catch(notify); }));
+  ends.push(
+    events.on("job", (job) => take(job).catch(notify)),
+    events.on("open", () => {
+      ask().catch(notify);
+    }),
+  );
   return { head, root, show };
 }

@@ -12,7 +12,7 @@ const LATER_MS = 300;
 const LEVEL = { good: "good", usable: "warn", poor: "bad" };
 
 /**
- * The rating, the switch of the map and its legend; `soon` rates anew once nothing has changed for a moment.
+ * The rating, the switch of the map and its legend; `soon` rates again once nothing has changed for a moment.
  * @param {string} id of the test
  * @param {View[]} views
  * @param {RegionEditor} editor
@@ -23,7 +23,11 @@ export function textureRating(id, views, editor, { reference, subset, spacing, n
   const rating = h("div", { role: "status", "data-role": "texture" });
   const showMap = h("input", { type: "checkbox" });
   const legend = h("span.quiet");
-  const overlays = views.map((view) => { const image = h("img", { alt: "", hidden: true }); view.content.insertBefore(image, view.svg); return image; });
+  const overlays = views.map((view) => {
+    const image = h("img", { alt: "", hidden: true });
+    view.content.insertBefore(image, view.svg);
+    return image;
+  });
 
   let asked = 0;
   async function rate() {
@@ -36,14 +40,39 @@ export function textureRating(id, views, editor, { reference, subset, spacing, n
       return;
     }
     try {
-      const rated = await api.post(`/tests/${id}/steps/${reference.value}/texture`, { region, subset_px: Number(subset.value), spacing_px: Number(spacing.value), noise_id: noise.value || null });
+      const rated = await api.post(`/tests/${id}/steps/${reference.value}/texture`, {
+        region,
+        subset_px: Number(subset.value),
+        spacing_px: Number(spacing.value),
+        noise_id: noise.value || null,
+      });
       if (mine !== asked) return;
       const proposed = rated.proposed_subset_px;
-      replace(rating,
-        h("p", badge(`${rated.level} speckle quality`, LEVEL[rated.level] ?? ""), ` ${num(100 * rated.good_share, 3)} % of ${count(rated.subsets)} subsets with an expected error below ${rated.good_px} px, ${num(100 * rated.usable_share, 3)} % below ${rated.usable_px} px; median ${quantity(rated.median_error_px, "px", 2)} at a noise of ${num(rated.noise_grey, 3)} grey levels.`),
-        proposed && proposed !== rated.subset_px ? h("p.row", `Min. subset for this texture: ${proposed} px. `, h("button", { type: "button", onclick: () => use(proposed) }, `Use ${proposed} px`)) : null,
+      replace(
+        rating,
+        h(
+          "p",
+          badge(`${rated.level} speckle quality`, LEVEL[rated.level] ?? ""),
+          ` ${num(100 * rated.good_share, 3)} % of ${count(rated.subsets)} subsets with an expected error below ${rated.good_px} px, ${num(100 * rated.usable_share, 3)} % below ${rated.usable_px} px; median ${quantity(rated.median_error_px, "px", 2)} at a noise of ${num(rated.noise_grey, 3)} grey levels.`,
+        ),
+        proposed && proposed !== rated.subset_px
+          ? h("p.row", `Min. subset for this texture: ${proposed} px. `, h("button", { type: "button", onclick: () => use(proposed) }, `Use ${proposed} px`))
+          : null,
         proposed ? null : h("p", "No subset up to 91 px is sufficient: the contrast is too low, or the speckles are too coarse."),
-        h("details", h("summary", "Other sizes"), table([["Subset", (row) => quantity(row.subset_px, "px"), { numeric: true }], [`below ${rated.good_px} px`, (row) => quantity(100 * row.good_share, "%", 3), { numeric: true }], [`below ${rated.usable_px} px`, (row) => quantity(100 * row.usable_share, "%", 3), { numeric: true }]], rated.sizes, { caption: "Share of the region's subsets with an expected random error" })));
+        h(
+          "details",
+          h("summary", "Other sizes"),
+          table(
+            [
+              ["Subset", (row) => quantity(row.subset_px, "px"), { numeric: true }],
+              [`below ${rated.good_px} px`, (row) => quantity(100 * row.good_share, "%", 3), { numeric: true }],
+              [`below ${rated.usable_px} px`, (row) => quantity(100 * row.usable_share, "%", 3), { numeric: true }],
+            ],
+            rated.sizes,
+            { caption: "Share of the region's subsets with an expected random error" },
+          ),
+        ),
+      );
     } catch (error) {
       if (mine === asked) replace(rating, problemText(error));
     }
@@ -52,13 +81,19 @@ export function textureRating(id, views, editor, { reference, subset, spacing, n
   /** @type {string[]} */
   let shownMaps = [];
   async function layMap() {
-    overlays.forEach((image) => { image.hidden = !showMap.checked; });
+    overlays.forEach((image) => {
+      image.hidden = !showMap.checked;
+    });
     legend.textContent = "";
     if (!showMap.checked || !correct(subset)) return;
-    const answers = await Promise.all(views.map((_, k) => api.raw(`/tests/${id}/steps/${reference.value}/cam${k + 1}/maps/texture`, { subset_px: Number(subset.value) })));
+    const answers = await Promise.all(
+      views.map((_, k) => api.raw(`/tests/${id}/steps/${reference.value}/cam${k + 1}/maps/texture`, { subset_px: Number(subset.value) })),
+    );
     legend.textContent = answers[0].headers.get("X-Legend") ?? "";
     const fresh = await Promise.all(answers.map(async (answer) => URL.createObjectURL(await answer.blob())));
-    overlays.forEach((image, k) => { image.src = fresh[k]; });
+    overlays.forEach((image, k) => {
+      image.src = fresh[k];
+    });
     shownMaps.forEach((url) => URL.revokeObjectURL(url));
     shownMaps = fresh;
   }
@@ -70,7 +105,10 @@ export function textureRating(id, views, editor, { reference, subset, spacing, n
   ends.push(() => clearTimeout(timer));
   function soon() {
     clearTimeout(timer);
-    timer = setTimeout(() => { rate(); if (showMap.checked) layMap().catch(notify); }, LATER_MS);
+    timer = setTimeout(() => {
+      rate();
+      if (showMap.checked) layMap().catch(notify);
+    }, LATER_MS);
   }
   return { rating, showMap, legend, soon };
 }

@@ -2,7 +2,7 @@
 import { num } from "../../lib/dom.js";
 
 /**
- * Width of the virtual gauge, px: from the outer edge of the first subset to that of the last.
+ * Width of the virtual gauge, px: from the outer edge of the first subset to the last one's.
  * @param {number} window points across
  * @param {number} spacing px
  * @param {number} subset px
@@ -10,7 +10,7 @@ import { num } from "../../lib/dom.js";
 export const gaugePx = (window, spacing, subset) => (window - 1) * spacing + subset;
 
 /**
- * What is said of the gauge, and whether it is a warning.
+ * Text about the gauge, and true if it is a warning.
  * @param {number} px its width
  * @param {number | null} mmPerPx scale of camera 1's image at the surface, or null
  * @param {number | null} regionPx shorter side of the box about the region, or null

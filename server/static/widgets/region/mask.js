@@ -55,7 +55,7 @@ export class Mask {
     const image = new Image();
     image.src = `data:image/png;base64,${png}`;
     await image.decode();
-    if (this.shown !== png) return false; // another one came meanwhile
+    if (this.shown !== png) return false; // another one came since
     this.#draw(image, size);
     this.#measure();
     return true;
@@ -86,20 +86,21 @@ export class Mask {
     const data = pen(this.canvas).getImageData(0, 0, width, height);
     let [x0, y0, x1, y1] = [width, height, -1, -1];
     this.white = 0;
-    for (let y = 0; y < height; y += 1) for (let x = 0; x < width; x += 1) {
-      if (data.data[4 * (y * width + x) + 3] <= 127) continue;
-      this.white += 1;
-      x0 = Math.min(x0, x);
-      x1 = Math.max(x1, x);
-      y0 = Math.min(y0, y);
-      y1 = Math.max(y1, y);
-    }
+    for (let y = 0; y < height; y += 1)
+      for (let x = 0; x < width; x += 1) {
+        if (data.data[4 * (y * width + x) + 3] <= 127) continue;
+        this.white += 1;
+        x0 = Math.min(x0, x);
+        x1 = Math.max(x1, x);
+        y0 = Math.min(y0, y);
+        y1 = Math.max(y1, y);
+      }
     this.box = this.white ? [x0, y0, x1, y1] : null;
     return data;
   }
 
   /**
-   * Begin to paint: what is drawn as outlines becomes white.
+   * Begin to paint: the drawn outlines become white.
    * @param {State} state
    * @param {{ width: number, height: number }} size
    * @param {boolean} [holes] whether holes become black too
@@ -144,7 +145,7 @@ export class Mask {
   }
 
   /**
-   * Keep what is painted.
+   * Keep the painting.
    * @returns {string | null} PNG in base64, white on black; null if nothing is white
    */
   kept() {
@@ -167,9 +168,10 @@ export class Mask {
   async read(file, size) {
     const image = await createImageBitmap(file).catch(() => null);
     if (!image) return `${file.name} is no picture that can be read: give a PNG.`;
-    if (image.width !== size.width || image.height !== size.height) return `The mask is ${image.width} x ${image.height} px, camera 1's image ${size.width} x ${size.height} px: draw it over camera 1's reference image.`;
+    if (image.width !== size.width || image.height !== size.height)
+      return `The mask is ${image.width} x ${image.height} px, camera 1's image ${size.width} x ${size.height} px: draw it over camera 1's reference image.`;
     this.#draw(image, size);
-    return this.#measure() && this.white ? "" : `${file.name} has no white: paint white where points may lie.`;
+    return this.#measure() && this.white ? "" : `${file.name} has no white: paint white where points are allowed.`;
   }
 }
 

@@ -12,14 +12,19 @@ export class Painting {
     this.brush = 20;
     this.size = number(this.brush, { min: 1, max: 1000, step: 1 });
     this.size.addEventListener("change", () => this.setBrush(Number(this.size.value)));
-    this.file = h("input", { type: "file", accept: "image/png,.png", title: "PNG of camera 1's size, white where points may lie" });
+    this.file = h("input", { type: "file", accept: "image/png,.png", title: "PNG of camera 1's size, white where points are allowed" });
     this.file.addEventListener("change", () => this.#load());
     this.trouble = h("p.problem", { role: "alert", hidden: true });
     this.controls = [
       field("Brush", this.size, "px"),
-      h("button", { type: "button", title: "Points lie where they did not, and the other way round; the region becomes a mask", onclick: () => this.invert() }, "Invert"),
+      h(
+        "button",
+        { type: "button", title: "Points are placed where there were none, and the other way round; the region becomes a mask", onclick: () => this.invert() },
+        "Invert",
+      ),
       field("Mask file", this.file),
-      h("button", { type: "button", title: "The whole region as a PNG, also for stereorig measure --mask", onclick: () => this.#save() }, "Save the mask"), this.trouble,
+      h("button", { type: "button", title: "The whole region as a PNG, also for stereorig measure --mask", onclick: () => this.#save() }, "Save the mask"),
+      this.trouble,
     ];
   }
 
@@ -40,7 +45,7 @@ export class Painting {
     return this.editor.tool === "eraser";
   }
 
-  /** Begin to paint; false where there is nothing to be erased. */
+  /** Begin to paint; false if there is nothing to erase. */
   begin() {
     if (this.erases && this.editor.region() === null) {
       this.editor.hint.textContent = "There is nothing to erase yet: draw or paint a region first.";
@@ -58,7 +63,7 @@ export class Painting {
     this.mask.stroke(from, to, this.brush, this.erases);
   }
 
-  /** Keep what was painted, in place of the outlines that it began with. */
+  /** Keep the painting, in place of the outlines that it began with. */
   end(more = {}) {
     const mask = this.mask.kept();
     this.editor.change((state) => Object.assign(state, { mask, outlines: [] }, more));

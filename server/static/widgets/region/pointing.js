@@ -4,7 +4,7 @@ import { distance, MIN_POINTS, trouble } from "./shapes.js";
 /** @import { RegionEditor } from "../region_editor.js" */
 /** @import { Spot } from "./shapes.js" */
 
-/** Tools that draw from where the button goes down to where it comes up. */
+/** Tools that draw from the button's press to its release. */
 const DRAGGED = ["rectangle", "circle"];
 const PAINTED = ["brush", "eraser"];
 
@@ -68,7 +68,11 @@ function finish(editor, dragged = false) {
   }
   const three = kind === "three";
   const shape = kind === "polygon" ? { form: kind, points } : three && points.length < 3 ? null : editor.draftShape;
-  const wrong = shape ? trouble(shape) : three && points.length === 3 ? "The three points lie on one line: no circle goes through them." : "Three points are needed.";
+  const wrong = shape
+    ? trouble(shape)
+    : three && points.length === 3
+      ? "The three points are on one line: no circle goes through them."
+      : "Three points are needed.";
   if (dragged || !wrong || (three && points.length === 3)) editor.draft = null;
   if (shape && !wrong) editor.put(shape);
   else {
@@ -85,7 +89,8 @@ function finish(editor, dragged = false) {
 function pickSeed(editor, spot, byKey) {
   editor.change((state) => state.seeds.push({ one: spot, two: null }));
   if (!byKey) return;
-  editor.hint.textContent = "Now the same point in camera 2: the focus is there. Arrow keys begin on its line; with Escape its position is found automatically.";
+  editor.hint.textContent =
+    "Now the same point in camera 2: the focus is there. Arrow keys begin on its line; with Escape its position is found automatically.";
   editor.two.setAim(null);
   editor.two.frame.focus();
 }
@@ -103,7 +108,9 @@ export function pickInTwo(editor, x, y, event) {
     editor.hint.textContent = "Click the point in camera 1 first.";
     return;
   }
-  editor.change((state) => { state.seeds[open].two = editor.inside([x, y], editor.two); });
+  editor.change((state) => {
+    state.seeds[open].two = editor.inside([x, y], editor.two);
+  });
   if (event.type === "keydown") {
     editor.two.setAim(null);
     editor.one.frame.focus();
@@ -129,50 +136,63 @@ export function listen(editor) {
     editor.draft = null;
     editor.draw();
   };
-  frame.addEventListener("pointerdown", (event) => {
-    const painted = PAINTED.includes(editor.tool);
-    if (!(painted || DRAGGED.includes(editor.tool)) || event.button !== 0 || onGrab(event) || !one.width) return;
-    if (held) { // a second finger: both move and zoom the picture, nothing is drawn
-      one.hold(held.id, held.at);
-      return drop();
-    }
-    event.stopImmediatePropagation();
-    event.preventDefault();
-    frame.focus();
-    frame.setPointerCapture(event.pointerId);
-    held = { id: event.pointerId, points: [spotOf(event)], at: [event.clientX, event.clientY] };
-    const [from] = held.points;
-    if (!painted) editor.draft = { kind: editor.tool === "circle" ? "circle" : "rectangle", points: [from, from] };
-    else if (!editor.painting.begin()) held = null;
-    else editor.painting.strokeTo(from, from);
-    return undefined;
-  }, true);
-  frame.addEventListener("pointermove", (event) => {
-    if (!held) {
-      if (event.pointerType === "touch" || one.aim || !(PAINTED.includes(editor.tool) || editor.draft)) return;
-      editor.tip = spotOf(event);
+  frame.addEventListener(
+    "pointerdown",
+    (event) => {
+      const painted = PAINTED.includes(editor.tool);
+      if (!(painted || DRAGGED.includes(editor.tool)) || event.button !== 0 || onGrab(event) || !one.width) return;
+      if (held) {
+        // a second finger: both move and zoom the picture, nothing is drawn
+        one.hold(held.id, held.at);
+        return drop();
+      }
+      event.stopImmediatePropagation();
+      event.preventDefault();
+      frame.focus();
+      frame.setPointerCapture(event.pointerId);
+      held = { id: event.pointerId, points: [spotOf(event)], at: [event.clientX, event.clientY] };
+      const [from] = held.points;
+      if (!painted) editor.draft = { kind: editor.tool === "circle" ? "circle" : "rectangle", points: [from, from] };
+      else if (!editor.painting.begin()) held = null;
+      else editor.painting.strokeTo(from, from);
+      return undefined;
+    },
+    true,
+  );
+  frame.addEventListener(
+    "pointermove",
+    (event) => {
+      if (!held) {
+        if (event.pointerType === "touch" || one.aim || !(PAINTED.includes(editor.tool) || editor.draft)) return;
+        editor.tip = spotOf(event);
+        editor.draw();
+        return;
+      }
+      if (event.pointerId !== held.id) return;
+      const spot = spotOf(event);
+      held.at = [event.clientX, event.clientY];
+      if (editor.draft) editor.draft.points[1] = spot;
+      else editor.painting.strokeTo(held.points[held.points.length - 1], spot);
+      held.points.push(spot);
+      editor.tip = PAINTED.includes(editor.tool) ? spot : null;
       editor.draw();
-      return;
-    }
-    if (event.pointerId !== held.id) return;
-    const spot = spotOf(event);
-    held.at = [event.clientX, event.clientY];
-    if (editor.draft) editor.draft.points[1] = spot;
-    else editor.painting.strokeTo(held.points[held.points.length - 1], spot);
-    held.points.push(spot);
-    editor.tip = PAINTED.includes(editor.tool) ? spot : null;
-    editor.draw();
-  }, true);
-  frame.addEventListener("pointerup", (event) => {
-    if (!held || event.pointerId !== held.id) return;
-    held = null;
-    if (!editor.draft) {
-      editor.painting.end();
-      return;
-    }
-    editor.draft.points[1] = spotOf(event);
-    finish(editor, true);
-  }, true);
+    },
+    true,
+  );
+  frame.addEventListener(
+    "pointerup",
+    (event) => {
+      if (!held || event.pointerId !== held.id) return;
+      held = null;
+      if (!editor.draft) {
+        editor.painting.end();
+        return;
+      }
+      editor.draft.points[1] = spotOf(event);
+      finish(editor, true);
+    },
+    true,
+  );
   frame.addEventListener("pointercancel", drop);
   frame.addEventListener("pointerleave", () => {
     if (held || one.aim || !editor.tip) return;
@@ -202,7 +222,8 @@ function key(editor, event) {
   } else if (event.key === "Escape" && draft && !editor.one.aim) {
     editor.draft = null;
     editor.draw();
-  } else if ((event.key === "[" || event.key === "]") && PAINTED.includes(editor.tool)) editor.painting.setBrush(editor.painting.brush * (event.key === "[" ? 0.8 : 1.25));
+  } else if ((event.key === "[" || event.key === "]") && PAINTED.includes(editor.tool))
+    editor.painting.setBrush(editor.painting.brush * (event.key === "[" ? 0.8 : 1.25));
   else return;
   event.preventDefault();
   event.stopPropagation();

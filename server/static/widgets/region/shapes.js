@@ -1,4 +1,4 @@
-// Shapes of a region as numbers: what is drawn, its corners, and what it is for the API. Nothing of the screen.
+// Shapes of a region as numbers: the drawing, its corners, and its form for the API. Nothing of the screen.
 //
 // Everything is kept in camera 1's pixels, the first pixel's centre at (0, 0), to a tenth of a pixel.
 
@@ -8,7 +8,7 @@
 /** @typedef {{ form: Form, points: Spot[] }} Shape a rectangle by two opposite corners, a circle by its centre and a point on it */
 /** @typedef {{ one: Spot, two: Spot | null }} Seed */
 /**
- * What is drawn: plain JSON, so that it can be kept and put back.
+ * The drawing: plain JSON, so that it can be kept and put back.
  * @typedef {{ outlines: Shape[], holes: Shape[], cracks: Spot[][], seeds: Seed[], mask: string | null }} State `mask`: a PNG in base64
  */
 
@@ -45,7 +45,7 @@ export function corners(shape) {
 }
 
 /**
- * The circle through three points, or null if they lie on one line.
+ * The circle through three points, or null if they are on one line.
  * @param {Spot[]} points
  * @returns {Shape | null}
  */
@@ -88,10 +88,11 @@ function outline(shape) {
  * @param {Spot[]} points
  * @param {{ width: number, height: number }} size
  */
-const inImage = (points, { width, height }) => points.map(([x, y]) => /** @type {Spot} */ ([Math.min(Math.max(x, 0), width - 1), Math.min(Math.max(y, 0), height - 1)]));
+const inImage = (points, { width, height }) =>
+  points.map(([x, y]) => /** @type {Spot} */ ([Math.min(Math.max(x, 0), width - 1), Math.min(Math.max(y, 0), height - 1)]));
 
 /**
- * The region as the API takes it; null where nothing is drawn that points may lie in.
+ * The region as the API takes it; null if the drawing has no area for points.
  * @param {State} state
  * @param {{ width: number, height: number }} image camera 1's; without a size while it is on its way: nothing is cut at a border that is not known
  * @returns {Model<"Region"> | null}
@@ -101,7 +102,10 @@ export function regionOf(state, image) {
   const cuts = { holes: state.holes.map((hole) => inImage(corners(hole), size)), cracks: state.cracks };
   if (state.mask !== null) return { mask_png_base64: state.mask, ...cuts };
   // a circle that reaches over the image's border ends there
-  const whole = (/** @type {Shape} */ shape) => { const [x0, y0, x1, y1] = box([shape]) ?? [0, 0, 0, 0]; return x0 >= 0 && y0 >= 0 && x1 <= size.width - 1 && y1 <= size.height - 1; };
+  const whole = (/** @type {Shape} */ shape) => {
+    const [x0, y0, x1, y1] = box([shape]) ?? [0, 0, 0, 0];
+    return x0 >= 0 && y0 >= 0 && x1 <= size.width - 1 && y1 <= size.height - 1;
+  };
   const outlines = state.outlines.map((shape) => (whole(shape) ? outline(shape) : { polygon: inImage(corners(shape), size) }));
   if (!outlines.length) return null;
   const [only] = outlines;
@@ -127,11 +131,20 @@ export function trouble(shape) {
  * @returns {Spot[] | null}
  */
 export function pointsFrom(text, form) {
-  const read = text.split(";").map((one) => one.trim()).filter(Boolean).map((one) => one.split(/[\s,]+/).map(Number));
+  const read = text
+    .split(";")
+    .map((one) => one.trim())
+    .filter(Boolean)
+    .map((one) => one.split(/[\s,]+/).map(Number));
   if (!read.length || !read.flat().every(Number.isFinite)) return null;
   if (form === "circle") {
     const [centre, size] = read;
-    return read.length === 2 && centre.length === 2 && size.length === 1 ? [[centre[0], centre[1]], [round(centre[0] + size[0]), centre[1]]] : null;
+    return read.length === 2 && centre.length === 2 && size.length === 1
+      ? [
+          [centre[0], centre[1]],
+          [round(centre[0] + size[0]), centre[1]],
+        ]
+      : null;
   }
   return read.every((p) => p.length === 2) ? /** @type {Spot[]} */ (read) : null;
 }
@@ -141,4 +154,5 @@ export function pointsFrom(text, form) {
  * @param {readonly Spot[]} points
  * @param {Form | "crack" | "seed"} form
  */
-export const textOf = (points, form) => (form === "circle" ? `${points[0][0]}, ${points[0][1]}; ${round(distance(points[0], points[1]))}` : points.map((p) => `${p[0]}, ${p[1]}`).join("; "));
+export const textOf = (points, form) =>
+  form === "circle" ? `${points[0][0]}, ${points[0][1]}; ${round(distance(points[0], points[1]))}` : points.map((p) => `${p[0]}, ${p[1]}`).join("; ");

@@ -1,6 +1,6 @@
-// The tools of the region's editor, and what they say of themselves.
+// The tools of the region's editor, and their descriptions.
 /** @typedef {"move" | "rectangle" | "polygon" | "circle" | "three" | "brush" | "eraser" | "hole" | "crack" | "seed"} Tool */
-/** @typedef {"new" | "add" | "cut"} Mode what a finished shape does to the region */
+/** @typedef {"new" | "add" | "cut"} Mode action of a finished shape on the region */
 
 /** @type {[tool: Tool, text: string, title: string][]} */
 export const TOOLS = [
@@ -10,8 +10,8 @@ export const TOOLS = [
   ["circle", "Circle", "Drag from the centre to the rim"],
   ["three", "3-point circle", "Click three points of the rim"],
   ["hole", "Hole", "Click each corner of an area where nothing is measured; Enter ends it"],
-  ["brush", "Brush", "Paint where points may lie; the region becomes a mask, over whose border no subset reaches. [ and ] change the size"],
-  ["eraser", "Eraser", "Paint where no points may lie; the region becomes a mask, over whose border no subset reaches. [ and ] change the size"],
+  ["brush", "Brush", "Paint where points are allowed; the region becomes a mask, over whose border no subset reaches. [ and ] change the size"],
+  ["eraser", "Eraser", "Paint where no points are allowed; the region becomes a mask, over whose border no subset reaches. [ and ] change the size"],
   ["crack", "Crack line", "Click the points that the crack goes through; Enter ends it"],
   ["seed", "Seed", "Click a point in camera 1, then the same point in camera 2 on the line that appears there"],
 ];
@@ -22,7 +22,6 @@ export const MODES = [
   ["cut", "Cut out", "Nothing is measured in the next rectangle, polygon or circle, and no subset crosses its border"],
 ];
 const KEYS = "By keyboard: arrow keys move the cross-hair (Shift 10 px, Alt 0.1 px), Enter sets a point, Enter there again ends, Escape leaves.";
-
 
 /** @param {Tool} tool */
 export const hintOf = (tool) => `${TOOLS.find(([name]) => name === tool)?.[2]}. ${tool === "move" ? "" : KEYS}`;

@@ -79,12 +79,6 @@ def further_s(outcomes: list[Outcome], sequence: Outcome) -> float:
     return float("nan")
 
 
-def title() -> str:
-    """The section's title."""
-    *names, last = (peer.name for peer in PEERS)
-    return f"Beside {', '.join(names)} and {last}"
-
-
 def text(ours: Ours, besides: list[Beside]) -> list[str]:
     """The section about the peers."""
     head = ["program", "run", "threads", "s", "points", "points/s", "lost", "sd of u / v / w / Z, um"]

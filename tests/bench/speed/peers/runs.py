@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from core.arrays import Float
-from core.cameras.lens import OpenCVLens
+from stereorig.core.arrays import Float
+from stereorig.core.cameras.lens import OpenCVLens
 from tests.bench.speed.pairs import BenchScene, Errors, compare
 from tests.bench.speed.peers.programs import Peer
 from tests.support.requirements import ROOT

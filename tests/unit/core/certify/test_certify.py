@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.certify.certify import certify
-from core.certify.evidence import Evidence
-from core.certify.limits import CertificateLimits
-from core.certify.scales import scales_of
+from stereorig.core.certify.certify import certify
+from stereorig.core.certify.evidence import Evidence
+from stereorig.core.certify.limits import CertificateLimits
+from stereorig.core.certify.scales import scales_of
 from tests.support.certificate_evidence import PITCH_U, Fault, evidence
 
 LIMITS = CertificateLimits.model_validate({})

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from core.certify.evidence import ExtensometerPoint, ExtensometerRun
-from core.certify.extensometer_class import extensometer_class
-from core.certify.noise_floor import independent_values
+from stereorig.core.certify.evidence import ExtensometerPoint, ExtensometerRun
+from stereorig.core.certify.extensometer_class import extensometer_class
+from stereorig.core.certify.noise_floor import independent_values
 
 
 def run(error: float = 0.0, offset_mm: float = 0.0, u_mm: float = 1e-5, **more: object) -> ExtensometerRun:

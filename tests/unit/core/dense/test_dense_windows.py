@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.dense.prediction import Prediction, predict
-from core.dense.windows import Windows, measure_windows, node_positions
-from core.errors import InputError
-from core.field.region.cuts import Cuts
-from core.matching import MatchOptions, prepare
-from core.noise import NoiseModel
-from core.status import PointStatus
+from stereorig.core.dense.prediction import Prediction, predict
+from stereorig.core.dense.windows import Windows, measure_windows, node_positions
+from stereorig.core.errors import InputError
+from stereorig.core.field.region.cuts import Cuts
+from stereorig.core.matching import MatchOptions, prepare
+from stereorig.core.noise import NoiseModel
+from stereorig.core.status import PointStatus
 from tests.support.dense_twin import Bent, DenseTwin
 from tests.support.matching_scene import (
     Plane,
@@ -184,7 +184,7 @@ def test_a_louder_image_weighs_less(one: Scene) -> None:
     assert (ratio[..., [15, 18, 20]] < 410.0).all()
 
 
-class TestPrediction:
+class PredictionTests:
     """Where a prediction is, and what it is."""
 
     X, Y = np.meshgrid(30.0 + 10.0 * np.arange(24), 40.0 + 10.0 * np.arange(20))
@@ -232,8 +232,8 @@ class TestPrediction:
 
 
 def test_a_step_that_is_no_denser_is_refused() -> None:
-    from core.dense.field import _check
-    from core.field.region.region import PointGrid
+    from stereorig.core.dense.field import _check
+    from stereorig.core.field.region.region import PointGrid
 
     grid = PointGrid.rectangle(40.0, 40.0, 90.0, 90.0, spacing_px=5.0)
     with pytest.raises(InputError, match="at most the points' spacing") as told:

@@ -1,0 +1,1 @@
+"""GenICam cameras by the names of their features, through any library that reaches them."""

@@ -1,0 +1,1 @@
+"""Reading of files that a client sent, in a process that can open nothing."""

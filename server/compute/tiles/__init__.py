@@ -1,1 +1,0 @@
-"""Tiles of a step's points, fitted by workers that share its folder."""

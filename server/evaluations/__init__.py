@@ -1,0 +1,1 @@
+"""Evaluations: numbers and verdicts worked out from the steps of an analysis."""

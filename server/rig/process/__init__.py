@@ -1,0 +1,1 @@
+"""The rig process: cameras, stage, pairing and stop, separate from the process that serves HTTP."""

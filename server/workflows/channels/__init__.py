@@ -1,0 +1,1 @@
+"""Channels of a test: read during the captures, or imported from a load frame's record."""

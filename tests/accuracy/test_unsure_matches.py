@@ -1,0 +1,186 @@
+"""Matches that are unsure, not wrong: kept with their uncertainty as far as it can be stated, and named beyond."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from stereorig.core.field.checks.validity import ValidityOptions
+from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.seeding.image_faults import unsure_error
+from stereorig.core.live.measurement import LiveMeasurement, LiveOptions
+from stereorig.core.measure import MeasureOptions, ReferencePair
+from stereorig.core.status import PointStatus
+from tests.support.bulged_panel import BulgedPanel
+from tests.support.relief_rig import exposed
+
+STRICT = MeasureOptions(subset_px=21, patch="affine", validity=ValidityOptions(max_sigma_px=0.1))
+
+
+@pytest.fixture(scope="module")
+def flat() -> BulgedPanel:
+    return BulgedPanel()
+
+
+@pytest.fixture(scope="module")
+def bulged() -> BulgedPanel:
+    return BulgedPanel(bulge_mm=0.3)
+
+
+def blurred(panel, px, camera=2):
+    """One camera out of focus at both times."""
+    return [gaussian_filter(image, px) if k % 2 == camera - 1 else image for k, image in enumerate(panel.clean)]
+
+
+@pytest.mark.fault(66)
+@pytest.mark.parametrize("camera", [1, 2])
+@pytest.mark.parametrize("noise", [2.0, 5.0])
+def test_one_camera_blurred_by_two_pixels_keeps_the_field(flat, camera, noise):
+    """A limit of 0.1 px on depth emptied it. The panel has some 230 subsets: their rms is known to 5 %."""
+    images = blurred(flat, 2.0, camera)
+    found = flat.measured(images[:2], noise=noise)
+    shape = flat.beside(found)
+    motion = flat.beside(flat.measured(images, noise=noise))
+    assert (found.status == PointStatus.NOT_CONVERGED).mean() < 0.005
+    assert min(shape.valid, motion.valid) > 0.98  # a per cent of the subsets has too little texture
+    assert 0.85 < shape.ratio[2] < 1.15
+    assert motion.ratio == pytest.approx(1.0, abs=0.2)
+    assert max(shape.worst, motion.worst) < 6.0
+
+
+@pytest.mark.fault(66)
+@pytest.mark.parametrize("camera", [1, 2])
+@pytest.mark.parametrize("px", [1.0, 1.5])
+def test_depth_of_one_blurred_camera_is_reported_as_it_scatters_at_both_times(flat, camera, px):
+    """Blocks counted what flows through their inner borders: the depth was reported up to a half too unsure."""
+    images = blurred(flat, px, camera)
+    shape, field = flat.beside(flat.measured(images[:2])), flat.measured(images)
+    assert shape.valid > 0.98
+    assert 0.88 < shape.ratio[2] < 1.12
+    assert flat.beside(replace(field, uvw_mm=None)).ratio[2] == pytest.approx(shape.ratio[2], rel=0.05)
+    whole = field.covariance[field.valid]  # of position and displacement together: that of some errors
+    assert np.linalg.eigvalsh(whole / np.trace(whole, axis1=1, axis2=2)[:, None, None]).min() > -1e-9
+
+
+@pytest.mark.fault(66)
+@pytest.mark.parametrize("gain", [1.5, 1.8])
+def test_an_exposure_that_rises_until_a_third_is_saturated_keeps_the_field(flat, gain):
+    one, two, one_t, two_t = flat.clean
+    assert np.mean(gain * one_t > 254) > 0.3
+    found = flat.beside(flat.measured([one, two, gain * one_t, gain * two_t]))
+    assert found.valid > 0.98
+    assert found.ratio == pytest.approx(1.0, abs=0.2)
+    assert found.worst < 6.0
+
+
+def why(flat, images, unsure):
+    """Text and remedy of images, reference and current."""
+    rng = np.random.default_rng(0)
+    taken = [MeasureImage(exposed(image, 2.0, rng)) for image in images]
+    region = flat.grid.extent_px
+    error = unsure_error(
+        "the field", flat.pair, (taken[0], taken[1]), taken[2:], unsure, subset_px=21, region_px=region
+    )
+    assert error.code == "sigma_too_large"
+    return error.cause, error.remedy
+
+
+@pytest.mark.fault(66)
+def test_a_field_too_unsure_is_refused_by_its_own_status_with_figure_cause_and_remedy(flat):
+    images = blurred(flat, 2.0)[:2]
+    field = flat.measured(images, options=STRICT)  # what was asked for holds
+    assert not field.valid.any()
+    assert (field.status == PointStatus.SIGMA_TOO_LARGE).mean() > 0.95
+    assert 0.1 < field.unsure.usual_px < 0.15
+    text, remedy = why(flat, images, field.unsure)
+    assert f"{field.unsure.usual_px:.3f} px" in text
+    assert "the limit is 0.1 px: camera 2's image is blurred by about 1.9 px against camera 1" in text
+    assert re.search(r"take subsets of (39|41|43|45|47) px, which give about 0.0(5\d|6) px, or allow more", remedy)
+    assert "--max-sigma 0.3 " in remedy
+    text, _ = why(flat, [2.0 * image for image in flat.clean[:2]], field.unsure)
+    assert "% of camera 1's image is saturated" in text
+
+
+@pytest.mark.fault(66)
+def test_a_motion_whose_usual_point_is_half_a_pixel_in_four_sigma_is_refused(flat):
+    images = [*flat.clean[:2], *(gaussian_filter(image, 2.0) for image in flat.clean[2:])]
+    field = flat.measured(images)
+    assert not field.valid.any()
+    assert (field.status == PointStatus.SIGMA_TOO_LARGE).mean() > 0.9
+    assert (
+        "camera 1's image is blurred by about 1.9 px against its reference image" in why(flat, images, field.unsure)[0]
+    )
+
+
+@pytest.mark.fault(66)
+@pytest.mark.parametrize("high_px", [0.8, 1.3, 1.8])
+def test_blur_that_follows_the_height_keeps_the_panel_and_the_uncertainty_of_its_bulge(bulged, high_px):
+    """The bulge counted as scatter, so that w was reported twice too wide; points on the crest were lost."""
+    images = [gaussian_filter(image, 0.5) for image in bulged.clean[:2]]
+    images += [bulged.blur_by_height(k, 0.5, high_px) for k in (2, 3)]
+    found = bulged.beside(bulged.measured(images))
+    assert found.valid > 0.95
+    assert 0.85 < found.ratio[2] < 1.15
+    # u and v of one ratio over a field whose blur varies fourfold: a fifth too wide on the rim
+    assert np.all((found.ratio > (0.85 if high_px < 1.5 else 0.75)) & (found.ratio < 1.15)), found.ratio
+    assert found.worst < 6.0
+
+
+@pytest.mark.fault(66)
+@pytest.mark.parametrize("which", [(2,), (3,), (2, 3)])
+def test_blur_at_t_alone_keeps_the_field_of_subsets_that_are_sure_in_it(flat, which):
+    """Subsets of 33 px: some 90 beside one another, whose rms is known to 8 %."""
+    images = [gaussian_filter(image, 2.0) if k in which else image for k, image in enumerate(flat.clean)]
+    found = flat.beside(flat.measured(images, options=MeasureOptions(subset_px=33, patch="affine")))
+    assert found.valid > 0.99
+    assert found.ratio == pytest.approx(1.0, abs=0.2)
+    assert found.worst < 6.0
+
+
+@pytest.mark.fault(66)
+@pytest.mark.parametrize(("contrast", "valid"), [(0.14, 0.99), (0.1, 0.95)])
+def test_a_faint_texture_keeps_a_shape_that_noise_makes_unsure(flat, contrast, valid):
+    """The fit's own limit of 0.1 px emptied it. Here it reports 0.1 px and more, and noise is all that there is."""
+    images = [100.0 + contrast * (image - image.mean()) for image in flat.clean[:2]]
+    found = flat.beside(flat.measured(images, noise=4.0))
+    assert found.valid > valid
+    assert found.ratio[2] == pytest.approx(1.0, abs=0.15)
+    assert found.worst < 6.0
+
+
+@pytest.mark.fault(66)
+def test_frames_are_followed_where_one_camera_is_blurred(flat):
+    """Each frame lost the points that its step had kept; a sure series keeps the limit of a single point."""
+    rng = np.random.default_rng(0)
+    for px, limit_px in ((2.0, 0.25), (0.0, 0.1)):
+        images = blurred(flat, px, 1)
+        reference = ReferencePair(flat.pair, *(exposed(image, 2.0, rng) for image in images[:2]))
+        options = MeasureOptions(subset_px=21, patch="affine")
+        live = LiveMeasurement(reference, flat.grid, options, (), LiveOptions(whole_field=True))
+        frames = [live.measure(*(exposed(image, 2.0, rng) for image in images[2:])) for _ in range(3)]
+        assert [frame.how for frame in frames] == ["step", "followed", "followed"]
+        assert flat.beside(frames[-1].field).valid > 0.98
+        assert live._follower._inputs.matcher.options.max_sigma_px == limit_px
+
+
+@pytest.mark.fault(66)
+def test_points_that_left_the_image_are_outside_it_however_far():
+    panel = BulgedPanel(shift_mm=(7.0, 0.0))
+    field = panel.measured(panel.clean)
+    left = field.x_px > panel.size[0] - 190  # 7 mm are some 210 px
+    assert (field.status[left] == PointStatus.OUTSIDE_IMAGE).all()
+    assert field.valid[:, 0].all()
+    assert not (field.status == PointStatus.NOT_SEEDED).any()
+
+
+@pytest.mark.fault(66)
+def test_blur_at_t_is_taken_for_no_localised_strain(flat):
+    """Its scatter of the slopes, several times the fit's noise, put quadratic patches everywhere: none converged."""
+    images = [*flat.clean[:2], *(gaussian_filter(image, 1.6) for image in flat.clean[2:])]
+    found = flat.beside(flat.measured(images, options=MeasureOptions(subset_px=21)))
+    assert found.valid > 0.98
+    assert found.ratio == pytest.approx(1.0, abs=0.2)
