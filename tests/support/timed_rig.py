@@ -97,8 +97,10 @@ def skews(*, latch: bool, skews_ms: list[float], count: int = 10, max_skew_ms: f
     with rig(one, two, max_skew_ms=max_skew_ms) as (devices, source, _):
         for skew_ms in skews_ms:
             devices(f"skewed({skew_ms})")
-            time.sleep(1.0)  # frames under way, and the second look at the clocks
+            time.sleep(1.0)  # the second look at the clocks
             after = source.newest(0)[0]
+            for _ in range(6):  # frames under way, and as many pairs as a constant between the stamps needs
+                after = source.newest(after)[0]
             pairs: list[dict[str, Any]] = []
             found[str(skew_ms)] = pairs
             while len(pairs) < count:
