@@ -23,6 +23,7 @@ PROGRAM = "arv-fake-gv-camera-0.8"
 _PREFIX = "srig"
 _FULL_MTU = 1500
 _START_S = 10.0
+_FRAMES_LOST = ("ipproto", "udp", "sport", "3957-65534", "prohibit")
 
 
 def what_is_missing() -> str | None:
@@ -170,6 +171,14 @@ class FakeCamera:
         """Let longer packets pass than usual."""
         _ip("link", "set", self._cable, "mtu", str(mtu))
         _ip("-n", self._space, "link", "set", "eth0", "mtu", str(mtu))
+
+    def mute(self) -> None:
+        """Let the network lose whole frames, and nothing else: what is sent from a port that is not for commands."""
+        _ip("-n", self._space, "rule", "add", *_FRAMES_LOST)
+
+    def unmute(self) -> None:
+        """Let frames pass again; nothing to do if they do."""
+        _ip("-n", self._space, "rule", "del", *_FRAMES_LOST, check=False)
 
     def narrow(self, mtu: int = 400) -> None:
         """Let the network lose every packet that is longer: image data, but neither commands nor a frame's header."""

@@ -53,6 +53,7 @@ def strict(cameras: tuple[FakeCamera, FakeCamera]) -> Iterator[FakeCamera]:
 
 def _refresh(camera: FakeCamera) -> None:
     camera.plug()
+    camera.unmute()
     camera.widen()
     camera.kill()
     camera.start()
@@ -442,18 +443,10 @@ def test_a_trigger_whose_frame_never_comes_does_not_shift_the_numbers(plain: Fak
     grabber = make(plain)
     grabber.configure(CameraSettings(trigger="software"))
     grabber.arm()
-    for _ in range(20):
-        # it checks for triggers every 40 ms: mostly the cable is out by then
-        number = grabber.trigger()
-        plain.unplug()
-        time.sleep(0.1)
-        plain.plug()
-        frame = grabber.next_frame(0.2)
-        if frame is None:
-            break
-        assert frame.trigger == number
-    else:
-        pytest.fail("the cable was never pulled in time")
+    plain.mute()
+    grabber.trigger()
+    assert grabber.next_frame(1.0) is None
+    plain.unmute()
     for _ in range(3):
         number = grabber.trigger()
         frame = _frames(grabber, 1)[0]
