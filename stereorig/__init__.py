@@ -17,7 +17,12 @@ failed has NaN and a `status`; every value has its standard uncertainty (`sigma_
 from __future__ import annotations
 
 import importlib
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+# Where a checkout or a copy of it made files of the links to the packages, they are found beside this one
+if (Path(__file__).parent / "core").is_file():
+    __path__.append(str(Path(__file__).parents[1]))
 
 if TYPE_CHECKING:
     from stereorig.calibration import calibrate, read_calibration

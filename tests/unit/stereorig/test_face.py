@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -50,6 +51,17 @@ def test_the_face_has_these_names_and_each_is_there() -> None:
         assert getattr(dic, name).__doc__, name
     with pytest.raises(AttributeError):
         dic.nothing  # noqa: B018
+
+
+def test_a_copy_whose_links_became_files_is_imported_too(tmp_path: Path) -> None:
+    for folder in ("stereorig", "core"):
+        shutil.copytree(ROOT / folder, tmp_path / folder, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    link = tmp_path / "stereorig" / "core"
+    link.unlink()
+    link.write_text("../core")
+    code = "from stereorig.core import names; print(names.__file__)"
+    shown = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert shown.stdout.strip() == str(tmp_path / "core" / "names.py")
 
 
 def test_importing_it_loads_neither_service_nor_kernels() -> None:
