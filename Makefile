@@ -97,11 +97,15 @@ kernels: $(KERNELS)
 quick: $(KERNELS)
 	$(PYTEST) -m 'not deep and not devices' tests/unit tests/contract $(ARGS)
 
-# A test that fails beside others runs once more, alone: it names a defect only if it fails there, too. pytest ends with 1 if
-# tests failed. build/tests.xml keeps each test's duration
+# A test that fails beside others runs again, alone, at most twice: it names a defect only if it fails there, too. pytest ends
+# with 1 if tests failed. build/tests.xml keeps each test's duration
+ALONE = $(BIN)/python -m pytest --last-failed --last-failed-no-failures=none
 test: $(KERNELS)
-	$(PYTEST) --junitxml=build/tests.xml $(ARGS) || { [ $$? = 1 ] && echo "Running what failed once more, alone ..." \
-		&& $(BIN)/python -m pytest --last-failed --last-failed-no-failures=none $(ARGS); }
+	@$(PYTEST) --junitxml=build/tests.xml $(ARGS); ended=$$?; \
+	for time in first second; do \
+		[ $$ended = 1 ] || break; \
+		echo "Running what failed once more, alone ..."; $(ALONE) $(ARGS); ended=$$?; \
+	done; exit $$ended
 
 test-deep: $(KERNELS)
 	$(PYTEST) -m deep $(ARGS)
