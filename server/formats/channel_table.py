@@ -11,8 +11,16 @@ import numpy as np
 from stereorig.core.arrays import Float
 from stereorig.core.errors import InputError
 from stereorig.server.formats.load_frames.description import RecordOptions, RecordRead
-from stereorig.server.formats.load_frames.layout import decoded, find_table, lines_of
+from stereorig.server.formats.load_frames.layout import decoded, find_table, lines_of, unreadable
 from stereorig.server.formats.load_frames.reading import Reader
+
+#: first bytes of files that people take for tables
+_NO_TEXT = {
+    b"PK\3\4": "a workbook (xlsx, ods) or an archive",
+    b"\xd0\xcf\x11\xe0": "a workbook (xls)",
+    b"TDSm": "a TDMS file",
+    b"%PDF": "a PDF",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +112,9 @@ def read_record(
     InputError
         ``channels_unreadable``: no column of that title, no such segment.
     """
+    kind = next((kind for begin, kind in _NO_TEXT.items() if content.startswith(begin)), None)
+    if kind is not None:
+        raise unreadable(f"The file is {kind}, not a text.", "Open it in its program and save the table as CSV.")
     text, encoding = decoded(content)
     lines = lines_of(text)
     made, read = Reader(lines, find_table(lines), options or RecordOptions(), zone).read(encoding)

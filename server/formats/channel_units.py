@@ -21,21 +21,27 @@ FORCE_N = {
 TIME_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0, "h": 3600.0, "d": 86400.0}
 #: other spellings of a unit, without blanks and signs of a product
 _SPELLINGS = {
-    "s": "sec secs second seconds sek sekunden seconde secondes segundos secondi seg 秒 с сек",
-    "ms": "msec millisecond milliseconds",
-    "min": "mins minute minutes minuten minutos 分",
-    "h": "hr hrs hour hours std stunden heures horas",
+    "s": "sec secs second seconds sek sekunde sekunden seconde secondes segundos secondi seg sn 秒 с сек",
+    "ms": "msec millisecond milliseconds мс",
+    "min": "mins minute minutes minuten minutos мин 分",
+    "h": "hr hrs hour hours std stunden heures horas ч",
     "d": "days",
+    "N": "newton newtons Н",
+    "kN": "kilonewton kilonewtons кН",
+    "daN": "даН",
     "lb": "lbs",
+    "lbf": "pound pounds poundforce poundsforce",
     "kip": "kips",
-    "kgf": "kp",
-    "tf": "tonf",
-    "in": 'inch inches "',
+    "kgf": "kp кгс",
+    "tf": "tonf тс",
+    "in": 'inch inches zoll pouce pollici "',
     "mil": "mils thou",
+    "mm": "millimeter millimeters millimetre millimetres мм",
+    "cm": "см",
     "degC": "C ℃",
     "degF": "℉",
-    "MPa": "N/mm2",
-    "um": "micron microns",
+    "MPa": "N/mm2 МПа",
+    "um": "micron microns мкм",
     "um/m": "ue uε microstrain ustrain",
     "N m": "Nm",
     "N mm": "Nmm",
@@ -60,6 +66,8 @@ _LONGEST_UNIT = 40
 def known_unit(written: str) -> str | None:
     """Return a unit in the program's spelling; None if it is not known, or is one of two as ``NM``."""
     plain = written.strip().translate(_SIGNS)
+    if plain == "mN" and "mN" not in written:  # metre times newton, as m·N
+        return "N m"
     found = _ANY_CASE.get(plain.lower(), set())
     return _WRITTEN.get(plain) or (next(iter(found)) if len(found) == 1 else None)
 
@@ -94,6 +102,9 @@ def titled_unit(title: str) -> tuple[str, str]:
     A title such as ``Force_MN`` keeps its ending, which is its unit in the letters of the file.
     """
     parted = title_and_unit(title, "[(/")
+    if parted is not None and parted[1][:1].isalpha() and not known_unit(parted[1]) and parted[0].endswith((")", "]")):
+        before = title_and_unit(parted[0], "[(")  # a channel may be named after the unit: Force (kN) [Ch 2]
+        parted = (f"{before[0]} {parted[1]}", before[1]) if before and known_unit(before[1]) else parted
     if parted is not None and (title[len(parted[0]) :].lstrip()[:1] != "/" or known_unit(parted[1])):
         return parted
     for mark in (" in ", ", ", ","):

@@ -84,7 +84,7 @@ class RecordRead(BaseModel):
     """The recognised parts of a record."""
 
     encoding: str = Field(description="Encoding of the text.")
-    separator: str = Field(description="Separator of the cells: `tab`, `semicolon`, `comma`.")
+    separator: str = Field(description="Separator of the cells: `tab`, `semicolon`, `comma`, `bar`, `blanks`.")
     titles_line: int = Field(description="Line of the titles.")
     columns: list[RecordColumn] = Field(description="Every column of the table.")
     left_above: int = Field(description="Lines above the table that were left out, titles and units not counted.")

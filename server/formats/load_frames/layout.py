@@ -15,7 +15,7 @@ from stereorig.server.formats.load_frames.times import NATIVE_TIMES, is_format, 
 #: largest number of readings; an hour at 200 Hz
 MAX_ROWS = 1_000_000
 _BLANK = "  "  # two or more: one may be within a title
-SEPARATORS = {"\t": "tab", ";": "semicolon", ",": "comma", _BLANK: "blanks", " ": "blanks"}
+SEPARATORS = {"\t": "tab", ";": "semicolon", ",": "comma", "|": "bar", _BLANK: "blanks", " ": "blanks"}
 #: tried where a text is not UTF-8: taken if the time is named in them
 CODE_PAGES = ("cp932", "gb18030", "big5", "euc-kr", "cp1251")
 _SAMPLE = 4000  # lines that the separator is chosen by
@@ -23,6 +23,11 @@ _BLANKS = " \u00a0\u2009\u202f"
 # a number, a time or a date, in any notation
 _LOOSE = re.compile(rf"[-+\u2212.,]{{0,2}}[0-9][-+\u2212.,'\u2019:/{_BLANKS}0-9eEdDTZ]*(?:[AaPp]\.?[Mm]\.?)?")
 _BEGINS = frozenset("0123456789+-.,\u2212")
+_DIGITS = frozenset("0123456789+-")
+_OPEN = re.compile('(?:^|[\t;,]) *"[^"]*$')  # the quote of a cell that goes on in the next line
+_MARKS = re.compile("[\t;,]")
+_MOST_JOINED, _LONGEST_HEAD = 50, 1000  # lines
+_THREE = re.compile("[0-9]{3}")
 
 
 def unreadable(cause: str, remedy: str = "") -> FileFormatError:
@@ -91,10 +96,29 @@ class Table:
 
 def lines_of(text: str) -> dict[int, str]:
     """Return the lines that are not blank, by their number from 1."""
-    lines = {n: line for n, line in enumerate(text.splitlines(), 1) if line.strip()}
+    lines = _whole_titles({n: line for n, line in enumerate(text.splitlines(), 1) if line.strip()})
     if max(map(len, lines.values()), default=0) > MAX_LINE:
         raise unreadable(f"A line of the file has more than {MAX_LINE} characters.")
     return lines
+
+
+def _whole_titles(lines: dict[int, str]) -> dict[int, str]:
+    """Join the lines of quoted titles that have more than one line, as a spreadsheet writes them."""
+    found = dict(lines)
+    numbers = list(lines)[:_LONGEST_HEAD]
+    for k, n in enumerate(numbers):
+        if n not in found or _OPEN.search(lines[n]) is None:
+            continue
+        quotes = lines[n].count('"')
+        for m in range(k + 1, min(k + _MOST_JOINED, len(numbers))):
+            line = lines[numbers[m]]
+            quotes += line.count('"')
+            if any(cell.strip('" ')[:1] in _DIGITS for cell in _MARKS.split(line)):
+                break  # a reading: the quote was an inch's mark
+            if quotes % 2 == 0:
+                found[n] = " ".join(found.pop(one) for one in numbers[k : m + 1])
+                break
+    return dict(sorted(found.items()))
 
 
 def is_loose(cell: str) -> bool:
@@ -120,16 +144,34 @@ def find_table(lines: dict[int, str]) -> Table:
     measured = [k for k, column in enumerate(held) if column and 2 * sum(map(is_loose, column)) >= len(column)]
     used = max(k for k, column in enumerate(held) if column) + 1
     parts = _parts(rows, width, used, measured)
+    if mark == ",":
+        _check_commas(parts, held, measured)
     if not parts:
         raise unreadable("The table has no row of titles.", _titles_remedy(rows, width, sample))
     return _joined(parts, lines, rows, mark, width, measured)
+
+
+def _check_commas(parts: list[_Part], held: list[list[str]], measured: list[int]) -> None:
+    """Refuse a table whose commas part its cells and may be within its numbers or titles too."""
+    for part in parts:
+        named = [title != "channel" for title in part.titles]
+        thousands = any(all(_THREE.fullmatch(cell) for cell in held[k]) for k in measured[1:])
+        units = [known_unit(title) is not None for title in part.titles]
+        if (thousands and named[0] and not named[measured[-1]]) or (
+            len(units) > 3 and units == [False, True] * (len(units) // 2)
+        ):
+            raise unreadable(
+                f"The cells below line {part.titles_line} may be parts of numbers: commas part the cells, and "
+                "numbers or titles may have commas too.",
+                "Export it again with semicolons, tabs, or quotes about each cell.",
+            )
 
 
 def _rows(lines: Iterable[str], mark: str) -> list[list[str]]:
     if mark == _BLANK:
         return [re.split("  +", line.strip()) for line in lines]
     if mark == " ":
-        return [line.split() for line in lines]
+        lines = map(str.strip, lines)
     # a quote that is not closed, as an inch's mark, parts no cell and joins no lines
     closed = [line if line.count('"') % 2 == 0 else line.replace('"', "") for line in lines]
     try:

@@ -24,10 +24,12 @@ from stereorig.server.formats.load_frames.description import (
 )
 from stereorig.server.formats.load_frames.layout import Table, is_loose, unreadable
 from stereorig.server.formats.load_frames.numbers import decimals, read_cells
-from stereorig.server.formats.load_frames.times import clock_times, dates, titled_times
+from stereorig.server.formats.load_frames.times import clock_times, dates, past_midnight, titled_times
 
 _MAX_COLUMNS = 50
 _MOST_SEGMENTS = 100
+#: seconds since 1904 are less; days of a spreadsheet since 1900 are more from 1982 on
+_MOST_S, _SHEET_DAYS = 1e10, 30_000
 Index = NDArray[np.intp]
 #: times, whether they are of the calendar, channels, units, times of cells that could not be read
 Made = tuple[Float, bool, dict[str, Float], dict[str, str], dict[str, Float]]
@@ -154,7 +156,7 @@ class Reader:
             return found, True, question
         days = [d for d in self._table.measured if d != k and ":" not in self._columns[d][0] and self._is_dates(d)]
         if len(days) != 1:
-            return clock, False, None
+            return past_midnight(clock), False, None
         self._date = days[0]
         both = [f"{day} {cell}" for day, cell in zip(self._columns[days[0]], cells, strict=True)]
         found, question = dates(both, order, self._zone)
@@ -171,6 +173,13 @@ class Reader:
                 "2026-03-01T12:00:00Z."
             )
         if self._is_number(at) and self._unit(at) == "1":
+            held = time_s[known]
+            if held.max() > _MOST_S or (held.min() > _SHEET_DAYS and np.ptp(held) < 1 and held.max() < 2 * _SHEET_DAYS):
+                raise unreadable(
+                    f"The column {title!r} states no unit of time, and its numbers, {held.min():.12g} to "
+                    f"{held.max():.12g}, are no seconds: milliseconds, days of a spreadsheet, or a date as one number?",
+                    "Export the times in seconds, with their unit in the title, or as dates.",
+                )
             self._doubts.append(f"The column {title!r} states no unit of time: seconds are taken.")
         return time_s, absolute
 

@@ -16,14 +16,19 @@ from stereorig.server.formats.load_frames.description import RecordQuestion, sho
 #: titles that mean the time itself; in any other title a word for time may be one among others
 _EXACT = """time t timestamp time_stamp datetime date_time zeit elapsed elapsed_time total_time run_time running_time
 test_time prufzeit pruefzeit testzeit temps tiempo tempo tijd czas cas tid aika zaman"""
-_WORDS = """time times timestamp datetime runtime elapsed zeit uhrzeit zeitstempel temps horodatage tiempo tempo tijd
-tid testtid provtid aika czas cas ido zaman timp"""
+_WORDS = """time times timestamp datetime runtime elapsed zeit uhrzeit zeitstempel zeitpunkt temps horodatage tiempo
+tempo tijd tid testtid provtid aika czas cas ido zaman timp"""
 _ENDINGS = ("zeit", "tijd")
 NATIVE_TIMES = ("時間", "时间", "時刻", "时刻", "시간", "время", "χρόνος")
 _FORM = frozenset("hmsdyf.:/, _-")
 _CLOCK = re.compile(r"([0-9]{1,4}):([0-9]{1,2})(?::([0-9]{1,2}))?(?:[.,:]([0-9]{1,9}))?")
 _DATE = re.compile(r"([0-9]{1,4})([-./])([0-9]{1,2})\2([0-9]{1,4})")
+_MONTH = re.compile(r"([0-9]{1,4})[-. /]+([A-Za-z]{3})[a-z]*[-. /,]+([0-9]{1,4})(.*)")
+_MONTHS = "jan feb mar apr may jun jul aug sep oct nov dec"
+_GERMAN = {"mrz": "mar", "mai": "may", "okt": "oct", "dez": "dec"}
+_ZONE = re.compile(r" ?(?:UTC|GMT)$| (?=[-+][0-9]{2}:?[0-9]{2}$)")
 _CAMEL = re.compile(r"([a-z])([A-Z])")
+_DAY_S = 86400.0
 _ORDERS = {"dmy": (2, 1, 0), "mdy": (2, 0, 1), "ymd": (0, 1, 2)}
 
 
@@ -83,7 +88,8 @@ def dates(cells: Sequence[str], order: str | None, zone: tzinfo) -> tuple[Float,
     """
     found = np.full(len(cells), np.nan)
     parted: list[tuple[int, tuple[str, ...], str]] = []
-    for k, cell in enumerate(cells):
+    for k, written in enumerate(cells):
+        cell = _ZONE.sub(lambda zone: "+00:00" if zone[0].strip() else "", _by_numbers(written))
         try:
             moment = datetime.fromisoformat(cell)
         except ValueError:
@@ -104,6 +110,26 @@ def dates(cells: Sequence[str], order: str | None, zone: tzinfo) -> tuple[Float,
             continue
         found[k] = midnight.timestamp() + seconds
     return found, question
+
+
+def _by_numbers(cell: str) -> str:
+    """Return a date with its month as a number: ``1-Mar-2026 12:00`` as ``1.3.2026 12:00``."""
+    named = _MONTH.fullmatch(cell)
+    month = folded(named[2]) if named else ""
+    place = _MONTHS.find(_GERMAN.get(month, month))
+    return cell if named is None or place < 0 else f"{named[1]}.{place // 4 + 1}.{named[3]}{named[4]}"
+
+
+def past_midnight(clock: Float) -> Float:
+    """Return clock times that go on after midnight, if no more time went by there than between other readings."""
+    held = np.flatnonzero(np.isfinite(clock))
+    steps = np.diff(clock[held])
+    days = (
+        (steps < 0) & (steps + _DAY_S > 0) & (steps + _DAY_S <= 10 * np.median(np.abs(steps)) if steps.size else True)
+    )
+    found = clock.copy()
+    found[held[1:]] += _DAY_S * np.cumsum(days)
+    return found
 
 
 def _order(parted: list[tuple[str, ...]], example: str) -> tuple[str, RecordQuestion | None]:

@@ -74,6 +74,13 @@ def test_a_unit_is_the_files(unit: str) -> None:
         ("µm", "um"),
         ("N·m", "N m"),
         ("furlong", "furlong"),
+        ("m·N", "N m"),
+        ("mN.", "mN"),
+        ("Newtons", "N"),
+        ("kilonewton", "kN"),
+        ("pound-force", "lbf"),
+        ("Н", "N"),
+        ("Zoll", "in"),
     ],
 )
 def test_an_unknown_unit_is_shown_as_written_and_a_known_one_in_one_spelling(unit: str, shown: str) -> None:
@@ -152,6 +159,22 @@ MAKERS: dict[str, tuple[str, str, str, str]] = {
     "dates and clock times": ("Date;Time;Load (N)\n", "01/03/2026;12:00:{0:04.1f};{1:.2f}", "utf-8", "date_order"),
     "Ibertest": ("Ensayo nº 12\nTiempo (s);Fuerza (daN);Posición (mm)\n", "{0:,.1f};{3:,.4f};{2:,.4f}", "cp1252", ""),
     "EMIC": ('"Tempo (s)";"Força (kgf)";"Curso (mm)"\n', '"{0:,.1f}";"{6:,.6f}";"{2:,.4f}"', "cp1252", ""),
+    "catman, a head of as many words": (
+        "Start: 01.03.2026 12:00:00\nZeit  1 - Messrate\tKraft\tWeg\ns\tkN\tmm\nRate: 2.0 Hz\tRate: 2.0 Hz\t2.0 Hz\n",
+        "{0:,.3f}\t{4:,.6f}\t{2:,.4f}",
+        "cp1252",
+        "",
+    ),
+    "quotes and blanks": ('"Testzeit" "Kraft" "Weg"\n"s" "N" "mm"\n', "{0:.3E} {1:.6E} {2:.6E}", "utf-8", ""),
+    "titles of two lines": (
+        'Breite;2" (nominal)\n"Time\n(s)";"Force\n(N)";"Stroke\n(mm)"\n',
+        "{0:.3f};{1:.3f};{2:.4f}",
+        "utf-8",
+        "",
+    ),
+    "Cyrillic units": ("Время, с;Нагрузка, кН;Перемещение, мм\n", "{0:,.3f};{4:,.6f};{2:,.4f}", "cp1251", ""),
+    "bars": ("Zeitpunkt|Force (N)|Stroke (mm)\n", "{0:.3f}|{1:.3f}|{2:.4f}", "utf-8", ""),
+    "channels behind units": ("Time (s) [Ch 1];Force (kN) [Ch 2]\n", "{0:.3f};{4:.6f}", "utf-8", ""),
     "blanks alone": ("Time Load Ext\ns N mm\n", "{0:.3f} {1:.3f} {2:.4f}", "utf-8", ""),
 }
 CHOICES = {"time_column": "1", "date_order": "dmy"}
@@ -237,6 +260,23 @@ def test_unquoted_commas_within_and_between_numbers_are_refused() -> None:
         assert "commas" in f"{refused.value.cause} {refused.value.remedy}"
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        # trailing separators have as many cells as commas within thousands
+        ("Time (s),Force (N),x (mm),\n" + "".join(f"{t}.5,2,{t}50,0.1\n" for t in range(1, 9)), "parts of numbers"),
+        ("Time, s,Force, N\n" + "".join(f"{t},5,{t}0,25\n" for t in range(1, 9)), "parts of numbers"),
+        ("Time,Force (N)\n46082.5000,1\n46082.5001,2\n", "days of a spreadsheet"),
+        ("Timestamp,Force (N)\n1772366400000,1\n1772366400500,2\n", "milliseconds"),
+        ("PK\3\4 and more", "workbook"),
+    ],
+)
+def test_numbers_that_would_be_others_are_refused_with_their_likely_meaning(text: str, said: str) -> None:
+    with pytest.raises(StereorigError, match=said) as refused:
+        read_channel_table(text.encode())
+    assert refused.value.code == "channels_unreadable"
+
+
 def test_a_cell_that_cannot_be_read_is_counted_and_no_step_bridges_it() -> None:
     text = "Time (s);Force (N)\n0,5;1\n1,0;2\n1,5;OVER\n2,0;4\n2,5;5\n"
     table, read = read_record(text.encode())
@@ -275,6 +315,10 @@ NOON = 1772366400.0  # date -u -d 2026-03-01T12:00:00 +%s
         ("Zeit", ["01.03.2026 12:00:00,5", "01.03.2026 12:00:01,5"], [NOON + 0.5, NOON + 1.5], {}),
         ("Timestamp", ["2026/03/01 12:00:00", "2026/03/01 12:00:01"], [NOON, NOON + 1.0], {}),
         ("Timestamp", ["03/01/2026 12:00:00 PM", "03/01/2026 12:00:01 PM"], [NOON, NOON + 1.0], {"date_order": "mdy"}),
+        ("Timestamp", ["01-Mar-2026 12:00:00", "01-Mar-2026 12:00:01"], [NOON, NOON + 1.0], {}),
+        ("Timestamp", ["1. Mrz 2026 12:00:00,5", "1. Mrz 2026 12:00:01,5"], [NOON + 0.5, NOON + 1.5], {}),
+        ("Timestamp", ["2026-03-01 14:00:00 +0200", "2026-03-01 12:00:01 UTC"], [NOON, NOON + 1.0], {}),
+        ("Uhrzeit", ["23:59:59,5", "00:00:00,5"], [86399.5, 86400.5], {}),
         ("Datum;Uhrzeit", ["01.03.2026;12:00:00", "01.03.2026;12:00:01"], [NOON, NOON + 1.0], {}),
     ],
 )
