@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -11,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stereorig.core.arrays import Bool, Float
-from stereorig.core.errors import InputError
 from stereorig.core.field.points.result import Field
 from stereorig.core.field.points.shared_pixels import SharedPixels
 from stereorig.core.gauge.area import AreaStatistics, area_statistics, points_within
@@ -20,12 +20,13 @@ from stereorig.core.gauge.rigid import RigidMotion, rigid_motion, without_rigid_
 from stereorig.core.settings import AnalysisSettings, StrainSettings
 from stereorig.core.strain import StrainField, StrainOptions, surface_strain
 from stereorig.core.strain.mean import mean_strain_variance
+from stereorig.server.base.errors import no_variable
 from stereorig.server.formats.results.dataset import as_dataset
 from stereorig.server.formats.results.layout import COVARIANCE_NAMES, stored_settings
 from stereorig.server.formats.results.reading import read_field, read_head
 from stereorig.server.formats.results.strain import read_strain
 from stereorig.server.formats.results.uncertainty import Included
-from stereorig.server.formats.results.variables import STRAIN_NAMES, values_of
+from stereorig.server.formats.results.variables import STRAIN_NAMES, VARIABLES, values_of
 from stereorig.server.formats.results.writing import Provenance, write_field
 from stereorig.server.formats.version import software_version
 
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     import xarray
 
 _POSITION = ("x_mm", "y_mm", "z_mm")
+_THUMBNAIL_PX = 420
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +67,23 @@ class Result:
         """(r, c) True where the point has values."""
         return self.field.valid
 
+    def __repr__(self) -> str:
+        kind = "shape" if self.strain is None and not self.field.has_motion else "displacement"
+        strain = "" if self.strain is None else f" with strain over {self.strain.options.window} points"
+        count = f"{self.valid.sum()} of {self.valid.size} points"
+        return f"<Result of step {self.step}: {kind}{strain}, {count} valid, system frame: {self.frame}>"
+
+    def _repr_html_(self) -> str:
+        from stereorig.server.formats.figures.figure import FigureData, draw  # slow to load
+        from stereorig.server.formats.figures.options import FigureStyle
+
+        name = "w_mm" if self.field.has_motion else "z_mm"
+        figure = FigureData(self[name], self.field.x_px, self.field.y_px, name.removesuffix("_mm").upper(), "mm", "")
+        picture = base64.b64encode(draw(figure, FigureStyle(width_px=_THUMBNAIL_PX), "png")).decode("ascii")
+        sigma_um = 1e3 * float(np.median(self[f"sigma_{name}"][self.valid])) if self.valid.any() else np.nan
+        text = f"{str(self)[1:-1]}; median standard uncertainty of {name} {sigma_um:.2g} um"
+        return f'<p>{text}</p><img alt="Map of {name}" src="data:image/png;base64,{picture}">'
+
     def __getitem__(self, name: str) -> Float:
         """Return a variable (r, c) by its name in result files: ``w_mm``, ``sigma_w_mm``, ``exx``, ``sigma_exx`` ...
 
@@ -75,8 +94,9 @@ class Result:
         """
         values = values_of(self.field, self.strain, name)
         if values is None:
-            raise InputError(
-                f"The result has no variable {name}.", code="field_missing", remedy="Ask for one that `dataset` lists."
+            names = [one for row in VARIABLES for one in (row, f"sigma_{row}")]
+            raise no_variable(
+                "The result", name, [one for one in names if values_of(self.field, self.strain, one) is not None]
             )
         return values
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +38,13 @@ class Reading(NamedTuple):
     budget: Budget = UNKNOWN
     common: Float | None = None
     causes: Causes | None = None
+
+    def __repr__(self) -> str:
+        """Return value and uncertainty, this with two digits, as ``Reading(0.000849 +- 0.000012)``."""
+        if not (math.isfinite(self.value) and math.isfinite(self.sigma) and self.sigma > 0.0):
+            return f"Reading({self.value:.6g} +- {self.sigma:.2g})"
+        decimals = max(1 - math.floor(math.log10(self.sigma)), 0)
+        return f"Reading({self.value:.{decimals}f} +- {self.sigma:.{decimals}f})"
 
 
 def reading_of(value: float, own: float, frozen: float | None, common: Float | None, causes: Causes | None) -> Reading:

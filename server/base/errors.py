@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
 from typing import Any
 
 from stereorig.core.errors import InputError, StateError
@@ -12,6 +14,19 @@ class NotFoundError(InputError):
 
     code = "not_found"
     remedy = "List the entries, and use one of their ids."
+
+
+def no_variable(where: str, name: str, names: Iterable[str]) -> NotFoundError:
+    """Return ``field_missing`` for a variable that a result lacks, with the names that it has, similar ones first."""
+    known = sorted(names)
+    similar = difflib.get_close_matches(name, known)
+    first = f"Perhaps {' or '.join(similar)} is meant; there are" if similar else "There are"
+    return NotFoundError(
+        f"{where} has no variable {name!r} with one number a point.",
+        code="field_missing",
+        remedy=f"{first} {', '.join(known)}.",
+        available=known,
+    )
 
 
 class BusyError(StateError):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereorig.core.field.region.cuts import Cuts
-from stereorig.server.base.errors import NotFoundError
+from stereorig.server.base.errors import NotFoundError, no_variable
 from stereorig.server.formats.figures.axes import directions_of, scale_of_image
 from stereorig.server.formats.figures.figure import FigureData, PictureForm, draw
 from stereorig.server.formats.figures.options import FigureStyle
@@ -39,12 +39,7 @@ def picture_of(
     """
     columns = columns_of(step)
     if name not in columns:
-        raise NotFoundError(
-            f"Step {step.n} has no variable {name!r} with one number a point.",
-            code="field_missing",
-            remedy="Use one of `available`.",
-            available=sorted(columns),
-        )
+        raise no_variable(f"Step {step.n}", name, columns)
     variable, document = columns[name], provenance(step, source)
     load = "" if step.load_n is None else f", load {step.load_n:g} N"
     label = f" ({step.label})" if step.label else ""

@@ -91,6 +91,8 @@ class FieldPart:
         Gives (r, c) of ``x_px`` or ``y_px``: the points' positions in camera 1's reference image.
     note
         Statement about the uncertainties: under a picture, and in a file.
+    frame
+        Frame of the values, in a file; empty if they are the same in every frame.
     """
 
     name: str
@@ -100,6 +102,7 @@ class FieldPart:
     cols: NDArray[np.intp]
     position: Callable[[str], NDArray[np.float64]]
     note: str = ""
+    frame: str = ""
 
     @property
     def headers(self) -> dict[str, str]:
@@ -117,8 +120,8 @@ def _range(indices: NDArray[np.intp]) -> str:
     return f"{int(indices[0])}:{int(indices[-1]) + 1}:{step}"
 
 
-def take(name: str, read: Callable[[str], FileVariable], part: Part, note: str = "") -> FieldPart:
-    """Take a part of a variable; ``note`` is the statement about its uncertainties.
+def take(name: str, read: Callable[[str], FileVariable], part: Part, note: str = "", frame: str = "") -> FieldPart:
+    """Take a part of a variable; ``note`` and ``frame`` as in :class:`FieldPart`.
 
     Raises
     ------
@@ -142,6 +145,7 @@ def take(name: str, read: Callable[[str], FileVariable], part: Part, note: str =
         np.arange(shape[1])[cols],
         lambda of: read(of).values[rows, cols],
         note,
+        frame,
     )
 
 
@@ -192,8 +196,9 @@ def _netcdf(part: FieldPart) -> bytes:
 
     def fill(data: Any) -> None:
         data.setncattr("Conventions", "CF-1.8")
-        if part.note:
-            data.setncattr("uncertainty", part.note)
+        for attribute, text in (("uncertainty", part.note), ("frame", part.frame)):
+            if text:
+                data.setncattr(attribute, text)
         for name, indices in (("row", part.rows), ("col", part.cols)):
             data.createDimension(name, len(indices))
             data.put(data.createVariable(name, "i4", (name,)), indices)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stereorig.core.settings import CoverageFields
 from stereorig.core.status import PointStatus
-from stereorig.server.base.errors import NotFoundError
+from stereorig.server.base.errors import no_variable
 from stereorig.server.documents.results import FieldVariable, Probe, ProbeValue, Uncertainty, ViewResiduals
 from stereorig.server.formats.results.budgets import PointBudget, field_budgets, strain_budgets
 from stereorig.server.formats.results.derived import DERIVED, derive, derived_names
@@ -80,12 +80,7 @@ def read_variable(path: Path, name: str) -> FileVariable:
         if name in derived_names(data.variables):
             return derived_variable(data.variables, name)
         if name not in data.variables:
-            raise NotFoundError(
-                f"{path.name} has no variable {name!r}.",
-                code="field_missing",
-                remedy="Use one of `available`.",
-                available=sorted(data.variables),
-            )
+            raise no_variable(path.name, name, data.variables)
         return FileVariable.of(data.variables[name])
 
 

@@ -15,7 +15,7 @@ from stereorig.core.errors import FileFormatError, InputError
 from stereorig.core.field.region.cuts import Cuts, from_arrays
 from stereorig.core.settings import Coverage, CoverageFields
 from stereorig.core.status import PointStatus
-from stereorig.server.base.errors import NotFoundError
+from stereorig.server.base.errors import NotFoundError, no_variable
 from stereorig.server.base.long_json import nothing
 from stereorig.server.formats.results.derived import derived_names
 from stereorig.server.formats.results.folder import home_of, number_of
@@ -194,12 +194,7 @@ def _read(path: Path, data: Any, names: Sequence[str] | None, always: Sequence[s
     derived = [name for name in derived_names(data.variables) if names is not None and name in names]  # where asked for
     missing = [name for name in names or () if name not in over_grid and name not in derived]
     if missing:
-        raise NotFoundError(
-            f"{path.name} has no variable {missing[0]!r} over its points; it has {', '.join(over_grid)}.",
-            code="field_missing",
-            remedy="Use one of these names.",
-            available=sorted(over_grid),
-        )
+        raise no_variable(path.name, missing[0], over_grid)
     wanted = set(over_grid) if names is None else {*always, *names}
     variables = {name: as_matrix(name, FileVariable.of(data.variables[name])) for name in over_grid if name in wanted}
     variables |= {name: derived_variable(data.variables, name) for name in derived}

@@ -296,17 +296,19 @@ class AsyncAnalysis:
         """Do as :meth:`Analysis.finish`."""
         return await self._client._watched("Measurement", lambda on: operations.finish(self._path, on))
 
-    async def dataset(self, step: int | None = None) -> xarray.Dataset:
+    async def dataset(self, step: int | None = None, *, frame: str | None = None) -> xarray.Dataset:
         """Do as :meth:`Analysis.dataset`."""
-        return datasets.stacked(await self._client._run(operations.netcdf_of(self._path, None, step)))
+        return datasets.stacked(await self._client._run(operations.netcdf_of(self._path, None, step, frame)))
 
-    async def field(self, name: str, step: int | None = None) -> xarray.DataArray:
+    async def field(self, name: str, step: int | None = None, *, frame: str | None = None) -> xarray.DataArray:
         """Do as :meth:`Analysis.field`."""
-        return datasets.stacked(await self._client._run(operations.netcdf_of(self._path, name, step)))[name]
+        return datasets.array_of(await self._client._run(operations.netcdf_of(self._path, name, step, frame)), name)
 
-    async def gauges(self, request: GaugeRequest | None = None, **gauges: Any) -> GaugesReply:
+    async def gauges(
+        self, request: GaugeRequest | None = None, *, frame: str | None = None, **gauges: Any
+    ) -> GaugesReply:
         """Do as :meth:`Analysis.gauges`."""
-        return await self._client._run(operations.gauges(self._path, request_of(GaugeRequest, request, gauges)))
+        return await self._client._run(operations.gauges(self._path, request_of(GaugeRequest, request, gauges), frame))
 
     async def extensometer(self, a_px: tuple[float, float], b_px: tuple[float, float], **more: Any) -> xarray.Dataset:
         """Do as :meth:`Analysis.extensometer`."""
@@ -318,6 +320,6 @@ class AsyncAnalysis:
         params = {"format": format, **options}
         return await self._client._run(operations.saved(f"{self._path}/export", Path(path), params))
 
-    async def report(self, path: str | Path) -> Path:
+    async def report(self, path: str | Path, *, frame: str | None = None) -> Path:
         """Do as :meth:`Analysis.report`."""
-        return await self._client._run(operations.saved(f"{self._path}/report", Path(path), {}))
+        return await self._client._run(operations.saved(f"{self._path}/report", Path(path), operations.in_frame(frame)))

@@ -50,6 +50,12 @@ def stacked(files: Mapping[int, bytes]) -> xarray.Dataset:
     return together.assign_coords({name: steps[-1][name].drop_vars("step") for name in positions})  # type: ignore[no-any-return]
 
 
+def array_of(files: Mapping[int, bytes], name: str) -> xarray.DataArray:
+    """Return a variable of the steps as :func:`stacked` does, with the frame that it is given in."""
+    data = stacked(files)
+    return data[name].assign_attrs({key: data.attrs[key] for key in ("frame",) if key in data.attrs})
+
+
 def _of_other_shape(one: Any, last: Any) -> list[str]:
     """Return variables that cannot be stacked: a shape compares two images, where a displacement compares four."""
     sizes = last.sizes

@@ -324,16 +324,22 @@ def finished_steps(path: str) -> Operation[list[int]]:
     return [one.n for one in each if one.state == "finished"]
 
 
-def netcdf_of(path: str, name: str | None, step: int | None) -> Operation[dict[int, bytes]]:
+def in_frame(frame: str | None) -> dict[str, str]:
+    """Return the parameter that asks for a frame; none for None."""
+    return {} if frame is None else {"frame": frame}
+
+
+def netcdf_of(path: str, name: str | None, step: int | None, frame: str | None) -> Operation[dict[int, bytes]]:
     """Return NetCDF files of one step or of all that are finished: of all variables, or of one."""
+    form = {"format": "nc", **in_frame(frame)}
     steps = (yield from finished_steps(path)) if step is None else [step]
     found: dict[int, bytes] = {}
     for n in steps:
         if name is None:
-            found[n] = (yield Ask("GET", f"{path}/export", params={"format": "nc", "step": n})).content
+            found[n] = (yield Ask("GET", f"{path}/export", params={**form, "step": n})).content
             continue
         try:
-            found[n] = (yield Ask("GET", f"{path}/steps/{n}/fields/{name}", params={"format": "nc"})).content
+            found[n] = (yield Ask("GET", f"{path}/steps/{n}/fields/{name}", params=form)).content
         except InputError as error:
             # the reference has a shape and no displacement
             if error.code != "field_missing" or len(steps) == 1 or n == steps[-1]:
@@ -341,10 +347,10 @@ def netcdf_of(path: str, name: str | None, step: int | None) -> Operation[dict[i
     return found
 
 
-def gauges(path: str, request: GaugeRequest) -> Operation[GaugesReply]:
+def gauges(path: str, request: GaugeRequest, frame: str | None) -> Operation[GaugesReply]:
     """Read gauges in every step, page by page."""
     pages: list[GaugesReply] = []
-    asked: dict[str, Any] = {"limit": _GAUGE_STEPS}
+    asked: dict[str, Any] = {"limit": _GAUGE_STEPS, **in_frame(frame)}
     while True:
         answer = yield Ask("POST", f"{path}/gauges", json=_body(request), params=dict(asked), key=uuid4().hex)
         pages.append(_read(answer, GaugesReply))

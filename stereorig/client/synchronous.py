@@ -75,6 +75,9 @@ class Client:
     def __enter__(self) -> Self:
         return self
 
+    def __repr__(self) -> str:
+        return f"<Client of {self.url}>"
+
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
@@ -235,6 +238,9 @@ class Test:
     def __init__(self, client: Client, test_id: str) -> None:
         self._client, self.id = client, test_id
 
+    def __repr__(self) -> str:
+        return f"<Test {self.id} of {self._client.url}>"
+
     def document(self) -> TestReply:
         """Return name, steps and analyses."""
         return self._client._run(operations.get(f"/tests/{self.id}", TestReply))
@@ -328,6 +334,9 @@ class Analysis:
         self._client, self.test_id, self.id = client, test_id, analysis_id
         self._path = f"/tests/{test_id}/analyses/{analysis_id}"
 
+    def __repr__(self) -> str:
+        return f"<Analysis {self.id} of {self.test_id}, {self._client.url}>"
+
     def document(self) -> AnalysisReply:
         """Return settings, state and summary."""
         return self._client._run(operations.get(self._path, AnalysisReply))
@@ -336,17 +345,21 @@ class Analysis:
         """Let an analysis that follows its test measure the steps there are, and end."""
         return self._client._watched("Measurement", lambda on: operations.finish(self._path, on))
 
-    def dataset(self, step: int | None = None) -> xarray.Dataset:
-        """Return one step's result, or all of them along ``step``; needs xarray."""
-        return datasets.stacked(self._client._run(operations.netcdf_of(self._path, None, step)))
+    def dataset(self, step: int | None = None, *, frame: str | None = None) -> xarray.Dataset:
+        """Return one step's result, or all of them along ``step``; needs xarray.
 
-    def field(self, name: str, step: int | None = None) -> xarray.DataArray:
-        """Return a variable (``w_mm``, ``exx`` ...) of one step or of all that have it; needs xarray."""
-        return datasets.stacked(self._client._run(operations.netcdf_of(self._path, name, step)))[name]
+        ``frame`` is that of positions, displacements and strain: None or ``system``, as stored; ``specimen``, the
+        test's own, in which the page shows them. The attribute ``frame`` of each array states it.
+        """
+        return datasets.stacked(self._client._run(operations.netcdf_of(self._path, None, step, frame)))
 
-    def gauges(self, request: GaugeRequest | None = None, **gauges: Any) -> GaugesReply:
+    def field(self, name: str, step: int | None = None, *, frame: str | None = None) -> xarray.DataArray:
+        """Return a variable (``w_mm``, ``exx`` ...) of one step or of all that have it, as :meth:`dataset` does."""
+        return datasets.array_of(self._client._run(operations.netcdf_of(self._path, name, step, frame)), name)
+
+    def gauges(self, request: GaugeRequest | None = None, *, frame: str | None = None, **gauges: Any) -> GaugesReply:
         """Read points, extensometers, lines and areas in every step: ``points=[{"xy_px": [210, 180]}]`` ..."""
-        return self._client._run(operations.gauges(self._path, request_of(GaugeRequest, request, gauges)))
+        return self._client._run(operations.gauges(self._path, request_of(GaugeRequest, request, gauges), frame))
 
     def extensometer(self, a_px: tuple[float, float], b_px: tuple[float, float], **more: Any) -> xarray.Dataset:
         """Read a strain gauge between two positions in every step, with load, channels and time; needs xarray."""
@@ -358,6 +371,6 @@ class Analysis:
         params = {"format": format, **options}
         return self._client._run(operations.saved(f"{self._path}/export", Path(path), params))
 
-    def report(self, path: str | Path) -> Path:
+    def report(self, path: str | Path, *, frame: str | None = None) -> Path:
         """Write the report, a self-contained HTML page."""
-        return self._client._run(operations.saved(f"{self._path}/report", Path(path), {}))
+        return self._client._run(operations.saved(f"{self._path}/report", Path(path), operations.in_frame(frame)))

@@ -284,6 +284,7 @@ class FieldReply(Reply):
     cols: str = Field("", description="Columns of the grid, start:stop:step.")
     values: Nested = Field(description="Nested rows; null if the point failed.")
     uncertainty: Uncertainty | None = Field(None, description="Terms that the step's uncertainties include.")
+    frame: str = Field("", description="Frame of the values; empty if they are the same in every frame.")
 
 
 class ProbeReply(Probe):

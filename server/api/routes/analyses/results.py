@@ -25,6 +25,7 @@ from stereorig.server.api.protocol.problems import errors
 from stereorig.server.formats.manifest import known_sha256
 from stereorig.server.formats.results.reading import read_head
 from stereorig.server.formats.results.uncertainty import Statement, read_included
+from stereorig.server.formats.results.variables import described
 from stereorig.server.results.field_forms import MEDIA_TYPES, RANGE_PATTERN, FieldForm, Part, encode, nested, take
 from stereorig.server.results.gauges.fields import AXES
 from stereorig.server.results.gauges.frames import text_of
@@ -92,7 +93,9 @@ def get_field(
     if etag in tags_in(request.headers.get("if-none-match", "")):
         return Response(status_code=304, headers=headers)
     statement = Statement(read_included(path), coverage)
-    part = take(name, lambda wanted: read_interval(path, wanted, statement), Part(rows, cols, stride), statement.text)
+    of_frame = "" if described(name).part == "none" else read_head(path).frame
+    wanted = Part(rows, cols, stride)
+    part = take(name, lambda one: read_interval(path, one, statement), wanted, statement.text, of_frame)
     headers |= part.headers | {"X-Uncertainty": statement.text}
     if format != "json":
         return Response(encode(part, format), media_type=MEDIA_TYPES[format], headers=headers)
@@ -105,6 +108,7 @@ def get_field(
         "cols": headers["X-Cols"],
         "values": nested(part.values),
         "uncertainty": statement.document(),
+        **({"frame": of_frame} if of_frame else {}),
     }
     return _json(document, headers)
 
@@ -130,16 +134,16 @@ def list_fields(
 ) -> FieldList:
     """Return name, unit, meaning and dimensions of every variable; the meaning of status values; the cuts."""
     path = service.tests.analyses.result_file(test_id, analysis_id, n)
-    fields, described = list_variables(path), read_head(path).frame
+    fields, text = list_variables(path), read_head(path).frame
     asked = asked_of(service, test_id, frame)
     if asked is not None:
-        described = f"{text_of(asked)}; before: {described}"
+        text = f"{text_of(asked)}; before: {text}"
         fields = [v.model_copy(update={"long_name": v.long_name.replace("_sys", AXES)}) for v in fields]
     return FieldList.model_validate(
         {
             "fields": fields,
             "cuts_px": read_cut_pieces(path),
-            "frame": described,
+            "frame": text,
             "uncertainty": Statement(read_included(path), coverage).document(),
         }
     )
