@@ -229,7 +229,8 @@ class SMC100Stage(WireStage):
         return found
 
     def _code_of(self, message: ControllerMessage) -> str | None:
-        return _CODES.get(message.code)
+        # a fault of the positioner has four digits: the command was taken, its motion failed
+        return "motion_fault" if len(message.code) == 4 else _CODES.get(message.code)
 
 
 class ConexCCStage(SMC100Stage):

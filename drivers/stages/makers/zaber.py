@@ -205,4 +205,5 @@ class ZaberStage(WireStage):
         ]
 
     def _code_of(self, message: ControllerMessage) -> str | None:
-        return _CODES.get(message.code)
+        # a warning has two letters: the command was taken, its motion failed
+        return "motion_fault" if len(message.code) == 2 else _CODES.get(message.code)
