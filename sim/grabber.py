@@ -22,8 +22,8 @@ from stereorig.drivers.cameras.protocol import CameraDescription, CameraSettings
 _NICE = 5
 
 
-# A trigger call within this time of another camera's belongs to the same pulse
-_SAME_PULSE_S = 1.0
+# A trigger call within this time of the first camera's belongs to the same pulse, however busy the machine is
+_SAME_PULSE_S = 10.0
 # Frames that wait to be taken; a real grabber's ring is as short
 _RING = 16
 _FRESH_HZ = 100.0  # above it images come back, which takes less time than fresh noise
@@ -128,11 +128,13 @@ class TriggerLine:
                 del self._holders[cam]
 
     def fire(self, cam: str) -> Pulse:
-        """Join the newest pulse if this camera has not used it yet, else make one."""
+        """Make a pulse; a camera that is not the first joins the newest one if it has not used it yet."""
         with self._lock:
             now = time.monotonic_ns()
             pulse = self._newest
-            if self._last_of.get(cam, 0) >= pulse.number or now - pulse.at_ns > _SAME_PULSE_S * 1e9:
+            is_first = cam <= min(self._last_of, default=cam)
+            is_used = self._last_of.get(cam, 0) >= pulse.number
+            if is_first or is_used or now - pulse.at_ns > _SAME_PULSE_S * 1e9:
                 pulse = self._newest = Pulse(pulse.number + 1, now)
             self._last_of[cam] = pulse.number
             return pulse

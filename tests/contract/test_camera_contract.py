@@ -28,6 +28,7 @@ from tests.support.camera_bench import (
     reading,
     seconds_until,
 )
+from tests.support.patience import Deadline
 from tests.support.requirements import missing
 
 FAULT_S = 1.0  # a lost camera is shown within this time, at frame periods up to 100 ms
@@ -480,9 +481,9 @@ def test_frames_of_both_cameras_make_pairs_by_time_with_their_skew(bench: Camera
         with reading(bench, one, "cam1") as first, reading(bench, two, "cam2") as second:
             readers = {"cam1": first, "cam2": second}
             pairs = []
-            end = time.monotonic() + 10.0
+            deadline = Deadline(10.0)
             while len(pairs) < 10:
-                assert time.monotonic() < end
+                assert deadline.left
                 for cam in CAMERAS:
                     frame = readers[cam].take(0.05)
                     made = None if frame is None else pairing.feed(cam, frame)

@@ -19,6 +19,7 @@ import pytest
 import serial
 
 from stereorig.drivers.channels.lines import ChannelLine, LineSource
+from tests.support.patience import Deadline
 
 Readings = list[tuple[float, float]]
 
@@ -35,9 +36,9 @@ def reading(source: LineSource) -> Iterator[tuple[ChannelLine, Readings]]:
 
 
 def until(true: Callable[[], Any], seconds: float = 20.0) -> None:
-    end = time.monotonic() + seconds
+    deadline = Deadline(seconds)
     while not true():
-        assert time.monotonic() < end
+        assert deadline.left
         time.sleep(0.005)
 
 

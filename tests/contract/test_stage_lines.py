@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import random
 import threading
 import time
@@ -15,8 +16,9 @@ from stereorig.drivers.registry import STAGE_DRIVERS
 from stereorig.drivers.stages.protocol import AxisOptions, AxisState
 from stereorig.sim.controllers.registry import make_controller
 from stereorig.sim.controllers.server import ControllerServer
+from tests.support.patience import within
 from tests.support.rfc2217_server import Rfc2217Server
-from tests.support.stage_bench import CONTROLLERS, FAKES, Bench, bench
+from tests.support.stage_bench import CONTROLLERS, FAKES, Bench, bench, in_thread, wait_until
 
 
 @contextlib.contextmanager
@@ -47,27 +49,19 @@ def test_a_controller_behind_a_terminal_server(driver: str) -> None:
 
 
 def test_a_stop_passes_a_terminal_server_at_once() -> None:
-    with behind_terminal_server("esp301", time_scale=1.0, start_mm=0.0) as (stand, _):
-        stand.ready(1)
-        errors: list[StageError] = []
+    def stopped_after_s() -> float:
+        with behind_terminal_server("esp301", time_scale=1.0, start_mm=0.0) as (stand, _):
+            stand.ready(1)
+            thread, errors = in_thread(lambda: stand.stage.move_to(1, 40.0))
+            wait_until(lambda: stand.axis(1).moving)
+            asked = time.monotonic()
+            stand.stage.stop()
+            thread.join(5.0)
+            assert [error.code for error in errors] == ["stage_stopped"]
+            arrived = next(entry.at_s for entry in stand.controller.received if entry.text == "ST")
+            return arrived - asked if stand.controller.true_position_mm(1) < 20.0 else math.inf
 
-        def move() -> None:
-            try:
-                stand.stage.move_to(1, 40.0)
-            except StageError as error:
-                errors.append(error)
-
-        thread = threading.Thread(target=move)
-        thread.start()
-        while not stand.axis(1).moving:
-            time.sleep(0.002)
-        asked = time.monotonic()
-        stand.stage.stop()
-        thread.join(5.0)
-        assert [error.code for error in errors] == ["stage_stopped"]
-        arrived = next(entry.at_s for entry in stand.controller.received if entry.text == "ST")
-        assert arrived - asked < 0.5
-        assert stand.controller.true_position_mm(1) < 20.0
+    within(0.5, stopped_after_s)
 
 
 def test_a_terminal_server_that_hangs_up_is_a_lost_stage_and_can_be_opened_again() -> None:

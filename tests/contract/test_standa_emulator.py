@@ -22,7 +22,7 @@ from stereorig.core.errors import StageError
 from stereorig.drivers.registry import make_stage
 from stereorig.drivers.stages.makers.standa import StandaStage
 from stereorig.drivers.stages.protocol import AxisOptions, AxisState, Stage
-from tests.support.patience import busy
+from tests.support.patience import Deadline, busy
 from tests.support.requirements import ROOT, missing
 
 # 1,000 steps a second: 10 mm/s
@@ -177,9 +177,9 @@ time.sleep(60)
         assert program.stdout is not None
         library = int(program.stdout.readline())
         os.kill(program.pid, signal.SIGKILL)
-    deadline = time.monotonic() + 5.0
+    deadline = Deadline(5.0)
     while Path(f"/proc/{library}/status").exists() and "zombie" not in Path(f"/proc/{library}/status").read_text():
-        assert time.monotonic() < deadline, "the library's process goes on"
+        assert deadline.left, "the library's process goes on"
         time.sleep(0.01)
     stage = opened(url)  # the emulator keeps its position in the file when it is closed
     try:

@@ -34,6 +34,7 @@ from stereorig.server.formats.images import decode
 from stereorig.server.formats.models.read import ending_of, read_model
 from stereorig.server.workflows.service import Service
 from tests.support import naive_readers as naive
+from tests.support.patience import Deadline
 from tests.support.service_rig import new_test, served, tiny_config
 
 API = "/api/v1"
@@ -216,8 +217,8 @@ def test_a_dead_keeper_is_started_again_and_its_readers_end(cell: Cell) -> None:
         cell.read(naive.content, [])
         waiting = pool.submit(outcome, cell, naive.waits, [b"x"], limits=ReadingLimits(wall_s=5.0))
         keeper = psutil.Process(cell.pid)
-        deadline = time.monotonic() + 60.0
-        while not keeper.children() and time.monotonic() < deadline:
+        deadline = Deadline(60.0)
+        while not keeper.children() and deadline.left:
             time.sleep(0.01)
         children = keeper.children()
         keeper.kill()
@@ -241,8 +242,8 @@ def test_files_are_read_at_once_and_too_many_are_refused() -> None:
     threads = [threading.Thread(target=wait) for _ in range(20)]
     for thread in threads:
         thread.start()
-    deadline = time.monotonic() + 60.0
-    while (len(errors) < 4 or len(psutil.Process(cell.pid).children()) < 4) and time.monotonic() < deadline:
+    deadline = Deadline(60.0)
+    while (len(errors) < 4 or len(psutil.Process(cell.pid).children()) < 4) and deadline.left:
         time.sleep(0.01)
     assert len(psutil.Process(cell.pid).children()) == 4
     assert [error.code for error in errors] == ["reads_waiting"] * 4

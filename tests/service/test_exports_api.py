@@ -21,7 +21,7 @@ from PIL import Image
 from stereorig.server.exports.process import FOLDER
 from stereorig.server.workflows.service import Service
 from tests.support.export_results import write_results
-from tests.support.patience import Deadline
+from tests.support.patience import Deadline, busy
 
 FILES = {
     "nc": "application/zip",
@@ -160,7 +160,7 @@ def test_the_service_answers_while_films_are_made_and_refuses_too_many(client: h
         assert client.get("/healthz").status_code == 200
         slowest = max(slowest, time.monotonic() - begun)
         time.sleep(0.02)
-    assert slowest < 1.0
+    assert slowest < 1.0 * busy()
     assert answers.count(200) == 4  # made one after the other
     assert answers.count(503) == 2
 

@@ -23,6 +23,7 @@ from stereorig.server.config.rig_file import parse_config
 from stereorig.server.http.line_protocol import MAX_LINE
 from stereorig.server.workflows.service import Service
 from tests.bench.live.socket_client import ValueSocket
+from tests.support.patience import Deadline
 from tests.support.service_rig import SMALL, plate_test, served, wait_for_rig
 from tests.support.stage_service import wait_until
 
@@ -86,8 +87,8 @@ def test_id(client: httpx.Client) -> str:
 
 
 def await_frames(client: httpx.Client, test_id: str, number: int, seconds: float = 120.0) -> dict[str, Any]:
-    until = time.monotonic() + seconds
-    while time.monotonic() < until:
+    deadline = Deadline(seconds)
+    while deadline.left:
         live: dict[str, Any] = client.get(f"{API}/tests/{test_id}/live").raise_for_status().json()
         assert live["state"] in ("starting", "running"), live
         if live["values"]["number"] >= number:
@@ -97,9 +98,9 @@ def await_frames(client: httpx.Client, test_id: str, number: int, seconds: float
 
 
 def await_valid(client: httpx.Client, test_id: str, seconds: float = 60.0) -> None:
-    until = time.monotonic() + seconds
+    deadline = Deadline(seconds)
     while not client.get(f"{API}/tests/{test_id}/live").json()["values"]["valid"]:
-        assert time.monotonic() < until
+        assert deadline.left
         time.sleep(0.05)
 
 
@@ -315,9 +316,9 @@ def test_wrong_lines_are_queued_as_errors_and_nothing_dies(client: httpx.Client,
 
 def test_channels_of_the_rig_file_are_read_and_known_at_the_exposure(client: httpx.Client, running: str) -> None:
     url = f"{API}/tests/{running}/live"
-    until = time.monotonic() + 30.0
+    deadline = Deadline(30.0)
     while not (known := client.get(url).json()["channels"])["force"]["readings"]:
-        assert time.monotonic() < until
+        assert deadline.left
         time.sleep(0.05)
     assert known["force"]["line"]["state"] == "reading"
     assert (known["force"]["last_value"], known["force"]["unit"]) == (812.5, "N")
@@ -430,9 +431,9 @@ def test_a_lost_camera_makes_the_values_invalid_and_names_it(
     faults = live_service.rig.pair.units["cam2"].grabber.faults  # type: ignore[attr-defined]
     faults.gone = True
     try:
-        until = time.monotonic() + 60.0
+        deadline = Deadline(60.0)
         while (values := client.get(f"{API}/tests/{test_id}/live").json()["values"])["valid"]:
-            assert time.monotonic() < until
+            assert deadline.left
             time.sleep(0.02)
         assert values["reason"] in ("camera_lost", "camera_gone"), values
         assert not values["gauges"]["e1"]["valid"]

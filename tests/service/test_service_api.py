@@ -19,6 +19,7 @@ from stereorig.server.workflows.service import Service
 from tests.support.patience import busy
 from tests.support.problems import assert_problem
 from tests.support.service_rig import new_test, served, tiny_config, wait_for_job, wait_for_rig
+from tests.support.stage_service import wait_until
 
 API = "/api/v1"
 
@@ -104,9 +105,9 @@ def test_settings_are_read_back_and_out_of_range_ones_refused(client: httpx.Clie
     before = client.get(f"{API}/cameras/cam2/stats").json()["quality"]["mean_grey"]
     answer = client.patch(f"{API}/cameras/cam2", json={"exposure_ms": 5.0})
     assert answer.json()["settings"]["exposure_ms"] == 5.0
-    time.sleep(0.25)
-    after = client.get(f"{API}/cameras/cam2/stats").json()["quality"]["mean_grey"]
-    assert after < 0.7 * before
+    wait_until(
+        lambda: client.get(f"{API}/cameras/cam2/stats").json()["quality"]["mean_grey"] < 0.7 * before, seconds=10.0
+    )
     assert_problem(client.patch(f"{API}/cameras/cam2", json={"exposure_ms": 5000.0}), 422, "out_of_range")
     assert client.get(f"{API}/cameras/cam2").json()["settings"]["exposure_ms"] == 5.0
     assert client.patch(f"{API}/cameras/cam2", json={"exposure_ms": 10.0}).status_code == 200
@@ -194,13 +195,16 @@ def test_reconnect_brings_the_rig_back(client: httpx.Client) -> None:
     wait_for_rig(client)
 
 
+def seen(client: httpx.Client, cam: str = "cam1") -> np.ndarray:
+    """What a camera sees now."""
+    return decode_image(client.get(f"{API}/cameras/{cam}/frame", params={"format": "tiff"}).content).astype(float)
+
+
 def test_scene_changes_what_the_cameras_see(client: httpx.Client) -> None:
     assert client.put(f"{API}/sim/scene", json={"scene": "steel"}).json() == {"scene": "steel", "load": 0.0}
-    steel = decode_image(client.get(f"{API}/cameras/cam1/frame", params={"format": "tiff"}).content)
+    steel = seen(client)
     client.put(f"{API}/sim/scene", json={"scene": "grid"})
-    time.sleep(0.15)
-    grid = decode_image(client.get(f"{API}/cameras/cam1/frame", params={"format": "tiff"}).content)
-    assert np.abs(steel.astype(float) - grid.astype(float)).mean() > 10.0
+    wait_until(lambda: np.abs(seen(client) - steel).mean() > 10.0, seconds=10.0)
     assert_problem(client.put(f"{API}/sim/scene", json={"scene": "moon"}), 422, "invalid_request")
     for params in ({"colour": 3}, {"load": 3}, {"name": 3}):
         refused = client.put(f"{API}/sim/scene", json={"scene": "plate", "params": params})
@@ -211,19 +215,20 @@ def test_a_board_in_a_hand_is_put_before_the_cameras_and_a_bumped_camera_stays_s
     params = {"pitch_mm": 1.6, "size": [6, 5], "hand": 2}
     scene = client.put(f"{API}/sim/scene", json={"scene": "checkerboard", "params": params})
     assert scene.json() == {"scene": "checkerboard", "load": 0.0, **params}, scene.text
-    time.sleep(0.15)
+
+    def shows_the_board(cam: str) -> bool:
+        image = seen(client, cam).astype(np.uint8)
+        return bool(cv2.findChessboardCornersSB(image, (6, 5), flags=cv2.CALIB_CB_EXHAUSTIVE)[0])
+
     for cam in ("cam1", "cam2"):
-        image = decode_image(client.get(f"{API}/cameras/{cam}/frame", params={"format": "tiff"}).content)
-        assert cv2.findChessboardCornersSB(image.astype(np.uint8), (6, 5), flags=cv2.CALIB_CB_EXHAUSTIVE)[0]
-    before = decode_image(client.get(f"{API}/cameras/cam1/frame", params={"format": "tiff"}).content).astype(float)
+        wait_until(lambda cam=cam: shows_the_board(cam), seconds=10.0)
+    before = seen(client)
     bump = [0.0, 0.3, 0.0, 0.0, 0.0, 0.0]
     knocked = client.put(f"{API}/sim/scene", json={"scene": "checkerboard", "params": {**params, "bump_cam1": bump}})
     assert knocked.status_code == 200, knocked.text
     client.put(f"{API}/sim/scene", json={"scene": "checkerboard", "params": params})
     for _ in range(2):
-        time.sleep(0.15)
-        after = decode_image(client.get(f"{API}/cameras/cam1/frame", params={"format": "tiff"}).content).astype(float)
-        assert np.abs(after - before).mean() > 5.0
+        wait_until(lambda: np.abs(seen(client) - before).mean() > 5.0, seconds=10.0)
         job = client.post(f"{API}/rig:reconnect").json()["job"]
         assert wait_for_job(client, job)["state"] == "succeeded"
         wait_for_rig(client)

@@ -20,7 +20,7 @@ from stereorig.server.config.rig_file import parse_config
 from stereorig.server.formats.images import encode_tiff
 from stereorig.server.formats.noise_json import load_noise
 from stereorig.server.workflows.service import Service
-from tests.support.patience import busy
+from tests.support.patience import Deadline, busy
 from tests.support.service_rig import SMALL, served, wait_for_job, wait_for_rig
 
 API = "/api/v1"
@@ -435,8 +435,8 @@ def test_cancelled_analysis_keeps_its_finished_steps(client: httpx.Client, plate
     body = {"region": {"rectangle": [20, 20, 230, 215]}, "subset_px": 25, "spacing_px": 2}
     accepted = client.post(f"{API}/tests/{plate_test}/analyses", json=body).json()
     url = f"{API}/tests/{plate_test}/analyses/{accepted['analysis_id']}"
-    deadline = time.monotonic() + 120
-    while not client.get(url).json()["steps_finished"] and time.monotonic() < deadline:
+    deadline = Deadline(120.0)
+    while not client.get(url).json()["steps_finished"] and deadline.left:
         time.sleep(0.02)
     asked = time.monotonic()
     client.post(f"{API}/jobs/{accepted['job']['id']}:cancel")

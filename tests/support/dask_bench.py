@@ -17,6 +17,7 @@ import httpx
 from stereorig.server.config.rig_file import parse_config
 from stereorig.server.workflows.service import Service
 from tests.support.copied_tests import CONFIG
+from tests.support.patience import Deadline
 from tests.support.requirements import ROOT, missing
 from tests.support.service_rig import served
 
@@ -33,8 +34,8 @@ class Cluster:
             "dask_scheduler", "--port", "0", "--host", "127.0.0.1", "--scheduler-file", str(self._file)
         )
         try:
-            deadline = time.monotonic() + 120
-            while not self._file.exists() and time.monotonic() < deadline:
+            deadline = Deadline(120.0)
+            while not self._file.exists() and deadline.left:
                 time.sleep(0.05)
             self.address: str = json.loads(self._file.read_text())["address"]
         except BaseException:

@@ -18,6 +18,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from stereorig.drivers.cameras.genicam.gvcp import ControlState, control_state
+from tests.support.patience import Deadline
 
 PROGRAM = "arv-fake-gv-camera-0.8"
 _PREFIX = "srig"
@@ -126,11 +127,11 @@ class FakeCamera:
 
     def await_answer(self) -> None:
         """Wait until it answers."""
-        end = time.monotonic() + _START_S
+        deadline = Deadline(_START_S)
         while control_state(self.address, timeout_s=0.05, attempts=1) is ControlState.SILENT:
             assert self._process is not None
             assert self._process.poll() is None, self._log.read_text()
-            assert time.monotonic() < end, f"{self.serial} does not answer: {self._log.read_text()}"
+            assert deadline.left, f"{self.serial} does not answer: {self._log.read_text()}"
 
     def kill(self) -> None:
         """Switch it off at once."""
@@ -144,9 +145,9 @@ class FakeCamera:
         assert self._process is not None
         self._process.send_signal(signal.SIGSTOP)
         # the signal reaches one thread, which stops the others: on a busy machine another still answers meanwhile
-        end = time.monotonic() + _START_S
+        deadline = Deadline(_START_S)
         while not _all_threads_stopped(self._process.pid):
-            assert time.monotonic() < end, f"{self.serial} does not stop"
+            assert deadline.left, f"{self.serial} does not stop"
             time.sleep(0.001)
 
     def resume(self) -> None:

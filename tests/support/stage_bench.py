@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -13,6 +14,7 @@ from typing import Any, Literal
 
 from stereorig.core.errors import StageError
 from stereorig.drivers.registry import STAGE_DRIVERS
+from stereorig.drivers.stages import serial_stage
 from stereorig.drivers.stages.protocol import AxisOptions
 from stereorig.drivers.stages.serial_stage import SerialStage
 from stereorig.sim.controllers.axis import SimAxis
@@ -22,6 +24,7 @@ from stereorig.sim.controllers.wire import Received
 from tests.support.fake_kinesis import FakeKinesis
 from tests.support.fake_pi import FakePI
 from tests.support.fake_zaber import FakeZaber
+from tests.support.patience import Deadline
 
 Transport = Literal["socket", "pty"]
 # simulated by the product, and by the tests alone
@@ -156,9 +159,20 @@ def in_thread(call: Callable[[], object]) -> tuple[threading.Thread, list[StageE
     return thread, errors
 
 
+def wait_for_its_turn(thread: threading.Thread) -> None:
+    """Wait until a motion in a thread of its own waits for another's end."""
+
+    def waits() -> bool:
+        frame = sys._current_frames().get(thread.ident or 0)
+        return frame is not None and frame.f_code.co_filename == serial_stage.__file__
+
+    wait_until(waits)
+    time.sleep(0.02)  # it may be a line before
+
+
 def wait_until(condition: Callable[[], object], seconds: float = 5.0) -> None:
     """Wait until a condition holds."""
-    end = time.monotonic() + seconds
+    deadline = Deadline(seconds)
     while not condition():
-        assert time.monotonic() < end, "waited in vain"
+        assert deadline.left, "waited in vain"
         time.sleep(0.002)

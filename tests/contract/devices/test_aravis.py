@@ -16,7 +16,7 @@ from stereorig.core.errors import CameraError
 from stereorig.drivers.cameras.protocol import CameraOptions, CameraSettings, Frame, FrameGrabber, FrameStatus
 from stereorig.drivers.registry import discover_cameras, make_camera
 from tests.support.fake_gige import FakeCamera, small_sensor_xml, strict_xml, what_is_missing
-from tests.support.patience import busy
+from tests.support.patience import Deadline, busy
 from tests.support.requirements import missing
 
 RETURN_S = 3.0
@@ -98,9 +98,9 @@ def _code_of(call: Callable[[], object]) -> str | None:
 
 def _frames(grabber: FrameGrabber, count: int, timeout_s: float = 5.0) -> list[Frame]:
     frames: list[Frame] = []
-    end = time.monotonic() + timeout_s
+    deadline = Deadline(timeout_s)
     while len(frames) < count:
-        assert time.monotonic() < end, f"{len(frames)} of {count} frames in {timeout_s} s"
+        assert deadline.left, f"{len(frames)} of {count} frames in {timeout_s} s"
         frame = grabber.next_frame(0.2)
         if frame is not None:
             frames.append(frame)
@@ -203,8 +203,10 @@ def test_packets_that_the_network_would_divide_are_not_used(plain: FakeCamera, m
     assert grabber.statistics()["received_packets"] / grabber.statistics()["completed_buffers"] < 70
     # on an armed camera it shows as incomplete frames, never as good ones
     plain.widen()
-    time.sleep(0.3)
-    assert _frames(grabber, 3)[-1].status is FrameStatus.INCOMPLETE
+    deadline = Deadline(5.0)  # frames that are under way still come whole
+    while _frames(grabber, 1)[0].status is not FrameStatus.INCOMPLETE:
+        assert deadline.left
+    assert {frame.status for frame in _frames(grabber, 3)} == {FrameStatus.INCOMPLETE}
     grabber.close()
     # its own size is too large now: it is made to fit
     small = make(plain)
@@ -468,9 +470,10 @@ def test_statistics_tell_what_became_of_the_buffers(plain: FakeCamera, make: Mak
     assert count["free_buffers"] + count["waiting_frames"] in (2, 3)  # one may be being filled
     assert count["transferred_bytes"] >= 5 * 512 * 512
     # frames are not taken: three wait, the others find no buffer and are lost, which the numbers show
-    time.sleep(0.6)
-    starved = grabber.statistics()
-    assert starved["underruns"] >= count["underruns"] + 10
+    deadline = Deadline(5.0)
+    while (starved := grabber.statistics())["underruns"] < count["underruns"] + 10:
+        assert deadline.left
+        time.sleep(0.02)
     assert starved["waiting_frames"] == 3
     later = _frames(grabber, 6)
     steps = np.diff([frame.sequence for frame in (*first, *later)])

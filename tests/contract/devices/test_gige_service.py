@@ -23,6 +23,7 @@ import pytest
 from stereorig.server.config.rig_file import parse_config
 from stereorig.sim.rig import SimRig
 from tests.support.namespace import Namespace, NamespaceTransport, namespaces_missing
+from tests.support.patience import Deadline
 from tests.support.requirements import ROOT, missing
 from tests.support.service_rig import SMALL, TINY, new_test, wait_for_job
 
@@ -97,9 +98,9 @@ def _ready(client: httpx.Client) -> bool:
 
 
 def _until(condition: Any, limit_s: float) -> float:
-    begin = time.monotonic()
+    begin, deadline = time.monotonic(), Deadline(limit_s)
     while not condition():
-        assert time.monotonic() - begin < limit_s, f"waited {limit_s} s in vain"
+        assert deadline.left, f"waited {limit_s} s in vain"
         time.sleep(0.02)
     return time.monotonic() - begin
 

@@ -22,6 +22,7 @@ from stereorig.drivers.cameras.genicam.triggers import TriggerNumbers
 from stereorig.drivers.cameras.genicam.watch import Watch
 from stereorig.drivers.cameras.protocol import CameraOptions, CameraSettings, FrameStatus
 from stereorig.drivers.registry import discover_cameras, look_at_camera, make_camera
+from tests.support.patience import Deadline
 from tests.support.requirements import missing
 
 MS = 1_000_000
@@ -238,9 +239,9 @@ def test_a_camera_that_is_not_gige_goes_the_same_way(fake_inside: str) -> None:
         assert (taken.region_px, taken.exposure_ms, taken.pixel_format) == ((8, 4, 256, 128), 2.0, "Mono16")
         grabber.arm()
         frames = []
-        end = time.monotonic() + 5.0
+        deadline = Deadline(5.0)
         while len(frames) < 6:
-            assert time.monotonic() < end
+            assert deadline.left
             frame = grabber.next_frame(0.2)
             frames += [] if frame is None else [frame]
         assert all(frame.pixels.shape == (128, 256) and frame.status is FrameStatus.OK for frame in frames)

@@ -15,7 +15,7 @@ from stereorig.drivers.acquisition.frame_counter import SequenceReader
 from stereorig.drivers.acquisition.reader import CameraReader
 from stereorig.drivers.cameras.protocol import CameraDescription, CameraSettings, Frame, FrameStatus
 from stereorig.sim.grabber import SimFrameGrabber
-from tests.support.patience import busy
+from tests.support.patience import Deadline, busy
 
 
 class ScriptedGrabber:
@@ -73,9 +73,9 @@ def started(grabber: ScriptedGrabber, **options: object) -> CameraReader:
 
 
 def wait_until(condition: Callable[[], bool], seconds: float = 5.0) -> None:
-    end = time.monotonic() + seconds
+    deadline = Deadline(seconds)
     while not condition():
-        assert time.monotonic() < end, "waited in vain"
+        assert deadline.left, "waited in vain"
         time.sleep(0.002)
 
 

@@ -20,6 +20,7 @@ from stereorig.drivers.stages.protocol import AxisOptions
 from stereorig.drivers.stages.transcript import Transcript
 from stereorig.sim.controllers.esp301 import SimESP301
 from stereorig.sim.controllers.server import ControllerServer
+from tests.support.patience import Deadline
 from tests.support.requirements import ROOT
 from tests.support.stage_bench import CONTROLLERS, bench
 
@@ -39,9 +40,9 @@ def test_every_byte_in_order_with_time_and_direction(driver: str, tmp_path: Path
     with bench(driver, "socket", record=record) as stand:
         stand.stage.position(1)
         stand.stage.stop()
-        deadline = time.monotonic() + 5.0
+        deadline = Deadline(5.0)
         while not stand.controller.commands("ST"):
-            assert time.monotonic() < deadline
+            assert deadline.left
             time.sleep(0.002)
         received = [entry.text for entry in stand.controller.received]
     lines = lines_of(record)

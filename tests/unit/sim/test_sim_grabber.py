@@ -12,7 +12,7 @@ import pytest
 
 from stereorig.core.errors import CameraError
 from stereorig.drivers.cameras.protocol import CameraSettings, FrameGrabber, FrameStatus, Pixels
-from stereorig.sim.grabber import SimFrameGrabber
+from stereorig.sim.grabber import SimFrameGrabber, TriggerLine
 
 SIZE = (24, 16)  # width, height
 
@@ -78,6 +78,23 @@ def test_a_camera_triggered_alone_does_not_pull_the_other_to_an_old_pulse(
         pair[0].trigger()
     first, second = pair[0].trigger(), pair[1].trigger()
     assert first == second
+
+
+def test_a_second_call_seconds_late_joins_the_pulse_and_the_first_camera_joins_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    line, now = TriggerLine(), [0]
+    monkeypatch.setattr(time, "monotonic_ns", lambda: now[0])
+    first = line.fire("cam1")
+    now[0] = 3 * 10**9  # as on a machine that stopped the process
+    assert line.fire("cam2") == first
+    alone = line.fire("cam2")
+    assert alone.at_ns == now[0]
+    now[0] = 4 * 10**9
+    second = line.fire("cam1")
+    assert (second.at_ns, line.fire("cam2")) == (now[0], second)
+    now[0] = 20 * 10**9
+    assert line.fire("cam2").at_ns == now[0]
 
 
 def test_settings_come_back_as_taken_and_bad_ones_change_nothing(pair: tuple[SimFrameGrabber, SimFrameGrabber]) -> None:

@@ -12,6 +12,7 @@ from stereorig.drivers.stages.makers.smc100 import SMC100Stage
 from stereorig.drivers.stages.protocol import AxisOptions, AxisState
 from stereorig.sim.controllers.server import ControllerServer
 from stereorig.sim.controllers.smc100 import SimSMC100
+from tests.support.patience import Deadline
 
 
 @pytest.fixture
@@ -29,9 +30,9 @@ def stage(chain: SimSMC100) -> Iterator[SMC100Stage]:
 
 
 def rest(chain: SimSMC100, state: bytes) -> None:
-    end = time.monotonic() + 5.0
+    deadline = Deadline(5.0)
     while chain.take_line(b"1TS") != b"1TS0000" + state + b"\r\n":
-        assert time.monotonic() < end
+        assert deadline.left
         time.sleep(0.002)
 
 
