@@ -117,7 +117,8 @@ def judge_offsets(
     covariance, names
         (n, n) of the cameras' parameters, and their names.
     own_px
-        The calibration's own offset at most, if it is known.
+        The calibration's own offset at most, if it is known. Against a step: of a calibration of unknown error, whose
+        offsets' change up to this size is not called a motion.
     imported
         True for another program's calibration, whose own error is not known.
 
@@ -159,6 +160,9 @@ def judge_offsets(
             moved, known = moved and rms > own_px, True
         if imported or not known:
             moved = None
+    elif moved and own_px is not None and rms <= own_px:
+        # a specimen that deforms or moves brings other parts of an unknown error to its points
+        moved = None
     estimate = estimate_change(pair, step.points, offset, slopes=step.change_slopes, shared=step.shared)
     cost = step.consequences
     parts = {name: float(np.sqrt(np.sum(c[part] ** 2))) for name, part in _PARTS.items()}

@@ -127,11 +127,18 @@ class CameraWatch:
         earlier = None
         if previous is not None and previous != self.reference:
             earlier = self._steps.get(previous) if before is None else self._offsets(previous, *before)
+        own_px = None
+        if self.imported and reference is not None:
+            # offsets at the reference are the unknown error of the calibration, or contain it
+            at_reference = judge_offsets(self.pair, reference, names=names, imported=True)
+            own_px = None if at_reference is None else at_reference.offset_rms_px
         compared: tuple[tuple[StepOffsets | None, Against], ...] = ((reference, "reference"), (earlier, "last_step"))
         against_reference, against_last = (
             None
             if other is None
-            else judge_offsets(self.pair, step, before=other, against=name, covariance=covariance, names=names)
+            else judge_offsets(
+                self.pair, step, before=other, against=name, covariance=covariance, names=names, own_px=own_px
+            )
             for other, name in compared
         )
         return MotionCheck.of(against_calibration, against_reference, against_last)

@@ -265,6 +265,19 @@ def test_an_imported_calibration_s_offset_asserts_nothing() -> None:
     assert "does not show that a camera moved" in finding.text
 
 
+@pytest.mark.parametrize(("turn_deg", "moved"), [(0.0, False), (0.002, None), (0.02, True)])
+def test_an_unknown_error_s_own_size_is_no_motion_between_steps(turn_deg: float, moved: bool | None) -> None:
+    wrong = turned(CAM2, (0.005, 0.0, 0.0))  # the calibration is wrong by this from the start
+    earlier = matches(CAM1, wrong, np.random.default_rng(0))
+    points = matches(CAM1, turned(wrong, (turn_deg, 0.0, 0.0)), np.random.default_rng(1))
+    own = judge_offsets(PAIR, earlier, imported=True)
+    assert own is not None
+    before = earlier, PAIR.epipolar_residual_px(earlier.xy1_px, earlier.xy2_px)
+    finding = judge_offsets(PAIR, points, before=before, against="reference", own_px=own.offset_rms_px)
+    assert finding is not None
+    assert finding.camera_moved is moved
+
+
 def test_offsets_that_no_orientation_explains_are_structure() -> None:
     rng = np.random.default_rng(1)
     points = joined(CAM1, turned(CAM2, (0.1, 0.0, 0.0)), rng)
