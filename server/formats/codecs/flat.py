@@ -156,6 +156,9 @@ def _by_pillow(data: bytes, name: str, kind: str) -> NDArray[Any]:
             with Image.open(io.BytesIO(data), formats=(kind,)) as image:
                 if image.mode == "P":
                     image.load()
+                    held = image.palette
+                    if held is None or np.asarray(image).max() >= len(held.palette) // len(held.mode):
+                        raise unreadable(name, f"{kind}, its palette has fewer colours than its pixels name")
                     return np.asarray(image.convert("RGBA" if "transparency" in image.info else "RGB"))
                 if image.mode not in ("1", "L", "LA", "I;16", "I;16B", "I;16L", "I;16N", "RGB", "RGBA"):
                     raise unsupported(name, f"its pixel type is {image.mode!r}")

@@ -23,10 +23,13 @@ _FIXED = {1: "B", 3: "H", 4: "I", 6: "b", 7: "B", 13: "I", 16: "Q", 18: "Q"}  # 
 _SUBFILE, _WIDTH, _LENGTH, _BITS, _COMPRESSION, _PHOTOMETRIC, _ORDER = 254, 256, 257, 258, 259, 262, 266
 _STRIPS, _SAMPLES, _ROWS, _STRIP_BYTES, _PLANAR, _PREDICTOR, _COLOURS = 273, 277, 278, 279, 284, 317, 320
 _TILE_WIDTH, _TILE_LENGTH, _TILES, _TILE_BYTES, _FORMAT, _TABLES, _DEPTH = 322, 323, 324, 325, 339, 347, 32997
+_ORIENTATION, _UPRIGHT = 274, 1
 _DEFAULTS = {_SUBFILE: 0, _BITS: 1, _COMPRESSION: 1, _ORDER: 1, _SAMPLES: 1, _PLANAR: 1, _PREDICTOR: 1, _FORMAT: 1}
+_DEFAULTS |= {_ORIENTATION: _UPRIGHT}
 _KNOWN = {*_DEFAULTS, _WIDTH, _LENGTH, _PHOTOMETRIC, _STRIPS, _ROWS, _STRIP_BYTES, _COLOURS, _TILE_WIDTH, _TILE_LENGTH}
 _KNOWN |= {_TILES, _TILE_BYTES, _TABLES, _DEPTH}
 WHITE_IS_ZERO, BLACK_IS_ZERO, RGB, PALETTE, YCBCR = 0, 1, 2, 3, 6
+_MOSAICS = (32803, 34892)  # of colour filters, and what was made of them
 _SPACES = {1: "MINISBLACK", 4: "MASK", 5: "SEPARATED", 8: "CIELAB", 9: "ICCLAB", 10: "ITULAB"}
 _READ_BITS = (1, 8, 12, 16)
 _MAX_PAGES = 4
@@ -108,13 +111,25 @@ def decode_tiff(data: bytes, name: str) -> tuple[NDArray[Any], str, int]:
     pixels = _assembled(data, tags, layout, name)
     if kind == PALETTE:
         pixels = _by_table(pixels, tags, layout, name)
-        return pixels, "RGB", 8 * pixels.itemsize
+        return _upright(pixels, _one(tags, _ORIENTATION), name), "RGB", 8 * pixels.itemsize
     if kind == WHITE_IS_ZERO:
         pixels = ~pixels if layout.bits == 1 else (1 << layout.bits) - 1 - pixels
     space = (
         "RGB" if kind == RGB or (kind == YCBCR and _one(tags, _COMPRESSION) == JPEG) else str(_SPACES.get(kind, kind))
     )
-    return pixels, space, layout.bits
+    return _upright(pixels, _one(tags, _ORIENTATION), name), space, layout.bits
+
+
+def _upright(pixels: NDArray[Any], orientation: int, name: str) -> NDArray[Any]:
+    """Return pixels whose first row is the top one and first column the left one, as other readers give them."""
+    if not 1 <= orientation <= 8:
+        raise unreadable(name, f"TIFF, its orientation is {orientation}")
+    if orientation == _UPRIGHT:
+        return pixels
+    if orientation > 4:
+        pixels = np.swapaxes(pixels, 0, 1)
+    rows, cols = orientation in (3, 4, 7, 8), orientation in (2, 3, 6, 7)
+    return np.ascontiguousarray(pixels[:: -1 if rows else 1, :: -1 if cols else 1])
 
 
 def _pages(data: bytes) -> list[Tags]:
@@ -175,6 +190,8 @@ def _layout(tags: Tags, name: str) -> _Layout:
         raise unsupported(name, f"it holds differences of the kind {predictor} in {depth} bit, compression {packing}")
     if _one(tags, _ORDER) != 1 or tags.get(_DEPTH, (1,))[0] != 1:
         raise unsupported(name, "its bits are in reverse order, or it is a volume")
+    if kind in _MOSAICS:
+        raise unsupported(name, "it is a camera's raw mosaic of colours")
     if kind == YCBCR and packing != JPEG:
         raise unsupported(name, "its colours are YCBCR, not RGB")
     if kind == PALETTE and (channels != 1 or depth != 8):

@@ -161,6 +161,20 @@ def test_a_palette_is_read_by_its_table_unless_it_paints_false_colours() -> None
     assert decode(_tiff(GREY8, photometric="palette", colormap=colours)).grey_from is not None
 
 
+@pytest.mark.fault(58)
+@pytest.mark.parametrize("form", ["PNG", "BMP"])
+def test_a_palette_that_lacks_colours_of_its_pixels_is_refused(form: str) -> None:
+    indices = Image.fromarray(GREY8 % 100).convert("P")
+    indices.putpalette(bytes(range(150)))
+    out = io.BytesIO()
+    indices.save(out, form)
+    data = out.getvalue()
+    if form == "BMP":  # Pillow writes 256 colours: 50 by its head
+        data = data[:46] + struct.pack("<I", 50) + data[50:]
+        data = data[:10] + struct.pack("<I", 54 + 200) + data[14 : 54 + 200] + data[54 + 1024 :]
+    assert code_of(data) == "image_unreadable"
+
+
 def test_masks_of_one_bit_are_read_whole_or_not_at_all() -> None:
     mask = GREY8 > 120
     for form in ("PNG", "BMP", "TIFF"):

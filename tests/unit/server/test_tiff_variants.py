@@ -106,6 +106,30 @@ def test_a_depth_that_is_not_read_is_named(bits: int) -> None:
     assert caught.value.code == "image_unsupported"
 
 
+@pytest.mark.fault(58)
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("channels", [1, 3])
+def test_an_orientation_is_applied_as_pillow_and_opencv_apply_it(orientation: int, channels: int) -> None:
+    image = np.squeeze(pixels(8, channels))
+    out = io.BytesIO()
+    kind = "rgb" if channels == 3 else "minisblack"
+    tifffile.imwrite(out, image, photometric=kind, metadata=None, extratags=[(274, "H", 1, orientation, True)])
+    found = decode_image(out.getvalue())
+    with Image.open(out) as opened:
+        pillow = np.asarray(opened)
+    opencv = cv2.imdecode(np.frombuffer(out.getvalue(), np.uint8), cv2.IMREAD_UNCHANGED)
+    for other in (pillow, opencv if channels == 1 else opencv[..., ::-1]):
+        grey = other if channels == 1 else np.rint(other @ np.array([0.299, 0.587, 0.114]))
+        np.testing.assert_array_equal(found, grey)
+
+
+def test_a_raw_mosaic_of_colours_is_refused() -> None:
+    out = io.BytesIO()
+    tifffile.imwrite(out, pixels(16, 1)[..., 0], photometric="cfa", metadata=None)
+    with pytest.raises(ImageError, match="mosaic"):
+        decode_image(out.getvalue())
+
+
 def test_twelve_packed_bits_state_their_full_scale(tmp_path: object) -> None:
     deep, wide = pixels(12, 1), pixels(16, 1)
     files = {
