@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -36,7 +37,13 @@ KINDS: list[tuple[str, Transport]] = [
 ]
 
 
-@pytest.fixture(params=KINDS, ids=["-".join(kind) for kind in KINDS])
+def _param(kind: tuple[str, Transport]) -> Any:
+    """A driver that a socket has tried is tried over a pty in depth only; a pty is tried with the CONEX-CC."""
+    tried = kind[1] == "pty" and (kind[0], "socket") in KINDS
+    return pytest.param(kind, id="-".join(kind), marks=[pytest.mark.deep] if tried else [])
+
+
+@pytest.fixture(params=[_param(kind) for kind in KINDS])
 def kind(request: pytest.FixtureRequest) -> tuple[str, Transport]:
     return request.param
 

@@ -77,7 +77,8 @@ def attacked(written: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     data = Path(shutil.copytree(written, tmp_path_factory.mktemp("attacked") / "data"))
     service = Service(parse_config(SMALL), data).start()
     try:
-        with served(service) as client:
+        with served(service) as client, pytest.MonkeyPatch.context() as patch:
+            patch.setattr("stereorig.server.store.verify._WRITING_S", 0.01)  # nothing is written meanwhile
             yield data, client
     finally:
         service.close()
