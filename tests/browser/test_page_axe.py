@@ -17,7 +17,6 @@ from tests.support.service_rig import served, tiny_config, wait_for_rig
 bench, page = results_page.bench, results_page.page  # fixtures
 
 pytestmark = pytest.mark.timeout(500)
-expect.set_options(timeout=30_000)  # the machine may be busy
 
 API = "/api/v1"
 AREA = ("Area left", "Area top", "Area right", "Area bottom")

@@ -22,7 +22,6 @@ from tests.support.tension import LATERAL, TENSION, pulled, shape
 bench = results_page.bench  # fixture
 
 pytestmark = pytest.mark.timeout(600)
-expect.set_options(timeout=30_000)  # the machine may be busy
 
 
 @pytest.fixture

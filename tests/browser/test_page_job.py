@@ -37,7 +37,6 @@ from tests.support.service_rig import SMALL, true_cameras
 pytestmark = pytest.mark.timeout(500)
 API = "/api/v1"
 SLOW = 200_000
-expect.set_options(timeout=30_000)  # the machine may be busy
 WIDTH, HEIGHT = 256, 240
 # load on the simulated plate in kPa, and the load frame's value in N
 STEPS = ((0.0, 0.0), (344.5, 193.9), (689.0, 387.8))

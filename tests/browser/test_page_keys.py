@@ -18,7 +18,6 @@ from tests.support.page_editor import asked
 from tests.support.service_rig import SMALL, plate_test
 
 pytestmark = pytest.mark.timeout(300)
-expect.set_options(timeout=30_000)  # the machine may be busy
 
 API = "/api/v1"
 

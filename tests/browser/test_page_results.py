@@ -43,7 +43,6 @@ from tests.support.service_rig import wait_for_job
 bench, page = results_page.bench, results_page.page  # fixtures
 
 pytestmark = pytest.mark.timeout(600)
-expect.set_options(timeout=30_000)  # the machine may be busy
 
 # matplotlib's own numbers at 0, 1/4, 1/2, 3/4 and 1, its documentation's viridis
 VIRIDIS = {0.0: (68, 1, 84), 0.25: (59, 82, 139), 0.5: (33, 145, 140), 0.75: (94, 201, 98), 1.0: (253, 231, 37)}

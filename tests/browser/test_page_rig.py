@@ -117,13 +117,13 @@ def test_the_focus_figure_keeps_its_peak_and_says_how_far_it_is_from_it(page: Wa
     shown = page.open()
     box = shown.get_by_role("region", name="cam1", exact=True)
     reading = box.locator('[data-role="focus"]')
-    expect(reading).to_contain_text("at the peak", timeout=15_000)
+    expect(reading).to_contain_text("at the peak")
     # the lens is capped: little but noise is seen, and the peak stays what it was
     client.patch("/api/v1/cameras/cam1", json={"exposure_ms": 0.01}).raise_for_status()
     expect(box.get_by_text("noise only")).to_be_visible(timeout=15_000)
     expect(reading).to_contain_text("no figure")
     client.patch("/api/v1/cameras/cam1", json={"exposure_ms": 10.0}).raise_for_status()
-    expect(reading).to_contain_text("at the peak", timeout=15_000)
+    expect(reading).to_contain_text("at the peak")
     page.sound()
 
 
@@ -156,7 +156,7 @@ def test_a_moved_camera_is_told_while_it_is_looked_at(page: Watched, client: htt
     # five hundredths of a degree over 3600 px of pinhole distance: three pixels
     bump = {"bump_cam2": [0.05, 0, 0, 0, 0, 0]}
     client.put(f"{api}/sim/scene", json={"scene": "plate", "params": bump}).raise_for_status()
-    expect(check).to_contain_text("cameras have moved", timeout=30_000)
+    expect(check).to_contain_text("cameras have moved")
     expect(check.get_by_role("link", name="Calibrate again")).to_be_visible()
     client.put(f"{api}/sim/scene", json={"scene": "plate", "params": {"bump_cam2": [0] * 6}}).raise_for_status()
     page.sound(409)
@@ -203,7 +203,7 @@ def test_jog_moves_the_axis_and_stop_is_told(page: Watched, client: httpx.Client
     shown = page.open()
     axis = shown.locator('[data-axis="1"]')
     axis.get_by_role("button", name="Jog axis 1 forward").click()
-    expect(axis.locator('[data-role="position"]')).to_have_text(re.compile(r"^1(\.0+)? ?mm|^1\.0"), timeout=15_000)
+    expect(axis.locator('[data-role="position"]')).to_have_text(re.compile(r"^1(\.0+)? ?mm|^1\.0"))
     shown.get_by_role("button", name="STOP").click()
     expect(shown.get_by_text("The stop command was sent")).to_be_visible()
     assert client.get("/api/v1/stage").json()["axes"][0]["position_mm"] == pytest.approx(1.0, abs=0.01)

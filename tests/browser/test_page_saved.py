@@ -20,7 +20,6 @@ from tests.support.service_rig import wait_for_job
 bench, page = results_page.bench, results_page.page  # fixtures
 
 pytestmark = pytest.mark.timeout(600)
-expect.set_options(timeout=30_000)  # the machine may be busy
 
 LIMITS = re.compile(r"from ([\d.-]+) to ([\d.-]+) mm")
 EDGE = 12  # px, white about the picture's frame

@@ -17,7 +17,6 @@ from tests.support.results_page import API, Bench, shown
 bench = results_page.bench  # fixture
 
 pytestmark = pytest.mark.timeout(600)
-expect.set_options(timeout=30_000)  # the machine may be busy
 
 Spot = tuple[float, float]
 

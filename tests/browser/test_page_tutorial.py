@@ -93,7 +93,7 @@ class Operator:
         """Return the one button, link or heading to open that has exactly this name."""
         button, link = (self.main.get_by_role(role, name=name, exact=True) for role in ("button", "link"))
         summary = self.main.locator("summary").get_by_text(name, exact=True)
-        expect(button.or_(link).or_(summary).first).to_be_visible(timeout=30_000)
+        expect(button.or_(link).or_(summary).first).to_be_visible()
         for kind in (button, link, summary):
             if kind.count():
                 return kind.first

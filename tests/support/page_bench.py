@@ -15,9 +15,10 @@ import pytest
 
 if os.environ.get("CI", "").lower() != "true":
     pytest.importorskip("playwright", reason="pip install playwright to test the page")
-from playwright.sync_api import Browser, BrowserContext, Page
+from playwright.sync_api import Browser, BrowserContext, Page, expect
 
 from tests.bench.page import browser as page_browser
+from tests.support.patience import busy
 
 # what has the focus, how it shows, and whether it lies in the window and not under the bar
 FOCUS = """() => {
@@ -66,7 +67,7 @@ class Watched:
         """Go to a screen (``#/rig``) and wait until it is drawn."""
         self.page.goto(f"{self.origin}/{address}")
         screen = address.removeprefix("#/").split("/")[0] or "rig"
-        self.page.wait_for_selector(f'[data-screen="{screen}"] h1', timeout=30_000)
+        self.page.wait_for_selector(f'[data-screen="{screen}"] h1')
         return self.page
 
     def sound(self, *expected: int) -> None:
@@ -95,7 +96,9 @@ def watched(made: Browser, origin: str, **options: Any) -> Iterator[Watched]:
     """Open a page of its own that is watched."""
     settings: dict[str, Any] = {"viewport": page_browser.SIZE} | options
     context: BrowserContext = made.new_context(**settings)
-    context.set_default_timeout(30_000)
+    patience_ms = 30_000 * busy()
+    context.set_default_timeout(patience_ms)
+    expect.set_options(timeout=patience_ms)
     page = context.new_page()
     watch = Watched(page, origin)
 
