@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -29,10 +29,12 @@ from stereorig.core.progress import Progress, no_progress
 from stereorig.core.strain import StrainField
 from stereorig.server.base.errors import NotFoundError
 from stereorig.server.base.json_values import without_nan
-from stereorig.server.formats.results.folder import file_of_step, number_of
+from stereorig.server.evaluations.histories import Ends, History, Mean, history
+from stereorig.server.formats.results.folder import file_of_step, home_of, number_of
 from stereorig.server.formats.results.reading import ResultHead, read_field, read_head
 from stereorig.server.formats.results.strain import read_strain
 from stereorig.server.formats.results.variables import SIGMA, values_of
+from stereorig.server.results.channels import Recorded, recorded_with
 from stereorig.server.wording import problems_in
 
 GROUP = "stereorig.evaluations"
@@ -71,11 +73,14 @@ class Evaluated:
         Step whose points ``variables`` belong to.
     variables
         Variables over the points, by name; they are written to the VTU file beside the document.
+    files
+        Further files that are written beside it: text by the end of the name, as ``.csv``.
     """
 
     document: BaseModel
     step: int = 0
     variables: Mapping[str, GridValues] = field(default_factory=dict)
+    files: Mapping[str, str] = field(default_factory=dict)
 
 
 class Results:
@@ -146,6 +151,16 @@ class Results:
     def sigma(self, step: int, name: str) -> Float:
         """Return the standard uncertainty (k = 1) of a variable; raises as :meth:`values`."""
         return self.values(step, SIGMA + name)
+
+    def recorded(self, step: int) -> Recorded:
+        """Return load, channels and time of a step, as far as they are known."""
+        head = self.head(step)
+        found = recorded_with(home_of(self.file(step)), head.step, head.reference_step)
+        return found if found.load_n is not None else replace(found, load_n=head.load_n)
+
+    def history(self, gauge: Ends | Mean) -> History:
+        """Return an engineering strain over :attr:`steps`, with what its errors have in common; see :func:`history`."""
+        return history([*self._files.values()], gauge)
 
 
 class Evaluation(Protocol):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import sys
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint, entry_points
@@ -18,13 +19,14 @@ from stereorig.core.progress import no_progress
 from stereorig.core.strain import StrainOptions, surface_strain
 from stereorig.server.evaluations import door
 from stereorig.server.evaluations.door import Evaluation, document_of, evaluate, evaluation
+from stereorig.server.evaluations.histories import Ends, Mean
 from stereorig.server.formats.results.writing import Provenance, write_field
 from tests.support.document_scripts import one_block
 from tests.support.gauge_field import SUBSET, make_field
 
 GRID = (14, 17)
 PAGE = "docs/how_to/evidence/evaluations.md"
-NAMES = sorted({entry.name for entry in entry_points(group=door.GROUP)} | {"conformity", "flatness"})
+NAMES = sorted({entry.name for entry in entry_points(group=door.GROUP)} | {"conformity", "flatness", "tensile"})
 
 
 @pytest.fixture(autouse=True)
@@ -41,7 +43,7 @@ def how_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.fixture
 def results(tmp_path: Path) -> list[Path]:
-    """A shape and two stretched steps with strain; some points are lost."""
+    """A shape and two stretched steps with strain and load; some points are lost."""
     failed = np.zeros(GRID, bool)
     failed[3:5, 6:9] = True
     files = []
@@ -49,8 +51,23 @@ def results(tmp_path: Path) -> list[Path]:
         field = make_field(None if n == 0 else lambda x, n=n: x * [1.0 + 0.01 * n, 1.0, 1.0], failed=failed)
         strain = None if n == 0 else surface_strain(field, StrainOptions(), subset_px=SUBSET)
         files.append(tmp_path / f"step_{n:04d}.nc")
-        write_field(files[-1], field, Provenance({"subset_px": SUBSET}, {}, "1", step=n), strain)
+        extra = {"load_n": f"{500.0 * n}"}
+        write_field(files[-1], field, Provenance({"subset_px": SUBSET}, {}, "1", step=n, extra=extra), strain)
     return files
+
+
+@pytest.mark.parametrize("gauge", [Mean("exx"), Ends((61.0, 88.0), (131.0, 88.0))])
+def test_a_history_has_the_stretch_of_each_step_and_the_errors_that_steps_share(
+    results: list[Path], gauge: Mean | Ends
+) -> None:
+    steps = door.Results(results)
+    assert [steps.recorded(n).load_n for n in steps.steps] == [0.0, 500.0, 1000.0]
+    found = steps.history(gauge)
+    # x is stretched by 1 % and 2 %; the surface climbs by 0.05 + 0.04 x, of which x alone is stretched
+    assert found.value == pytest.approx([0.0, 0.01, 0.02], rel=0.02)
+    assert found.own[0] == 0.0
+    assert (found.own[1:] > 0.0).all()
+    assert not found.known, "the calibration's part is not known"
 
 
 def settings_of(made: Evaluation) -> dict[str, Any]:
@@ -84,6 +101,9 @@ def test_it_answers_with_its_document_and_changes_no_file(name: str, results: li
         assert one.values.shape == GRID, variable
         assert one.units
         assert one.long_name
+    for ending, text in outcome.files.items():
+        assert re.fullmatch(r"[a-z_]*\.[a-z]{2,5}", ending), "it ends a file's name, in the folder that was asked for"
+        assert text
     assert [hashlib.sha256(path.read_bytes()).digest() for path in results] == before
 
 

@@ -54,6 +54,8 @@ def run(args: argparse.Namespace) -> int:
         write_bytes(args.out / f"{args.name}.json", to_json(document))
         if outcome.variables:
             write_points(args.out / f"{args.name}.vtu", outcome, files)
+        for ending, text in outcome.files.items():
+            write_bytes(args.out / f"{args.name}{ending}", text.encode())
     print(to_json(document).decode() if args.json else "\n".join([made.title, *_lines(document)]))
     return 1 if document.get("accepted") is False else 0
 

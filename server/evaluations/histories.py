@@ -1,0 +1,151 @@
+"""A strain over all steps of a measurement, with the errors that are new at each step and those that steps share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from stereorig.core.arrays import Float
+from stereorig.core.common.factor import Causes, joined
+from stereorig.core.errors import InputError
+from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.gauge.area import points_within
+from stereorig.core.gauge.extensometer import extensometer
+from stereorig.core.gauge.reading import MISSING, Reading, reading_of
+from stereorig.core.names import ALL_CAUSES
+from stereorig.core.strain.mean import mean_strain_variance
+from stereorig.server.formats.results.reading import read_field, read_head
+from stereorig.server.formats.results.strain import read_strain
+from stereorig.server.formats.results.variables import STRAIN_NAMES
+
+_Positions = tuple[tuple[float, float], ...]
+
+
+class Ends(NamedTuple):
+    """An extensometer between two positions of camera 1's reference image."""
+
+    a_px: tuple[float, float]
+    b_px: tuple[float, float]
+
+
+class Mean(NamedTuple):
+    """The mean of a component of strain, ``exx`` or ``eyy``, over a polygon; over the whole field without one."""
+
+    component: str
+    polygon_px: _Positions | None = None
+
+
+#: engineering strain of a component of each tensor, and its derivative
+_ENGINEERING: dict[str, Callable[[float], tuple[float, float]]] = {
+    "green_lagrange": lambda e: (float(np.sqrt(1.0 + 2.0 * e)) - 1.0, 1.0 / float(np.sqrt(1.0 + 2.0 * e))),
+    "hencky": lambda e: (float(np.expm1(e)), float(np.exp(e))),
+    "infinitesimal": lambda e: (e, 1.0),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """An engineering strain over n steps; the reference has zero strain without an error.
+
+    Attributes
+    ----------
+    value
+        (n,) strain; NaN where there is none.
+    own
+        (n,) standard deviation of the errors that are new at each step.
+    shared
+        By cause (n, k): what one standard deviation of each error that all steps share adds to the values. Columns of
+        two histories of one measurement with equal cause and number belong to the same error, but for ``reference``.
+    known
+        False if a step's own uncertainty or the calibration's part is not known.
+    """
+
+    value: Float
+    own: Float
+    shared: dict[str, Float]
+    known: bool
+
+
+def history(files: Sequence[Path], gauge: Ends | Mean) -> History:
+    """Read a gauge in every step.
+
+    Parameters
+    ----------
+    files
+        Result files of one measurement, by step.
+    gauge
+        What to read.
+
+    Raises
+    ------
+    RegionError
+        ``gauge_outside``, ``gauge_unusable``.
+    InputError
+        ``evaluation_needs`` if a displacement field has no strain; ``settings_missing``.
+    """
+    readings = [_reading(path, gauge) for path in files]
+    n = len(readings)
+    moved = [k for k, one in enumerate(readings) if one is not None]
+    known = [(k, one) for k, one in enumerate(readings) if one is not None and np.isfinite(one.value)]
+    value, own, reference = np.zeros(n), np.zeros(n), np.zeros((n, 1))
+    value[moved] = np.nan
+    causes = [one.causes or Causes.unseparated(len(one.common)) for _, one in known if one.common is not None]
+    every = reduce(joined, causes, Causes((), ()))
+    factor = np.zeros((n, len(every.columns)))
+    for k, one in known:
+        value[k], own[k] = one.value, one.budget.matching if one.budget.matching is not None else np.nan
+        reference[k] = one.budget.reference or 0.0
+        if one.common is not None:
+            factor[k] = (one.causes or Causes.unseparated(len(one.common))).aligned(one.common, every)
+    columns = {str(c): factor[:, [k for k, name in enumerate(every.columns) if name == c]] for c in ALL_CAUSES}
+    every_part: dict[str, Float] = {"reference": reference, **columns}
+    shared = {cause: held for cause, held in every_part.items() if held.any()}
+    complete = len(causes) == len(known) and all(one.budget.matching is not None for _, one in known)
+    return History(value, own, shared, complete)
+
+
+def _reading(path: Path, gauge: Ends | Mean) -> Reading | None:
+    """Return an engineering strain of a step; None for a shape."""
+    field = read_field(path)
+    if field.uvw_mm is None:
+        return None
+    if isinstance(gauge, Mean):
+        return _mean(path, field, gauge)
+    subset = read_head(path).settings.get("subset_px")
+    if not isinstance(subset, int | float):
+        raise InputError(
+            f"{path.name} does not state its subset.",
+            code="settings_missing",
+            remedy="Measure again with this program.",
+        )
+    return extensometer(field, gauge.a_px, gauge.b_px, shared=SharedPixels.of(field, float(subset))).strain
+
+
+def _mean(path: Path, field: Field, gauge: Mean) -> Reading:
+    strain, axis = read_strain(path), STRAIN_NAMES.index(gauge.component)
+    if strain is None:
+        raise InputError(
+            f"{path.name} has no variable {gauge.component!r}.",
+            code="evaluation_needs",
+            remedy="Switch strain on when it is measured, or give an extensometer.",
+        )
+    inside = points_within(field, gauge.polygon_px) & strain.valid
+    if not inside.any():
+        return MISSING
+    mean = float(strain.strain[..., axis][inside].mean())
+    found = mean_strain_variance(field, strain.options, inside, subset_px=strain.subset_px)
+    own, frozen, common, causes = found.of(axis)
+    value, slope = _ENGINEERING[strain.options.tensor](mean)
+    return reading_of(
+        value,
+        own * slope**2,
+        None if frozen is None else frozen * slope**2,
+        None if common is None else common * slope,
+        causes,
+    )
