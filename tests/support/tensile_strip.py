@@ -72,17 +72,29 @@ def orthotropic(
     e: float = 200_000.0, nu: float = 0.3, k: float = 550.0, n: float = 0.2, r: float = 1.6, offset: float = 0.002
 ) -> Law:
     """Sheet in true quantities: s = K (p + offset)^n; width against thickness strains as 1 to 1 / r."""
-    strain = _steps(0.17, elastic=0.005, fine=120)
+    strain = _steps(0.28, elastic=0.005, fine=120, coarse=60)
     along = np.log1p(strain)
 
     def excess(p: float, at: float) -> float:
         return p + k * (p + offset) ** n / e - at
 
+    def of_neck(p: float) -> float:
+        # Considere: the load is largest where the true stress rises by itself
+        true = k * (p + offset) ** n
+        rise = n * true / (p + offset)
+        return rise / (1.0 + rise / e) - true
+
     start = k * offset**n / e
     plastic = np.array([brentq(excess, 0.0, 1.0, args=(at,)) if at > start else 0.0 for at in along])
     true = np.where(along > start, k * (plastic + offset) ** n, e * along)
     width = -nu * true / e - r / (1.0 + r) * plastic
-    return Law("orthotropic", strain, np.expm1(width), true / (1.0 + strain), {"r": r})
+    neck = brentq(of_neck, 0.01, 1.0)
+    at_neck = float(np.expm1(neck + k * (neck + offset) ** n / e))
+    strength = k * (neck + offset) ** n / (1.0 + at_neck)
+    grid = np.log1p(np.linspace(0.10, 0.15, 1000))
+    exponent = float(np.polynomial.polynomial.polyfit(np.log(grid), n * np.log(grid + offset), 1)[1])
+    truth = {"r": r, "n": exponent, "strength": strength, "uniform": at_neck - strength / e}
+    return Law("orthotropic", strain, np.expm1(width), true / (1.0 + strain), truth)
 
 
 LAWS = {law.name: law for law in (linear(), ramberg_osgood(), voce(), orthotropic())}

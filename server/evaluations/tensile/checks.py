@@ -16,7 +16,7 @@ from stereorig.server.evaluations.tensile.propagate import Uncertain
 
 ALL = tuple(UNITS)
 _OF_STRESS = tuple(key for key in ALL if key not in ("poisson", "r"))
-_ON_LINE = ("proof", "n", "k")
+_ON_LINE = ("proof", "n", "k", "uniform", "strain_at_strength", "strain_at_break", "elongation")
 _BEYOND = 4.0
 _CHANCE = 1e-3  # share of sound tests whose scatter is called too large
 _CURVED = 0.8  # share of the scatter that a parabola explains

@@ -15,14 +15,14 @@ _ROUNDS = 6
 
 @dataclass(frozen=True, eq=False)
 class Local:
-    """Steps through which a parabola is laid.
+    """Steps through which a parabola, or a cubic, is laid.
 
     Attributes
     ----------
     at
         Their indices.
     solve
-        (3, m) coefficients over the readings: constant, linear, quadratic in the place along the curve.
+        (q, m) coefficients over the readings: constant, linear, quadratic ... in the place along the curve.
     place
         Where on the curve its value is asked for.
     """
@@ -32,19 +32,19 @@ class Local:
     place: float = 0.0
 
     @staticmethod
-    def through(at: Indices, places: Float, place: float = 0.0) -> Local:
+    def through(at: Indices, places: Float, place: float = 0.0, *, degree: int = 2) -> Local:
         """Return the steps ``at`` with their places (m,) along the curve."""
-        powers = np.vander(places, min(3, len(at)), increasing=True)
+        powers = np.vander(places, min(degree + 1, len(at)), increasing=True)
         return Local(at, np.asarray(np.linalg.pinv(powers), dtype=np.float64), place)
 
     def coefficients(self, y: Float) -> Float:
-        """Return the parabola (..., 3) through readings (..., n)."""
+        """Return the four coefficients (..., 4) of the line through readings (..., n)."""
         found = y[..., self.at] @ self.solve.T
-        return np.concatenate([found, np.zeros((*found.shape[:-1], 3 - found.shape[-1]))], axis=-1)
+        return np.concatenate([found, np.zeros((*found.shape[:-1], 4 - found.shape[-1]))], axis=-1)
 
     def value(self, y: Float) -> Float:
-        """Return the parabola through readings (..., n) at the place asked for."""
-        return np.asarray(self.coefficients(y) @ np.array([1.0, self.place, self.place**2]))
+        """Return the line through readings (..., n) at the place asked for."""
+        return np.asarray(self.coefficients(y) @ self.place ** np.arange(4))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,10 +109,13 @@ def numbers_of(x: Float, plan: Plan, *, only_line: bool = False) -> dict[str, Fl
     if plan.peak is not None:
         found["strength"] = plan.peak.value(stress)
     if plan.around_peak is not None and "strength" in found:
-        bend = plan.around_peak.coefficients(stress)
-        place = -bend[..., 1] / (2.0 * bend[..., 2])
+        bend = np.moveaxis(plan.around_peak.coefficients(stress), -1, 0)
+        place = np.zeros(modulus.shape)
+        for _ in range(_ROUNDS):
+            rise = bend[1] + 2.0 * bend[2] * place + 3.0 * bend[3] * place**2
+            place = place - rise / (2.0 * bend[2] + 6.0 * bend[3] * place)
         strain = plan.around_peak.coefficients(axial)
-        at_peak = strain[..., 0] + strain[..., 1] * place + strain[..., 2] * place**2 - toe
+        at_peak = (strain * place[..., None] ** np.arange(4)).sum(axis=-1) - toe
         found |= {"strain_at_strength": at_peak, "uniform": at_peak - found["strength"] / modulus}
     if plan.upper is not None:
         found["upper_yield"] = stress[..., plan.upper]

@@ -237,8 +237,10 @@ class _Chooser:
         self.plan = replace(self.plan, peak=replace(local, place=place))
         level = np.flatnonzero(self.stress >= _PLATEAU * self.stress[self.top])
         plateau = np.arange(min(level[0], near[0]), max(level[-1], near[-1]) + 1)
-        self.plan = replace(self.plan, around_peak=Local.through(self.at[plateau], places[plateau]))
-        if len(plateau) < self.asked.min_steps:
+        around = Local.through(self.at[plateau], places[plateau], degree=3)
+        if len(plateau) >= self.asked.min_steps and around.coefficients(self.curve.values[STRESS])[2] < 0.0:
+            self.plan = replace(self.plan, around_peak=around)
+        else:
             text = f"{len(plateau)} steps are on the plateau of the largest load; {self.asked.min_steps} are needed."
             self.lacks |= dict.fromkeys(keys[1:], Lack("too_few_steps", text))
 
