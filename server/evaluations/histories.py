@@ -15,14 +15,18 @@ from stereorig.core.common.factor import Causes, joined
 from stereorig.core.errors import InputError
 from stereorig.core.field.points.result import Field
 from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.gauge.align import Alignment, aligned
 from stereorig.core.gauge.area import points_within
 from stereorig.core.gauge.extensometer import extensometer
 from stereorig.core.gauge.reading import MISSING, Reading, reading_of
 from stereorig.core.names import ALL_CAUSES
+from stereorig.core.strain import surface_strain
 from stereorig.core.strain.mean import mean_strain_variance
 from stereorig.server.formats.results.reading import read_field, read_head
 from stereorig.server.formats.results.strain import read_strain
 from stereorig.server.formats.results.variables import STRAIN_NAMES
+from stereorig.server.results.gauges.frames import lay
+from stereorig.server.results.gauges.request import PlaneAlignment
 
 _Positions = tuple[tuple[float, float], ...]
 
@@ -35,10 +39,14 @@ class Ends(NamedTuple):
 
 
 class Mean(NamedTuple):
-    """The mean of a component of strain, ``exx`` or ``eyy``, over a polygon; over the whole field without one."""
+    """The mean of a component of strain, ``exx`` or ``eyy``, over a polygon; over the whole field without one.
+
+    X runs along the image's rows, or from the first to the second of two positions.
+    """
 
     component: str
     polygon_px: _Positions | None = None
+    x_line_px: tuple[tuple[float, float], tuple[float, float]] | None = None
 
 
 #: engineering strain of a component of each tensor, and its derivative
@@ -86,10 +94,16 @@ def history(files: Sequence[Path], gauge: Ends | Mean) -> History:
     ------
     RegionError
         ``gauge_outside``, ``gauge_unusable``.
+    MeasurementError
+        ``too_few_points`` for the surface's plane.
     InputError
         ``evaluation_needs`` if a displacement field has no strain; ``settings_missing``.
     """
-    readings = [_reading(path, gauge) for path in files]
+    frame = None
+    if isinstance(gauge, Mean):
+        asked = PlaneAlignment(kind="plane", x_direction="image_rows", x_line_px=gauge.x_line_px)
+        frame = lay(asked, read_field(files[0]), _shared(files[0], read_field(files[0])))
+    readings = [_reading(path, gauge, frame) for path in files]
     n = len(readings)
     moved = [k for k, one in enumerate(readings) if one is not None]
     known = [(k, one) for k, one in enumerate(readings) if one is not None and np.isfinite(one.value)]
@@ -110,13 +124,7 @@ def history(files: Sequence[Path], gauge: Ends | Mean) -> History:
     return History(value, own, shared, complete)
 
 
-def _reading(path: Path, gauge: Ends | Mean) -> Reading | None:
-    """Return an engineering strain of a step; None for a shape."""
-    field = read_field(path)
-    if field.uvw_mm is None:
-        return None
-    if isinstance(gauge, Mean):
-        return _mean(path, field, gauge)
+def _shared(path: Path, field: Field) -> SharedPixels:
     subset = read_head(path).settings.get("subset_px")
     if not isinstance(subset, int | float):
         raise InputError(
@@ -124,17 +132,29 @@ def _reading(path: Path, gauge: Ends | Mean) -> Reading | None:
             code="settings_missing",
             remedy="Measure again with this program.",
         )
-    return extensometer(field, gauge.a_px, gauge.b_px, shared=SharedPixels.of(field, float(subset))).strain
+    return SharedPixels.of(field, float(subset))
+
+
+def _reading(path: Path, gauge: Ends | Mean, frame: Alignment | None) -> Reading | None:
+    """Return an engineering strain of a step; None for a shape."""
+    field = read_field(path)
+    if field.uvw_mm is None:
+        return None
+    if isinstance(gauge, Mean):
+        assert frame is not None
+        return _mean(path, aligned(field, frame), gauge)
+    return extensometer(field, gauge.a_px, gauge.b_px, shared=_shared(path, field)).strain
 
 
 def _mean(path: Path, field: Field, gauge: Mean) -> Reading:
-    strain, axis = read_strain(path), STRAIN_NAMES.index(gauge.component)
-    if strain is None:
+    measured, axis = read_strain(path), STRAIN_NAMES.index(gauge.component)
+    if measured is None:
         raise InputError(
             f"{path.name} has no variable {gauge.component!r}.",
             code="evaluation_needs",
             remedy="Switch strain on when it is measured, or give an extensometer.",
         )
+    strain = surface_strain(field, measured.options, subset_px=measured.subset_px)
     inside = points_within(field, gauge.polygon_px) & strain.valid
     if not inside.any():
         return MISSING

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 import html
-import io
 from collections.abc import Sequence
 from typing import Literal
 
 from pydantic import BaseModel, Field
 
 from stereorig.server.base.models import Reply
+from stereorig.server.formats.csv_cells import row
 
 
 class CardNumber(BaseModel):
@@ -67,12 +66,12 @@ class MaterialCardFound(Reply):
 
 def table_of(card: MaterialCardFound) -> str:
     """Return the numbers as CSV."""
-    out = io.StringIO()
-    rows = csv.writer(out, lineterminator="\n")
-    rows.writerow(("symbol", "value", "units", "u", "lower_95", "upper_95", "state", "why"))
-    for symbol, one in card.numbers.items():
-        rows.writerow((symbol, one.value, one.units, one.u, one.lower, one.upper, one.state, one.why))
-    return out.getvalue()
+    head = ("symbol", "value", "units", "u", "lower_95", "upper_95", "state", "why")
+    each = [
+        (symbol, one.value, one.units, one.u, one.lower, one.upper, one.state, one.why)
+        for symbol, one in card.numbers.items()
+    ]
+    return "".join(map(row, [head, *each]))
 
 
 def page_of(title: str, card: MaterialCardFound) -> str:
@@ -93,7 +92,7 @@ def page_of(title: str, card: MaterialCardFound) -> str:
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
         f"<style>{style}</style><h1>{html.escape(title)}</h1><p>{head}</p>"
-        f"<table>{_row('th', titles)}{''.join(_row('td', row) for row in rows)}</table><ul>{marks}</ul></html>\n"
+        f"<table>{_row('th', titles)}{''.join(_row('td', cells) for cells in rows)}</table><ul>{marks}</ul></html>\n"
     )
 
 

@@ -113,13 +113,14 @@ def _strains(results: Results, asked: TensileSettings) -> tuple[History, History
     if asked.rectangle_px is not None:
         x0, y0, x1, y1 = asked.rectangle_px
         corners = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
-    along, across = ("exx", "eyy") if asked.direction == "x" else ("eyy", "exx")
+    of_line = asked.pull_px is not None or asked.direction == "rows"
+    along, across = ("exx", "eyy") if of_line else ("eyy", "exx")
     ends = None if asked.extensometer_px is None else Ends(*asked.extensometer_px)
-    axial = results.history(ends or Mean(along, corners))
+    axial = results.history(ends or Mean(along, corners, asked.pull_px))
     if not asked.lateral:
         return axial, None
     ends = None if asked.lateral_px is None else Ends(*asked.lateral_px)
-    return axial, results.history(ends or Mean(across, corners))
+    return axial, results.history(ends or Mean(across, corners, asked.pull_px))
 
 
 def _joined(axial: History, lateral: History | None) -> dict[str, Float]:

@@ -55,8 +55,11 @@ class TensileSettings(Request):
     )
     load_late_s: Number = Field(0.0, description="How much later the load is than the images: its lag, s.")
     load_late_u_s: _NotNegative = Field(0.0, description="Standard uncertainty of that; 0 for steps at rest.")
-    direction: Literal["x", "y"] = Field(
-        "y", description="Axis of the system frame along which the specimen is pulled."
+    direction: Literal["columns", "rows"] = Field(
+        "columns", description="The specimen is pulled along the columns or the rows of camera 1's image."
+    )
+    pull_px: _Ends | None = Field(
+        None, description="Two positions in the image along the pull, for the area's mean strain; instead of direction."
     )
     rectangle_px: tuple[Pixel, Pixel, Pixel, Pixel] | None = Field(
         None, description="x0, y0, x1, y1 of the area whose mean strain is used; null: the whole field."
