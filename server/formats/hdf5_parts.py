@@ -6,6 +6,7 @@ not show them. h5py does; nothing of another file is opened by looking.
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import h5py
@@ -52,18 +53,21 @@ def require_own_parts(path: Path, content: bytes | None = None) -> None:
 
 
 def _walk(file: h5f.FileID, name: str) -> None:
-    waiting, seen = [h5g.open(file, b"/")], set[int]()
+    waiting, soft = [h5g.open(file, b"/")], []
+    seen = {h5o.get_info(waiting[0]).addr}
     while waiting:
         group = waiting.pop()
         for k in range(group.get_num_objs()):
             link = group.get_objname_by_idx(k)
             kind = group.links.get_info(link).type
             if kind == h5l.TYPE_SOFT:
-                continue  # of the same file: its target is found by its own link
+                soft.append((group, link))
+                continue
             if kind != h5l.TYPE_HARD:
                 raise _elsewhere(name, "a link to another file")
             held = h5o.get_info(group, link)
             if held.addr in seen:
+                _require_one_name(held.type, name)
                 continue
             seen.add(held.addr)
             if len(seen) > _MAX_OBJECTS:
@@ -72,6 +76,16 @@ def _walk(file: h5f.FileID, name: str) -> None:
                 waiting.append(h5g.open(group, link))
             elif held.type == h5o.TYPE_DATASET:
                 _check(h5d.open(group, link).get_create_plist(), name)
+
+    for group, link in soft:  # now that no link leaves the file
+        with contextlib.suppress(KeyError, ValueError, RuntimeError, OSError):  # of a target that is not there
+            _require_one_name(h5o.get_info(group, link).type, name)
+
+
+def _require_one_name(kind: int, name: str) -> None:
+    """Refuse a group under two names, which netCDF would read as often as it is reached, and for ever in a loop."""
+    if kind == h5o.TYPE_GROUP:
+        raise FileFormatError(f"{name} has a group under two names.", file=name)
 
 
 def _check(made: h5p.PropDCID, name: str) -> None:

@@ -70,7 +70,7 @@ class LoadedCalibration:
     notes
         Assumptions made in reading another program's file.
     unit
-        Unit of length that the user stated for another program's file; None: millimetres were assumed.
+        Unit of length that the user or another program's file states; None: millimetres were assumed.
     """
 
     pair: StereoPair
@@ -227,6 +227,9 @@ def parse_calibration(data: bytes, *, name: str, unit: str | None = None) -> Loa
         if unit is not None and unit_mm(unit) != LENGTHS_MM["mm"]:
             raise _other_unit(name, "mm", unit)
         return _own(data, digest, name)
+    if found.unit is not None and unit is not None and unit_mm(found.unit) != unit_mm(unit):
+        raise _other_unit(name, found.unit, unit)
+    unit = found.unit if unit is None else unit
     if unit is None:
         return found
     cam1, cam2 = (
@@ -252,8 +255,8 @@ def _of_other_program(data: bytes, digest: str, name: str) -> LoadedCalibration 
         pair, size, notes = parse_dice_txt(data, name=name)
         return LoadedCalibration(pair, size, size, "dice_txt", digest, {}, notes)
     if is_opencv(data):  # last: its names are plain words
-        pair, size = parse_opencv(data, name=name)
-        return LoadedCalibration(pair, size, size, "opencv_yaml", digest, {})
+        pair, size, stated = parse_opencv(data, name=name)
+        return LoadedCalibration(pair, size, size, "opencv_yaml", digest, {}, unit=stated)
     return None
 
 

@@ -18,6 +18,7 @@ _BLANK = "  "  # two or more: one may be within a title
 SEPARATORS = {"\t": "tab", ";": "semicolon", ",": "comma", "|": "bar", _BLANK: "blanks", " ": "blanks"}
 #: tried where a text is not UTF-8: taken if the time is named in them
 CODE_PAGES = ("cp932", "gb18030", "big5", "euc-kr", "cp1251")
+_MOST_WIDE = 1000  # columns, read or not
 _SAMPLE = 4000  # lines that the separator is chosen by
 _BLANKS = " \u00a0\u2009\u202f"
 # a number, a time or a date, in any notation
@@ -135,6 +136,8 @@ def find_table(lines: dict[int, str]) -> Table:
         ``channels_unreadable``: no table of numbers, no titles, two tables, cells that commas part within a number.
     """
     mark, width = _separator(list(lines.values()))
+    if width > _MOST_WIDE:
+        raise unreadable(f"The table has {width} columns, {_MOST_WIDE} at most are read.")
     rows = dict(zip(lines, _rows(lines.values(), mark), strict=True))
     alike = [row for row in rows.values() if len(row) == width]
     if len(alike) > MAX_ROWS:

@@ -37,7 +37,7 @@ def read_vtu(content: bytes) -> MeshFile:
         raise unreadable(f"it is no XML ({error})") from error
     grid = root.find("UnstructuredGrid")
     if root.tag != "VTKFile" or grid is None:
-        raise unreadable(f"it is a {root.get('type') or root.tag}, not VTK's UnstructuredGrid")
+        raise unreadable(f"it is {root.get('type') or root.tag}, and has no UnstructuredGrid of a VTKFile")
     decoder = Decoder.of(root.attrib, appended, appended_base64=is_text)
     pieces = [_piece(one, decoder) for one in grid.findall("Piece")]
     if not pieces:

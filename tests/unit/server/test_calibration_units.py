@@ -141,6 +141,59 @@ def test_a_unit_that_is_no_length_is_refused(tmp_path: Path, unit: str) -> None:
     assert caught.value.code == "calibration_unit_unknown"
 
 
+@pytest.mark.parametrize(
+    ("said", "scale", "unit"), [("unit: cm", 0.1, "cm"), ("length_unit: meters", 1e-3, "m"), ("units: mm", 1.0, "mm")]
+)
+def test_a_unit_that_the_file_states_is_taken(tmp_path: Path, said: str, scale: float, unit: str) -> None:
+    path = in_units(tmp_path, scale)
+    path.write_text(f"{path.read_text()}{said}\n")
+    for loaded in (load_calibration(path), load_calibration(path, unit=unit)):
+        is_the_pair(loaded)
+        assert loaded.unit == unit
+    again = parse_calibration(json.dumps(imported_content(path.read_bytes(), name="a")).encode(), name="b")
+    is_the_pair(again)
+    with pytest.raises(InputError, match=f"in {unit}, but in was given") as refused:
+        load_calibration(path, unit="in")
+    assert refused.value.code == "calibration_unit_conflict"
+
+
+@pytest.mark.parametrize(
+    ("said", "code"),
+    [
+        ("T: [1, 2, 3]", "calibration_unreadable"),
+        ("---\nT: [1, 2, 3]", "calibration_unreadable"),
+        ("model: fisheye", "calibration_unsupported"),
+        ("distortion_model: equidistant", "calibration_unsupported"),
+        ("fisheye: 1", "calibration_unsupported"),
+        ("model: plumb_bob", None),
+        ("fisheye: 0", None),
+    ],
+)
+def test_two_values_of_an_entry_and_a_lens_of_other_terms_are_refused(
+    tmp_path: Path, said: str, code: str | None
+) -> None:
+    path = in_units(tmp_path, 1.0)
+    path.write_text(f"{path.read_text()}{said}\n")
+    if code is None:
+        is_the_pair(load_calibration(path))
+        return
+    with pytest.raises(FileFormatError) as refused:
+        load_calibration(path)
+    assert refused.value.code == code
+
+
+@pytest.mark.parametrize(("old", "new"), [("[mm]", "[m]"), ("[mm]", "[in]"), ("[deg]", "[rad]"), ("[deg]", "[°]")])
+def test_a_caldat_in_other_units_is_refused(tmp_path: Path, old: str, new: str) -> None:
+    path = in_units(tmp_path, 1.0)
+    text = convert_calibration(load_calibration(path), "matchid", path.read_bytes()).data.decode()
+    assert old in text
+    if new == "[°]":
+        assert parse_calibration(text.replace(old, new).encode(), name="a").source == "matchid_caldat"
+        return
+    with pytest.raises(FileFormatError, match=f"in {new[1:-1]}, not in mm or deg"):
+        parse_calibration(text.replace(old, new).encode(), name="a")
+
+
 def test_a_calibration_of_this_program_has_its_unit_already(tmp_path: Path) -> None:
     write_test_folder(tmp_path / "t", 1)
     own = tmp_path / "t" / "calibration.json"

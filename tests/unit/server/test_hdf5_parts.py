@@ -103,7 +103,6 @@ def test_whole_files_of_every_kind_pass(tmp_path: Path) -> None:
         file.create_dataset("w", data=np.arange(100.0), chunks=(10,), compression="gzip", shuffle=True, fletcher32=True)
         file["again"] = file["w"]
         file["soft"] = h5py.SoftLink("/nowhere")
-        file.create_group("g")["root"] = file["/"]  # a ring
     for form in ("NETCDF4", "NETCDF4_CLASSIC", "NETCDF3_CLASSIC"):
         with netCDF4.Dataset(tmp_path / f"{form}.nc", "w", format=form) as data:
             data.createDimension("n", 4)
@@ -125,3 +124,35 @@ def test_a_damaged_file_is_refused_by_its_name_alone(tmp_path: Path) -> None:
             changed[k] = rng.integers(0, 256)
         with contextlib.suppress(FileFormatError):  # whole where the damage is in numbers; nothing else is raised
             require_own_parts(tmp_path / "b.h5", bytes(changed))
+
+
+def _in_itself(file: h5py.File) -> None:
+    file.create_group("a")["root"] = file["/"]
+
+
+def _soft_loop(file: h5py.File) -> None:
+    file.create_group("a")["root"] = h5py.SoftLink("/")
+
+
+def _doubling(file: h5py.File) -> None:
+    group = file
+    for _ in range(30):
+        below = group.create_group("a")
+        group["b"] = below
+        group = below
+
+
+@pytest.mark.fault(56)
+@pytest.mark.parametrize("kind", [_in_itself, _soft_loop, _doubling])
+def test_a_group_under_two_names_is_refused(tmp_path: Path, kind: Callable[[h5py.File], None]) -> None:
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        kind(file)
+    with pytest.raises(FileFormatError, match="two names"):
+        require_own_parts(tmp_path / "x.h5")
+
+
+def test_a_data_set_under_two_names_and_a_soft_link_that_ends_nowhere_are_taken(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        file["w"] = np.zeros(3)
+        file["v"], file["u"], file["t"] = file["w"], h5py.SoftLink("/w"), h5py.SoftLink("/nowhere")
+    require_own_parts(tmp_path / "x.h5")

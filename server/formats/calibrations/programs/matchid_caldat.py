@@ -21,6 +21,7 @@ from stereorig.server.formats.calibrations.programs.imported_pair import (
     opencv_lens,
     pair_of,
     unreadable,
+    unsupported,
 )
 from stereorig.server.formats.calibrations.programs.named_numbers import has_line, named_numbers
 
@@ -41,6 +42,8 @@ _NEEDED = ("fx", "fy", "cx", "cy")
 _POSE = ("Tx [mm]", "Ty [mm]", "Tz [mm]", "Theta [deg]", "Phi [deg]", "Psi [deg]")
 _BEGIN = re.compile(rb"cam[0-9]_f[xy]\b", re.IGNORECASE)
 _CAMERA_KEY = re.compile(r"cam[0-9]_")
+_STATED = re.compile(rb"^\s{0,9}(T[xyz]|theta|phi|psi)\s{0,9}\[\s{0,9}([^\[\]\s]{0,20})", re.IGNORECASE | re.MULTILINE)
+_UNITS = {True: (b"", b"mm"), False: (b"", b"deg", b"degree", b"degrees", "°".encode(), b"\xb0")}
 _UNIT = re.compile(r"\[[^\[\]]*\]|\s+")
 
 
@@ -55,8 +58,11 @@ def parse_caldat(data: bytes, *, name: str) -> StereoPair:
     Raises
     ------
     FileFormatError
-        ``calibration_unreadable`` or ``calibration_invalid``.
+        ``calibration_unreadable``, ``calibration_invalid``, or ``calibration_unsupported`` for other units.
     """
+    for key, unit in _STATED.findall(data):
+        if unit.lower() not in _UNITS[key[:1] in b"tT" and len(key) == 2]:
+            raise unsupported(name, f"it has {key.decode()} in {unit.decode('ascii', 'replace')}, not in mm or deg")
     values = named_numbers(data, name=name, parted=_parted, key_of=_key, is_remark=_is_remark)
     prefixes = sorted({key.split("_", 1)[0] for key in values if _CAMERA_KEY.match(key)})
     if len(prefixes) != 2:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
+from collections import Counter
 from typing import Any
 from xml.etree.ElementTree import Element
 
@@ -22,12 +23,14 @@ from stereorig.core.cameras.opencv_full import OpenCVFullLens
 from stereorig.core.cameras.stereo import StereoPair
 from stereorig.core.errors import FileFormatError
 from stereorig.server.formats.calibrations.programs.imported_pair import (
+    LENGTHS_MM,
     MAX_SIDE_PX,
     ImageSize,
     invalid,
     opencv_lens,
     pair_of,
     unreadable,
+    unsupported,
 )
 from stereorig.server.formats.xml_tree import read_side_by_side
 
@@ -36,6 +39,7 @@ _ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4"
 _MAX_NUMBERS = 100
 _MAX_BYTES = 1 << 20  # a calibration is some kilobytes
 _LENSES, _POSE = ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2"), ("R", "T")
+_NEEDED = {*_LENSES, *_POSE}
 #: without marks and capitals, but for single letters: k1 is a lens term, K1 a matrix
 _MATRIX = ("M", "K", "cameramatrix", "intrinsicmatrix", "intrinsics", "mtx")
 _BENT = ("D", "distcoeffs", "distcoeff", "distortioncoefficients", "distortion", "dist")
@@ -51,6 +55,40 @@ for (_name, _stems), (_k, _sides) in itertools.product(
         for spelled in (stem + side, side + stem)
     }
 _ENTRY = re.compile(rb"\b([A-Za-z][A-Za-z0-9_-]{0,40})[\"'>]?\s{0,9}[:>]")
+
+
+_UNITS = ("unit", "units", "lengthunit", "unitoflength", "translationunit")
+_UNIT_NAMES = {"meter": "m", "meters": "m", "metre": "m", "metres": "m", "millimeter": "mm", "millimeters": "mm"}
+_UNIT_NAMES |= {"millimetre": "mm", "millimetres": "mm", "centimeter": "cm", "centimeters": "cm", "inch": "in"}
+_MODELS = ("model", "cameramodel", "lensmodel", "distortionmodel", "distortiontype")
+#: models of a lens that have other terms under the same names
+_OTHER_MODELS = {
+    "fisheye",
+    "equidistant",
+    "equi",
+    "kannala",
+    "omni",
+    "omnidirectional",
+    "ucm",
+    "eucm",
+    "division",
+    "fov",
+}
+
+
+class _TwiceError(yaml.YAMLError):
+    """A key that occurs twice."""
+
+
+class _OnceLoader(yaml.BaseLoader):
+    """Refuses a mapping that has a key twice: the last one would be taken without a word."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Return a mapping whose keys are all different."""
+        keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        if any(count > 1 for count in keys.values()):
+            raise _TwiceError(keys.most_common(1)[0][0])
+        return super().construct_mapping(node, deep)
 
 
 def is_opencv(data: bytes) -> bool:
@@ -97,13 +135,18 @@ def _load(name: str, text: str) -> dict[str, object]:
             # OpenCV's own first line, %YAML:1.0, is not the directive of YAML
             lines = [line for line in text.splitlines(keepends=True) if not line.startswith("%YAML")]
             # every scalar stays a text, every tag unknown: nothing is made of them but lists, mappings and texts
-            documents = [one for one in yaml.load_all("".join(lines), Loader=yaml.BaseLoader) if one]
+            documents = [one for one in yaml.load_all("".join(lines), Loader=_OnceLoader) if one]
             if not all(isinstance(one, dict) for one in documents):
                 raise unreadable(name, "it names no values")
             pairs = [pair for one in documents for pair in one.items()]
+    except _TwiceError as error:
+        raise unreadable(name, f"{str(error)[:40]} occurs twice in it") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise unreadable(name, f"it is damaged ({type(error).__name__})") from error
     stated: dict[str, object] = {key: value for key, value in pairs if isinstance(key, str)}
+    other = next((key for key, value in pairs if stated.get(key) != value and _plain_name(key) in _NEEDED), None)
+    if other is not None:
+        raise unreadable(name, f"it has two values of {other}")
     content = dict(stated)
     for key, value in stated.items():
         plain = _plain_name(key)
@@ -175,18 +218,35 @@ def _lens(name: str, content: dict[str, object], which: int) -> OpenCVLens:
     return opencv_lens(name, f"camera {which}", {k: float(v) for k, v in values.items()})
 
 
-def parse_opencv(data: bytes, *, name: str) -> tuple[StereoPair, ImageSize]:
+def _stated(content: dict[str, object], keys: tuple[str, ...]) -> str:
+    """Return the text of an entry under any of these names; empty for none."""
+    found = (value for key, value in content.items() if re.sub("[-_ ]", "", key).lower() in keys)
+    return next((value.strip().lower() for value in found if isinstance(value, str)), "")
+
+
+def _require_known_lens(content: dict[str, object], name: str) -> None:
+    model = _stated(content, _MODELS)
+    if _stated(content, ("fisheye", "isfisheye")) in ("1", "true", "yes"):
+        model = "fisheye"
+    if _OTHER_MODELS.intersection(re.findall("[a-z]+", model)):
+        raise unsupported(
+            name, f"its lenses are of the model {model[:40]!r}, whose terms are others than OpenCV's k1, k2"
+        )
+
+
+def parse_opencv(data: bytes, *, name: str) -> tuple[StereoPair, ImageSize, str | None]:
     """Read an OpenCV stereo calibration.
 
     Returns
     -------
     tuple
-        The pair (system frame = camera 1) and the image size (width, height), None where the file has none.
+        The pair (system frame = camera 1), its lengths taken for millimetres; the image size (width, height), None
+        where the file has none; the unit of length that it states.
 
     Raises
     ------
     FileFormatError
-        ``calibration_unreadable`` or ``calibration_invalid``.
+        ``calibration_unreadable``, ``calibration_invalid`` or ``calibration_unsupported``.
     """
     if len(data) > _MAX_BYTES:
         raise unreadable(name, f"it has {len(data)} bytes, far more than a calibration")
@@ -204,16 +264,19 @@ def parse_opencv(data: bytes, *, name: str) -> tuple[StereoPair, ImageSize]:
             remedy="Append the other file's text to this one, and give that; a command also finds the other file if "
             "both are in one folder as intrinsics.yml and extrinsics.yml.",
         )
+    _require_known_lens(content, name)
+    named = _stated(content, _UNITS)
+    unit = _UNIT_NAMES.get(named, named if named in LENGTHS_MM else None)
     lens1, lens2 = _lens(name, content, 1), _lens(name, content, 2)
     pair = pair_of(name, lens1, lens2, _array(name, content, "R"), _array(name, content, "T"))
     if {"width", "height"} <= content.keys():
         content.setdefault("imageSize", [content["width"], content["height"]])
     if content.get("imageSize") is None:
-        return pair, None
+        return pair, None, unit
     size = _array(name, content, "imageSize").ravel()
     if size.size != 2 or size.min() < 1 or size.max() > MAX_SIDE_PX or np.any(size % 1):
         raise invalid(name, f"imageSize is {size.tolist()}, not (width, height)")
-    return pair, (int(size[0]), int(size[1]))
+    return pair, (int(size[0]), int(size[1])), unit
 
 
 def opencv_text(
