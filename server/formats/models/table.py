@@ -83,6 +83,7 @@ def read_table(content: bytes, displacement: str | None = None) -> MeshFile:
             remedy="Give the columns x, y, z, u, v, w with their unit, as in 'x_mm,y_mm,z_mm,u_mm,v_mm,w_mm'.",
         )
     held = _displacements(titles, vectors, displacement)
+    _require_once(titles, [*positions, *(one for vector in held.values() for one in vector)])
     columns = [at for at, _ in [*positions, *(one for vector in held.values() for one in vector)]]
     values = _numbers(body, columns, _mark(head), len(titles))
     units = {"": _one_unit(positions, "positions") or _length_unit(remarks)}
@@ -125,20 +126,38 @@ def _displacements(
     )
 
 
+def _require_once(titles: Sequence[tuple[str, str]], columns: Sequence[Column]) -> None:
+    """Refuse titles that differ in the case alone, as COMSOL's X of the body and x of its deformed state."""
+    plain = [title.strip().lower() for title, _ in titles]
+    for at, _ in columns:
+        if plain.count(plain[at]) > 1:
+            raise unreadable(
+                f"its table has two columns {plain[at]!r}",
+                remedy="Export the positions before the deformation and one displacement, each once.",
+            )
+
+
 def _numbers(body: Sequence[str], columns: Sequence[int], mark: str | None, titles: int) -> Float:
     """Return (n, k) numbers of some columns of each row, which has no more cells than there are titles."""
     require_count(len(columns) * len(body), "its table")
     if not body or len(body) > _MOST_ROWS:
         raise unreadable(f"its table has {len(body)} rows, 1 to {_MOST_ROWS} are read")
-    values = np.empty((len(body), len(columns)))
+    values, marks = np.empty((len(body), len(columns))), set[str]()
     for k, line in enumerate(body):
         cells = _cells(line, mark) if '"' in line else line.split(mark)
         if mark is not None and any(cell.strip() for cell in cells[titles:]):
             raise unreadable(f"row {k + 1} of its table, {line[:80]!r}, has {len(cells)} cells under {titles} titles")
         try:
-            values[k] = [float(cells[c].replace(",", ".") if mark != "," else cells[c]) for c in columns]
+            held = ";".join([cells[c] for c in columns])
+            marks.update(m for m in ",._" if m in held)
+            values[k] = [float(cell) for cell in (held.replace(",", ".") if mark != "," else held).split(";")]
         except (ValueError, IndexError):
             raise unreadable(f"row {k + 1} of its table, {line[:80]!r}, has not {len(columns)} numbers") from None
+    if "_" in marks or (mark != "," and len(marks) > 1):
+        raise unreadable(
+            "its numbers have points and commas, or other signs that group thousands",
+            remedy="Export the numbers without groups of thousands.",
+        )
     return values
 
 

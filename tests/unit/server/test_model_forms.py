@@ -12,7 +12,7 @@ from vtkmodules.vtkCommonCore import vtkDoubleArray, vtkPoints
 from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
 from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
-from stereorig.core.errors import StereorigError
+from stereorig.core.errors import FileFormatError, StereorigError
 from stereorig.server.cell.cell import Cell
 from stereorig.server.cell.models import model
 from stereorig.server.formats.models.read import ModelFile, read_model
@@ -213,3 +213,18 @@ def test_polygons_and_higher_orders_of_an_xdmf_are_read(tmp_path: Path) -> None:
     read = xdmf('TopologyType="Hexahedron_27"', numbers, BOX + MANY[:19])
     assert read.mesh.corners_only == 1
     assert read.surface(TOWARDS).area_mm2.sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        # 1,214 is 1214 here; quoted or not, a row alone would not show it
+        ("x;y;z;u;v;w\n363;1,214;5;1.5;0.5;0.25\n364;1,215;6;1.5;0.5;0.25\n", "points and commas"),
+        ("x,y,z,u,v,w\n1_214,2,3,1,2,3\n", "points and commas"),
+        ("x,y,z,X,Y,Z,u,v,w\n1,2,3,4,5,6,7,8,9\n", "two columns 'x'"),
+        ("x,y,z,u,v,w,u,v,w\n1,2,3,4,5,6,7,8,9\n", "two columns 'u'"),
+    ],
+)
+def test_numbers_and_titles_of_two_meanings_are_refused(text: str, said: str) -> None:
+    with pytest.raises(FileFormatError, match=said):
+        read_model(Path("m.csv"), unit="mm", contents={"m.csv": text.encode()})
