@@ -61,6 +61,7 @@ _ANY_CASE: dict[str, set[str]] = {}
 for _one, _unit in _WRITTEN.items():
     _ANY_CASE.setdefault(_one.lower(), set()).add(_unit)
 _LONGEST_UNIT = 40
+_CHANNELS = ("ch ", "ch.", "channel", "kanal", "canal", "sensor", "dev", "ai", "slot", "mod")
 
 
 def known_unit(written: str) -> str | None:
@@ -102,7 +103,7 @@ def titled_unit(title: str) -> tuple[str, str]:
     A title such as ``Force_MN`` keeps its ending, which is its unit in the letters of the file.
     """
     parted = title_and_unit(title, "[(/")
-    if parted is not None and parted[1][:1].isalpha() and not known_unit(parted[1]) and parted[0].endswith((")", "]")):
+    if parted is not None and parted[1].lower().startswith(_CHANNELS) and parted[0].endswith((")", "]")):
         before = title_and_unit(parted[0], "[(")  # a channel may be named after the unit: Force (kN) [Ch 2]
         parted = (f"{before[0]} {parted[1]}", before[1]) if before and known_unit(before[1]) else parted
     if parted is not None and (title[len(parted[0]) :].lstrip()[:1] != "/" or known_unit(parted[1])):

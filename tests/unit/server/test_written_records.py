@@ -88,6 +88,14 @@ def test_an_unknown_unit_is_shown_as_written_and_a_known_one_in_one_spelling(uni
     assert list(table.units.values()) == [shown]
 
 
+@pytest.mark.parametrize(
+    ("title", "unit"), [("A (N) [Ch 2]", "N"), ("A (N) [x1000]", "x1000"), ("A (N) [milli]", "milli")]
+)
+def test_a_channel_behind_a_unit_leaves_it_and_a_factor_does_not(title: str, unit: str) -> None:
+    table = read_channel_table(f"Time (s),{title}\n0.5,1\n1.5,2\n".encode())
+    assert list(table.units.values()) == [unit]
+
+
 # files in the manner of makers' own programs: lines above the rows, a row's form, encoding, what is asked; a row's
 # time in s, force in N and stroke in mm, the force as daN, kN, lbf and kgf, the number, the stroke in inches
 MAKERS: dict[str, tuple[str, str, str, str]] = {
