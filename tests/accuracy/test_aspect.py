@@ -122,13 +122,19 @@ def test_images_moved_about_without_known_travel_average_the_noise_and_the_disto
     assert result.tilt_rad is None
 
 
-@pytest.mark.parametrize("standoff_mm", [400.0, None])
-def test_images_along_the_normal_give_lambda_and_its_doubt(standoff_mm: float | None) -> None:
+@pytest.fixture(scope="module")
+def along_the_normal() -> list[GridView]:
     cameras = [
         paper_camera(0.2, beta_deg=0.2, alpha_deg=a, offset_mm=(0.3 * k, 0.0)) for k, a in enumerate((44, 45, 46))
     ]
-    views = [detect_grid(grid_image(c, seed=k), PAPER_TARGET) for k, c in enumerate(cameras)]
-    found = measure_aspect_normal(views, standoff_mm=standoff_mm)
+    return [detect_grid(grid_image(c, seed=k), PAPER_TARGET) for k, c in enumerate(cameras)]
+
+
+@pytest.mark.parametrize("standoff_mm", [400.0, None])
+def test_images_along_the_normal_give_lambda_and_its_doubt(
+    along_the_normal: list[GridView], standoff_mm: float | None
+) -> None:
+    found = measure_aspect_normal(along_the_normal, standoff_mm=standoff_mm)
     assert found.images == 3
     assert found.standoff_known is (standoff_mm is not None)
     # the noise, and what the grid's tilt of 0.28 degrees may do

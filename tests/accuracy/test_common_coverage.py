@@ -33,11 +33,11 @@ def test_every_declared_error_is_covered(stratum: Stratum) -> None:
 
 
 def test_a_tilt_that_is_not_declared_is_not_covered() -> None:
-    found = gathered(Stratum("tilt", 1e-3), 24, declared=Stratum("none", 1e-3, tilt_sigma_rad=0.0))
+    found = gathered(Stratum("tilt", 1e-3), 12, declared=Stratum("none", 1e-3, tilt_sigma_rad=0.0))
     assert found["length of 25 mm"][0] < 0.6, found
 
 
 def test_a_tolerance_that_is_not_declared_is_not_covered() -> None:
-    found = gathered(Stratum("grid", 4e-3), 24, declared=Stratum("none"))
+    found = gathered(Stratum("grid", 4e-3), 12, declared=Stratum("none"))
     # its residuals show, so that a part is taken for the localiser's noise; a length's error is still 1.5 times sigma
     assert found["length of 25 mm"][1] > 1.25, found

@@ -214,8 +214,11 @@ def _render(
                 X = (h[0, 0] * u + h[0, 1] * v + h[0, 2]) / w
                 Y = (h[1, 0] * u + h[1, 1] * v + h[1, 2]) / w
                 # the samples' distance on the plane: without this ramp, edges at simple slopes beat with the lattice
-                dx = np.hypot((h[0, 0] - X * h[2, 0]) / w, (h[0, 1] - X * h[2, 1]) / w / aspect) * f / samples
-                dy = np.hypot((h[1, 0] - Y * h[2, 0]) / w, (h[1, 1] - Y * h[2, 1]) / w / aspect) * f / samples
+                # `hypot` keeps from overflow, which takes half of the renderer's time
+                x_right, x_down = h[0, 0] - X * h[2, 0], (h[0, 1] - X * h[2, 1]) / aspect
+                y_right, y_down = h[1, 0] - Y * h[2, 0], (h[1, 1] - Y * h[2, 1]) / aspect
+                dx = np.sqrt(x_right * x_right + x_down * x_down) * f / (samples * w)
+                dy = np.sqrt(y_right * y_right + y_down * y_down) * f / (samples * w)
                 a = _under_family(nodes, 0, X, Y, pitch, half, over, dx)
                 b = _under_family(nodes, 1, Y, X, pitch, half, over, dy)
                 value = 1.0 - (1.0 - a) * (1.0 - b)
