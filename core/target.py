@@ -86,11 +86,6 @@ class GridTarget:
         check_errors(self.pitch_scale_sigma, self.flatness_mm)
 
     @property
-    def inner_shape(self) -> tuple[int, int]:
-        """Number of usable intersections along X_sys and along Y_sys."""
-        return self.lines[0] - 2, self.lines[1] - 2
-
-    @property
     def present_lines(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Indices, from 0, of the lines that the grid has, along X_sys and along Y_sys."""
         return self._present(0), self._present(1)

@@ -1,8 +1,7 @@
-"""Number of computing threads, and the lock around kernels with threads of their own.
+"""Number of computing threads: kernels that release the GIL are run over ranges by :func:`run_ranges`.
 
-Kernels that release the GIL are run over ranges by :func:`run_ranges`, on plain threads. numba's own parallel kernels
-(``prange``) are different: its ``workqueue`` layer aborts the process when two threads run such kernels at once, so a
-caller of one holds :data:`kernel_lock` and calls :func:`apply_threads` first.
+numba's own parallel kernels (``prange``) are not used: its ``workqueue`` layer aborts the process when two threads run
+such kernels at once.
 """
 
 from __future__ import annotations
@@ -13,12 +12,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import pairwise
 
-import numba
-
 from stereorig.core.errors import InputError
-
-kernel_lock = threading.RLock()
-"""Held around every call of a numba ``prange`` kernel; reentrant, so a caller may hold it over several."""
 
 _state_lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
@@ -56,11 +50,6 @@ def set_threads(n: int) -> None:
         if _pool is not None:
             _pool.shutdown(wait=False)  # running ranges are finished
             _pool = None
-
-
-def apply_threads() -> None:
-    """Give numba's ``prange`` kernels the same number, in the calling thread. Call with :data:`kernel_lock` held."""
-    numba.set_num_threads(min(_threads, int(numba.config.NUMBA_NUM_THREADS)))  # type: ignore[attr-defined]
 
 
 def run_ranges(function: Callable[[int, int], None], n: int, size: int, min_size: int | None = None) -> None:

@@ -61,13 +61,8 @@ def detect_target(
         raise _named(image, target, error) from error
 
 
-def find_target(image: NDArray[Any], target: GridTarget | BoardTarget, *, options: GridOptions | None = None) -> Float:
+def find_target(image: NDArray[Any], target: GridTarget | BoardTarget) -> Float:
     """Find the target declared coarsely and fast, for a live picture.
-
-    Parameters
-    ----------
-    image, target, options
-        As for :func:`detect_target`.
 
     Returns
     -------
@@ -82,7 +77,7 @@ def find_target(image: NDArray[Any], target: GridTarget | BoardTarget, *, option
     """
     if isinstance(target, BoardTarget):
         return find_board(image, target)
-    return find_grid(image, target, options=options)
+    return find_grid(image, target)
 
 
 def _named(image: NDArray[Any], target: GridTarget, error: TargetError) -> TargetError:

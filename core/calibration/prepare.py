@@ -141,8 +141,6 @@ def predict_uncertainty(
     target: AnyTarget,
     nominals: tuple[NominalValues, NominalValues],
     options: CalibrationOptions | None = None,
-    *,
-    noise_px: float = EXPECTED_NOISE_PX,
 ) -> VolumeUncertainty:
     """Predict the uncertainty of a calibration with views at these stage positions, from nominal values alone.
 
@@ -161,7 +159,7 @@ def predict_uncertainty(
         reference = min(own, key=lambda v: abs(v.position_mm))
         x[layout.lens(c)] = layout.form.start(nominal.phd_px, nominal.centre_px, nominal.aspect)
         x[layout.pose(c)] = start_pose(reference, problem.nodes_mm, nominal, float(np.radians(nominal.placed()[1])))
-    return predict_at(problem, layout, x, target, noise_px=noise_px)
+    return predict_at(problem, layout, x, target, noise_px=EXPECTED_NOISE_PX)
 
 
 def predict_at(problem: FitData, layout: Layout, x: Float, target: AnyTarget, *, noise_px: float) -> VolumeUncertainty:

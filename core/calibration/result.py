@@ -204,10 +204,3 @@ class CalibrationResult:
     def sigma(self) -> dict[str, float]:
         """Standard deviation of each estimated parameter, by its name in ``names``."""
         return dict(zip(self.names, np.sqrt(np.maximum(np.diagonal(self.covariance), 0.0)).tolist(), strict=True))
-
-    @property
-    def covariance_per_camera(self) -> tuple[Float, Float]:
-        """(n, n) of each camera."""
-        own = [[k for k, name in enumerate(self.names) if name.startswith(f"{camera}.")] for camera in CAMERAS]
-        one, two = (self.covariance[np.ix_(k, k)] for k in own)
-        return one, two

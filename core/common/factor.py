@@ -296,9 +296,7 @@ def sample_of(count: int) -> slice:
     return slice(None, None, max(count // _SAMPLE, 1))
 
 
-def factor_of(
-    source: ParameterCovariance, points_mm: Float, displaced_mm: Float | None = None, *, own_mm: Float | None = None
-) -> Factor:
+def factor_of(source: ParameterCovariance, points_mm: Float, displaced_mm: Float | None = None) -> Factor:
     """Return the common factor of points, with as few columns as hold :data:`KEPT` of each point's common variance.
 
     Parameters
@@ -309,8 +307,6 @@ def factor_of(
         (n, 3) points at the reference, system frame, all finite.
     displaced_mm
         (n, 3) their current positions.
-    own_mm
-        (3,) or (6,) typical standard deviations of the points' own noise; values far below them are rounded to zero.
 
     Raises
     ------
@@ -319,7 +315,7 @@ def factor_of(
     """
     some = sample_of(len(points_mm))
     sample = Estimator.at(source.pair, points_mm[some], None if displaced_mm is None else displaced_mm[some])
-    columns = FactorColumns.chosen(source, sample, own_mm)
+    columns = FactorColumns.chosen(source, sample)
     return Factor(columns.at(Estimator.at(source.pair, points_mm, displaced_mm)), columns.causes)
 
 
@@ -367,8 +363,8 @@ def common_factor(source: ParameterCovariance, points_mm: Float, displaced_mm: F
     return factor_of(source, points_mm, displaced_mm).values
 
 
-def fewest_columns(factor: Float, causes: Causes, kept: float = KEPT) -> list[int]:
-    """Return which columns of a factor (n, m, q) hold at least a share of each component's variance.
+def fewest_columns(factor: Float, causes: Causes) -> list[int]:
+    """Return which columns of a factor (n, m, q) hold :data:`KEPT` of each component's variance.
 
     The columns of each cause are returned from its first on, without gaps.
     """
@@ -386,7 +382,7 @@ def fewest_columns(factor: Float, causes: Causes, kept: float = KEPT) -> list[in
     order = np.argsort(-worth, kind="stable")
     share = np.cumsum(square[:, order], axis=1)
     worst = np.where(variance[:, None] > 0.0, share, 1.0).min(axis=0)
-    count = int(np.argmax(worst >= kept)) + 1 if worst[-1] >= kept else q
+    count = int(np.argmax(worst >= KEPT)) + 1 if worst[-1] >= KEPT else q
     return sorted(order[:count].tolist())
 
 

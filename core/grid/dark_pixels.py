@@ -92,9 +92,7 @@ def _collect(
                     p *= u
 
 
-def dark_pixel_lines(
-    image: Float32, table: PieceTable, fits: Float, good: Bool, *, dark_lines: bool, share: float = THRESHOLD
-) -> Parabolas:
+def dark_pixel_lines(image: Float32, table: PieceTable, fits: Float, good: Bool, *, dark_lines: bool) -> Parabolas:
     """Fit each line's parabola to its dark pixels.
 
     Parameters
@@ -105,8 +103,6 @@ def dark_pixel_lines(
         Pieces, their ground and depth, and True for those to use. The pieces' positions only bound the search.
     dark_lines
         Sign of the contrast.
-    share
-        The threshold, as part of the depth below the local ground.
 
     Raises
     ------
@@ -129,7 +125,7 @@ def dark_pixel_lines(
         index.astype(np.float64),
         steep,
         centre,
-        share,
+        THRESHOLD,
         _BLURS,
         -1.0 if dark_lines else 1.0,
         N,

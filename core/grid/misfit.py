@@ -155,15 +155,7 @@ def _apply(
         out[k, 12] = sqrt(variance * np.mean(v))
 
 
-def without_misfit(
-    image: Float32,
-    pieces: Float,
-    fits: Float,
-    *,
-    family: NDArray[np.intp],
-    good: Bool,
-    guard_blurs: float = GUARD_BLURS,
-) -> Float:
+def without_misfit(image: Float32, pieces: Float, fits: Float, *, family: NDArray[np.intp], good: Bool) -> Float:
     """Take the misfit common to each family's pieces off their offsets and their noise.
 
     Parameters
@@ -176,8 +168,6 @@ def without_misfit(
         (n,) 0 or 1 of each piece.
     good
         (n,) pieces that show the misfit; the others keep their fit as it is.
-    guard_blurs
-        As :func:`stereorig.core.grid.profile.fit_pieces` had it.
 
     Returns
     -------
@@ -187,7 +177,7 @@ def without_misfit(
     out = fits.copy()
     table = np.ascontiguousarray(pieces, dtype=np.float64)
     usable = good & (fits[:, OUT["ok"]] > 0.0)
-    count, free, total, squares = _pool(image, table, fits, family, usable, guard_blurs)
+    count, free, total, squares = _pool(image, table, fits, family, usable, GUARD_BLURS)
     enough = count >= _MIN_COUNT
     misfit = np.where(enough, total / np.maximum(count, 1.0), 0.0)
     within = np.where(enough, np.maximum(squares - count * misfit**2, 0.0), 0.0)
@@ -201,5 +191,5 @@ def without_misfit(
         if mean > 0.0:
             local = np.divide(smooth[f], weight[f], out=np.full(_BINS, mean), where=weight[f] > 1.0)
             noise[f] = np.maximum(local / mean, _LEAST_NOISE)
-    _apply(image, table, fits, family, usable, guard_blurs, count, misfit, noise, out)
+    _apply(image, table, fits, family, usable, GUARD_BLURS, count, misfit, noise, out)
     return out

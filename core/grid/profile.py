@@ -340,7 +340,7 @@ def _fit_pieces(image: Float32, pieces: Float, guard_blurs: float, sign: float, 
         _fit_piece(image, pieces[k], guard_blurs, sign, out[k])
 
 
-def fit_pieces(image: Float32, pieces: Float, *, dark_lines: bool, guard_blurs: float = GUARD_BLURS) -> Float:
+def fit_pieces(image: Float32, pieces: Float, *, dark_lines: bool) -> Float:
     """Fit every piece of the table.
 
     Parameters
@@ -351,8 +351,6 @@ def fit_pieces(image: Float32, pieces: Float, *, dark_lines: bool, guard_blurs: 
         (n, :data:`stereorig.core.grid.strip.INPUTS`) base lines, crossings, start values; pixels, and unit vectors.
     dark_lines
         Sign of the contrast searched for.
-    guard_blurs
-        Pixels nearer to a crossing line than half its width and this many blurs are left out.
 
     Returns
     -------
@@ -361,5 +359,5 @@ def fit_pieces(image: Float32, pieces: Float, *, dark_lines: bool, guard_blurs: 
     """
     out = np.empty((len(pieces), len(OUTPUTS)))
     table = np.ascontiguousarray(pieces, dtype=np.float64)
-    _fit_pieces(image, table, guard_blurs, -1.0 if dark_lines else 1.0, out)
+    _fit_pieces(image, table, GUARD_BLURS, -1.0 if dark_lines else 1.0, out)
     return out

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -25,11 +24,6 @@ def strain_settings(options: StrainOptions | None) -> dict[str, Any] | None:
     if options is None:
         return None
     return {"window": options.window, "order": options.order, "tensor": options.tensor}
-
-
-def strain_options(settings: Mapping[str, Any] | None) -> StrainOptions | None:
-    """Return the options that :func:`strain_settings` wrote, or a request's."""
-    return None if settings is None else StrainOptions(**settings)
 
 
 def smoothed_step(field: Field, window: int | None, *, subset_px: float) -> Field:

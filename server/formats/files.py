@@ -10,7 +10,7 @@ import errno
 import hashlib
 import os
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from stereorig.core.errors import FileFormatError, InputError, StorageError
@@ -73,14 +73,11 @@ def mismatch(name: str, of: str, folder: str) -> FileFormatError:
 
 
 @contextlib.contextmanager
-def written_temporary(
-    path: Path, *, checksum: bool = False, before: Callable[[], None] | None = None
-) -> Iterator[Path]:
+def written_temporary(path: Path, *, checksum: bool = False) -> Iterator[Path]:
     """Yield a temporary path in the same folder; on leaving, sync it, rename it to ``path``, sync the folder.
 
     With ``checksum``, its SHA-256 file is written first, so that a file under its real name never lacks it.
-    ``before`` is called when the temporary file is durable, and before it is renamed. If the body or ``before`` raises,
-    the temporary file is removed and ``path`` is left as it was.
+    If the body raises, the temporary file is removed and ``path`` is left as it was.
 
     Raises
     ------
@@ -93,8 +90,6 @@ def written_temporary(
         fsync_path(temporary)
         if checksum:
             write_bytes(checksum_file(path), f"{sha256_of(temporary)}  {path.name}\n".encode())
-        if before is not None:
-            before()
         _disk.disk.replace(temporary, path)
         fsync_path(path.parent)
     except OSError as error:

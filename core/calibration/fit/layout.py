@@ -158,10 +158,6 @@ class State:
             poses[number] = RigidTransform(turned(d[:3]) @ pose.rotation, pose.translation_mm + d[3:])
         return State(x, poses, self.nodes_mm + nodes_step)
 
-    def without_nodes(self) -> State:
-        """Return the state with the nominal nodes."""
-        return replace(self, nodes_mm=np.zeros_like(self.nodes_mm))
-
 
 def turned(rotation_vector: Float) -> Float:
     """Rotation (3, 3) by a rotation vector, radians."""

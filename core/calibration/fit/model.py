@@ -43,13 +43,8 @@ class Linearised:
     valid: bool
 
 
-def linearise(layout: Layout, state: State, view: ViewRows, nominal_nodes_mm: Float) -> Linearised:
-    """Evaluate one view at the nominal nodes (n, 3) and the state's corrections of them."""
-    return linearise_all(layout, state, [view], nominal_nodes_mm)[0]
-
-
 def linearise_all(layout: Layout, state: State, views: Sequence[ViewRows], nominal_nodes_mm: Float) -> list[Linearised]:
-    """Evaluate views as :func:`linearise` does, all views of a camera at once."""
+    """Evaluate views at the nominal nodes (n, 3) and the state's corrections of them, all views of a camera at once."""
     out: list[Linearised | None] = [None] * len(views)
     for c in range(2):
         own = [k for k, view in enumerate(views) if view.camera == c]

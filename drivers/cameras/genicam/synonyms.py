@@ -9,7 +9,6 @@ RATE = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs", "FrameRate")
 RATE_ENABLE = ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled")
 RESULTING_RATE = ("AcquisitionResultingFrameRate", "ResultingFrameRate", "ResultingFrameRateAbs")
 GAIN = ("Gain", "GainRaw")
-BLACK_LEVEL = ("BlackLevel", "BlackLevelRaw")
 SOFTWARE_TRIGGER = ("TriggerSoftware", "SoftwareTrigger")
 #: entries of TriggerSource for a trigger by command
 SOFTWARE_SOURCE = ("Software", "SoftwareTrigger")

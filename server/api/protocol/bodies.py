@@ -20,8 +20,8 @@ from stereorig.server.http.rights import by_name
 from stereorig.server.workflows.service import Service
 
 JSON_LIMIT = 2**20
-#: of a body that may hold a mask, and of a form
-MASK_LIMIT = FORM_LIMIT = 32 * 2**20
+#: of a body that may hold a mask
+MASK_LIMIT = 32 * 2**20
 UPLOAD_LIMIT = 1024 * 2**20
 #: entries of lists and objects, and names of objects among them, in a body of JSON
 MAX_VALUES = 60_000

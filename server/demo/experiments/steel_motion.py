@@ -24,7 +24,6 @@ MOTIONS = (
 )
 STRAINS = ("exx", "eyy", "exy")
 FALSE_LIMIT = 20.0  # microstrain, mean of the worst component: the project's own limit
-FEW = 20  # every 20th point is enough to show the calibration's effect
 OF_MANY = 4.0  # standard deviations that chance is given in the worst of many
 
 

@@ -25,22 +25,15 @@ _MAX_SCANS = 100
 _PIXELS_A_BYTE = 2048  # at most: each block of 64 pixels has a bit and more, of channels of a quarter of the pixels too
 
 
-def decode_jpeg(data: bytes, name: str, *, size: tuple[int, int] | None = None) -> NDArray[Any]:
+def decode_jpeg(data: bytes, name: str) -> NDArray[Any]:
     """Return (rows, cols) or (rows, cols, 3) uint8 of a JPEG file.
-
-    Parameters
-    ----------
-    size
-        Width and height that it must have; None: any that is read.
 
     Raises
     ------
     ImageError
         ``image_unreadable``, ``image_unsupported``, ``image_too_large``.
     """
-    width, height, components = _checked(data, name)
-    if size is not None and size != (width, height):
-        raise unreadable(name, f"a part of it is {width} x {height} px, not {size[0]} x {size[1]}")
+    components = _checked(data, name)
     try:
         pixels = simplejpeg.decode_jpeg(data, "GRAY" if components == 1 else "RGB", strict=True)
     except ValueError as error:
@@ -48,8 +41,8 @@ def decode_jpeg(data: bytes, name: str, *, size: tuple[int, int] | None = None) 
     return np.asarray(pixels[..., 0] if components == 1 else pixels)
 
 
-def _checked(data: bytes, name: str) -> tuple[int, int, int]:
-    """Return width, height and components, once every marker and scan was found to be there."""
+def _checked(data: bytes, name: str) -> int:
+    """Return the number of components, once every marker and scan was found to be there."""
     at, frame, scans = 2, None, 0
     missing: dict[int, NDArray[np.int8]] = {}  # by component, of each coefficient the bits that no scan has held so far
     while True:
@@ -92,7 +85,7 @@ def _checked(data: bytes, name: str) -> tuple[int, int, int]:
             at = found.start()
     if frame is None or any(bits.any() for bits in missing.values()):
         raise unreadable(name, "JPEG, scans are missing")
-    return width, height, components
+    return components
 
 
 def _take_scan(body: bytes, missing: dict[int, NDArray[np.int8]], name: str, *, progressive: bool) -> None:

@@ -19,8 +19,6 @@ from stereorig.server.results.gauges.request import GivenAlignment, PlaneAlignme
 
 #: the specimen's frame if none was chosen
 SPECIMEN = PlaneAlignment(kind="plane", x_direction="image_rows")
-#: longest text of a frame that is written out
-MAX_TEXT = 2000
 _ASKED: TypeAdapter[Asked] = TypeAdapter(Asked)
 
 

@@ -13,7 +13,6 @@ def test_inner_points_of_the_papers_grid() -> None:
     target = GridTarget(pitch_mm=1.0, lines=(11, 11), line_width_mm=0.03, node_tolerance_mm=0.004)
     points = target.inner_points_mm()
     assert points.shape == (9, 9, 2)
-    assert target.inner_shape == (9, 9)
     np.testing.assert_allclose(points[0, 0], [-4.0, -4.0])
     np.testing.assert_allclose(points[8, 0], [4.0, -4.0])  # first index runs along X_sys
     np.testing.assert_allclose(points[4, 4], [0.0, 0.0])
