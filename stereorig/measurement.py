@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereorig.core.errors import InputError
-from stereorig.core.field.checks.extrapolated import mark_extrapolated
+from stereorig.core.field.checks.unreached import mark_extrapolated
 from stereorig.core.field.common import with_common_parts
 from stereorig.core.field.points.images import MeasureImage, check_calibrated_size
 from stereorig.core.field.points.result import Field

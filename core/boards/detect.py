@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereorig.core.arrays import Bool, Float, Float32
-from stereorig.core.boards.beyond import extends_beyond
 from stereorig.core.boards.board import BoardTarget
 from stereorig.core.boards.corners import (
     any_checkerboard,
     dark_at_start,
+    extends_beyond,
     find_charuco,
     find_checkerboard,
     search_checkerboard,

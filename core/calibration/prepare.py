@@ -12,8 +12,7 @@ from stereorig.core.calibration.checks.positions import PositionCheck, check_pos
 from stereorig.core.calibration.fit.adjust import expected_covariance
 from stereorig.core.calibration.fit.layout import Layout, State, camera_of
 from stereorig.core.calibration.fit.named import named_covariance, parameter_names
-from stereorig.core.calibration.fit.problem import FitData
-from stereorig.core.calibration.fit.start import start_pose
+from stereorig.core.calibration.fit.problem import FitData, start_pose
 from stereorig.core.calibration.inputs import (
     AnyTarget,
     CalibrationOptions,

@@ -15,9 +15,8 @@ from stereorig.core.calibration.choice.lens import Chosen
 from stereorig.core.calibration.choice.screening import points_mm
 from stereorig.core.calibration.choice.structure import Structure, image_fields
 from stereorig.core.calibration.fit.adjust import Adjustment
-from stereorig.core.calibration.fit.layout import camera_of, camera_seeing
+from stereorig.core.calibration.fit.layout import camera_of, camera_seeing, direction
 from stereorig.core.calibration.fit.named import named_by_cause, named_covariance, named_derivatives, parameter_names
-from stereorig.core.calibration.fit.unit_vector import direction
 from stereorig.core.calibration.inputs import AnyTarget, CalibrationOptions, NominalValues, flatness_mm
 from stereorig.core.calibration.result import CalibrationResult, LensChosen, StageFound, ViewResult
 from stereorig.core.calibration.uncertainty import (

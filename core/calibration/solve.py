@@ -10,8 +10,8 @@ import numpy as np
 from stereorig.core.arrays import Float
 from stereorig.core.calibration.checks.angles import check_angles, check_order
 from stereorig.core.calibration.checks.positions import focus_px
-from stereorig.core.calibration.choice.exchanged import name_exchanged, remark_on_distances
 from stereorig.core.calibration.choice.lens import Chosen, choose_lens
+from stereorig.core.calibration.choice.pairs import name_exchanged, remark_on_distances
 from stereorig.core.calibration.fit.layout import camera_of
 from stereorig.core.calibration.inputs import AnyTarget, CalibrationOptions, CalibrationView, NominalValues, nodes_of
 from stereorig.core.calibration.prepare import (

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from stereorig.core.arrays import Float
-from stereorig.core.calibration.checks.agreement import DISAGREE_SHARE
-from stereorig.core.calibration.checks.lenses import lens_faults
+from stereorig.core.calibration.checks.agreement import DISAGREE_SHARE, lens_faults
 from stereorig.core.calibration.checks.measures import CheckMeasures, focal_lengths_px
 from stereorig.core.calibration.choice.contradictions import FAILED_LEVEL
 from stereorig.core.calibration.choice.declared import DECLARED, SCALE, SCALE_GROUPS

@@ -6,11 +6,18 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from stereorig.core.certify.comparison import Group, Judged, Outcome, coverage_factor, judged, worst_of
+from stereorig.core.certify.comparison import (
+    CertificateLimits,
+    Group,
+    Judged,
+    Outcome,
+    coverage_factor,
+    judged,
+    worst_of,
+)
 from stereorig.core.certify.comparisons import comparisons_of
 from stereorig.core.certify.evidence import Evidence
 from stereorig.core.certify.extensometer_class import ExtensometerClass, extensometer_class, is_coarser
-from stereorig.core.certify.limits import CertificateLimits
 from stereorig.core.certify.noise_floor import FloorRow, noise_floor
 from stereorig.core.certify.scales import Scales, scales_of
 from stereorig.core.certify.suspects import Suspect, suspects_of

@@ -7,9 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from stereorig.core.arrays import Float
-from stereorig.core.certify.comparison import Comparison
+from stereorig.core.certify.comparison import CertificateLimits, Comparison
 from stereorig.core.certify.evidence import CheckedLength, Evidence, MovedStep, StaticStep
-from stereorig.core.certify.limits import CertificateLimits
 from stereorig.core.certify.measured import Measured
 
 _AXES = ("X", "Y", "Z")

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stereorig.core.certify.comparison import ClassName
 from stereorig.core.certify.evidence import ExtensometerPoint, ExtensometerRun
-from stereorig.core.certify.limits import ClassName
 
 READINGS = 10
 """Readings of a series at least."""

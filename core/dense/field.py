@@ -17,9 +17,9 @@ from stereorig.core.dense.kernels.finish import AtPoints, Limits, Shape
 from stereorig.core.dense.prediction import predict
 from stereorig.core.dense.windows import Windows, finish_windows, measure_windows, node_positions
 from stereorig.core.errors import InputError
-from stereorig.core.field.points.dense_record import DenseRecord
 from stereorig.core.field.points.images import MeasureImage
 from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.smoothing_record import DenseRecord
 from stereorig.core.field.region.region import PointGrid
 from stereorig.core.field.settings import MeasureOptions
 from stereorig.core.matching.arguments import own

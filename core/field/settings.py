@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 
 from stereorig.core.errors import InputError
 from stereorig.core.field.checks.validity import ValidityOptions
-from stereorig.core.field.prefilter import check_prefilter
 from stereorig.core.field.region.region import check_subset
 from stereorig.core.matching.blur import Blur
 from stereorig.core.matching.options import MatchOptions, Patch
@@ -15,6 +14,7 @@ from stereorig.core.settings import (
     DEFAULT_INTERPOLATION,
     DEFAULT_PATCH,
     PATCH_SETTINGS,
+    PREFILTER_OF_SUBSET,
     SUBSET_PX,
     AnalysisSettings,
     Interpolation,
@@ -103,4 +103,27 @@ class MeasureOptions:
             patch=patch,
             interpolation=self.interpolation,
             max_sigma_px=single_sigma_px(self.validity.max_sigma_px),
+        )
+
+
+# Bounds of the Gaussian prefilter of all images of a measurement.
+#
+# All images of all steps are blurred alike before gradients and splines are made of them; seeds are searched for in the
+# images as they are. The effect of the blur on noise and covariance: ``stereorig.core.matching.blur``.
+
+
+def check_prefilter(prefilter_px: float, subset_px: int) -> None:
+    """Raise an error for a standard deviation that is negative, no number, or above a quarter of the subset.
+
+    Raises
+    ------
+    InputError
+        ``prefilter_invalid``.
+    """
+    if isinstance(prefilter_px, bool) or not 0.0 <= prefilter_px <= PREFILTER_OF_SUBSET * subset_px:
+        raise InputError(
+            f"the prefilter is {prefilter_px} px; it must lie in 0 (off) to a quarter of the subset, "
+            f"{PREFILTER_OF_SUBSET * subset_px:g} px.",
+            code="prefilter_invalid",
+            remedy="Give 0.5 to 1, for example, or 0 for none; against noise a larger subset does more.",
         )

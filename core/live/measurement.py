@@ -21,7 +21,7 @@ from stereorig.core.calibration.volume import CalibratedVolume
 from stereorig.core.cameras.stereo import StereoPair
 from stereorig.core.common.factor import ParameterCovariance
 from stereorig.core.errors import InputError, MeasurementError
-from stereorig.core.field.checks.extrapolated import mark_extrapolated
+from stereorig.core.field.checks.unreached import mark_extrapolated
 from stereorig.core.field.common import CommonParts
 from stereorig.core.field.points.images import MeasureImage
 from stereorig.core.field.points.result import Field

@@ -18,7 +18,7 @@ from stereorig.core.model.regions import ChiSquare, Tiles, holm, own_covariance_
 from stereorig.core.model.result import Compared, CompareOptions, ModelComparison, ModelStatus
 from stereorig.core.model.strains import compare_strain
 from stereorig.core.model.surface import ModelSurface
-from stereorig.core.significance import chi_square_tail
+from stereorig.core.robust import chi_square_tail
 from stereorig.core.strain.options import StrainOptions
 
 _FAR = 0.02  # share of the field's size: not on the model

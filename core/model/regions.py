@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 from stereorig.core.arrays import Bool, Float
 from stereorig.core.field.points.result import Field
 from stereorig.core.field.points.shared_pixels import SharedPixels, roots_of, steps_px
-from stereorig.core.significance import chi_square_tail
+from stereorig.core.robust import chi_square_tail
 
 _MIN_SHARE = 0.4  # share of a tile's points; smaller rests at the rim join a neighbour
 _SMALL = 1e-10  # share of the largest eigenvalue: rounding makes a direction without variance this large

@@ -10,7 +10,7 @@ from stereorig.core.arrays import Float
 from stereorig.core.field.points.result import Field
 from stereorig.core.model.regions import ChiSquare, Tiles, holm
 from stereorig.core.model.result import Compared
-from stereorig.core.significance import chi_square_tail
+from stereorig.core.robust import chi_square_tail
 from stereorig.core.strain.mean import mean_strain_variances
 from stereorig.core.strain.options import StrainOptions
 from stereorig.core.strain.result import StrainStatus

@@ -16,7 +16,7 @@ from stereorig.core.orientation.consequence import Consequence
 from stereorig.core.orientation.estimate import estimate_change
 from stereorig.core.orientation.matched import MatchedPoints
 from stereorig.core.orientation.offsets import StepOffsets
-from stereorig.core.significance import f_tail, two_sided_sigmas
+from stereorig.core.robust import f_tail, two_sided_sigmas
 
 Against = Literal["calibration", "reference", "last_step"]
 Pattern = Literal["mean", "slope", "curvature"]

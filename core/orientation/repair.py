@@ -25,7 +25,7 @@ from stereorig.core.orientation.coarse import coarse_change, feature_matches
 from stereorig.core.orientation.consequence import Consequence, consequence_of
 from stereorig.core.orientation.estimate import OrientationEstimate, estimate_change
 from stereorig.core.orientation.matched import MatchedPoints, matched_points
-from stereorig.core.orientation.structure import structure_left_px
+from stereorig.core.orientation.noise import structure_left_px
 from stereorig.core.progress import CancelToken, Progress, no_progress
 
 _ROUNDS = 2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from docs.built.tables import cell, table
-from stereorig.server.api.docs.problem_pages import known_problems
+from stereorig.server.api.docs.pages import known_problems
 
 
 def errors() -> str:

@@ -11,7 +11,7 @@ from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
 from starlette.types import Lifespan
 
-from stereorig.server.api.docs import front, openapi, problem_pages
+from stereorig.server.api.docs import openapi
 from stereorig.server.api.docs import pages as doc_pages
 from stereorig.server.api.protocol import problems
 from stereorig.server.api.protocol.audit import Recorder
@@ -121,8 +121,7 @@ def create_app(
     app.add_api_route("/readyz", system.readyz, include_in_schema=False)
     app.add_api_route("/metrics", system.metrics, include_in_schema=False)
     app.include_router(doc_pages.router)
-    app.include_router(problem_pages.router)
-    front.install(app)
+    doc_pages.install(app)
     # the last that is added is the first that a request meets
     app.add_middleware(Delivery)
     app.add_middleware(Bodies, service=service)

@@ -7,7 +7,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 from stereorig.server.base.kernel_folder import ensure_kernel_folder  # noqa: E402
-from stereorig.server.base.memory import end_at_once  # noqa: E402
+from stereorig.server.base.priority import end_at_once  # noqa: E402
 from stereorig.server.cli.main import main  # noqa: E402
 
 end_at_once()

@@ -12,7 +12,7 @@ from typing import NoReturn
 from stereorig.core.errors import Cancelled, StereorigError
 from stereorig.core.lazy import load_module
 from stereorig.server.base.library_threads import one_library_thread
-from stereorig.server.base.memory import go_on, hurry
+from stereorig.server.base.priority import go_on, hurry
 from stereorig.server.formats.version import software_version
 from stereorig.server.worker.kernel_compiler import compiled_aside
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stereorig.core.errors import InputError
-from stereorig.core.field.region.outlines import outlines_of
+from stereorig.core.field.region.lay_points import outlines_of
 from stereorig.core.settings import Outline
 from stereorig.server.formats.files import make_folder, write_bytes
 

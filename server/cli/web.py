@@ -15,8 +15,7 @@ from pathlib import Path
 
 from stereorig.core.errors import StereorigError
 from stereorig.server.base import logs
-from stereorig.server.base.memory import hurry, settle
-from stereorig.server.base.priority import die_first, end_with_parent, raise_file_limit, raise_service
+from stereorig.server.base.priority import die_first, end_with_parent, hurry, raise_file_limit, raise_service, settle
 from stereorig.server.cli.operation.serve import default_config, is_loopback, names_of
 from stereorig.server.http.server import FrontLink
 from stereorig.server.worker.kernel_compiler import compiled_aside

@@ -9,7 +9,7 @@ from __future__ import annotations
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
-from stereorig.core.field.checks.extrapolated import mark_extrapolated
+from stereorig.core.field.checks.unreached import mark_extrapolated
 from stereorig.core.field.common import CommonParts
 from stereorig.core.field.points.images import MeasureImage
 from stereorig.core.field.points.result import Field

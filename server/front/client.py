@@ -14,13 +14,13 @@ from typing import Any, cast
 
 import h11
 
-from stereorig.server.front.limits import ConnectionLimits
 from stereorig.server.front.messages import (
     AWAY,
     CROWDED,
     MALFORMED,
     TWO_LENGTHS,
     Answer,
+    ConnectionLimits,
     Halt,
     HaltFailed,
     HaltMade,

@@ -15,8 +15,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 from stereorig.server.front.client import ClientConnection, Clients
-from stereorig.server.front.limits import ConnectionLimits
-from stereorig.server.front.messages import Halt, HaltFailed, HaltMade, Headers
+from stereorig.server.front.messages import ConnectionLimits, Halt, HaltFailed, HaltMade, Headers
 
 __all__ = ["ConnectionLimits", "Front", "HaltFailed", "HaltMade"]
 

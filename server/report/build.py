@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereorig.core.field.points.result import Field
-from stereorig.core.field.region.outlines import corners_px
+from stereorig.core.field.region.lay_points import corners_px
 from stereorig.core.names import ALL_PARTS, BUDGET, CAMERAS
 from stereorig.core.settings import CoverageFields, Outline
 from stereorig.server.formats.results.camera_motion import MOVED_REMEDY

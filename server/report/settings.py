@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from stereorig.core.field.points.dense_record import METHOD
+from stereorig.core.field.points.smoothing_record import METHOD
 from stereorig.server.formats.version import software_version
 from stereorig.server.report.geometry import Geometry
 from stereorig.server.report.items import MEASURED, SETTINGS, Item, Value, one

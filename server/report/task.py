@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -29,3 +30,20 @@ def report_task(results: str, out: str, coverage: Coverage, framed: Sequence[str
     made = make_report(source, coverage)
     (Path(out) / NAME).write_bytes(made.page)
     return made.policy, len(made.missing)
+
+
+# A certificate as a task of the export process.
+
+
+def certificate_task(results: str, plan_json: str, certificate_id: str, out: str) -> str:
+    """Make the certificate of an analysis: ``certificate.json`` and ``certificate.html``; return the verdict."""
+    # matplotlib is loaded with the report's library
+    from stereorig.server.report.certificate.document import make_certificate
+    from stereorig.server.report.source import find_source
+    from stereorig.server.results.certificate.plan import plan_in
+
+    plan = plan_in(json.loads(plan_json), name="the request")
+    made = make_certificate(find_source(Path(results)), plan, certificate_id=certificate_id)
+    (Path(out) / "certificate.html").write_bytes(made.page)
+    (Path(out) / "certificate.json").write_text(json.dumps({**made.document, "policy": made.policy}), encoding="utf-8")
+    return made.outcome

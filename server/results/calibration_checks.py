@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass, replace
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,14 +24,17 @@ from stereorig.core.calibration.checks.compare import (
 from stereorig.core.calibration.checks.distance import MARK_SIGMA_PX, DistanceCheck, check_known_distance
 from stereorig.core.calibration.checks.target_distance import check_target_images
 from stereorig.core.calibration.result import COVARIANCE_NAMES
-from stereorig.core.errors import CalibrationInputError, StereorigError
+from stereorig.core.errors import CalibrationInputError, FileFormatError, InputError, StereorigError
 from stereorig.core.grid import GridView
+from stereorig.core.orientation.matched import seen_by_camera2
 from stereorig.core.target import GridTarget
 from stereorig.server.formats.calibrations.native import parameters_in
-from stereorig.server.formats.calibrations.programs.plausibility import image_sizes, shared_points
-from stereorig.server.formats.calibrations.recognise import LoadedCalibration
+from stereorig.server.formats.calibrations.programs.plausibility import Residual, image_sizes, shared_points
+from stereorig.server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from stereorig.server.formats.calibrations.volume import volume_of
 from stereorig.server.formats.version import software_version
+from stereorig.server.results.provenance import calibration_of
+from stereorig.server.results.steps import read_step
 
 KNOWN_DISTANCE = "known_distance"
 Images = tuple[NDArray[Any], NDArray[Any]]
@@ -193,3 +197,58 @@ def _plain(value: Any) -> Any:
 
 def _sizes(sizes: tuple[tuple[int, int], tuple[int, int], bool]) -> str:
     return " and ".join(f"{w} x {h} px" for w, h in sizes[:2])
+
+
+# The epipolar residual of a calibration over points that were measured with another.
+
+
+@dataclass(frozen=True)
+class EpipolarComparison:
+    """The epipolar residuals of two calibrations over the points of a result, whose file's name comes first."""
+
+    results: str
+    measured_with: Residual
+    this_calibration: Residual
+
+
+def check_against(loaded: LoadedCalibration, files: Sequence[Path], measured_with: Path) -> EpipolarComparison:
+    """Return the epipolar residual of a calibration over points that were measured with another.
+
+    Parameters
+    ----------
+    loaded
+        The calibration to check.
+    files
+        Result files; the first is read.
+    measured_with
+        The calibration that they were measured with, which gives each point's position in camera 2.
+
+    Raises
+    ------
+    FileFormatError
+        ``calibration_changed`` if it is not the one that the results name.
+    InputError
+        ``too_few_points`` without a valid point.
+    """
+    step = read_step(files[0], ["epipolar_px"])
+    own = load_calibration(measured_with)
+    named = calibration_of(step)
+    if named is not None and named != own.sha256:
+        raise FileFormatError(
+            f"{measured_with} is not the calibration that {files[0].name} was measured with.",
+            code="calibration_changed",
+            remedy="Give the calibration that the analysis was measured with.",
+        )
+    ok = step.valid
+    if not ok.any():
+        raise InputError(f"{files[0].name} has no valid point.", code="too_few_points", remedy="Give other results.")
+    variables = step.variables
+    xy1 = np.stack([variables[n].values[ok] for n in ("x_px", "y_px")], axis=1)
+    xyz = np.stack([variables[n].values[ok] for n in ("x_mm", "y_mm", "z_mm")], axis=1)
+    ray1 = own.pair.cam1.rays_cam(xy1)
+    xy2 = seen_by_camera2(own.pair, ray1, xyz, variables["epipolar_px"].values[ok].astype(np.float64))
+    return EpipolarComparison(
+        results=files[0].name,
+        measured_with=Residual.of(own.pair.epipolar_residual_px(xy1, xy2)),
+        this_calibration=Residual.of(loaded.pair.epipolar_residual_px(xy1, xy2)),
+    )

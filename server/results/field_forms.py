@@ -7,6 +7,7 @@ import re
 import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import cv2
@@ -15,8 +16,9 @@ from numpy.typing import NDArray
 
 from stereorig.core.errors import InputError
 from stereorig.server.formats import csv_cells
+from stereorig.server.formats.calibrations.recognise import load_calibration
 from stereorig.server.formats.results.netcdf import dataset_bytes
-from stereorig.server.results.reader import FileVariable
+from stereorig.server.results.reader import FileVariable, read_point_positions
 
 FieldForm = Literal["json", "npy", "csv", "nc", "f32", "png"]
 MEDIA_TYPES: dict[FieldForm, str] = {
@@ -264,3 +266,34 @@ def _png(part: FieldPart) -> bytes:
 
 def _write(picture: NDArray[np.uint8], text: str, x: int, y: int, size: float) -> None:
     cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, (0, 0, 0), 1, cv2.LINE_AA)
+
+
+# Positions of a result's points in a step's own image.
+
+
+def image_positions(result: Path, calibration: Path, cam: str) -> NDArray[np.float64]:
+    """Project each point at its position in that step into one camera's image.
+
+    Parameters
+    ----------
+    result
+        Result file of the step.
+    calibration
+        The test's calibration.
+    cam
+        ``cam1`` or ``cam2``.
+
+    Returns
+    -------
+    NDArray
+        (rows, cols, 2) column and row in px; NaN where the point was not measured or has no image.
+    """
+    pair = load_calibration(calibration).pair
+    positions = read_point_positions(result)
+    camera = pair.cam1 if cam == "cam1" else pair.cam2
+    found: NDArray[Any] = np.full((*positions.shape[:-1], 2), np.nan)
+    there = np.isfinite(positions).all(axis=-1)
+    if there.any():
+        mapped = camera.project(positions[there])
+        found[there] = np.where(mapped.valid[:, None], mapped.xy, np.nan)
+    return found

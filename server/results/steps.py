@@ -16,7 +16,7 @@ from stereorig.core.field.region.cuts import Cuts, from_arrays
 from stereorig.core.settings import Coverage, CoverageFields
 from stereorig.core.status import PointStatus
 from stereorig.server.base.errors import NotFoundError, no_variable
-from stereorig.server.base.long_json import nothing
+from stereorig.server.base.json_values import nothing
 from stereorig.server.formats.results.derived import derived_names
 from stereorig.server.formats.results.folder import home_of, number_of
 from stereorig.server.formats.results.netcdf import opened

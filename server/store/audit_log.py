@@ -14,8 +14,8 @@ import os
 import threading
 from pathlib import Path
 
+from stereorig.server.store.durable import Reserve
 from stereorig.server.store.folder import now_utc
-from stereorig.server.store.reserved import Reserve
 
 _log = logging.getLogger("stereorig.audit")
 

@@ -23,7 +23,7 @@ from stereorig.core.errors import StorageError
 from stereorig.server.base.models import Ids
 from stereorig.server.documents.jobs import JobRecord
 from stereorig.server.formats.manifest import kept
-from stereorig.server.store.reserved import Reserve
+from stereorig.server.store.durable import Reserve
 
 T = TypeVar("T")
 #: kind, parent, id, document

@@ -6,8 +6,10 @@ renamed, and the folder fsynced (:mod:`stereorig.server.formats.files`). A file 
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import json
+import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
@@ -17,7 +19,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from stereorig.core.errors import FileFormatError
-from stereorig.server.base import long_json
+from stereorig.server.base import json_values
 from stereorig.server.base.json_values import without_nan
 from stereorig.server.base.models import Document
 from stereorig.server.formats import disk as _disk
@@ -61,7 +63,7 @@ def json_bytes(document: Any) -> bytes:
     return text.encode() + b"\n"
 
 
-def read_json(path: Path, keep: Mapping[str, long_json.Keep] | None = None) -> dict[str, Any]:
+def read_json(path: Path, keep: Mapping[str, json_values.Keep] | None = None) -> dict[str, Any]:
     """Read a JSON object.
 
     Parameters
@@ -69,7 +71,7 @@ def read_json(path: Path, keep: Mapping[str, long_json.Keep] | None = None) -> d
     path
         The file.
     keep
-        For long lists in it, the part of each entry to keep; see :func:`stereorig.server.base.long_json.loads`.
+        For long lists in it, the part of each entry to keep; see :func:`stereorig.server.base.json_values.loads`.
 
     Raises
     ------
@@ -77,7 +79,7 @@ def read_json(path: Path, keep: Mapping[str, long_json.Keep] | None = None) -> d
         If the file is missing, cut short or no object; ``checksum_mismatch`` if it is not as it was written.
     """
     try:
-        document = long_json.loads(checked_bytes(path).decode(), keep)
+        document = json_values.loads(checked_bytes(path).decode(), keep)
     except FileNotFoundError as error:
         raise FileFormatError(f"{path.name} is missing.", code="file_missing", file=path.name) from error
     except (OSError, ValueError) as error:
@@ -164,7 +166,7 @@ def known_record(kind: type[Record], path: Path, **missing: object) -> Record:
         return kind.model_validate(missing)
 
 
-def known_json(path: Path, keep: Mapping[str, long_json.Keep] | None = None) -> dict[str, Any]:
+def known_json(path: Path, keep: Mapping[str, json_values.Keep] | None = None) -> dict[str, Any]:
     """Read a JSON object; empty if it is missing or unreadable, for readers that can do without it.
 
     Raises
@@ -178,3 +180,45 @@ def known_json(path: Path, keep: Mapping[str, long_json.Keep] | None = None) -> 
         raise
     except FileFormatError:
         return {}
+
+
+# Disk that a file holds ahead of its end, so that a full disk still takes its next lines.
+
+_KEEP_SIZE = 1  # FALLOC_FL_KEEP_SIZE of linux/falloc.h: readers see no byte of the reserve
+
+
+class Reserve:
+    """Keeps blocks ahead of the end of an open file; has none where system or file system cannot.
+
+    Parameters
+    ----------
+    file
+        Descriptor that can write.
+    ahead_bytes
+        Length of the reserve.
+    """
+
+    def __init__(self, file: int, ahead_bytes: int) -> None:
+        self._file, self._ahead = file, ahead_bytes
+        self._end = os.fstat(file).st_size
+        self.renew()
+
+    def renew(self) -> None:
+        """Make the reserve whole once half of it is used; on a full disk it stays as it is."""
+        size = os.fstat(self._file).st_size
+        if self._end - size < self._ahead // 2:
+            start = max(size, self._end)
+            if _allocate(self._file, start, size + self._ahead - start):
+                self._end = size + self._ahead
+
+    @property
+    def left_bytes(self) -> int:
+        """Room that is certain."""
+        return max(0, self._end - os.fstat(self._file).st_size)
+
+
+def _allocate(file: int, start: int, count: int) -> bool:
+    allocate = getattr(ctypes.CDLL(None), "fallocate", None)
+    if allocate is None:
+        return False
+    return bool(allocate(file, _KEEP_SIZE, ctypes.c_int64(start), ctypes.c_int64(count)) == 0)

@@ -23,8 +23,7 @@ from typing import Any
 from stereorig.core.compiling import COMPILING, report_compiling
 from stereorig.core.errors import Cancelled
 from stereorig.server.base.library_threads import one_library_thread
-from stereorig.server.base.memory import settle
-from stereorig.server.base.priority import end_with_parent, lower_worker
+from stereorig.server.base.priority import end_with_parent, lower_worker, settle
 from stereorig.server.worker.kernel_compiler import compiled_aside
 
 _log = logging.getLogger("stereorig.worker")

@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 
 from stereorig.core.arrays import Float
 from stereorig.core.errors import Cancelled, InputError, StageError, StateError, StereorigError
-from stereorig.core.live.triggers import Cycles, level_reached, moments, slope_reached
+from stereorig.core.live.channels import Cycles, level_reached, moments, slope_reached
 from stereorig.drivers.cameras.protocol import CameraDescription, CameraSettings
 from stereorig.server.base.models import Ids, Request
 from stereorig.server.documents.steps import BurstIndex, StepMetadata

@@ -10,9 +10,8 @@ import numpy as np
 
 from stereorig.core.arrays import Float
 from stereorig.sim.boards.dots import dots_board
-from stereorig.sim.boards.markers import charuco_squares, checkerboard_squares
 from stereorig.sim.boards.pattern import field_points
-from stereorig.sim.boards.squares import squares_board
+from stereorig.sim.boards.squares import charuco_squares, checkerboard_squares, squares_board
 from stereorig.sim.surface import Surface, bowl, flat
 from stereorig.sim.texture import Texture, line_grid
 

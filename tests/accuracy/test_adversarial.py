@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stereorig.core.errors import SeedError
-from stereorig.core.field.region.repeats import repeats
+from stereorig.core.field.region.textured import repeats
 from stereorig.core.field.seeding.seeds import Seed
 from stereorig.core.measure import MeasureOptions, ReferencePair
 from stereorig.sim.render import render

@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 
 from stereorig.core.calibration.volume import CalibratedVolume, calibrated_volume
-from stereorig.core.field.checks.extrapolated import mark_extrapolated
+from stereorig.core.field.checks.unreached import mark_extrapolated
 from stereorig.core.field.region.region import PointGrid
 from stereorig.core.measure import MeasureOptions, measure_motion
 from stereorig.core.status import PointStatus

@@ -27,7 +27,7 @@ from stereorig.server.formats.calibrations.export import FORMS, convert_calibrat
 from stereorig.server.formats.calibrations.programs.plausibility import check_calibration, shared_points
 from stereorig.server.formats.calibrations.recognise import LoadedCalibration, load_calibration, parse_calibration
 from stereorig.server.formats.results.writing import Provenance, write_field
-from stereorig.server.results.epipolar_check import check_against
+from stereorig.server.results.calibration_checks import check_against
 
 SIZE = (1280, 1024)
 PAPER = {

@@ -20,7 +20,7 @@ import pytest
 import scipy.io
 import xarray
 
-from stereorig.core.field.points.dense_record import METHOD
+from stereorig.core.field.points.smoothing_record import METHOD
 from stereorig.server.cli.main import main
 from stereorig.server.exports.request import ExportRequest
 from stereorig.server.exports.run import export

@@ -15,7 +15,7 @@ import httpx
 import pytest
 
 from stereorig.server.api.app import create_app
-from stereorig.server.front.limits import ConnectionLimits
+from stereorig.server.front.messages import ConnectionLimits
 from stereorig.server.workflows.service import Service
 from tests.support.fronted import Fronted, fronted, web_process
 from tests.support.patience import Deadline

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stereorig.server.api.docs.problem_pages import known_problems
+from stereorig.server.api.docs.pages import known_problems
 from stereorig.server.results.field_forms import Part, encode, nested, take
 from stereorig.server.results.reader import FileVariable
 from stereorig.server.workflows.service import Service

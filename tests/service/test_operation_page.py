@@ -9,7 +9,7 @@ import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from stereorig.server.api.docs.problem_pages import known_problems
+from stereorig.server.api.docs.pages import known_problems
 from stereorig.server.cli.main import main
 from stereorig.server.config.rig_file import ServiceSection
 from tests.support.api_description import current

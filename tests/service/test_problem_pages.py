@@ -10,7 +10,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from stereorig.server.api.docs.problem_pages import known_problems
+from stereorig.server.api.docs.pages import known_problems
 from tests.bench.documents.problem_list import LIST, PACKAGES, ROOT, scan, text_of, tree
 
 STATIC = ROOT / "server" / "static"

@@ -26,7 +26,7 @@ from schemathesis.engine import events, from_schema
 
 from stereorig.core.errors import StateError
 from stereorig.server.api.app import create_app
-from stereorig.server.api.docs.problem_pages import known_problems
+from stereorig.server.api.docs.pages import known_problems
 from stereorig.server.config.rig_file import parse_config
 from stereorig.server.workflows.deletion import restore
 from stereorig.server.workflows.service import Service

@@ -24,7 +24,7 @@ from typing import Any
 from stereorig.core.errors import CameraError
 from stereorig.core.names import CAMERAS, CameraName
 from stereorig.drivers.cameras.aravis import discover
-from stereorig.drivers.cameras.aravis.grabber import AravisGrabber
+from stereorig.drivers.cameras.aravis.session import AravisGrabber
 from stereorig.drivers.cameras.protocol import CameraOptions, CameraSettings, FrameGrabber, LatchingGrabber, TriggerMode
 from stereorig.server.config.rig_file import RigConfig, load_config
 from stereorig.server.rig import build

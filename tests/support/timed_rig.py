@@ -24,7 +24,7 @@ from stereorig.core.names import CAMERAS, CameraName
 from stereorig.drivers.acquisition.pairing import Pair
 from stereorig.drivers.acquisition.sources import StreamedPairs
 from stereorig.drivers.acquisition.unit import CameraUnit
-from stereorig.drivers.cameras.aravis.grabber import AravisGrabber
+from stereorig.drivers.cameras.aravis.session import AravisGrabber
 from stereorig.drivers.cameras.protocol import CameraOptions, CameraSettings, TriggerMode
 from stereorig.server.config.rig_file import parse_config
 from stereorig.server.rig import cameras

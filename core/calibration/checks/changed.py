@@ -18,7 +18,7 @@ from stereorig.core.arrays import Float
 from stereorig.core.cameras.camera import POSE_NAMES, Camera, angles_from_rotation, rotation_derivatives
 from stereorig.core.cameras.stereo import StereoPair
 from stereorig.core.names import CAMERAS
-from stereorig.core.significance import chi_square_tail
+from stereorig.core.robust import chi_square_tail
 
 Cause = Literal["scale", "camera_moved", "focal_length", "image_centre", "distortion", "lens"]
 _FOCAL = ("phd_px", "fx_px", "fy_px")

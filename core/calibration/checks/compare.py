@@ -22,7 +22,7 @@ from stereorig.core.calibration.volume import CalibratedVolume
 from stereorig.core.cameras.camera import Camera, RigidTransform
 from stereorig.core.cameras.stereo import StereoPair
 from stereorig.core.errors import CalibrationInputError
-from stereorig.core.significance import chi_square_tail
+from stereorig.core.robust import chi_square_tail
 
 #: probability below which two calibrations differ: three standard deviations of a Gaussian
 SIGNIFICANT = 0.0027

@@ -9,7 +9,6 @@ from functools import cached_property
 
 import numpy as np
 
-from stereorig.core.calibration.checks.flatness import check_flatness
 from stereorig.core.calibration.choice.contradictions import (
     FAILED_LEVEL,
     bow_of,
@@ -33,7 +32,7 @@ from stereorig.core.calibration.choice.structure import (
     no_target,
     scored,
 )
-from stereorig.core.calibration.choice.target_errors import find_target_errors
+from stereorig.core.calibration.choice.target_errors import check_flatness, find_target_errors
 from stereorig.core.calibration.choice.target_shape import with_smooth_errors
 from stereorig.core.calibration.choice.tilted import (
     TILTED,

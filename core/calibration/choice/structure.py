@@ -25,7 +25,7 @@ from stereorig.core.calibration.fit.observations import ViewRows
 from stereorig.core.calibration.inputs import NominalValues
 from stereorig.core.cameras.lens import LensModel
 from stereorig.core.names import CAMERAS
-from stereorig.core.significance import f_tail
+from stereorig.core.robust import f_tail
 
 SIGNIFICANT = 1e-4
 _DEGREE = 5

@@ -9,9 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereorig.core.arrays import Float
-from stereorig.core.calibration.fit.layout import Layout, State, camera_of, shift_cam_mm, travel_mm
+from stereorig.core.calibration.fit.layout import (
+    Layout,
+    State,
+    camera_of,
+    direction,
+    direction_jacobian,
+    shift_cam_mm,
+    travel_mm,
+)
 from stereorig.core.calibration.fit.observations import ViewRows
-from stereorig.core.calibration.fit.unit_vector import direction, direction_jacobian
 from stereorig.core.cameras.camera import normalised_jacobian, rotation_derivatives
 
 

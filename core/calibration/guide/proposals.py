@@ -9,9 +9,9 @@ import numpy as np
 
 from stereorig.core.arrays import Float
 from stereorig.core.calibration.fit.layout import turned
+from stereorig.core.calibration.guide.coverage import Sightline, sightline
 from stereorig.core.calibration.guide.estimate import Estimate
 from stereorig.core.calibration.guide.information import Information, Spread
-from stereorig.core.calibration.guide.sightline import Sightline, sightline
 from stereorig.core.cameras.camera import RigidTransform
 from stereorig.core.errors import CalibrationError
 

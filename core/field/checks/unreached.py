@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial import cKDTree
 
 from stereorig.core.arrays import Bool, Float
+from stereorig.core.calibration.volume import CalibratedVolume
+from stereorig.core.errors import RegionError
 from stereorig.core.field.points.fitter import Fitter, PointFits
+from stereorig.core.field.points.result import Field
 from stereorig.core.field.points.starts import move_matrix, move_w
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.matching.blur import Blur
 from stereorig.core.status import PointStatus
 
 _REACH_SUBSETS = 4.0
@@ -87,3 +94,67 @@ def _outside(fitter: Fitter, before: Float, now: Float | None, margin_px: float 
             inside = (p[:, 2] > 0) & ((xy >= margin_px) & (xy <= last)).all(axis=1)
         out |= ~inside
     return out
+
+
+# Points near the images' edges, where a Gaussian prefilter lacks neighbours and mirrors the pixels that it has.
+
+
+def clear_of_edges(fits_image: Bool, grid: PointGrid, shape: tuple[int, int], subset_px: int, blur: Blur) -> Bool:
+    """Return (r, c) True where a subset holds only pixels of camera 1's image that were blurred with true neighbours.
+
+    Raises
+    ------
+    RegionError
+        ``region_too_small`` if no point is left.
+    """
+    margin = subset_px // 2 + blur.edge_px
+    rows, cols = shape
+    x, y = grid.x_px, grid.y_px
+    clear = fits_image & (x >= margin) & (y >= margin) & (x <= cols - 1 - margin) & (y <= rows - 1 - margin)
+    if not clear.any():
+        raise RegionError(
+            f"all points lie nearer than {margin} px to the border of camera 1's image, where the prefilter of "
+            f"{blur.sd_px:g} px has no neighbours.",
+            code="region_too_small",
+            remedy="Give a region further from the image's border, a smaller subset or a smaller prefilter.",
+        )
+    return np.asarray(clear)
+
+
+def reject_near_edges(fitter: Fitter, points: PointFits, xy_px: Float, blur: Blur) -> None:
+    """Reject points, OUTSIDE_IMAGE, with a patch so near to an image's border that the blur lacks neighbours."""
+    ok = np.flatnonzero(points.ok)
+    off = leaves_an_image(fitter, xy_px[ok], xy_px[ok], points.take(ok), margin_px=blur.edge_px)
+    rejected = np.zeros(len(points.status), bool)
+    rejected[ok[off]] = True
+    points.reject(rejected, PointStatus.OUTSIDE_IMAGE)
+
+
+# Points outside the volume in which the cameras were calibrated: flagged.
+
+
+def mark_extrapolated(field: Field, volume: CalibratedVolume | None) -> Field:
+    """Return the field with those points marked that are, or were at the reference, outside the calibrated volume.
+
+    Their status becomes EXTRAPOLATED. The calibration's part of their uncertainty, which grows without bound there, is
+    in the field's common factor as everywhere.
+
+    Parameters
+    ----------
+    field
+        As measured. A step's starts and the shape that later steps are measured with are taken from the unmarked field.
+    volume
+        The calibrated volume; None if not known: nothing is marked.
+    """
+    if volume is None:
+        return field
+    outside = field.status == PointStatus.OK
+    outside &= ~volume.contains(field.xyz_mm)
+    now = None if field.uvw_mm is None else field.xyz_mm + field.uvw_mm
+    if now is not None:
+        outside |= (field.status == PointStatus.OK) & ~volume.contains(now)
+    if not outside.any():
+        return field
+    status = field.status.copy()
+    status[outside] = PointStatus.EXTRAPOLATED
+    return replace(field, status=status)

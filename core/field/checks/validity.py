@@ -15,8 +15,12 @@ from numpy.typing import NDArray
 
 from stereorig.core.arrays import Float
 from stereorig.core.cameras.stereo import StereoPair
-from stereorig.core.field.checks.epipolar_mismatch import EpipolarLimits, epipolar_mismatches
-from stereorig.core.field.checks.groups import connected, neighbour_pairs
+from stereorig.core.field.checks.epipolar_mismatch import (
+    EpipolarLimits,
+    connected,
+    epipolar_mismatches,
+    neighbour_pairs,
+)
 from stereorig.core.field.checks.lost_correlation import CorrelationLimits, lost_correlation
 from stereorig.core.field.points.fitter import PointFits
 from stereorig.core.field.points.scales import depth_per_px, px_per_ray

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from stereorig.core.field.checks.blank_centres import reject_blank_centres
-from stereorig.core.field.checks.edges import reject_near_edges
 from stereorig.core.field.checks.residual_test import residual_test
-from stereorig.core.field.checks.unreached import mark_outside
+from stereorig.core.field.checks.unreached import mark_outside, reject_near_edges
 from stereorig.core.field.checks.validity import apply_validity_checks
 from stereorig.core.field.growth.grow import grow
 from stereorig.core.field.growth.state import FieldInputs, GrowthState

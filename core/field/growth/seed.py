@@ -21,7 +21,7 @@ from stereorig.core.field.points.fitter import PointFits
 from stereorig.core.field.points.images import features_of
 from stereorig.core.field.points.result import Field
 from stereorig.core.field.points.starts import Starts
-from stereorig.core.field.seeding.predict import predict
+from stereorig.core.field.seeding.predicted import predict
 from stereorig.core.field.seeding.scattered_matches import (
     ScatteredMotion,
     ScatteredShape,

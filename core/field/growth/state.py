@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from stereorig.core.arrays import Bool, Float
 from stereorig.core.cameras.stereo import StereoPair
-from stereorig.core.field.checks.edges import clear_of_edges
 from stereorig.core.field.checks.residual_test import OF_USUAL
+from stereorig.core.field.checks.unreached import clear_of_edges
 from stereorig.core.field.growth.grow import Attempts
 from stereorig.core.field.points.fitter import Fitter, PointFits
 from stereorig.core.field.points.images import MeasureImage, different, refuse_stale, same_size

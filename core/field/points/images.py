@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereorig.core.arrays import Bool, Float
 from stereorig.core.errors import ImageError
 from stereorig.core.field.points.features import Box, Features, Picture, detect_all
-from stereorig.core.field.region.repeats import Peaks, repeats
+from stereorig.core.field.region.textured import Peaks, repeats
 from stereorig.core.matching.blur import Blur
 from stereorig.core.matching.defects import find_defects
 from stereorig.core.matching.image import ImageData, prepare

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from stereorig.core.arrays import Bool, Float, Floats
 from stereorig.core.common.factor import Causes
-from stereorig.core.field.points.dense_record import DenseRecord
 from stereorig.core.field.points.patch import PatchChoice
-from stereorig.core.field.points.smoothing_record import Smoothing
+from stereorig.core.field.points.smoothing_record import DenseRecord, Smoothing
 from stereorig.core.field.points.starts import Starts
 from stereorig.core.field.region.cuts import Cuts
 from stereorig.core.status import PointStatus

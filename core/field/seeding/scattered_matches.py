@@ -12,9 +12,11 @@ from stereorig.core.arrays import Bool, Float
 from stereorig.core.cameras.stereo import StereoPair
 from stereorig.core.errors import ImageError
 from stereorig.core.field.points.features import Box, Features, match
+from stereorig.core.field.points.images import MeasureImage, features_of
 from stereorig.core.field.points.scales import depth_per_px
 from stereorig.core.field.points.starts import Starts
 from stereorig.core.field.seeding.local_fit import AreSeparated, consistent, robust_local_fits
+from stereorig.core.field.seeding.search_region import scales
 from stereorig.core.field.seeding.stretched import stretched_features, stretches
 
 EPIPOLAR_PX = 1.5
@@ -226,3 +228,47 @@ def _on_line(pair: StereoPair, xy1: Float, xy2: Float, limit_px: float) -> Bool:
         with np.errstate(invalid="ignore"):
             near[both] = np.abs(pair.epipolar_residual_px(xy1[both], xy2[both])) < limit_px
     return near
+
+
+# Scale of camera 1's image where the surface is, before anything is measured: from feature matches of a pair.
+
+
+@dataclass(frozen=True)
+class ImageScale:
+    """Scale of camera 1's image at the surface.
+
+    Attributes
+    ----------
+    mm_per_px
+        Across the line of sight, at the median depth of the matches: a slanted surface is stretched by 1 / cos(slant).
+    distance_mm
+        That depth, along camera 1's optical axis.
+    matches
+        Matches with camera 2 that it comes from.
+    """
+
+    mm_per_px: float
+    distance_mm: float
+    matches: int
+
+
+def image_scale(pair: StereoPair, image1: MeasureImage, image2: MeasureImage) -> ImageScale | None:
+    """Return the scale of camera 1's image at the surface that both cameras see; None with too few matches.
+
+    Raises
+    ------
+    ImageError
+        ``cameras_swapped``.
+    """
+    (rows, cols), (rows2, cols2) = image1.shape, image2.shape
+    boxes = (0, 0, cols, rows), (0, 0, cols2, rows2)
+    scale = scales(boxes, (image1.shape, image2.shape))[0]
+    shape = scattered_shape(pair, *features_of([(image1, boxes[0]), (image2, boxes[1])], scale))
+    if len(shape.xy_px) < _MIN_MATCHES:
+        return None
+    depth_mm = float(1.0 / np.median(shape.w0))
+    x, y = np.median(shape.xy_px, axis=0)
+    around = np.array([[x - 0.5, y], [x + 0.5, y], [x, y - 0.5], [x, y + 0.5]])
+    at = pair.cam1.back_project_at_depth(around, np.full(4, depth_mm)).xyz_mm
+    sides = np.linalg.norm(at[[1, 3]] - at[[0, 2]], axis=1)
+    return ImageScale(float(np.sqrt(sides[0] * sides[1])), depth_mm, len(shape.xy_px))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from stereorig.core.arrays import Bool, Float
-from stereorig.core.grid.lines.distortion import Distortion
 from stereorig.core.grid.lines.points import LineFit, LinePoints, line_index
+from stereorig.core.grid.lines.straight import Distortion
 from stereorig.core.grid.view import LineOffsets
 
 

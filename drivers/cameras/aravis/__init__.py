@@ -9,7 +9,7 @@ from __future__ import annotations
 from stereorig.drivers.cameras.aravis.connect import connected
 from stereorig.drivers.cameras.aravis.discovery import discover
 from stereorig.drivers.cameras.aravis.features import AravisFeatures
-from stereorig.drivers.cameras.aravis.grabber import AravisGrabber
+from stereorig.drivers.cameras.aravis.session import AravisGrabber
 from stereorig.drivers.cameras.genicam.table import Feature, feature_table
 from stereorig.drivers.cameras.protocol import CameraOptions, FrameGrabber
 
@@ -17,7 +17,7 @@ __all__ = ["discover", "look", "make"]
 
 
 def make(options: CameraOptions) -> FrameGrabber:
-    """Make a camera, not yet opened; see `stereorig.drivers.cameras.aravis.grabber.AravisGrabber`.
+    """Make a camera, not yet opened; see `stereorig.drivers.cameras.aravis.session.AravisGrabber`.
 
     Raises
     ------

@@ -10,7 +10,7 @@ from stereorig.drivers.cameras.aravis.connect import connected
 from stereorig.drivers.cameras.aravis.discovery import find
 from stereorig.drivers.cameras.aravis.features import AravisFeatures
 from stereorig.drivers.cameras.aravis.library import aravis
-from stereorig.drivers.cameras.genicam import force_ip
+from stereorig.drivers.cameras.genicam import gvcp
 from stereorig.drivers.cameras.genicam.gvcp import ControlState, control_state
 
 # A camera takes its new address at once or after a restart of its network
@@ -39,7 +39,7 @@ def set_address(name: str, wanted: IPv4Interface, gateway: IPv4Address | None = 
     """
     aravis().update_device_list()
     listed = find(name)
-    mac = force_ip.mac_of(name if listed is None else listed.physical_id)
+    mac = gvcp.mac_of(name if listed is None else listed.physical_id)
     if mac is None:
         raise CameraError(
             f"{name} is no GigE Vision camera that answers, nor a MAC address.",
@@ -52,7 +52,7 @@ def set_address(name: str, wanted: IPv4Interface, gateway: IPv4Address | None = 
     if listed is None or listed.address != address:
         if control_state(address) is not ControlState.SILENT:
             raise _lost(name, f"would share {address} with another device that answers there", "Choose a free address.")
-        _force(name, force_ip.packet(mac, wanted, way_out), address)
+        _force(name, gvcp.force_ip_packet(mac, wanted, way_out), address)
     with connected(address) as device:
         features = AravisFeatures(device)
         for feature, value in zip(_PERSISTENT, (wanted.ip, wanted.netmask, way_out), strict=True):
@@ -61,7 +61,7 @@ def set_address(name: str, wanted: IPv4Interface, gateway: IPv4Address | None = 
 
 
 def _force(name: str, command: bytes, address: str) -> None:
-    if not force_ip.send(command):
+    if not gvcp.send_force_ip(command):
         raise _lost(name, "cannot be reached: no interface has an IPv4 address", "Give this machine's interface one.")
     until = time.monotonic() + _TAKES_S
     while control_state(address) is ControlState.SILENT:

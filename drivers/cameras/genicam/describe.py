@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import TypeVar
 
 from stereorig.core.errors import CameraError
 from stereorig.drivers.cameras.genicam import synonyms
@@ -11,7 +13,7 @@ from stereorig.drivers.cameras.genicam.errors import NamedCamera
 from stereorig.drivers.cameras.genicam.features import CameraFeatures
 from stereorig.drivers.cameras.genicam.link import held_back_by
 from stereorig.drivers.cameras.genicam.settings import CameraControl
-from stereorig.drivers.cameras.genicam.temperature import temperature_c
+from stereorig.drivers.cameras.genicam.synonyms import TEMPERATURE, TEMPERATURE_PLACES, TEMPERATURE_SELECTOR
 from stereorig.drivers.cameras.protocol import CameraDescription, CameraIdentity
 
 #: as a driver names the protocol
@@ -161,3 +163,51 @@ def with_clock(description: CameraDescription, features: CameraFeatures) -> Came
         clock_error_ms=_clock_error_ms(features, clock),
         extra={**description.extra, **_ptp_status(features)},
     )
+
+
+# The temperature that a camera reports, by any name that its description gives it.
+
+_T = TypeVar("_T")
+#: zero of kelvin, degrees Celsius
+_KELVIN = -273.15
+#: a number beyond these is no temperature of a camera at work, but a register that is not filled
+_LOW_C, _HIGH_C = -60.0, 150.0
+
+
+def choose_place(features: CameraFeatures) -> None:
+    """Let a camera of several thermometers report the sensor's, or the one nearest to it."""
+    selector = features.first(*TEMPERATURE_SELECTOR)
+    if selector is None or not features.writable(selector):
+        return
+    known = features.entries(selector)
+    place = next((place for place in TEMPERATURE_PLACES if place in known), None)
+    if place is not None and not features.is_at(selector, place):
+        _asked(lambda: features.write(selector, place))
+
+
+def temperature_c(features: CameraFeatures) -> float | None:
+    """Return the temperature in degrees Celsius; None if the camera has none, or none that can be one.
+
+    Raises
+    ------
+    CameraError
+        ``camera_lost``.
+    """
+    name = features.first(*TEMPERATURE)
+    if name is None:
+        return None
+    value = _asked(lambda: features.read_number(name))
+    if value is None:
+        return None
+    value += _KELVIN if features.unit(name).strip().lower() in ("k", "kelvin") else 0.0
+    return round(value, 3) if math.isfinite(value) and _LOW_C < value < _HIGH_C else None
+
+
+def _asked(question: Callable[[], _T]) -> _T | None:
+    """Return the answer; None if the camera has none now."""
+    try:
+        return question()
+    except CameraError as error:
+        if error.code == "camera_lost":
+            raise
+        return None

@@ -9,13 +9,12 @@ from dataclasses import replace
 from typing import Protocol
 
 from stereorig.core.errors import CameraError
-from stereorig.drivers.cameras.genicam.describe import switch_ptp_on, with_clock
+from stereorig.drivers.cameras.genicam.describe import choose_place, switch_ptp_on, temperature_c, with_clock
 from stereorig.drivers.cameras.genicam.errors import NamedCamera
 from stereorig.drivers.cameras.genicam.features import CameraFeatures
 from stereorig.drivers.cameras.genicam.link import hold_back
 from stereorig.drivers.cameras.genicam.settings import CameraControl
 from stereorig.drivers.cameras.genicam.synonyms import TICK_FREQUENCY
-from stereorig.drivers.cameras.genicam.temperature import choose_place, temperature_c
 from stereorig.drivers.cameras.genicam.triggers import TriggerNumbers
 from stereorig.drivers.cameras.genicam.watch import Watch
 from stereorig.drivers.cameras.pixels import BY_NAME, PixelFormat

@@ -12,6 +12,7 @@ from stereorig.drivers.acquisition.simultaneity import SKEW_SOURCES, SkewSource
 from stereorig.server.api.models.jobs import Accepted
 from stereorig.server.api.models.warnings import AnalysisWarning
 from stereorig.server.base.models import ON_ONE_LINE, Channels, Label, Listing, Notes, Number, Reply, Request, Timestamp
+from stereorig.server.documents.made import TrashEntry
 from stereorig.server.documents.steps import BurstIndex, StepQuality
 from stereorig.server.workflows.recording import RecordPlan
 
@@ -260,3 +261,33 @@ class ReadingReply(Reply):
     value: float | None = Field(None, description="Value of the watched channel; null if it was absent.")
     last_value: float | None = Field(None, description="Value that it was compared with; null: there was none.")
     step: StepReply | None = Field(None, description="The step, durable on disk.")
+
+
+# The trash, and the acknowledgement of copies, as they travel.
+
+
+class TrashList(Listing):
+    """The trash, oldest first."""
+
+    trash: list[TrashEntry] = Field(description="Entries of the trash.")
+
+
+class ExportedRequest(Request):
+    """Contents of a test's copy elsewhere."""
+
+    steps: Annotated[Whole, Field(ge=0, le=10000)] = Field(
+        description="Number of complete steps in the copy.", examples=[120]
+    )
+    results: Annotated[Whole, Field(ge=0, le=10_000_000)] = Field(
+        description="Number of result files (step_*.nc) in the copy, over all analyses.", examples=[240]
+    )
+
+
+class ExportedReply(Reply):
+    """That the test was copied elsewhere."""
+
+    utc: str = Field(description="Time of the acknowledgement.")
+    by: str = Field(description="Whose key it was.")
+    steps: int = Field(description="Number of complete steps.")
+    results: int = Field(description="Number of result files.")
+    sha256: str = Field(description="Checksum of the checksums of all of them.")

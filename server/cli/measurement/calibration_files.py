@@ -23,7 +23,7 @@ from stereorig.server.formats.calibrations.recognise import (
 from stereorig.server.formats.files import make_folder, write_bytes
 from stereorig.server.formats.results.folder import first_results
 from stereorig.server.formats.results.reading import read_head
-from stereorig.server.results.epipolar_check import EpipolarComparison, check_against
+from stereorig.server.results.calibration_checks import EpipolarComparison, check_against
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stereorig.core.errors import FileFormatError, InputError, RegionError
-from stereorig.core.field.prefilter import check_prefilter
+from stereorig.core.field.settings import check_prefilter
 from stereorig.core.settings import (
     DEFAULT_INTERPOLATION,
     DEFAULT_MAX_SIGMA_PX,
@@ -30,9 +30,14 @@ from stereorig.core.settings import (
 )
 from stereorig.server.cli.measurement.image_lists import ImagePair, expand, pair_up, pairs_of_test_folder
 from stereorig.server.cli.measurement.image_pairs import check_cameras, checked_pairs, checked_shapes, first_readable
-from stereorig.server.cli.measurement.region import check_region, check_whole, parse_outline
+from stereorig.server.cli.measurement.region import (
+    SPECIMEN_FILE,
+    check_region,
+    check_whole,
+    found_specimen,
+    parse_outline,
+)
 from stereorig.server.cli.measurement.sequence import MeasureJob, measure_sequence
-from stereorig.server.cli.measurement.specimen import SPECIMEN_FILE, found_specimen
 from stereorig.server.cli.recipe import mask_of, notes_on, with_recipe
 from stereorig.server.cli.terminal import ProgressLine
 from stereorig.server.compute.seeds import check_positions

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from stereorig.core.errors import FileFormatError, InputError
 from stereorig.server.base import logs
-from stereorig.server.base.memory import settle
+from stereorig.server.base.priority import settle
 from stereorig.server.cli.ports import port_unusable
 from stereorig.server.http.access import KeyFile
 

@@ -17,7 +17,7 @@ from stereorig.core.errors import CalibrationError, CalibrationInputError
 from stereorig.core.names import CAMERAS
 from stereorig.core.plan.quantities import planned_quantities
 from stereorig.core.plan.settings import PlannedMeasurement, PlannedRig
-from stereorig.core.plan.texture import correlation_px, match_variance_px2
+from stereorig.core.plan.synthetic import correlation_px, match_variance_px2
 from stereorig.server.compute.calibration.inputs import nominals_of, options_of, target_of
 
 Localiser = Literal["profile", "paper"]

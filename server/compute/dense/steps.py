@@ -11,9 +11,9 @@ import numpy as np
 
 from stereorig.core.cameras.stereo import StereoPair
 from stereorig.core.errors import InputError
-from stereorig.core.field.points.dense_record import METHOD
 from stereorig.core.field.points.images import MeasureImage
 from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.smoothing_record import METHOD
 from stereorig.core.field.region.region import PointGrid
 from stereorig.core.field.settings import MeasureOptions
 from stereorig.server.formats.results.layout import COVARIANCE_NAMES

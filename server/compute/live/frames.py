@@ -9,15 +9,14 @@ import numpy as np
 from stereorig.core.arrays import Float
 from stereorig.core.errors import StateError
 from stereorig.core.field.points.images import MeasureImage, check_calibrated_size
-from stereorig.core.field.region.lay_points import make_grid
-from stereorig.core.field.region.outlines import points_inside
+from stereorig.core.field.region.lay_points import make_grid, points_inside
 from stereorig.core.field.settings import MeasureOptions
 from stereorig.core.live.gauges import LiveGauge, status_counts
 from stereorig.core.live.measurement import LiveFrame, LiveMeasurement, LiveOptions
 from stereorig.core.measure import ReferencePair
 from stereorig.core.names import CAMERAS
 from stereorig.core.settings import Outline
-from stereorig.server.base.memory import settle
+from stereorig.server.base.priority import settle
 from stereorig.server.compute.tasks import LiveTask, Plain
 from stereorig.server.formats.calibrations.recognise import load_calibration
 from stereorig.server.formats.calibrations.volume import parameter_covariance, volume_of

@@ -34,8 +34,8 @@ from stereorig.server.formats.calibrations.programs.imported_pair import (
     unreadable,
 )
 from stereorig.server.formats.calibrations.programs.matchid_caldat import is_caldat, parse_caldat
+from stereorig.server.formats.calibrations.programs.named_numbers import is_pyvale, parse_pyvale
 from stereorig.server.formats.calibrations.programs.opencv_yaml import is_half, is_opencv, joined, parse_opencv
-from stereorig.server.formats.calibrations.programs.pyvale_txt import is_pyvale, parse_pyvale
 from stereorig.server.formats.calibrations.programs.vic3d_xml import is_vic3d, parse_vic3d
 from stereorig.server.formats.calibrations.record import CalibrationRecord
 from stereorig.server.formats.manifest import checked_bytes

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from stereorig.core.common.factor import Causes
 from stereorig.core.errors import FileFormatError
-from stereorig.core.field.points.dense_record import DenseRecord
 from stereorig.core.field.points.patch import PatchChoice
 from stereorig.core.field.points.result import Field, References
-from stereorig.core.field.points.smoothing_record import Smoothing
+from stereorig.core.field.points.smoothing_record import DenseRecord, Smoothing
 from stereorig.core.field.region.cuts import Cuts, from_arrays
 from stereorig.core.names import ALL_CAUSES, CameraName
 from stereorig.core.status import PointStatus

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereorig.core.common.factor import Causes
-from stereorig.core.field.points.dense_record import METHOD, NEIGHBOURS
 from stereorig.core.field.points.result import Field
+from stereorig.core.field.points.smoothing_record import METHOD, NEIGHBOURS
 from stereorig.core.status import STATUS_MEANINGS, PointStatus
 from stereorig.core.strain import StrainField
 from stereorig.server.formats.environment import current_environment

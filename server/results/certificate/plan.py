@@ -8,7 +8,7 @@ from typing import Annotated, Self
 
 from pydantic import ConfigDict, Field, StringConstraints, ValidationError, model_validator
 
-from stereorig.core.certify.limits import Above, CertificateLimits, NotNegative
+from stereorig.core.certify.comparison import Above, CertificateLimits, NotNegative
 from stereorig.core.errors import FileFormatError, InputError
 from stereorig.core.settings import Pixel, Whole, disagreement
 from stereorig.server.base.models import Label, Notes, Number, Request, StepNumber, not_both, one_of

@@ -14,9 +14,9 @@ from stereorig.core.field.points.result import Field
 from stereorig.core.field.points.shared_pixels import SharedPixels
 from stereorig.core.gauge.align import Alignment, aligned
 from stereorig.core.gauge.area import points_within
-from stereorig.core.gauge.line import positions_along
 from stereorig.core.gauge.locate import positions_from_mm
 from stereorig.core.gauge.rigid import rigid_motion, without_rigid_motion
+from stereorig.core.gauge.sampling import positions_along
 from stereorig.server.formats.calibrations.in_test import calibration_id_in
 from stereorig.server.formats.files import sha256_of
 from stereorig.server.formats.gauges.readings import GaugeReadings, RigidMotionReading, StepProblem, StepReadings
@@ -27,10 +27,9 @@ from stereorig.server.formats.results.reading import ResultHead, read_field, rea
 from stereorig.server.formats.results.uncertainty import Included, Statement, read_included
 from stereorig.server.formats.version import software_version
 from stereorig.server.results.channels import recorded_with
-from stereorig.server.results.gauges.differences import KeptReading, with_differences
+from stereorig.server.results.gauges.differences import KeptReading, frame_reading, motion_reading, with_differences
 from stereorig.server.results.gauges.fields import FieldWriter
 from stereorig.server.results.gauges.frames import lay, text_of
-from stereorig.server.results.gauges.motions import frame_reading, motion_reading
 from stereorig.server.results.gauges.request import ExtensometerGauge, GaugeRequest, LineGauge, PointGauge
 from stereorig.server.results.gauges.values import of_area, of_extensometer, of_line, of_point
 from stereorig.server.results.gauges.variables import Variables

@@ -10,9 +10,8 @@ from stereorig.core.arrays import Float
 from stereorig.core.common.budget import UNKNOWN, Budget, budget_of
 from stereorig.core.gauge.area import area_statistics, points_within
 from stereorig.core.gauge.extensometer import extensometer
-from stereorig.core.gauge.line import positions_along
 from stereorig.core.gauge.reading import Reading
-from stereorig.core.gauge.sampling import Samples, sample
+from stereorig.core.gauge.sampling import Samples, positions_along, sample
 from stereorig.core.names import ALL_PARTS
 from stereorig.core.strain.reference import reference_share
 from stereorig.core.strain.result import StrainField
@@ -26,8 +25,7 @@ from stereorig.server.formats.gauges.readings import (
     PointReading,
 )
 from stereorig.server.formats.results.variables import STRAIN_NAMES
-from stereorig.server.results.gauges.differences import KeptReading
-from stereorig.server.results.gauges.numbers import finite, number, plain
+from stereorig.server.results.gauges.differences import KeptReading, finite, number, plain
 from stereorig.server.results.gauges.request import LineGauge
 from stereorig.server.results.gauges.variables import Variables, component_of
 

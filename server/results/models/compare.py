@@ -25,7 +25,7 @@ from stereorig.server.formats.results.reading import ResultHead, read_field, rea
 from stereorig.server.formats.results.strain import read_strain
 from stereorig.server.formats.results.uncertainty import read_included
 from stereorig.server.formats.version import software_version
-from stereorig.server.results.gauges.numbers import finite
+from stereorig.server.results.gauges.differences import finite
 from stereorig.server.results.models.document import (
     ChiSquareReply,
     ComparedNumber,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from stereorig.server.base.long_json import Keep, nothing
+from stereorig.server.base.json_values import Keep, nothing
 from stereorig.server.formats.calibrations.in_test import calibration_id_in, calibration_in, measured_with
 from stereorig.server.formats.manifest import DamagedError
 from stereorig.server.formats.results.camera_motion import MOVED_REMEDY

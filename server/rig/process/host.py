@@ -30,8 +30,7 @@ from stereorig.drivers.registry import discover_cameras
 from stereorig.drivers.stages.controllers import Line
 from stereorig.drivers.stages.serial_ports import discover_ports
 from stereorig.server.base import logs
-from stereorig.server.base.memory import settle
-from stereorig.server.base.priority import raise_file_limit, raise_service
+from stereorig.server.base.priority import raise_file_limit, raise_service, settle
 from stereorig.server.config.rig_file import RigConfig
 from stereorig.server.rig.build import Devices, open_devices
 from stereorig.server.rig.process.wire import GIVEN_UP, Channel, OpenedDevices

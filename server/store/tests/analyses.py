@@ -7,7 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from stereorig.server.base.errors import NotFoundError
-from stereorig.server.base.long_json import Keep, the_first
+from stereorig.server.base.json_values import Keep, the_first
 from stereorig.server.documents.tests import AnalysisJob, AnalysisRecord, StepOutcome, SummaryRecord
 from stereorig.server.formats.manifest import Listed, checked_bytes, is_there, require_sound
 from stereorig.server.formats.results.folder import DENSE, dense_result

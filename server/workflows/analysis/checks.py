@@ -11,18 +11,20 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from stereorig.core.errors import StereorigError
+from stereorig.core.errors import FileFormatError, StereorigError
+from stereorig.server.base.errors import NotFoundError
 from stereorig.server.base.problem import JobProblem
 from stereorig.server.results.warnings.analysis import ResultWarning
 from stereorig.server.results.warnings.checks import Checks, checks_if_changed, checks_of
 from stereorig.server.store.tests.tests import TestStore
 from stereorig.server.worker.executor import WorkerDiedError
 from stereorig.server.worker.resting import RestingWorker
+from stereorig.server.workflows.service import Service
 
 _log = logging.getLogger("stereorig.service")
 #: an ``analysis.json`` of more bytes is of many steps: each takes some 190
@@ -148,3 +150,17 @@ _NOT_YET = Checks(
         ),
     ),
 )
+
+
+# Warnings to know before an analysis' results are used, as the API shows them.
+
+
+def with_warnings(service: Service, test_id: str, entries: Sequence[Mapping[str, object]]) -> list[dict[str, object]]:
+    """Return entries of analyses in a list with their warnings; an unreadable analysis gets none."""
+    made = []
+    for entry in entries:
+        found: list[dict[str, object]] = []
+        with contextlib.suppress(FileFormatError, NotFoundError):
+            found = service.checks.of(test_id, str(entry["id"])).plain_warnings()
+        made.append({**entry, "warnings": found})
+    return made

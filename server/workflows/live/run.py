@@ -30,8 +30,7 @@ from stereorig.server.worker.embedded import ComputeWorker
 from stereorig.server.worker.executor import WorkerDiedError
 from stereorig.server.worker.shared_images import SharedImages
 from stereorig.server.workflows.channels.reading import ReadChannels
-from stereorig.server.workflows.live.account import Account
-from stereorig.server.workflows.live.pace import Pace
+from stereorig.server.workflows.live.account import Account, Pace
 from stereorig.server.workflows.live.series import LiveSeries, Moment
 
 _log = logging.getLogger("stereorig.live")

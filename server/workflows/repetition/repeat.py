@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from stereorig.core.errors import Cancelled, FileFormatError, StateError, StereorigError, StorageError
+from stereorig.server.compute.functions import measure_step
 from stereorig.server.compute.tasks import StepTask
 from stereorig.server.documents.tests import AnalysisRecord
 from stereorig.server.formats.environment import Change
 from stereorig.server.formats.files import sha256_of
 from stereorig.server.formats.manifest import checked_bytes, is_there
+from stereorig.server.jobs.job import Job, Phase
 from stereorig.server.results.repeated import WITHIN_U, StepRepetition, Verdict, changes_of, compare_results
 from stereorig.server.store.tests.steps import StepFiles
 from stereorig.server.store.tests.tests import TestStore
 from stereorig.server.worker.dask_cluster import ClusterError
 from stereorig.server.worker.executor import WorkerDiedError
 from stereorig.server.workflows.analysis.tasks import is_independent, task_of
+from stereorig.server.workflows.service import Service
+from stereorig.server.workflows.waiting import run_task
 
 Measure = Callable[[StepTask], object]
 
@@ -185,3 +190,43 @@ def _copy_inputs(analysis: Path, document: AnalysisRecord, folder: Path) -> None
             remedy="Restore the file from a backup, or measure again.",
             file=f"analyses/{document.id}/mask.png",
         )
+
+
+# The repetition of an analysis as a job.
+
+
+def start_repetition(service: Service, test_id: str, analysis_id: str) -> Job:
+    """Begin to measure an analysis again; the job's result is the comparison, and nothing else is kept.
+
+    Raises
+    ------
+    NotFoundError
+        There is no such test or analysis.
+    QueueFullError
+        Too many computations wait.
+    """
+    service.tests.analyses.path(test_id, analysis_id)
+
+    def run(job: Job) -> dict[str, object]:
+        folder = service.exports.new_folder()
+        at = {"n": 0, "k": 0, "of": 1}
+
+        def on_step(n: int, k: int, of: int) -> None:
+            job.check()
+            service.require_room()
+            at.update(n=n, k=k, of=of)
+
+        def progress(phase: str, found: int, of: int) -> None:
+            share = min(found / of, 1.0) if of > 0 else 0.0
+            job.progress(f"step {at['n']}: {phase}", round(1000 * (at["k"] + share)), 1000 * at["of"])
+
+        def measure(task: StepTask) -> object:
+            return run_task(service.executor, job, measure_step, task, progress=progress)
+
+        try:
+            return repeat(service.tests, test_id, analysis_id, folder, measure, on_step=on_step).document()
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    subject = {"test_id": test_id, "analysis_id": analysis_id}
+    return service.jobs.submit("repetition", "the repetition of an analysis", subject, [Phase("compute", run)])

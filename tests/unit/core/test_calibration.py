@@ -19,7 +19,7 @@ from stereorig.core.calibration import (
     calibrate,
     check_known_distance,
 )
-from stereorig.core.calibration.checks.lenses import lens_faults
+from stereorig.core.calibration.checks.agreement import lens_faults
 from stereorig.core.calibration.fit.lens_form import LensChoice
 from stereorig.core.cameras.lens import LensModel, OpenCVLens, SeidelLens
 from stereorig.core.errors import CalibrationError, CalibrationInputError

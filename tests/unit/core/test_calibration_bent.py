@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stereorig.core.calibration import CalibrationOptions, CalibrationView, calibrate
-from stereorig.core.calibration.checks.lenses import lens_faults
+from stereorig.core.calibration.checks.agreement import lens_faults
 from stereorig.core.cameras.opencv_full import OpenCVFullLens
 from tests.support.board_points import CHECKERBOARD, SIZE_PX, free_views, nominal_pair, shape_error_um, true_pair
 from tests.support.calibration_rigs import aligned_rms_um

@@ -19,7 +19,7 @@ from stereorig.core.field.points.starts import current_position, move_matrix, mo
 from stereorig.core.field.region.neighbours import compare_with_neighbours, sorting_network
 from stereorig.core.field.seeding.epipolar_search import sweep
 from stereorig.core.field.seeding.local_fit import consistent, robust_local_fits
-from stereorig.core.field.seeding.predict import predict
+from stereorig.core.field.seeding.predicted import predict
 from stereorig.core.field.seeding.scattered_matches import combine
 from stereorig.core.matching.fit import no_motion
 from stereorig.core.measure import MeasureOptions, ReferencePair, measure_shape

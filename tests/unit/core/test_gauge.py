@@ -17,11 +17,10 @@ from stereorig.core.field.region.cuts import Cuts
 from stereorig.core.gauge.align import Alignment, align_3_2_1, align_plane, aligned
 from stereorig.core.gauge.area import area_statistics, points_within
 from stereorig.core.gauge.extensometer import Extensometer, extensometer
-from stereorig.core.gauge.line import positions_along
 from stereorig.core.gauge.locate import positions_from_mm
 from stereorig.core.gauge.reading import Reading
 from stereorig.core.gauge.rigid import rigid_motion, without_rigid_motion
-from stereorig.core.gauge.sampling import sample
+from stereorig.core.gauge.sampling import positions_along, sample
 from tests.support.gauge_field import STEP, SUBSET, make_field, pixel_noise, surface
 
 SHARED = SharedPixels(SUBSET)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereorig.core.live.triggers import Cycles, level_reached, moments, slope_reached
+from stereorig.core.live.channels import Cycles, level_reached, moments, slope_reached
 
 
 def test_a_level_is_passed_between_two_readings() -> None:

@@ -13,10 +13,10 @@ from stereorig.core.cameras.stereo import StereoPair
 from stereorig.core.orientation import changed, changes_between, consequence_of, estimate_change, judge_offsets
 from stereorig.core.orientation.change import ends_of
 from stereorig.core.orientation.matched import MatchedPoints
+from stereorig.core.orientation.noise import structure_left_px
 from stereorig.core.orientation.offsets import StepOffsets, calibration_slopes
 from stereorig.core.orientation.propagate import pose_parameters, repaired_covariance
 from stereorig.core.orientation.repair import RepairedPair
-from stereorig.core.orientation.structure import structure_left_px
 from tests.support.bumped_rig import SIZE, core_pair, false_strain, plain_camera, pose_points, turned
 from tests.support.independent_rig import PlainCamera
 

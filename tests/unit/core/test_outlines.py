@@ -8,8 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from stereorig.core.errors import RegionError
-from stereorig.core.field.region.lay_points import lay_points
-from stereorig.core.field.region.outlines import corners_px
+from stereorig.core.field.region.lay_points import corners_px, lay_points
 from stereorig.core.settings import Outline, Region
 from stereorig.server.api.models import Region as RegionRequest
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stereorig.core.field.points.images import MeasureImage
-from stereorig.core.field.region import repeats as module
+from stereorig.core.field.region import textured as module
 
 SUBSET_PX = 21
 

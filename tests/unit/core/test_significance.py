@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, f, norm
 
-from stereorig.core.significance import chi_square_tail, f_tail, two_sided_sigmas
+from stereorig.core.robust import chi_square_tail, f_tail, two_sided_sigmas
 from tests.support.requirements import ROOT
 
 DEGREES = (1, 3, 6, 41.5, 2000.0)

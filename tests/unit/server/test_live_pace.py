@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereorig.server.workflows.live.pace import Pace
+from stereorig.server.workflows.live.account import Pace
 
 PERIOD_S = 0.02
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stereorig.server.base import long_json
+from stereorig.server.base import json_values
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
@@ -20,13 +20,13 @@ layouts = st.sampled_from([None, 1, 4])
 
 @pytest.fixture(autouse=True)
 def nothing_is_short(monkeypatch):
-    monkeypatch.setattr(long_json, "_LONG", 0)
+    monkeypatch.setattr(json_values, "_LONG", 0)
 
 
 @given(values, layouts, st.sampled_from(["", " ", "\n\t"]))
 def test_it_reads_what_the_standard_library_reads(value, indent, around):
     text = f"{around}{json.dumps(value, indent=indent)}{around}"
-    found = long_json.loads(text)
+    found = json_values.loads(text)
     assert found == json.loads(text)
     assert json.dumps(found) == json.dumps(value)  # true is no 1, and the order is the file's
 
@@ -40,24 +40,24 @@ def test_it_refuses_what_the_standard_library_refuses(value, data):
         expected = json.loads(changed)
     except ValueError:
         with pytest.raises(json.JSONDecodeError):
-            long_json.loads(changed)
+            json_values.loads(changed)
     else:
-        assert long_json.loads(changed) == expected
+        assert json_values.loads(changed) == expected
 
 
 def test_of_a_list_only_what_is_wanted_is_kept():
     text = json.dumps({"steps": [{"n": 1, "file": "a"}, {"n": 2}], "more": [{"n": 3}], "of": {"steps": [{"n": 4}]}})
-    found = long_json.loads(text, {"steps": lambda one: one["n"]})
+    found = json_values.loads(text, {"steps": lambda one: one["n"]})
     assert found == {"steps": [1, 2], "more": [{"n": 3}], "of": {"steps": [{"n": 4}]}}
 
 
 def test_entries_of_which_nothing_is_kept_are_left_out():
     text = json.dumps({"steps": [5, 6, 7], "more": [8]})
-    assert long_json.loads(text, {"steps": long_json.the_first(2)}) == {"steps": [5, 6], "more": [8]}
-    assert long_json.loads(text, {"steps": long_json.nothing}) == {"steps": [], "more": [8]}
-    assert long_json.loads(text, {"steps": lambda n: n if n > 6 else None}) == {"steps": [7], "more": [8]}
+    assert json_values.loads(text, {"steps": json_values.the_first(2)}) == {"steps": [5, 6], "more": [8]}
+    assert json_values.loads(text, {"steps": json_values.nothing}) == {"steps": [], "more": [8]}
+    assert json_values.loads(text, {"steps": lambda n: n if n > 6 else None}) == {"steps": [7], "more": [8]}
 
 
 @pytest.mark.parametrize("other", [None, 3, {"n": 1}])
 def test_what_is_no_list_stays_as_it_is(other):
-    assert long_json.loads(json.dumps({"steps": other}), {"steps": long_json.nothing}) == {"steps": other}
+    assert json_values.loads(json.dumps({"steps": other}), {"steps": json_values.nothing}) == {"steps": other}

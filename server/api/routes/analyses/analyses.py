@@ -22,8 +22,7 @@ from stereorig.server.api.models import (
     Region,
 )
 from stereorig.server.api.models.recipes import WORKSPACE, recipe_in
-from stereorig.server.api.protocol.attached import Wait, job_reply
-from stereorig.server.api.protocol.dependencies import AnalysisId, KeyHeader, ServiceDep, TestId, mark
+from stereorig.server.api.protocol.dependencies import AnalysisId, KeyHeader, ServiceDep, TestId, Wait, job_reply, mark
 from stereorig.server.api.protocol.paging import FIGURES, WHOLE, PageDep
 from stereorig.server.api.protocol.problems import errors
 from stereorig.server.api.routes.tests.recipes import check_against_test
@@ -34,7 +33,7 @@ from stereorig.server.documents.tests import Finished, SummaryRecord
 from stereorig.server.jobs.idempotency import RequestMark
 from stereorig.server.store.tests.steps import MAX_STEPS
 from stereorig.server.workflows.analysis import start as analysis_start
-from stereorig.server.workflows.analysis.warnings import with_warnings
+from stereorig.server.workflows.analysis.checks import with_warnings
 from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}/analyses", tags=["analyses"])

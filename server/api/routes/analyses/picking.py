@@ -12,7 +12,7 @@ from pydantic import Field, StringConstraints
 from stereorig.core.errors import InputError
 from stereorig.core.field.points.images import MeasureImage
 from stereorig.core.field.region.lay_points import make_grid
-from stereorig.core.field.seeding.image_scale import image_scale
+from stereorig.core.field.seeding.scattered_matches import image_scale
 from stereorig.core.field.seeding.seeds import Seed
 from stereorig.core.settings import SPACING_PX, SUBSET_PX, AnalysisSettings, Pixel, Real, SpacingPx, SubsetPx, Whole
 from stereorig.server.api.models import Region, Reply, Request

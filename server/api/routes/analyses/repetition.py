@@ -6,10 +6,9 @@ from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 
 from stereorig.server.api.models import Accepted
-from stereorig.server.api.protocol.attached import Wait, job_reply
-from stereorig.server.api.protocol.dependencies import AnalysisId, ServiceDep, TestId
+from stereorig.server.api.protocol.dependencies import AnalysisId, ServiceDep, TestId, Wait, job_reply
 from stereorig.server.api.protocol.problems import errors
-from stereorig.server.workflows.repetition.job import start_repetition
+from stereorig.server.workflows.repetition.repeat import start_repetition
 from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}/analyses", tags=["analyses"])

@@ -11,7 +11,7 @@ from fastapi.responses import Response
 from pydantic_core import to_json
 
 from stereorig.server.api.models import FieldList, FieldReply, ProbeReply
-from stereorig.server.api.protocol.conditional import etag_of, tags_in
+from stereorig.server.api.protocol.delivery import etag_of, tags_in
 from stereorig.server.api.protocol.dependencies import (
     AnalysisId,
     Camera,
@@ -26,10 +26,18 @@ from stereorig.server.formats.manifest import known_sha256
 from stereorig.server.formats.results.reading import read_head
 from stereorig.server.formats.results.uncertainty import Statement, read_included
 from stereorig.server.formats.results.variables import described
-from stereorig.server.results.field_forms import MEDIA_TYPES, RANGE_PATTERN, FieldForm, Part, encode, nested, take
+from stereorig.server.results.field_forms import (
+    MEDIA_TYPES,
+    RANGE_PATTERN,
+    FieldForm,
+    Part,
+    encode,
+    image_positions,
+    nested,
+    take,
+)
 from stereorig.server.results.gauges.fields import AXES
 from stereorig.server.results.gauges.frames import text_of
-from stereorig.server.results.positions import image_positions
 from stereorig.server.results.reader import list_variables, probe_result, read_cut_pieces
 from stereorig.server.results.uncertainty import read_interval
 from stereorig.server.workflows.analysis.framed import asked_of, result_in

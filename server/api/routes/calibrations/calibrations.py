@@ -21,9 +21,16 @@ from stereorig.server.api.models import (
     ViewList,
 )
 from stereorig.server.api.models.calibrations import CalibrationFile
-from stereorig.server.api.protocol.attached import Wait, job_reply
-from stereorig.server.api.protocol.conditional import tagged
-from stereorig.server.api.protocol.dependencies import CalibrationId, Camera, KeyHeader, ServiceDep, mark
+from stereorig.server.api.protocol.delivery import tagged
+from stereorig.server.api.protocol.dependencies import (
+    CalibrationId,
+    Camera,
+    KeyHeader,
+    ServiceDep,
+    Wait,
+    job_reply,
+    mark,
+)
 from stereorig.server.api.protocol.paging import PageDep
 from stereorig.server.api.protocol.problems import errors
 from stereorig.server.base.errors import NotFoundError

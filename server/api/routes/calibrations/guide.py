@@ -9,8 +9,7 @@ from fastapi.concurrency import run_in_threadpool
 
 from stereorig.server.api.models import Accepted, CalibrationAccepted
 from stereorig.server.api.models.guide import GuideReply, GuideRequest
-from stereorig.server.api.protocol.attached import Wait, job_reply
-from stereorig.server.api.protocol.dependencies import CalibrationId, KeyHeader, ServiceDep, mark
+from stereorig.server.api.protocol.dependencies import CalibrationId, KeyHeader, ServiceDep, Wait, job_reply, mark
 from stereorig.server.api.protocol.problems import errors
 from stereorig.server.workflows.calibration.guided import GuidePlan, Guides
 

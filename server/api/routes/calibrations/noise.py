@@ -12,8 +12,7 @@ from fastapi.responses import FileResponse, Response
 from stereorig.core.errors import FileFormatError
 from stereorig.server.api.models import NoiseAccepted, NoiseList, NoiseReply, NoiseRequest
 from stereorig.server.api.models.noise import NoiseFile
-from stereorig.server.api.protocol.attached import Wait, job_reply
-from stereorig.server.api.protocol.dependencies import KeyHeader, ServiceDep, mark
+from stereorig.server.api.protocol.dependencies import KeyHeader, ServiceDep, Wait, job_reply, mark
 from stereorig.server.api.protocol.paging import PageDep
 from stereorig.server.api.protocol.problems import errors
 from stereorig.server.base.models import Ids

@@ -6,8 +6,7 @@ from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 
 from stereorig.server.api.models import CalibrationAccepted, RepairRequest
-from stereorig.server.api.protocol.attached import Wait, job_reply
-from stereorig.server.api.protocol.dependencies import CalibrationId, KeyHeader, ServiceDep, mark
+from stereorig.server.api.protocol.dependencies import CalibrationId, KeyHeader, ServiceDep, Wait, job_reply, mark
 from stereorig.server.api.protocol.problems import errors
 from stereorig.server.api.routes.analyses.analyses import mask_of
 from stereorig.server.base.models import Ids

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Request, Response
 from stereorig.core.plan.settings import PlannedMeasurement, PlannedRig
 from stereorig.server.api.models import CalibrationReply
 from stereorig.server.api.models.calibrations import ExpectReply, ExpectRequest, ReviewRequest
-from stereorig.server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
+from stereorig.server.api.protocol.delivery import IfMatch, etag_of, require_match, tagged
 from stereorig.server.api.protocol.dependencies import CalibrationId, ServiceDep, person_name
 from stereorig.server.api.protocol.problems import errors
 from stereorig.server.workflows.calibration import review as calibration_review

@@ -15,15 +15,13 @@ from stereorig.server.api.models.evidence.certificates import (
     WithdrawRequest,
 )
 from stereorig.server.api.models.jobs import Accepted
-from stereorig.server.api.protocol.attached import Wait, job_reply
-from stereorig.server.api.protocol.dependencies import KeyHeader, ServiceDep, mark, person_name
+from stereorig.server.api.protocol.dependencies import KeyHeader, ServiceDep, Wait, job_reply, mark, person_name
 from stereorig.server.api.protocol.paging import PageDep
 from stereorig.server.api.protocol.problems import errors
 from stereorig.server.base.models import Ids
 from stereorig.server.documents.made import CertificateRecord
-from stereorig.server.report.certificate.task import certificate_task
-from stereorig.server.workflows.certificates.job import start_certificate
-from stereorig.server.workflows.certificates.state import state_of
+from stereorig.server.report.task import certificate_task
+from stereorig.server.workflows.certificates.job import start_certificate, state_of
 from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/certificates", tags=["certificates"])

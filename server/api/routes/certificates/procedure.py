@@ -7,8 +7,16 @@ from fastapi.concurrency import run_in_threadpool
 
 from stereorig.server.api.models.evidence.procedure import NextRequest, ProcedureReply
 from stereorig.server.api.models.jobs import Accepted
-from stereorig.server.api.protocol.attached import Attached, Wait, job_reply
-from stereorig.server.api.protocol.dependencies import KeyHeader, ServiceDep, TestId, get_service, mark
+from stereorig.server.api.protocol.dependencies import (
+    Attached,
+    KeyHeader,
+    ServiceDep,
+    TestId,
+    Wait,
+    get_service,
+    job_reply,
+    mark,
+)
 from stereorig.server.api.protocol.problems import errors
 from stereorig.server.base.models import Ids
 from stereorig.server.results.certificate.procedure import PlannedProcedure

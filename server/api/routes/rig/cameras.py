@@ -31,9 +31,8 @@ from stereorig.server.api.models import (
     SceneRequest,
     SettingsPatch,
 )
-from stereorig.server.api.protocol.attached import Wait, job_reply
-from stereorig.server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
-from stereorig.server.api.protocol.dependencies import Camera, KeyHeader, ServiceDep, get_service, mark
+from stereorig.server.api.protocol.delivery import IfMatch, etag_of, require_match, tagged
+from stereorig.server.api.protocol.dependencies import Camera, KeyHeader, ServiceDep, Wait, get_service, job_reply, mark
 from stereorig.server.api.protocol.problems import errors
 from stereorig.server.base.models import Ids
 from stereorig.server.formats.images import encode_tiff

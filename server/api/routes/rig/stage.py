@@ -25,9 +25,16 @@ from stereorig.server.api.models import (
     StageReply,
     StopReply,
 )
-from stereorig.server.api.protocol.attached import Attached, Wait, job_reply
-from stereorig.server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
-from stereorig.server.api.protocol.dependencies import KeyHeader, ServiceDep, get_service, mark
+from stereorig.server.api.protocol.delivery import IfMatch, etag_of, require_match, tagged
+from stereorig.server.api.protocol.dependencies import (
+    Attached,
+    KeyHeader,
+    ServiceDep,
+    Wait,
+    get_service,
+    job_reply,
+    mark,
+)
 from stereorig.server.api.protocol.problems import errors
 from stereorig.server.base.models import Ids
 from stereorig.server.jobs.idempotency import RequestMark

@@ -11,8 +11,7 @@ from fastapi.responses import FileResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from stereorig.server.api.models import JobList, JobReply, JobStepList
-from stereorig.server.api.protocol.attached import Wait, waited
-from stereorig.server.api.protocol.dependencies import JobId, ServiceDep
+from stereorig.server.api.protocol.dependencies import JobId, ServiceDep, Wait, waited
 from stereorig.server.api.protocol.paging import WHOLE, PageDep, ShortPageDep
 from stereorig.server.api.protocol.problems import errors
 from stereorig.server.api.routes.service.system import EventStream, LastEventId

@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Response
 
 from stereorig.core.errors import StateError
-from stereorig.server.api.protocol.conditional import etag_of, tagged
+from stereorig.server.api.protocol.delivery import etag_of, tagged
 from stereorig.server.api.protocol.dependencies import ServiceDep, TestId
 from stereorig.server.api.protocol.problems import errors
 from stereorig.server.results.metadata import TestMetadata

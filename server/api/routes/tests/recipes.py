@@ -8,7 +8,7 @@ from fastapi import APIRouter, Path, Response
 
 from stereorig.core.errors import StereorigError
 from stereorig.server.api.models.recipes import Recipe, RecipeList, RecipePatch, RecipeReply, RecipeRequest
-from stereorig.server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
+from stereorig.server.api.protocol.delivery import IfMatch, etag_of, require_match, tagged
 from stereorig.server.api.protocol.dependencies import KeyHeader, ServiceDep, mark
 from stereorig.server.api.protocol.paging import PageDep
 from stereorig.server.api.protocol.problems import errors

@@ -29,15 +29,17 @@ from stereorig.server.api.models import (
     Timestamp,
     utc_text,
 )
-from stereorig.server.api.protocol.attached import Attached, Wait, job_reply
-from stereorig.server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
+from stereorig.server.api.protocol.delivery import IfMatch, etag_of, require_match, tagged
 from stereorig.server.api.protocol.dependencies import (
+    Attached,
     Camera,
     KeyHeader,
     ServiceDep,
     StepNumber,
     TestId,
+    Wait,
     get_service,
+    job_reply,
     mark,
 )
 from stereorig.server.api.protocol.paging import WHOLE, PageDep, cursor_of
@@ -49,7 +51,7 @@ from stereorig.server.formats.manifest import checked_bytes
 from stereorig.server.jobs.idempotency import RequestMark
 from stereorig.server.store.indexing.entries import step_entry, test_entry
 from stereorig.server.wording import problems_in
-from stereorig.server.workflows.analysis.warnings import with_warnings
+from stereorig.server.workflows.analysis.checks import with_warnings
 from stereorig.server.workflows.burst import start_burst
 from stereorig.server.workflows.capture import capture_step, import_step
 from stereorig.server.workflows.service import Service

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Request, Response
 
-from stereorig.server.api.models.trash import ExportedReply, ExportedRequest, TrashList
+from stereorig.server.api.models.tests import ExportedReply, ExportedRequest, TrashList
 from stereorig.server.api.protocol.dependencies import (
     AnalysisId,
     CalibrationId,

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Depends, Request, Response
 from fastapi.responses import JSONResponse
 
 from stereorig.server.api.models import ReadingReply, ReadingRequest, WatchRequest
-from stereorig.server.api.protocol.conditional import IfMatch, PreconditionFailedError, etag_of, require_match, tagged
+from stereorig.server.api.protocol.delivery import IfMatch, PreconditionFailedError, etag_of, require_match, tagged
 from stereorig.server.api.protocol.dependencies import KeyHeader, ServiceDep, TestId, mark
 from stereorig.server.api.protocol.problems import errors
 from stereorig.server.api.routes.tests.tests import step_metadata

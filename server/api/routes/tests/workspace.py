@@ -7,7 +7,7 @@ import base64
 from fastapi import APIRouter, Response
 
 from stereorig.server.api.models.recipes import Recipe, RecipeSettings, Workspace
-from stereorig.server.api.protocol.conditional import IfMatch, etag_of, require_match, tagged
+from stereorig.server.api.protocol.delivery import IfMatch, etag_of, require_match, tagged
 from stereorig.server.api.protocol.dependencies import AnalysisId, ServiceDep, TestId
 from stereorig.server.api.protocol.problems import errors
 from stereorig.server.api.routes.tests.recipes import check_against_test, reference_size_px

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from stereorig.core.certify.certify import certify
+from stereorig.core.certify.comparison import CertificateLimits
 from stereorig.core.certify.evidence import Evidence
-from stereorig.core.certify.limits import CertificateLimits
 from stereorig.core.certify.scales import scales_of
 from tests.support.certificate_evidence import PITCH_U, Fault, evidence
 
