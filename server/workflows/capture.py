@@ -20,9 +20,9 @@ from stereorig.server.results.images.quality import ImageQuality, image_quality,
 from stereorig.server.rig.cameras import CapturedPair
 from stereorig.server.store.folder import now_utc
 from stereorig.server.store.indexing.entries import step_entry
+from stereorig.server.workflows.camera_identity import check_same_cameras
 from stereorig.server.workflows.channels.reading import StepChannels
 from stereorig.server.workflows.service import Service
-from stereorig.server.workflows.test_start import check_same_cameras
 
 #: a camera further from its calibrated position than this is off: 10 um of 400 mm change the scale by 2.5e-5
 OFF_ZERO_MM = 0.01

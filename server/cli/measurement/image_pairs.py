@@ -15,7 +15,7 @@ from stereorig.server.formats.calibrations.recognise import LoadedCalibration
 from stereorig.server.formats.images import decode, decode_image, read_file
 from stereorig.server.results.images.quality import saturated_share
 from stereorig.server.store.durable import read_json
-from stereorig.server.workflows.test_start import check_same_cameras
+from stereorig.server.workflows.camera_identity import check_same_cameras
 
 
 def checked_pairs(

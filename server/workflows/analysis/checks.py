@@ -24,7 +24,6 @@ from stereorig.server.results.warnings.checks import Checks, checks_if_changed, 
 from stereorig.server.store.tests.tests import TestStore
 from stereorig.server.worker.executor import WorkerDiedError
 from stereorig.server.worker.resting import RestingWorker
-from stereorig.server.workflows.service import Service
 
 _log = logging.getLogger("stereorig.service")
 #: an ``analysis.json`` of more bytes is of many steps: each takes some 190
@@ -99,6 +98,16 @@ class AnalysisChecks:
                 running.result(timeout=_WAIT_FIRST_S)
         return kept.checks or _NOT_YET
 
+    def with_warnings(self, test_id: str, entries: Sequence[Mapping[str, object]]) -> list[dict[str, object]]:
+        """Return entries of analyses in a list with their warnings; an unreadable analysis gets none."""
+        made = []
+        for entry in entries:
+            found: list[dict[str, object]] = []
+            with contextlib.suppress(FileFormatError, NotFoundError):
+                found = self.of(test_id, str(entry["id"])).plain_warnings()
+            made.append({**entry, "warnings": found})
+        return made
+
     def _renew(self, kept: _KeptChecks, folder: Path, problems: Mapping[str, object] | None, mark: object) -> None:
         began = time.monotonic()
         found: Checks | None = None
@@ -150,17 +159,3 @@ _NOT_YET = Checks(
         ),
     ),
 )
-
-
-# Warnings to know before an analysis' results are used, as the API shows them.
-
-
-def with_warnings(service: Service, test_id: str, entries: Sequence[Mapping[str, object]]) -> list[dict[str, object]]:
-    """Return entries of analyses in a list with their warnings; an unreadable analysis gets none."""
-    made = []
-    for entry in entries:
-        found: list[dict[str, object]] = []
-        with contextlib.suppress(FileFormatError, NotFoundError):
-            found = service.checks.of(test_id, str(entry["id"])).plain_warnings()
-        made.append({**entry, "warnings": found})
-    return made

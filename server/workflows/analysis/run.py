@@ -31,8 +31,8 @@ from stereorig.server.workflows.analysis.block import Outcome
 from stereorig.server.workflows.analysis.blocks import Blocks
 from stereorig.server.workflows.analysis.side_by_side import goes_in_blocks, is_certain, measure_in_blocks
 from stereorig.server.workflows.analysis.tasks import is_independent, task_of
+from stereorig.server.workflows.camera_identity import check_same_cameras
 from stereorig.server.workflows.service import Service
-from stereorig.server.workflows.test_start import check_same_cameras
 from stereorig.server.workflows.waiting import report_away, run_side_by_side, run_task
 
 

@@ -25,8 +25,9 @@ from stereorig.server.results.warnings import checks
 from stereorig.server.store.indexing.entries import analysis_entry
 from stereorig.server.workflows.analysis.run import AnalysisRun, close
 from stereorig.server.workflows.analysis.tasks import calibration_changed
+from stereorig.server.workflows.camera_identity import check_same_cameras
 from stereorig.server.workflows.service import Service
-from stereorig.server.workflows.test_start import calibration_asked, check_same_cameras, give_calibration
+from stereorig.server.workflows.test_start import calibration_asked, give_calibration
 
 
 def steps_to_measure(service: Service, test_id: str, reference: int, wanted: list[int] | None) -> list[int]:

@@ -14,8 +14,8 @@ from stereorig.server.jobs.idempotency import RequestMark
 from stereorig.server.jobs.job import Job, Phase
 from stereorig.server.store.calibrations import REJECTED
 from stereorig.server.workflows.calibration.sequence import close
+from stereorig.server.workflows.camera_identity import check_same_cameras
 from stereorig.server.workflows.service import Service
-from stereorig.server.workflows.test_start import check_same_cameras
 from stereorig.server.workflows.waiting import run_task
 
 

@@ -14,10 +14,10 @@ from stereorig.server.formats.images import read_image
 from stereorig.server.formats.noise_json import load_noise
 from stereorig.server.workflows.analysis.start import calibration_of, check_region
 from stereorig.server.workflows.analysis.tasks import images_of
+from stereorig.server.workflows.camera_identity import check_same_cameras
 from stereorig.server.workflows.live.request import LiveSettings
 from stereorig.server.workflows.live.run import LiveRun
 from stereorig.server.workflows.service import Service
-from stereorig.server.workflows.test_start import check_same_cameras
 
 
 class LiveRuns:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from stereorig.core.errors import CameraError
-from stereorig.server.workflows.test_start import check_same_cameras
+from stereorig.server.workflows.camera_identity import check_same_cameras
 
 ONE = {"cam1": {"model": "A", "serial": "11"}, "cam2": {"model": "A", "serial": "22"}}
 
