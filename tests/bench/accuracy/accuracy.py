@@ -35,7 +35,6 @@ from tests.bench.accuracy import (
     sequence,
 )
 from tests.bench.accuracy import experiments as accuracy_experiments
-from tests.bench.accuracy import faces_before as accuracy_faces_before
 from tests.bench.accuracy import faces_speed as accuracy_faces_speed
 from tests.bench.accuracy import large as accuracy_large
 from tests.bench.accuracy import models as accuracy_models
@@ -80,7 +79,6 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     "adversarial": accuracy_adversarial.adversarial,
     **accuracy_adversarial_reliefs.SECTIONS,
     **accuracy_reliefs.SECTIONS,
-    **accuracy_faces_before.SECTIONS,
     **accuracy_faces_speed.SECTIONS,
     "noise-random": accuracy_noise.random_error,
     "noise-mean": accuracy_noise.mean_error,

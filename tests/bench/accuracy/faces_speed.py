@@ -18,11 +18,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stereorig.core.names import CAMERAS
-from tests.bench.accuracy.faces_before import COMMIT
 from tests.bench.accuracy.table import Row, Section
 from tests.bench.speed.scene import SequenceFiles, sequence_files
 from tests.support.requirements import ROOT
 
+COMMIT = "b6816770"
 _ROI = "60,60,1050,1040"
 _PAIRS = {1: 10, 2: 6}  # of processes, by number of processors
 _MAX_RATIO = 1.03

@@ -61,7 +61,7 @@ TOPICS = (
     Topic(
         "faces",
         "Every face of a part",
-        ("faces-plate", "faces-ball", "faces-misfit", "faces-cylinder", "faces-before", "faces-speed"),
+        ("faces-plate", "faces-ball", "faces-misfit", "faces-cylinder", "faces-speed"),
     ),
     Topic("difficult_images", "Difficult images", ("adversarial", "adversarial-reliefs")),
     Topic("experiments", "The paper's experiments, simulated", ("plate", "steel", "panel")),
