@@ -46,10 +46,6 @@ NAMES = [
 ]
 
 
-def names_under(root: Path) -> set[str]:
-    return {path.name for path in root.rglob("*")}
-
-
 @pytest.mark.fault(9)
 @pytest.mark.fault(46)
 def test_every_label_is_kept_to_the_letter_and_names_no_file(service: Service, client: httpx.Client) -> None:

@@ -59,9 +59,7 @@ TOPICS = (
     Topic("long_sequences", "Long sequences", ("updates",)),
     Topic("smoothing", "Smoothing", ("smoothing",)),
     Topic(
-        "faces",
-        "Every face of a part",
-        ("faces-plate", "faces-ball", "faces-misfit", "faces-cylinder", "faces-speed"),
+        "faces", "Every face of a part", ("faces-plate", "faces-ball", "faces-misfit", "faces-cylinder", "faces-speed")
     ),
     Topic("difficult_images", "Difficult images", ("adversarial", "adversarial-reliefs")),
     Topic("experiments", "The paper's experiments, simulated", ("plate", "steel", "panel")),
