@@ -19,10 +19,10 @@ from stereorig.core.arrays import Float
 from stereorig.core.cameras.stereo import StereoPair
 from stereorig.core.common.derivatives import Estimator
 from stereorig.core.field.points.result import Field
+from stereorig.core.matching.defects import MIN_LINES, SURE, box_about, line_covariance, strips_along
 from stereorig.core.matching.filters import prefilter
 from stereorig.core.matching.image import ImageData
 from stereorig.core.matching.odd_filters import REACH
-from stereorig.core.matching.sensor_lines import MIN_LINES, SURE, box_about, line_covariance, strips_along
 
 _MIN_SHARE = 0.02  # share of the pixels' noise variance: lines below it move a field by less than its mean's noise
 _STILL = 0.6  # share of a pixel in the value interpolated half a pixel from it

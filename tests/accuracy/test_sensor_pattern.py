@@ -22,8 +22,7 @@ from stereorig.core.field.points.shared_pixels import SharedPixels
 from stereorig.core.field.region.region import PointGrid
 from stereorig.core.gauge.area import area_statistics
 from stereorig.core.gauge.reading import difference
-from stereorig.core.matching.defects import find_defects
-from stereorig.core.matching.sensor_lines import line_covariance, strips_along
+from stereorig.core.matching.defects import find_defects, line_covariance, strips_along
 from stereorig.core.measure import MeasureOptions, ReferencePair
 from stereorig.core.names import CAMERAS
 from stereorig.core.noise import NoiseModel, measure_noise, measure_pattern

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from stereorig.core.arrays import Float
 from stereorig.core.field.points.fitter import Fitter, PointFits
 from stereorig.core.field.points.subset_residuals import SubsetResiduals, subset_residuals
+from stereorig.core.matching.defects import SURE, box_about, line_covariance, strips_along
 from stereorig.core.matching.kernels.cluster_robust import blocks_across
-from stereorig.core.matching.sensor_lines import SURE, box_about, line_covariance, strips_along
 from stereorig.core.robust import spread_indices
 
 _FAR_PX = 8  # farther than blur or a lens' error correlates

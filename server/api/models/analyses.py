@@ -12,9 +12,8 @@ from pydantic_core import PydanticKnownError
 from stereorig.core import settings
 from stereorig.core.settings import StoredSettings, disagreement
 from stereorig.server.api.models.jobs import Accepted, JobProblem
-from stereorig.server.api.models.systematic import SystematicTerms
 from stereorig.server.api.models.tests import AnalysisEntry
-from stereorig.server.api.models.warnings import AnalysisWarning
+from stereorig.server.api.models.warnings import AnalysisWarning, SystematicTerms
 from stereorig.server.base.json_values import Nested
 from stereorig.server.base.models import JobState, Label, Listing, Reply, Request, StepNumber, Switch, any_of, given
 from stereorig.server.documents.results import FieldVariable, Probe, Uncertainty

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from stereorig.core.errors import InputError, StateError
-from stereorig.server.api.models.evidence.procedure import ProcedureReply, ProcedureStepReply
+from stereorig.server.api.models.evidence.certificates import ProcedureReply, ProcedureStepReply
 from stereorig.server.cli.terminal import ProgressLine
 from stereorig.server.demo.client import ServiceClient
 from stereorig.server.results.certificate.plan import CertificatePlan

@@ -20,7 +20,7 @@ from stereorig.core.gauge.sampling import positions_along
 from stereorig.server.formats.calibrations.in_test import calibration_id_in
 from stereorig.server.formats.files import sha256_of
 from stereorig.server.formats.gauges.readings import GaugeReadings, RigidMotionReading, StepProblem, StepReadings
-from stereorig.server.formats.gauges.stated import stated
+from stereorig.server.formats.gauges.table import stated
 from stereorig.server.formats.results.folder import home_of, number_of
 from stereorig.server.formats.results.layout import COVARIANCE_NAMES
 from stereorig.server.formats.results.reading import ResultHead, read_field, read_head

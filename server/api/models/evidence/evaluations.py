@@ -5,7 +5,8 @@ from __future__ import annotations
 from pydantic import Field
 from pydantic.json_schema import JsonSchemaValue
 
-from stereorig.server.base.models import Reply, Request
+from stereorig.server.base.models import Listing, Reply, Request
+from stereorig.server.store.models import ModelRecord
 
 
 class EvaluationRequest(Request):
@@ -42,3 +43,12 @@ class EvaluationList(Reply):
     """Every evaluation that is installed."""
 
     evaluations: list[EvaluationEntry] = Field(description="By name.")
+
+
+# Models of a test.
+
+
+class ModelList(Listing):
+    """Models, oldest first."""
+
+    models: list[ModelRecord] = Field(description="Each with its reading options and its placement.")

@@ -17,7 +17,7 @@ from stereorig.server.api.protocol.problems import errors
 from stereorig.server.formats.calibrations.recognise import load_calibration
 from stereorig.server.formats.images import encode_png, read_image
 from stereorig.server.formats.results.summary import region_found
-from stereorig.server.results.images.found_region import region_to_edit
+from stereorig.server.results.images.texture import region_to_edit
 
 router = APIRouter(prefix="/tests/{test_id}", tags=["analyses"])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 
-from stereorig.server.api.models.evidence.procedure import NextRequest, ProcedureReply
+from stereorig.server.api.models.evidence.certificates import NextRequest, ProcedureReply
 from stereorig.server.api.models.jobs import Accepted
 from stereorig.server.api.protocol.dependencies import (
     Attached,

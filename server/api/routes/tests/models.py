@@ -10,7 +10,7 @@ from fastapi import APIRouter, File, Form, Path, UploadFile
 from starlette.concurrency import run_in_threadpool
 
 from stereorig.core.errors import InputError
-from stereorig.server.api.models.evidence.model_files import ModelList
+from stereorig.server.api.models.evidence.evaluations import ModelList
 from stereorig.server.api.protocol.dependencies import KeyHeader, ServiceDep, TestId, mark
 from stereorig.server.api.protocol.paging import PageDep
 from stereorig.server.api.protocol.problems import errors

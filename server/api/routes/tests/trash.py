@@ -19,8 +19,7 @@ from stereorig.server.api.protocol.paging import PageDep
 from stereorig.server.api.protocol.problems import errors
 from stereorig.server.api.routes.calibrations.noise import NoiseId
 from stereorig.server.documents.made import TrashEntry
-from stereorig.server.store.copies import acknowledge_export
-from stereorig.server.store.trash import Kind
+from stereorig.server.store.trash import Kind, acknowledge_export
 from stereorig.server.workflows.deletion import delete, restore
 from stereorig.server.workflows.service import Service
 
