@@ -27,12 +27,8 @@ from stereorig.core.measure import MeasureOptions, ReferencePair
 from stereorig.core.progress import CancelToken, Progress
 from stereorig.core.systematic.interpolation import SmoothSlopes, interpolation_term
 from stereorig.core.threads import available_threads, set_threads
-from stereorig.server.compute.background_compilation import (
-    BackgroundCompilation,
-    KernelsAside,
-    find_drawn_grid,
-    grid_aside,
-)
+from stereorig.server.compute.background_compilation import BackgroundCompilation, KernelsAside
+from stereorig.server.compute.grid_kernels import find_drawn_grid, grid_aside
 from stereorig.server.compute.overlap import Measure, MeasureAhead, RequestedStep, timed
 from stereorig.server.compute.sequence import Pair, SequenceMeasurement
 from stereorig.server.compute.tasks import StepImages, StepTask

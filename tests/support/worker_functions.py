@@ -85,7 +85,7 @@ def compiled_while_waiting() -> list[int]:
     import stereorig.server.compute.measurement
     from stereorig.core.compiling import report_compiling
     from stereorig.core.target import GridTarget
-    from stereorig.server.compute.background_compilation import await_grid_kernels, find_drawn_grid
+    from stereorig.server.compute.grid_kernels import await_grid_kernels, find_drawn_grid
 
     await_grid_kernels(GridTarget(pitch_mm=1.0, lines=(9, 9), line_width_mm=0.05))
     stereorig.server.compute.measurement.await_kernels()

@@ -17,8 +17,8 @@ from stereorig.core.calibration.from_images import ImageOfTarget, calibrate_view
 from stereorig.core.errors import CalibrationError, CalibrationInputError
 from stereorig.core.grid import GridOptions, GridView
 from stereorig.core.names import CAMERAS
-from stereorig.server.compute.background_compilation import await_grid_kernels
 from stereorig.server.compute.calibration.inputs import nominals_of, options_of, target_of
+from stereorig.server.compute.grid_kernels import await_grid_kernels
 from stereorig.server.compute.tasks import FitTask
 from stereorig.server.formats.calibrations.native import calibration_content, view_record
 from stereorig.server.formats.images import GrayImage, read_image

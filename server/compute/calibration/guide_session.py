@@ -25,8 +25,8 @@ from stereorig.core.names import CAMERAS
 from stereorig.core.target import GridTarget
 from stereorig.server.base.json_values import without_nan
 from stereorig.server.base.problem import problem_of
-from stereorig.server.compute.background_compilation import await_grid_kernels
 from stereorig.server.compute.calibration.inputs import nominals_of, options_of, target_of
+from stereorig.server.compute.grid_kernels import await_grid_kernels
 from stereorig.server.compute.tasks import GuideTask, LookTask
 from stereorig.server.formats.images import GrayImage, read_image
 
