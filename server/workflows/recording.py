@@ -8,11 +8,11 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
 import numpy as np
 import psutil
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from stereorig.core.arrays import Float
 from stereorig.core.errors import Cancelled, InputError, StageError, StateError, StereorigError
@@ -67,14 +67,24 @@ class RecordTrigger(Request):
         """True if all pairs around one moment are kept."""
         return self.kind in ("call", "level", "slope")
 
-    @model_validator(mode="after")
-    def _complete(self) -> Self:
+    def require_complete(self) -> None:
+        """Refuse a trigger that lacks what its kind needs.
+
+        Raises
+        ------
+        InputError
+            ``trigger_incomplete``.
+        """
         more = {"level": ["level"], "slope": ["slope_per_s"]}.get(self.kind, [])
         needed = [] if self.kind == "call" else ["channel", *more]
         missing = [name for name in needed if getattr(self, name) is None]
         if missing:
-            raise ValueError(f"a trigger of kind {self.kind} needs {', '.join(missing)}")
-        return self
+            raise InputError(
+                f"A trigger of kind {self.kind} needs {' and '.join(missing)}.",
+                code="trigger_incomplete",
+                remedy="State it within `trigger`.",
+                missing=missing,
+            )
 
 
 class RecordPlan(Request):
@@ -127,12 +137,13 @@ class Recordings:
         Raises
         ------
         InputError
-            ``channel_unknown``; ``recording_too_large`` if the ring does not fit into the memory that is free.
+            ``trigger_incomplete``; ``channel_unknown``; ``recording_too_large`` if the ring does not fit into the memory that is free.
         BusyError
             A job or another client has the cameras.
         """
         service = self._service
         service.require_room()
+        plan.trigger.require_complete()
         if plan.trigger.channel is not None:
             service.channels.readings(plan.trigger.channel)
         plan, limits = self._bounded(plan)

@@ -155,7 +155,9 @@ def test_a_recording_that_does_not_fit_is_refused_by_name(rig: tuple[httpx.Clien
     assert "MiB" in answer.json()["detail"]
     answer = client.post(f"{API}/tests/{test_id}/record", json={"trigger": {"kind": "peak", "channel": "x"}})
     assert answer.json()["code"] == "channel_unknown"
-    assert client.post(f"{API}/tests/{test_id}/record", json={"trigger": {"kind": "level"}}).status_code == 422
+    answer = client.post(f"{API}/tests/{test_id}/record", json={"trigger": {"kind": "level"}})
+    assert (answer.status_code, answer.json()["code"]) == (422, "trigger_incomplete")
+    assert answer.json()["missing"] == ["channel", "level"]
 
 
 def test_a_recording_that_is_cancelled_keeps_what_it_listed(rig: tuple[httpx.Client, Service]) -> None:

@@ -122,6 +122,10 @@ def _within(path: str, folder: str) -> bool:
     return path == folder or path.startswith(f"{folder}/")
 
 
+def _no_verb(value: Any) -> Any:
+    return value.replace(":", ";") if isinstance(value, str) else value
+
+
 @dataclass
 class Known:
     """What there is when a run begins: without it, most requests would end at an unknown id."""
@@ -136,7 +140,8 @@ class Known:
         for entry in service.trash.entries():
             if needed & {entry.test_id, entry.calibration_id, entry.noise_id}:
                 restore(service, entry.id)
-        if not needed & set((case.path_parameters or {}).values()):
+        # a whole list that was deleted is there still, and empty
+        if case.path_parameters and not needed & set(case.path_parameters.values()):
             gone = case.formatted_path
             self.deleted.add(gone)
             self.made = {path for path in self.made if not _within(path, gone)}
@@ -166,6 +171,12 @@ class Known:
             # "+0.0" is a number's other text, which a reader of whole numbers takes: no violation of its schema
             for name in [n for n, v in (values or {}).items() if isinstance(v, str) and _OTHER_TEXT.fullmatch(v)]:
                 values[name] = "half"
+        # nor are 0 and 1 in a form, whose values are texts, another kind than true and false
+        if wrong and isinstance(case.body, dict) and case.media_type != "application/json":
+            case.body = {name: "half" if value in (0, 1, "0", "1") else value for name, value in case.body.items()}
+        if wrong:
+            # a colon in a path is another operation's address
+            case.path_parameters = {name: _no_verb(value) for name, value in (case.path_parameters or {}).items()}
         parts = case.meta.components if case.meta is not None else {}
         path = next((info for kind, info in parts.items() if kind.value == "path_parameters"), None)
         mutations = getattr(case.meta.phase.data, "mutations", ()) if case.meta is not None else ()
