@@ -137,8 +137,8 @@ class Recordings:
         Raises
         ------
         InputError
-            ``trigger_incomplete``; ``channel_unknown``; ``recording_too_large`` if the ring does not fit into the memory
-            that is free.
+            ``trigger_incomplete``; ``channel_unknown``; ``recording_too_large`` if the ring does not fit into the free
+            memory.
         BusyError
             A job or another client has the cameras.
         """
