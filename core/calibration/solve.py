@@ -87,8 +87,11 @@ def calibrate(
     except np.linalg.LinAlgError as error:
         raise CalibrationError(f"The solver failed: {error}.", code="calibration_singular") from error
     angles = _check_cameras(chosen, nominals)
-    # wider, if a sensor may be tilted in place of the axes
-    options = replace(options, axis_tilt_sigma_rad=chosen.screened.problem.options.axis_tilt_sigma_rad)
+    # wider, if a sensor may be tilted in place of the axes, or if the positions scatter
+    taken = chosen.screened.problem.options
+    options = replace(
+        options, axis_tilt_sigma_rad=taken.axis_tilt_sigma_rad, stage_step_sigma_mm=taken.stage_step_sigma_mm
+    )
     result = build_result(chosen, target, nominals, options, predicted=predicted, positions=positions, remarks=remarks)
     checks = tuple(replace(c, text=angles) if c.name == "angles" else c for c in result.checks)
     reasons = (*result.verdict.reasons, *remark_on_distances(result.pair, nominals))

@@ -45,11 +45,14 @@ def contradicted(groups: Sequence[Group], score: Score) -> list[tuple[Structure,
     the quantity that contradicts the millimetre.
     """
     rivals_px = [_rivals_px(groups, score, one=one) for one in (False, True)]
+    # axes near the limit of their prior pull aspect ratios apart, and no scale is wrong
+    pulling = [g for g in groups if g.name == AXES and score.test(g, []).probability < FAILED_LEVEL]
     found: list[tuple[Structure, Group]] = []
     left = [g for g in groups if g.name in DECLARED]
     while left:
         given = [g for _, g in found]
-        tests = [(score.test(g, given), g) for g in left]
+        known = [*given, *(g for g in pulling if g not in given)]
+        tests = [(score.test(g, known if g.name in SCALE_GROUPS else given), g) for g in left]
         # after another finding the amounts are no longer small, and a test to first order is less sure
         levels = [SCALE_LEVEL if g.name in SCALE_GROUPS and not found else SIGNIFICANT for g in left]
         certain = [
@@ -118,7 +121,7 @@ def in_words(screened: Screened, found: Sequence[tuple[Structure, Group]], score
             if not k or abs(off) > 2.0 * sigma:
                 out.append(stated)
         elif group.name == POSITIONS:
-            out.append(replace(structure, sentence=_positions(screened.adjustment, structure, group, score, given)))
+            out.append(replace(structure, sentence=_positions(screened.adjustment, group, score, given)))
         else:
             sentence = _axes(screened, structure) if group.name == AXES else _moved(screened, structure)
             out.append(replace(structure, sentence=sentence))
@@ -180,7 +183,7 @@ def _values(screened: Screened, places: Sequence[int]) -> list[tuple[float, floa
     return [(float(found.state.x[k]), float(np.sqrt(found.covariance[k, k]))) for k in places]
 
 
-def _positions(adjustment: Adjustment, structure: Structure, group: Group, score: Score, given: Sequence[Group]) -> str:
+def _positions(adjustment: Adjustment, group: Group, score: Score, given: Sequence[Group]) -> str:
     """Put errors of the positions read back in words: one that alone explains them, or how far all scatter."""
     steps = adjustment.layout.steps
     alone = [Group(POSITIONS, None, (name,), group.columns[k : k + 1]) for k, name in enumerate(group.names)]
@@ -193,11 +196,20 @@ def _positions(adjustment: Adjustment, structure: Structure, group: Group, score
             f"The position {dz:+.3f} mm of {whose} is off by {1e3 * value:+.1f} +- {1e3 * sigma:.1f} um against the "
             "others: it slipped there, or something moved."
         )
-    scatter = float(np.sqrt(np.mean([v**2 for v, _ in structure.terms.values()])))
+    scatter = score.spread(group, given)
     return (
         f"The stage's positions are off by {1e3 * scatter:.1f} um rms against the images, most of all {dz:+.3f} mm of "
         f"{whose}. Declare stage_step_sigma_mm, or look for a periodic error of the screw."
     )
+
+
+def with_open_steps(screened: Screened, groups: Sequence[Group], score: Score) -> Screened:
+    """Return the fit with errors of the positions read back as unknowns, with a prior as large as they scatter."""
+    options = screened.problem.options
+    scatter = max(score.spread(g, ()) for g in groups if g.name == POSITIONS)
+    if scatter <= options.stage_step_sigma_mm:
+        return screened
+    return _refitted(screened, replace(options, stage_step_sigma_mm=scatter))
 
 
 def _axes(screened: Screened, structure: Structure) -> str:

@@ -16,8 +16,9 @@ from stereorig.core.calibration.choice.contradictions import (
     in_words,
     scale_seen,
     with_open_scales,
+    with_open_steps,
 )
-from stereorig.core.calibration.choice.declared import AXES, SCALE_GROUPS
+from stereorig.core.calibration.choice.declared import AXES, POSITIONS, SCALE_GROUPS
 from stereorig.core.calibration.choice.held_out import HeldOutView, held_out_views, leave_out_in_turn, staged_views
 from stereorig.core.calibration.choice.pairs import apart_pairs
 from stereorig.core.calibration.choice.screening import Screened, fit_screened, not_of_one_pose, points_mm
@@ -108,7 +109,8 @@ def choose_lens(problem: FitData, held: Sequence[CalibrationView]) -> Chosen:
     """Fit under the lens model that the options ask for, or find the simplest that leaves no structure.
 
     If all views agree that points of a target declared exact are displaced, the lens is chosen again with these errors
-    as unknowns, with a prior from the residuals. With free poses they are corrected, too.
+    as unknowns, with a prior from the residuals. With free poses they are corrected, too. Errors of the positions read
+    back become unknowns of the chosen lens's fit in the same way.
 
     Parameters
     ----------
@@ -128,6 +130,9 @@ def choose_lens(problem: FitData, held: Sequence[CalibrationView]) -> Chosen:
     begun = _FitStart(start, apart, tuple(v for v in held if v.frame is None or v.frame not in apart))
     chosen = _corrected(problem, begun)
     fit = chosen.screened
+    if any(found.name == POSITIONS for found in chosen.structure):
+        with suppress(CalibrationError):
+            fit = with_open_steps(fit, *_Candidate(fit, ()).asked)
     fit = replace(fit, adjustment=with_smooth_errors(fit), dropped=(*fit.dropped, *lost))
     return replace(chosen, screened=fit)
 

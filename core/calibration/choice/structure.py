@@ -30,6 +30,7 @@ from stereorig.core.robust import f_tail
 SIGNIFICANT = 1e-4
 _DEGREE = 5
 _LEAST_LEFT = 1e-3
+_VARIANCES = 1000
 _ROUNDING = 1e-12  # relative, of differences of sums
 _MORE = 1.2  # a sheared grid that a stage shows both cameras the same way is a skew of both, and some noise
 _LOOSE_WEIGHT = 1e-2**-2  # weight of an aspect ratio's loosest prior; a narrower prior fixes the ratio
@@ -414,6 +415,20 @@ class Score:
         if group.name == "smooth":
             gain -= q * left / freedom  # its many terms take up as much of mere noise
         return Structure(group.name, name, terms, probability, noise * float(np.sqrt(max(gain, 0.0) / max(count, 1.0))))
+
+    def spread(self, group: Group, given: Sequence[Group]) -> float:
+        """Return the most likely standard deviation of a group's terms, if all are drawn from one distribution.
+
+        Terms of which the views show only some combinations are uncertain by many times as much.
+        """
+        M, r, _ = self._left([group], given)
+        values, vectors = np.linalg.eigh(M)
+        shown = values > 1e-9 * max(float(values[-1]), 1e-300)
+        m, squares = values[shown], (vectors[:, shown].T @ r) ** 2
+        variance = np.geomspace(1e-6, 1e6, _VARIANCES) * float(np.max(squares / m**2, initial=1e-300))
+        gain = 1.0 + m * variance[:, None]
+        likelihood = np.sum(squares * variance[:, None] / gain - np.log(gain), axis=1)
+        return float(np.sqrt(variance[np.argmax(likelihood)]))
 
     def weights(self, group: Group, given: Sequence[Group]) -> Float:
         """Return prior weights (q,) of terms: each alone is as large as the group's gain beyond the others."""

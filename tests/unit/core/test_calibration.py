@@ -25,7 +25,7 @@ from stereorig.core.cameras.lens import LensModel, OpenCVLens, SeidelLens
 from stereorig.core.errors import CalibrationError, CalibrationInputError
 from stereorig.core.names import CAMERAS
 from stereorig.core.target import GridTarget
-from tests.support.calibration_rigs import aligned_rms_um, flat, observed, ordinary_pair
+from tests.support.calibration_rigs import TrueCamera, aligned_rms_um, flat, observed, ordinary_pair
 from tests.support.calibration_rigs import shape_error_um as rig_shape_error_um
 from tests.support.calibration_truth import HELD, NOISE_PX, NOMINAL, PAPER, Array, Grid, make_views, nodes, project
 
@@ -318,22 +318,35 @@ def test_right_scales_are_good_and_the_check_says_how_well_they_agree() -> None:
     assert "% farther than it reads" in check.text
 
 
-@pytest.mark.fault(32)
-def test_a_scale_that_a_wide_lens_hides_is_no_check_made_and_its_size_is_stated() -> None:
-    # a lens of 12 mm on pixels of 3.45 um, five coefficients, OpenCV's projection: the stage reads 0.2 % too little
-    focal_px, size, pitch_mm = 12.0 / 0.00345, (2448, 2048), 8.0
+def _modern_rig(
+    focal_mm: float,
+    lens: tuple[float, ...],
+    *,
+    long: float = 1.0,
+    step_mm: float = 0.0,
+    axis_rad: tuple[float, float] = (0.0, 0.0),
+) -> tuple[list[CalibrationView], GridTarget, tuple[NominalValues, NominalValues], tuple[TrueCamera, TrueCamera]]:
+    """Six positions of two stages before pixels of 3.45 um, with errors of the travel; OpenCV's projection."""
+    focal_px, size, pitch_mm = focal_mm / 0.00345, (2448, 2048), 8.0
     standoff_mm = focal_px * 10.0 * pitch_mm / 1.05 / size[1]
-    cameras = ordinary_pair((-0.1, 0.08, 0.0, 0.0, 0.0), focal_px=focal_px, standoff_mm=standoff_mm)
+    cameras = ordinary_pair(lens, focal_px=focal_px, standoff_mm=standoff_mm)
     at = (np.arange(11) - 5.0) * pitch_mm
     points = flat(np.stack(np.meshgrid(at, at, indexing="ij"), axis=-1))
     rng = np.random.default_rng(1)
+    along = np.array([*axis_rad, np.sqrt(1.0 - np.square(axis_rad).sum())])
     views = []
     for name, camera in zip(CAMERAS, cameras, strict=True):
         for dz in np.linspace(0.0, 0.1 * standoff_mm, 6):
-            moved = camera.moved(np.array([0.0, 0.0, 1.002 * dz]))
+            moved = camera.moved((long * dz + step_mm * rng.standard_normal()) * along)
             views.append(CalibrationView(name, float(dz), observed(moved, points, rng, 0.02)))
     nominal = NominalValues(size, focal_px, standoff_mm, -12.5), NominalValues(size, focal_px, standoff_mm, 12.5)
-    target = GridTarget(pitch_mm=pitch_mm, lines=(13, 13), line_width_mm=0.8)
+    return views, GridTarget(pitch_mm=pitch_mm, lines=(13, 13), line_width_mm=0.8), nominal, cameras
+
+
+@pytest.mark.fault(32)
+def test_a_scale_that_a_wide_lens_hides_is_no_check_made_and_its_size_is_stated() -> None:
+    # a lens of 12 mm on pixels of 3.45 um, five coefficients, OpenCV's projection: the stage reads 0.2 % too little
+    views, target, nominal, cameras = _modern_rig(12.0, (-0.1, 0.08, 0.0, 0.0, 0.0), long=1.002)
     result = calibrate(views, target, nominal)
     assert result.verdict.level == "good", "no residual shows it"
     check = {c.name: c for c in result.checks}["scales"]
@@ -346,6 +359,30 @@ def test_a_scale_that_a_wide_lens_hides_is_no_check_made_and_its_size_is_stated(
     assert true_um < 1.5e3 * result.uncertainty.shape_rms_mm
     certain = calibrate(views, target, nominal, CalibrationOptions(stage_scale_sigma=1e-4))
     assert certain.uncertainty.shape_rms_mm < 0.3 * result.uncertainty.shape_rms_mm
+
+
+@pytest.mark.parametrize("lens", [(-0.05, 0.1, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0)])
+@pytest.mark.parametrize("step_mm", [0.003, 0.01])
+def test_the_scatter_of_a_stages_positions_is_named_by_its_size_and_reported(
+    step_mm: float, lens: tuple[float, ...]
+) -> None:
+    views, target, nominal, cameras = _modern_rig(25.0, lens, step_mm=step_mm)
+    result = calibrate(views, target, nominal, CalibrationOptions(stage_scale_sigma=0.0))
+    assert result.verdict.level == "warning"
+    said = [re.search(r"positions are off by ([0-9.]+) um rms", reason) for reason in result.verdict.reasons]
+    # 18 to 22 um by the terms alone; twelve errors know their rms to a fifth
+    assert [float(found[1]) for found in said if found] == [pytest.approx(1e3 * step_mm, rel=0.5)]
+    # up to 3.2 times as much as reported where the positions were held
+    true_um = rig_shape_error_um(result.pair, cameras, result.uncertainty.points_mm)
+    assert true_um < 1.5e3 * result.uncertainty.shape_rms_mm
+
+
+def test_stages_off_their_axes_near_the_limit_of_the_prior_are_no_wrong_aspect_ratio() -> None:
+    views, target, nominal, cameras = _modern_rig(25.0, (-0.05, 0.1, 0.0, 0.0, 0.0), axis_rad=(0.003, -0.0015))
+    result = calibrate(views, target, nominal)
+    assert result.verdict.level == "good", result.verdict.reasons
+    true_um = rig_shape_error_um(result.pair, cameras, result.uncertainty.points_mm)
+    assert true_um < 1e3 * result.uncertainty.shape_rms_mm
 
 
 @pytest.mark.parametrize(
