@@ -45,14 +45,18 @@ def contradicted(groups: Sequence[Group], score: Score) -> list[tuple[Structure,
     the quantity that contradicts the millimetre.
     """
     rivals_px = [_rivals_px(groups, score, one=one) for one in (False, True)]
-    # axes near the limit of their prior pull aspect ratios apart, and no scale is wrong
-    pulling = [g for g in groups if g.name == AXES and score.test(g, []).probability < FAILED_LEVEL]
+    axes = [(score.test(g, []).probability, g) for g in groups if g.name == AXES]
     found: list[tuple[Structure, Group]] = []
     left = [g for g in groups if g.name in DECLARED]
     while left:
         given = [g for _, g in found]
-        known = [*given, *(g for g in pulling if g not in given)]
-        tests = [(score.test(g, known if g.name in SCALE_GROUPS else given), g) for g in left]
+        tests = [(score.test(g, given), g) for g in left]
+        if axes and axes[0][0] < FAILED_LEVEL and axes[0][1] not in given:
+            # axes near the limit of their prior pull aspect ratios apart, and no scale is wrong
+            tests = [
+                (score.test(g, [*given, axes[0][1]]) if g.name in SCALE_GROUPS and axes[0][0] < t.probability else t, g)
+                for t, g in tests
+            ]
         # after another finding the amounts are no longer small, and a test to first order is less sure
         levels = [SCALE_LEVEL if g.name in SCALE_GROUPS and not found else SIGNIFICANT for g in left]
         certain = [
