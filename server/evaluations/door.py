@@ -179,6 +179,11 @@ class Evaluation(Protocol):
         with 1.
     needs
         Variables that the chosen steps must have, such as ``w_mm`` or ``exx``.
+
+    Notes
+    -----
+    An evaluation may have a method ``over``, from documents by the name of each measurement to an `Evaluated` over all
+    of them.
     """
 
     name: str

@@ -11,7 +11,16 @@ from typing import Any
 
 from stereorig.core.errors import InputError
 from stereorig.core.progress import no_progress
-from stereorig.server.evaluations.door import Described, Evaluated, described, document_of, evaluate, evaluation
+from stereorig.server.cli.evidence.batch import rows_of, run_batch
+from stereorig.server.evaluations.door import (
+    Described,
+    Evaluated,
+    Evaluation,
+    described,
+    document_of,
+    evaluate,
+    evaluation,
+)
 from stereorig.server.exports.vtu import write_vtu
 from stereorig.server.formats.files import make_folder, write_bytes
 from stereorig.server.formats.results.folder import first_results, number_of
@@ -31,7 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add = parser.add_argument
     add("name", metavar="NAME", nargs="?", help="evaluation, as conformity; left out: list those that are installed")
-    add("folder", metavar="FOLDER", nargs="?", type=Path, help="results of stereorig measure, or of an analysis")
+    text = "results of stereorig measure, or of an analysis; a CSV with a column folder: those of several, a row each"
+    add("folder", metavar="FOLDER", nargs="?", type=Path, help=text)
     add("--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", help="a setting; VALUE may be JSON")
     add("--out", type=Path, metavar="DIR", help="folder for NAME.json, and NAME.vtu if it adds variables to the points")
     add("--json", action="store_true", help="print JSON")
@@ -46,18 +56,47 @@ def run(args: argparse.Namespace) -> int:
     if args.folder is None:
         raise InputError("No folder of results is given.", code="wrong_usage", remedy="See stereorig evaluate --help.")
     made = evaluation(args.name)
-    files = first_results(args.folder, (args.folder, args.folder / "exports" / "measure"))
-    outcome = evaluate(made, files, dict(_setting(text) for text in args.settings), no_progress)
+    settings = dict(_setting(text) for text in args.settings)
+    if args.folder.suffix.lower() == ".csv":
+        return _several(made, args, settings)
+    files = results_of(args.folder)
+    outcome = evaluate(made, files, settings, no_progress)
     document = document_of(outcome)
     if args.out is not None:
-        make_folder(args.out)
-        write_bytes(args.out / f"{args.name}.json", to_json(document))
+        _write(args.out, args.name, outcome)
         if outcome.variables:
             write_points(args.out / f"{args.name}.vtu", outcome, files)
-        for ending, text in outcome.files.items():
-            write_bytes(args.out / f"{args.name}{ending}", text.encode())
     print(to_json(document).decode() if args.json else "\n".join([made.title, *_lines(document)]))
     return 1 if document.get("accepted") is False else 0
+
+
+def results_of(folder: Path) -> list[Path]:
+    """Return the result files of a folder that a user named."""
+    return first_results(folder, (folder, folder / "exports" / "measure"))
+
+
+def _several(made: Evaluation, args: argparse.Namespace, settings: dict[str, Any]) -> int:
+    """Evaluate each row of a table, write a folder for each, and print what there is over all."""
+    found, refused, over = run_batch(made, rows_of(args.folder), settings, args.folder.parent, results_of, _setting)
+    if args.out is not None:
+        for name, outcome in found.items():
+            _write(args.out / name, args.name, outcome)
+        if over is not None:
+            _write(args.out, f"{args.name}_all", over)
+    documents = {name: document_of(outcome) for name, outcome in found.items()}
+    of_all = {} if over is None else document_of(over)
+    failures = {name: {"code": one.code, "cause": one.cause, "remedy": one.remedy} for name, one in refused.items()}
+    shown: dict[str, object] = {"all": of_all, "refused": failures}
+    lines = [made.title, *_lines(shown)]
+    print(to_json({**shown, "each": documents}).decode() if args.json else "\n".join(lines))
+    return 1 if refused or any(one.get("accepted") is False for one in documents.values()) else 0
+
+
+def _write(out: Path, name: str, outcome: Evaluated) -> None:
+    make_folder(out)
+    write_bytes(out / f"{name}.json", to_json(document_of(outcome)))
+    for ending, text in outcome.files.items():
+        write_bytes(out / f"{name}{ending}", text.encode())
 
 
 def write_points(path: Path, outcome: Evaluated, files: list[Path]) -> None:

@@ -12,6 +12,7 @@ from stereorig.core.progress import Progress
 from stereorig.server.evaluations.door import Evaluated, Results
 from stereorig.server.evaluations.histories import Ends, History, Mean
 from stereorig.server.evaluations.tensile.assessment import Assessed, Found, assessed
+from stereorig.server.evaluations.tensile.batch import over_specimens, table_over
 from stereorig.server.evaluations.tensile.curve import AXIAL, LATERAL, STRESS, Curve, with_load_errors
 from stereorig.server.evaluations.tensile.document import (
     CardNumber,
@@ -64,6 +65,11 @@ class MaterialCard:
         card = _card(curve, found, profile, asked, missing)
         files = {".csv": table_of(card), ".html": page_of(self.title, card)}
         return Evaluated(card, results.steps[-1], files=files)
+
+    def over(self, cards: Mapping[str, MaterialCardFound]) -> Evaluated:
+        """Return mean, spread and bound of each number over specimens."""
+        found = over_specimens(cards)
+        return Evaluated(found, files={".csv": table_over(found)})
 
 
 def curve_of(results: Results, asked: TensileSettings, progress: Progress) -> tuple[Curve, list[str]]:
