@@ -168,7 +168,9 @@ def residual_test(
         _scale(points, usual, ratio / np.where(ratio > 1.0, _shared_texture(points, usual), 1.0), seen)
     if noise is None and len(usual):
         estimated = bool((correction[:-1] > 1.0).any())
-        if estimated:
+        # below the reported ones in a motion: the fit took for noise what blur of one image changed, and blocks count
+        # part of that, too
+        if estimated or (fitter.comparisons == 3 and (correction[:-1] < 1.0).any()):
             limits.as_observed(usual)
         limits.follow(estimated=estimated)
         limits.reject_far(usual, estimated=estimated)
@@ -374,7 +376,7 @@ class _Limits:
         ``estimated``: the covariances are the residuals' own estimates, not noise as the fit knows it.
         """
         ok = self._points.ok
-        if not ok.any():
+        if not ok.any() or not self._px.any():  # all were refused as one kind: those left are of it, too
             return
         sigma = np.where(ok, 1.0, np.nan)
         sigma[ok] = self._sigma_px(np.flatnonzero(ok), estimated=estimated)

@@ -83,10 +83,12 @@ def observed_over_reported(
         # a bending motion is no scatter: in the sixth order little of it remains
         if which.sum() < points.ok.sum():  # a difference has sixteen points: of a part of them there are few
             off, variance = _off_linear(pair, points, points.ok, xy_px, shape)
-        ratio = _mixed_differences(off, variance, int(np.ceil((subset_px + _NEAR_PX) / spacing)))
-        if len(ratio) * area >= _MIN_INDEPENDENT:
-            left = np.maximum(np.quantile(np.abs(ratio), _QUANTILES[0], axis=0) / _OF_NORMAL[0], 1.0)
-            found = np.where(found > _BENDS * left, left, found)
+        for weights in reversed(_DIFFERENCES):  # a field with gaps has more places for nine points than for sixteen
+            ratio = _mixed_differences(off, variance, int(np.ceil((subset_px + _NEAR_PX) / spacing)), np.array(weights))
+            if len(ratio) * area >= _MIN_INDEPENDENT:
+                left = np.maximum(np.quantile(np.abs(ratio), _QUANTILES[0], axis=0) / _OF_NORMAL[0], 1.0)
+                found = np.where(found > _BENDS * left, left, found)
+                break
     return np.asarray(found)
 
 
@@ -201,9 +203,8 @@ def _differences(values: Float, variance: Float, lag: int, weights: Float) -> li
     return out
 
 
-def _mixed_differences(values: Float, variance: Float, lag: int) -> Float:
-    """Third differences along rows of those along columns (m, k), over their reported standard deviation."""
-    weights = np.array(_DIFFERENCES[-1])
+def _mixed_differences(values: Float, variance: Float, lag: int, weights: Float) -> Float:
+    """Differences along rows of those along columns (m, k), over their reported standard deviation."""
     rows, cols = (size - lag * (len(weights) - 1) for size in values.shape[:2])
     if min(rows, cols) < 1:
         return np.zeros((0, values.shape[2]))
