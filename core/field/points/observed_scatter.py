@@ -26,7 +26,7 @@ _FEW_INDEPENDENT, _CLEARLY_LESS = 10.0, 0.75  # sufficient for a direction that 
 _QUANTILES, _OF_NORMAL = (0.8, 0.95, 0.99), (1.2816, 1.96, 2.5758)  # localised strain and wrong matches are beyond 0.8
 _UNCERTAINTY = 1.03  # relative uncertainty of a standard deviation from so many points
 _AS_REPORTED = (0.92, 1.08)  # within, nothing is changed
-_MAX_RAISE, _MOTION = 2.0, 4.0
+_MAX_RAISE = 2.0
 _CALM, _OF_NORMAL_CALM = 0.25, 0.3186  # quantile that strain in half of the field leaves alone
 _FLAT = 1e-2  # extent along the normal, of the largest, that is none
 _NEAR_PX = 5.5  # between subsets of a difference of sixth order: a good speckle, so that the motion has little room
@@ -90,7 +90,7 @@ def observed_over_reported(
                 found = np.where(found > _BENDS * left, left, found)
                 break
     # no residuals are off by so much: that is the motion, and the directions without one show what noise scatters
-    moves, calm = found > _MOTION, found < _MAX_RAISE
+    moves, calm = found > _MAX_RAISE, found <= _MAX_RAISE
     if calm.any():
         found[moves] = max(1.0, found[calm].max())
     return np.asarray(found)
