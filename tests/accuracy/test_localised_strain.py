@@ -77,7 +77,7 @@ def measured(name: str, patch: str = "auto") -> tuple[Field, np.ndarray]:
         ("kink 10 %", 0.95, 0.6),  # on the line itself a subset shows two motions
         ("band 5 %", 0.99, 0.6),
         ("band 20 %", 0.85, 0.5),  # the band is as wide as a subset
-        ("notch", 0.94, 0.4),  # its strain reaches over the whole of so small a field
+        ("notch", 0.97, 0.65),  # its strain reaches over the whole of so small a field: more than any noise scatters
     ],
 )
 def test_where_strain_is_localised_no_valid_point_is_far_off_and_right_points_stay(
