@@ -28,9 +28,11 @@ _UNCERTAINTY = 1.03  # relative uncertainty of a standard deviation from so many
 _AS_REPORTED = (0.92, 1.08)  # within, nothing is changed
 _MAX_RAISE = 2.0
 _CALM, _OF_NORMAL_CALM = 0.25, 0.3186  # quantile that strain in half of the field leaves alone
+_SURELY_CALM = 3.6  # two standard deviations of that quantile over its value, of one difference
 _FLAT = 1e-2  # extent along the normal, of the largest, that is none
 _NEAR_PX = 5.5  # between subsets of a difference of sixth order: a good speckle, so that the motion has little room
 _BENDS = 1.25  # ratio of scatters with and without bends: for subsets this near the common part of the noise is smaller
+_DROPS = 2.0  # the same ratio, from ten differences on: the quantile of so few is known to a quarter
 _DIFFERENCES = ((1.0, -2.0, 1.0), (1.0, -3.0, 3.0, -1.0))
 
 
@@ -64,7 +66,7 @@ def observed_over_reported(
     off, variance = _off_linear(pair, points, which, xy_px, shape)
     area = min(1.0, (spacing / subset_px) ** 2)
     out = np.full((len(_DIFFERENCES), 3), np.nan)
-    least = np.full(3, np.inf)
+    least, at_most = np.full(3, np.inf), np.full(3, np.inf)
     for i, weights in enumerate(_DIFFERENCES):
         by_direction = _differences(off, variance, int(np.ceil((subset_px + _APART_PX) / spacing)), np.array(weights))
         ratio = np.concatenate([np.zeros((0, 3)), *by_direction])
@@ -74,25 +76,30 @@ def observed_over_reported(
             out[i] = np.maximum(scale[0], np.minimum(_UNCERTAINTY * scale.max(axis=0), 1.0))
         for one in by_direction:
             if len(one) * area >= _FEW_INDEPENDENT:
-                calm = np.quantile(np.abs(one), _CALM, axis=0) / _OF_NORMAL_CALM
-                least = np.minimum(least, _UNCERTAINTY * calm)
+                calm = _UNCERTAINTY * np.quantile(np.abs(one), _CALM, axis=0) / _OF_NORMAL_CALM
+                least = np.minimum(least, calm)
+                at_most = np.minimum(at_most, (1.0 + _SURELY_CALM / np.sqrt(len(one) * area)) * calm)
     found = np.fmin(out[0], out[1])
     # noise scatters alike in all directions and nearly everywhere, localised strain does not: that raises nothing
-    found = np.where((found > 1.0) & (least < _CLEARLY_LESS * found), np.maximum(least, 1.0), found)
+    found = np.where((found > 1.0) & (at_most < _CLEARLY_LESS * found), np.maximum(least, 1.0), found)
+    moves = np.zeros(3, bool)
     if (found > _AS_REPORTED[1]).any():
         # a bending motion is no scatter: in the sixth order little of it remains
         if which.sum() < points.ok.sum():  # a difference has sixteen points: of a part of them there are few
             off, variance = _off_linear(pair, points, points.ok, xy_px, shape)
         for weights in reversed(_DIFFERENCES):  # a field with gaps has more places for nine points than for sixteen
             ratio = _mixed_differences(off, variance, int(np.ceil((subset_px + _NEAR_PX) / spacing)), np.array(weights))
+            if len(ratio) * area < _FEW_INDEPENDENT:
+                continue
+            left = np.maximum(np.quantile(np.abs(ratio), _QUANTILES[0], axis=0) / _OF_NORMAL[0], 1.0)
+            moves |= (found > _MAX_RAISE) & (found > _DROPS * left)
             if len(ratio) * area >= _MIN_INDEPENDENT:
-                left = np.maximum(np.quantile(np.abs(ratio), _QUANTILES[0], axis=0) / _OF_NORMAL[0], 1.0)
                 found = np.where(found > _BENDS * left, left, found)
                 break
-    # no residuals are off by so much: that is the motion, and the directions without one show what noise scatters
-    moves, calm = found > _MAX_RAISE, found <= _MAX_RAISE
-    if calm.any():
-        found[moves] = max(1.0, found[calm].max())
+    # scatter beyond any noise's, which grows with the distance: the directions that move evenly show what noise scatters
+    even = found <= _MAX_RAISE
+    if even.any():
+        found[moves & ~even] = max(1.0, found[even].max())
     return np.asarray(found)
 
 
