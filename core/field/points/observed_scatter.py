@@ -96,7 +96,7 @@ def observed_over_reported(
             if len(ratio) * area >= _MIN_INDEPENDENT:
                 found = np.where(found > _BENDS * left, left, found)
                 break
-    # scatter beyond any noise's, which grows with the distance: the directions that move evenly show what noise scatters
+    # no noise scatters more over a longer distance: directions that move evenly show how much it does
     even = found <= _MAX_RAISE
     if even.any():
         found[moves & ~even] = max(1.0, found[even].max())
