@@ -164,7 +164,8 @@ def test_blur_of_one_camera_at_t_is_reported_as_it_scatters(flat, which, subset_
 def test_a_smear_as_long_as_the_speckle_leaves_no_point_far_off(flat, seed):
     """The calmest of few differences, calm by chance, passed the others' scatter off as strain in one place."""
     images = [*flat.clean[:2], *(uniform_filter1d(image, 7, axis=1) for image in flat.clean[2:])]
-    assert flat.beside(flat.measured(images, options=MeasureOptions(subset_px=21), seed=seed)).worst < 6.0
+    field = flat.measured(images, options=MeasureOptions(subset_px=21), seed=seed)
+    assert not field.valid.any() or flat.beside(field).worst < 6.0
 
 
 @pytest.mark.fault(66)
