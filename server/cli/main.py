@@ -35,7 +35,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "live": ("stereorig.server.cli.operation.live", "measure a test while it runs: begin, show, stop"),
     "calibrate": ("stereorig.server.cli.measurement.calibrate", "calibrate a pair of cameras from grid images"),
-    "expect": ("stereorig.server.cli.operation.expect", "predict the uncertainties of a planned measurement"),
+    "expect": ("stereorig.server.cli.planning.expect", "predict the uncertainties of a planned measurement"),
+    "print": ("stereorig.server.cli.planning.prints", "calibration targets and speckle as PDF or SVG, in true mm"),
     "channels": (
         "stereorig.server.cli.operation.channels",
         "a load frame's record, aligned with the steps of a test by time",

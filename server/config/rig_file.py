@@ -680,6 +680,14 @@ class RigConfig(_Closed):
         return [*cameras, *(["stage"] if self.stage_is_simulated else [])]
 
     @property
+    def mm_per_px(self) -> float | None:
+        """Return the size of a pixel at the stand-off, mean of both cameras; None if a stand-off is not stated."""
+        one, two = self.cam1, self.cam2
+        if one.standoff_mm is None or two.standoff_mm is None:
+            return None
+        return 0.5 * (one.standoff_mm / one.phd_px + two.standoff_mm / two.phd_px)
+
+    @property
     def axes(self) -> tuple[int, ...]:
         """Stage axes that the cameras use; none without a stage."""
         return () if self.stage is None else tuple(sorted({self.cam1.stage_axis, self.cam2.stage_axis}))

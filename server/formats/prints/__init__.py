@@ -1,0 +1,1 @@
+"""Targets and speckle as vector drawings in true millimetres."""
