@@ -55,6 +55,8 @@ class PlannedMeasurement(Settings):
     translations_mm: Annotated[list[Annotated[Real, Field(ge=0.0, le=1e3)]], Field(min_length=1, max_length=5)] = Field(
         [0.5, 2.0], description="Translations of the body, each along X, Y and Z in turn."
     )
+    exposure_ms: Positive | None = Field(None, description="Exposure, for the blur by motion.")
+    speed_mm_s: Positive | None = Field(None, description="Speed of the specimen, for the blur by motion.")
     length_mm: Positive = Field(10.0, description="The length whose uncertainty is predicted, about the middle.")
     area_mm: Positive = Field(5.0, description="Side of the square over which means are taken, about the middle.")
 
@@ -71,6 +73,9 @@ class PlannedRig(Settings):
 
     focal_mm: Positive | None = Field(None, description="Focal length of both lenses; needs pixel_um.")
     pixel_um: Annotated[Real, Field(ge=0.1, le=100.0)] | None = Field(None, description="Width of a sensor's pixel.")
+    f_number: Annotated[Real, Field(ge=0.5, le=100.0)] | None = Field(
+        None, description="Aperture of both lenses, for the depth of field."
+    )
     phd_px: Positive | None = Field(None, description="Pinhole distance of both cameras, in place of focal_mm.")
     image_size_px: tuple[Annotated[Whole, Field(ge=16, le=32767)], Annotated[Whole, Field(ge=16, le=32767)]] | None = (
         Field(None, description="Width and height of both images.")

@@ -96,3 +96,28 @@ def test_the_service_predicts_the_same_for_a_rig_that_differs_from_its_own(clien
     assert stage > 0.0
     wrong = client.post("/api/v1/calibrations:expect", json={"measurement": {"subset_px": 20}})
     assert wrong.status_code == 422
+
+
+def test_what_the_cameras_see_follows_from_what_is_stated(capsys: pytest.CaptureFixture[str]) -> None:
+    plain = document(capsys, *NOT_THERE)["views"]["cam1"]
+    # similar triangles: 2448 pixels of 5 um behind 35 mm, at 500 mm
+    assert plain["field_mm"][0] == pytest.approx(2448 * 0.005 * 500.0 / 35.0)
+    assert plain["um_per_px"] == pytest.approx(5.0 * 500.0 / 35.0)
+    assert plain["speckle_mm"] == pytest.approx([3e-3 * plain["um_per_px"], 5e-3 * plain["um_per_px"]])
+    assert (plain["depth_mm"], plain["blur_px"]) == (None, None)
+    assert plain["missing"] == ["f_number", "exposure_ms", "speed_mm_s"]
+    moved = ("--f-number", "8", "--exposure-ms", "10", "--speed-mm-s", "2")
+    full = document(capsys, *NOT_THERE, *moved)["views"]["cam2"]
+    assert full["missing"] == []
+    # 0.02 mm of motion during the exposure
+    assert full["blur_px"] == pytest.approx(0.02 / (1e-3 * full["um_per_px"]))
+    # a thin lens with the sensor at 35 mm in focus on 500 mm: the cone of a point elsewhere, cut by the sensor
+    pupil, sensor = 35.0 / 8.0, 35.0
+    for z in (500.0 - full["depth_mm"][0], 500.0 + full["depth_mm"][1]):
+        image = 1.0 / (1.0 / 500.0 + 1.0 / sensor - 1.0 / z)
+        assert pupil * abs(image - sensor) / image == pytest.approx(0.005, rel=1e-9)
+    assert main(["expect", *NOT_THERE, *moved]) == 0
+    shown = capsys.readouterr().out
+    assert "mm nearer to" in shown
+    assert main(["expect", *NOT_THERE]) == 0
+    assert "not stated: f_number, exposure_ms, speed_mm_s" in capsys.readouterr().out

@@ -147,6 +147,20 @@ class PlannedQuantityReply(Reply):
     missing: str = Field(description="Reason why it is not known.", examples=[""])
 
 
+class ExpectedView(Reply):
+    """What a camera sees at its stand-off."""
+
+    field_mm: tuple[float, float] = Field(description="Width and height of its field of view.", examples=[[175, 146]])
+    um_per_px: float = Field(description="Size of a pixel on the specimen.", examples=[71.4])
+    speckle_mm: tuple[float, float] = Field(description="Diameters of speckle of 3 and 5 px.", examples=[[0.21, 0.36]])
+    depth_mm: tuple[float, float | None] | None = Field(
+        description="Distances nearer and farther at which a point is blurred to one pixel; null: without end, or "
+        "focal length and f-number are not stated."
+    )
+    blur_px: float | None = Field(description="Motion during the exposure; null if that or the speed is not stated.")
+    missing: list[str] = Field(description="Values that are not stated.", examples=[["f_number"]])
+
+
 class ExpectReply(Reply):
     """Expected uncertainty of a plan."""
 
@@ -161,6 +175,7 @@ class ExpectReply(Reply):
     refused: bool = Field(description="True if views at these positions would be refused.")
     reasons: list[str] = Field(description="Reasons.")
     measurement: AssumedMeasurement = Field(description="Assumptions of the quantities.")
+    views: dict[str, ExpectedView] = Field(description="What each camera sees, by its name.")
     quantities: list[PlannedQuantityReply] = Field(description="Quantities of a measurement about the middle.")
 
 

@@ -95,8 +95,29 @@ def table(document: Mapping[str, Any]) -> str:
         for row in rows
     ]
     lines += ["", document["assumed"]["text"], document["measurement"]["text"]]
+    lines += [f"{name}: {_seen(view)}" for name, view in document["views"].items()]
     lines += [f"would be refused: {reason}" for reason in document["reasons"]]
     return "\n".join(line.rstrip() for line in lines)
+
+
+def _seen(view: Mapping[str, Any]) -> str:
+    """Write what a camera sees in one line, and the values that are missing for more."""
+    width, height = view["field_mm"]
+    small, large = view["speckle_mm"]
+    parts = [
+        f"field {width:.4g} x {height:.4g} mm",
+        f"{view['um_per_px']:.4g} um per px",
+        f"speckle of 3 to 5 px: {small:.3g} to {large:.3g} mm",
+    ]
+    if view["depth_mm"] is not None:
+        near, far = view["depth_mm"]
+        end = "without end" if far is None else f"{far:.3g} mm farther"
+        parts.append(f"blurred by less than 1 px from {near:.3g} mm nearer to {end}")
+    if view["blur_px"] is not None:
+        parts.append(f"blur by motion {view['blur_px']:.3g} px")
+    if view["missing"]:
+        parts.append(f"not stated: {', '.join(view['missing'])}")
+    return "; ".join(parts)
 
 
 def _base(path: Path | None, planned: PlannedRig) -> tuple[dict[str, Any], tuple[float, ...], Any]:

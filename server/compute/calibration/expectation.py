@@ -18,6 +18,7 @@ from stereorig.core.names import CAMERAS
 from stereorig.core.plan.quantities import planned_quantities
 from stereorig.core.plan.settings import PlannedMeasurement, PlannedRig
 from stereorig.core.plan.synthetic import correlation_px, match_variance_px2
+from stereorig.core.plan.view import planned_view
 from stereorig.server.compute.calibration.inputs import nominals_of, options_of, target_of
 
 Localiser = Literal["profile", "paper"]
@@ -52,7 +53,9 @@ def rig_as_planned(rig: dict[str, Any], planned: PlannedRig) -> dict[str, Any]:
     out = rig | _stated(stage) | {"target": rig["target"] | _stated(target)}
     for name, sign in zip(CAMERAS, (-1.0, 1.0), strict=True):
         angle = None if planned.angle_deg is None else 0.5 * sign * planned.angle_deg
-        out[name] = rig[name] | _stated(camera | {"angle_deg": angle})
+        lens = _stated({"focal_length_mm": planned.focal_mm, "f_number": planned.f_number})
+        stated = _stated(camera | {"angle_deg": angle})
+        out[name] = rig[name] | stated | {"lens": (rig[name].get("lens") or {}) | lens}
     return out
 
 
@@ -118,8 +121,24 @@ def expectation_document(
             "gradient_grey_per_px": measured.contrast_grey / correlation_px(measured),
             "text": _measured_text(measured),
         },
+        "views": {name: _view(rig[name], measured) for name in CAMERAS},
         "quantities": [asdict(q) | {"budget": dict(q.budget)} for q in quantities],
     }
+
+
+def _view(camera: dict[str, Any], measured: PlannedMeasurement) -> dict[str, object]:
+    """Return what a camera sees, as far as the rig file and the plan state it."""
+    lens = camera.get("lens") or {}
+    found = planned_view(
+        camera["image_size_px"],
+        camera["phd_px"],
+        camera["standoff_mm"],
+        focal_mm=lens.get("focal_length_mm"),
+        f_number=lens.get("f_number"),
+        exposure_ms=camera.get("exposure_ms") if measured.exposure_ms is None else measured.exposure_ms,
+        speed_mm_s=measured.speed_mm_s,
+    )
+    return asdict(found)
 
 
 def _line_model(target: AnyTarget, localiser: Localiser) -> LineModel:
