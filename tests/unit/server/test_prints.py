@@ -96,9 +96,7 @@ def test_opencv_finds_the_boards(name: str, per_mm: float) -> None:
     target = TARGETS[name]
     assert isinstance(target, BoardTarget)
     found = opencv_points(as_seen(pdf_image(target_drawing(target), per_mm)), target)
-    # its blobs and interpolated ChArUco corners have errors of hundredths of a pixel, over 500 pixels and more
-    bound = EXACT if target.kind == "checkerboard" else 1e-4
-    assert np.abs(pitch_errors(found, nominal(target), per_mm)).max() < bound
+    assert np.abs(pitch_errors(found, nominal(target), per_mm)).max() < EXACT
 
 
 @pytest.mark.parametrize("per_mm", [4.0, 7.5, 10.0])
