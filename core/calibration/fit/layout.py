@@ -211,8 +211,8 @@ class Priors:
     free
         (size,) False for held unknowns.
     carried
-        (size,) 1 over the variance of unknowns whose uncertainty is propagated into the covariance: held ones, and
-        those that may err by more than the fit allows; 0 elsewhere.
+        (size,) 1 over the variance of unknowns whose uncertainty is propagated into the covariance: of held ones, and of
+        others that may err by more than the fit allows; 0 elsewhere.
     node_weight
         (3,) 1 over the variance of a node's corrections along X, Y and Z; infinite for a held one.
     """
