@@ -16,9 +16,6 @@ from stereorig.core.names import CameraName
 Moves = Literal["cameras", "target", "both_cameras", "free"]
 MOVES: tuple[Moves, ...] = get_args(Moves)
 
-#: of the scale of a stage that is not declared, in the fit and in the covariance: a wide lens absorbs a scale error that
-#: no test finds, and screws of the coarsest grade are off by 7e-4
-STAGE_SCALE_SIGMA, UNDECLARED_SCALE_SIGMA = 1e-4, 1e-3
 _MIN_SPREAD_PX = 5.0  # rms over the narrower direction
 
 

@@ -13,8 +13,8 @@ from stereorig.core.calibration.choice.contradictions import FAILED_LEVEL
 from stereorig.core.calibration.choice.declared import DECLARED, SCALE, SCALE_GROUPS
 from stereorig.core.calibration.choice.screening import DroppedView
 from stereorig.core.calibration.choice.structure import Structure
-from stereorig.core.calibration.fit.layout import ASPECT_SIGMA
-from stereorig.core.calibration.inputs import UNDECLARED_SCALE_SIGMA, CalibrationOptions, Moves
+from stereorig.core.calibration.fit.layout import ASPECT_SIGMA, UNDECLARED_SCALE_SIGMA
+from stereorig.core.calibration.inputs import CalibrationOptions, Moves
 from stereorig.core.calibration.result import CheckDone, Level, Verdict, ViewResult
 from stereorig.core.calibration.uncertainty import VolumeUncertainty
 from stereorig.core.cameras.lens import LensModel

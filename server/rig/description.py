@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from datetime import UTC, datetime
-from typing import Annotated, Literal
+from typing import Literal
 
-from pydantic import ConfigDict, Field, field_validator
+from pydantic import ConfigDict, Field
 
-from stereorig.core.calibration.inputs import STAGE_SCALE_SIGMA
 from stereorig.core.names import CameraName
 from stereorig.drivers.cameras.protocol import CameraDescription, CameraIdentity, CameraSettings
 from stereorig.drivers.stages.controllers import ControllerStatus, DeviceState
@@ -49,15 +48,6 @@ class UsualPlan(CalibrationSection):
     """The rig file's plan of a calibration."""
 
     model_config = ConfigDict(extra="allow")
-
-    stage_scale_sigma: Annotated[float, Field(ge=0.0, le=0.1)] = Field(
-        STAGE_SCALE_SIGMA, description="Prior on the relative error of the stage's scale in the fit; 0: exact."
-    )
-
-    @field_validator("stage_scale_sigma", mode="before")
-    @classmethod
-    def _of_fit(cls, value: float | None) -> float:
-        return STAGE_SCALE_SIGMA if value is None else value
 
 
 # cameras -----------------------------------------------------------------------------------------------------------
