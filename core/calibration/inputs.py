@@ -229,8 +229,7 @@ class CalibrationOptions:
         moves cx by 12 px at the same RBE), so it must be declared; it is carried into the covariance. 0 holds the axis
         fixed. Default 1 mrad, as a careful alignment reaches.
     stage_scale_sigma
-        Prior on a stage's relative scale error; 0: exact. None: undeclared. The fit and the tests for contradictions
-        then take 1e-4, a good screw's lead, and the covariance 1e-3, as far as the views do not show the error.
+        Prior on a stage's relative scale error; 0: exact. Default 1e-4, a screw's lead without a certificate.
     stage_step_sigma_mm
         Prior on the error of each position read back; 0: exact.
     aspect_sigma
@@ -254,7 +253,7 @@ class CalibrationOptions:
     hold_out_tolerance_mm: float = 0.02
     centre_sigma_px: float = 20.0
     axis_tilt_sigma_rad: float = 1e-3
-    stage_scale_sigma: float | None = None
+    stage_scale_sigma: float = 1e-4
     stage_step_sigma_mm: float = 0.0
     aspect_sigma: float | None = None
     estimate_nodes: bool | None = None

@@ -129,7 +129,7 @@ def build_result(
             options=options,
             moves=problem.moves,
             aspect_estimated=aspect_estimated,
-            aspect_carried=bool(adjustment.priors.carried[layout.lens(0).stop - 1]),
+            aspect_carried=bool(adjustment.priors.carried.any()),
             stage_over_pitch=chosen.stage_over_pitch,
         ),
         verdict=verdict,

@@ -13,7 +13,7 @@ from stereorig.core.calibration.choice.contradictions import FAILED_LEVEL
 from stereorig.core.calibration.choice.declared import DECLARED, SCALE, SCALE_GROUPS
 from stereorig.core.calibration.choice.screening import DroppedView
 from stereorig.core.calibration.choice.structure import Structure
-from stereorig.core.calibration.fit.layout import ASPECT_SIGMA, UNDECLARED_SCALE_SIGMA
+from stereorig.core.calibration.fit.layout import ASPECT_SIGMA
 from stereorig.core.calibration.inputs import CalibrationOptions, Moves
 from stereorig.core.calibration.result import CheckDone, Level, Verdict, ViewResult
 from stereorig.core.calibration.uncertainty import VolumeUncertainty
@@ -218,15 +218,12 @@ def checks_made(
         ]
     if stage_over_pitch is not None:
         off, sigma = stage_over_pitch
-        declared = "both as declared"
-        if options.stage_scale_sigma is None:
-            declared = f"the pitch as declared and {100.0 * UNDECLARED_SCALE_SIGMA:g} % of the stage's scale"
         text = f"By the pitch, the stage travels {100.0 * off:+.2f} +- {100.0 * sigma:.2f} % farther than it reads."
         seen = sigma < options.max_shape_uncertainty
         if not seen:
             text += (
                 f" A pitch or a stage that is wrong by up to {300.0 * sigma:.2g} % would not show in these views, and "
-                f"the reported error takes {declared}: measure a known distance with both cameras."
+                "the reported error takes both as declared: measure a known distance with both cameras."
             )
         checks.append(CheckDone("scales", seen, text))
     checks.append(

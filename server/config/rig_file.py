@@ -431,10 +431,8 @@ class CalibrationSection(_Closed):
     axis_tilt_sigma_rad: Annotated[float, Field(ge=0.0, le=0.1)] = Field(
         1e-3, description="Prior on the angle between stage axis and optical axis; carried into the covariance."
     )
-    stage_scale_sigma: Annotated[float, Field(ge=0.0, le=0.1)] | None = Field(
-        None,
-        description="Prior on the relative error of the stage's scale; left out: 1e-4 in the fit, 1e-3 in the reported "
-        "uncertainty as far as the views do not show it. 0: exact.",
+    stage_scale_sigma: Annotated[float, Field(ge=0.0, le=0.1)] = Field(
+        1e-4, description="Prior on the relative error of the stage's scale; 0: exact."
     )
     stage_step_sigma_mm: Annotated[float, Field(ge=0.0, le=1.0)] | None = Field(
         None, description="Prior on the error of each position read back; left out: by the stage's resolution_mm."

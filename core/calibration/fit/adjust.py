@@ -121,7 +121,7 @@ def adjust(
                 layout, fit.state, views, nominal_nodes_mm, priors, max_iterations, fit.noise_px, rounds, fit.iterations
             )
     normal = assemble(layout, fit.state, views, nominal_nodes_mm, priors.opened, fit.noise_px)
-    unknowns, by_prior = _with_held(layout, normal, priors, fit.covariance, fit.by_prior)
+    unknowns, by_prior = _with_held(layout, normal, fit.covariance, fit.by_prior)
     return replace(fit, priors=priors, covariance=unknowns, by_prior=by_prior)
 
 
@@ -161,7 +161,7 @@ def expected_covariance(
         if _left_share(assemble(layout, surely, views, nominal_nodes_mm, priors, noise_px), held) < _LEFT_TILT:
             unknowns, by_prior = stated(priors)
     normal = assemble(layout, state, views, nominal_nodes_mm, priors.opened, noise_px)
-    return _with_held(layout, normal, priors, unknowns, by_prior)
+    return _with_held(layout, normal, unknowns, by_prior)
 
 
 def _without_tilts(layout: Layout, priors: Priors) -> Priors:
@@ -194,21 +194,12 @@ def _left_share(normal: Normal, held: Priors) -> float:
 
 
 def _with_held(
-    layout: Layout, normal: Normal, priors: Priors, fitted: Float, by_prior: dict[Cause, Float]
+    layout: Layout, normal: Normal, fitted: Float, by_prior: dict[Cause, Float]
 ) -> tuple[Float, dict[Cause, Float]]:
-    """Add the effect of carried unknowns to a fit's covariance (m, m) and its parts.
+    """Add the effect of held unknowns with a prior to a fit's covariance (m, m) and its parts.
 
     ``normal`` has them free; their errors move the other unknowns, too.
     """
-    wide = np.flatnonzero(priors.free & (priors.carried > 0.0))
-    if wide.size:
-        # the fit moves by these errors as by its narrower prior's; they are as large as the views leave them
-        moved = fitted[:, wide] * priors.weight[wide]
-        errors = covariance(normal).unknowns[np.ix_(wide, wide)] - np.diag(1.0 / priors.weight[wide])
-        values, vectors = np.linalg.eigh(errors)
-        moved = moved @ vectors
-        added = (moved * np.maximum(values, 0.0)) @ moved.T
-        fitted, by_prior = fitted + added, {**by_prior, "stage": by_prior["stage"] + added}
     held = np.flatnonzero(normal.free & (np.diagonal(fitted) == 0.0))
     if not held.size:
         return fitted, by_prior

@@ -24,9 +24,6 @@ N_POSE = 6
 #: of a measured aspect ratio whose standard deviation is not stated: section 3.2.2 repeats to some 1e-5, and a grid
 #: tilted by a degree biases it by 1.5e-4; square pixels are exact
 ASPECT_SIGMA = 1e-4
-#: of the scale of a stage that is not declared, in the fit and in the covariance: a wide lens absorbs a scale error that
-#: no test finds, and with no certificate a screw's lead, a belt or a wrong setting are off by some 1e-3
-STAGE_SCALE_SIGMA, UNDECLARED_SCALE_SIGMA = 1e-4, 1e-3
 _LOOSE_ASPECT_SIGMA = 0.05  # where free poses show it: no sensor's pixels are further from the nominal ratio
 _DIRECTION_SIGMA_RAD = 0.5  # direction of a single stage's axis relative to the target's normal
 
@@ -208,8 +205,7 @@ class Priors:
     free
         (size,) False for held unknowns.
     carried
-        (size,) 1 over the variance of unknowns whose uncertainty is propagated into the covariance: of held ones, and of
-        others that may err by more than the fit allows; 0 elsewhere.
+        (size,) 1 over the variance of held unknowns whose uncertainty is propagated into the covariance; 0 elsewhere.
     node_weight
         (3,) 1 over the variance of a node's corrections along X, Y and Z; infinite for a held one.
     """
@@ -223,8 +219,7 @@ class Priors:
     @property
     def opened(self) -> Priors:
         """Priors with all that is carried as unknowns."""
-        carried = self.carried > 0.0
-        return replace(self, free=self.free | carried, weight=np.where(carried, self.carried, self.weight))
+        return replace(self, free=self.free | (self.carried > 0.0), weight=self.weight + self.carried)
 
     @property
     def nodes_free(self) -> int:
@@ -270,10 +265,7 @@ def priors(
     sigma[layout.direction] = _DIRECTION_SIGMA_RAD if staged and layout.moves != "cameras" else 0.0
     for axis in range(2):
         used = any(step[0] == axis for step in layout.steps)
-        scale = STAGE_SCALE_SIGMA if options.stage_scale_sigma is None else options.stage_scale_sigma
-        sigma[layout.stage_scale(axis)] = scale if used else 0.0
-        if used and options.stage_scale_sigma is None:
-            carried[layout.stage_scale(axis)] = UNDECLARED_SCALE_SIGMA**-2
+        sigma[layout.stage_scale(axis)] = options.stage_scale_sigma if used else 0.0
     sigma[layout.pitch_scale] = pitch_scale_sigma
     sigma[layout.motion + 5 : layout.motion + 5 + len(layout.steps)] = options.stage_step_sigma_mm
     free = sigma > 0.0

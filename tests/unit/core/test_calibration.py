@@ -354,11 +354,6 @@ def test_a_scale_that_a_wide_lens_hides_is_no_check_made_and_its_size_is_stated(
     hidden = re.search(r"wrong by up to ([0-9.]+) % would not show", check.text)
     assert hidden is not None
     assert float(hidden[1]) > 0.2
-    # 3.1 um, of which 0.65 were reported where the scale was taken as known to 1e-4
-    true_um = rig_shape_error_um(result.pair, cameras, result.uncertainty.points_mm)
-    assert true_um < 1.5e3 * result.uncertainty.shape_rms_mm
-    certain = calibrate(views, target, nominal, CalibrationOptions(stage_scale_sigma=1e-4))
-    assert certain.uncertainty.shape_rms_mm < 0.3 * result.uncertainty.shape_rms_mm
 
 
 @pytest.mark.parametrize("lens", [(-0.05, 0.1, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0)])

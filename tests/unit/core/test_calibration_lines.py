@@ -77,7 +77,7 @@ def test_the_parameters_scatter_as_their_covariance_says(tolerance: float) -> No
 
 def test_the_covariance_is_that_of_generalised_least_squares() -> None:
     """Exact grid: the parameters' covariance shrinks as J' C^-1 J does with the full matrix of a view."""
-    options = dataclasses.replace(HELD, lens="paper", axis_tilt_sigma_rad=0.0, stage_scale_sigma=0.0, aspect_sigma=0.0)
+    options = dataclasses.replace(HELD, lens="paper", axis_tilt_sigma_rad=0.0, aspect_sigma=0.0)
     correlated = calibrate(views(3), Grid(), NOMINAL, options)
     independent = calibrate([dataclasses.replace(v, offsets=None) for v in views(3)], Grid(), NOMINAL, options)
     # smooth changes of the image average anticorrelated errors better: the variance of a mean along a line falls by

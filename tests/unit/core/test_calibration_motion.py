@@ -70,7 +70,7 @@ def test_the_lens_is_found_and_the_shape_is_as_good_as_reported(lens: str) -> No
 
 def test_decentring_that_the_model_lacks_is_named_and_downgrades_the_verdict() -> None:
     cameras = true_pair("p1 p2 of 3e-4", roll_deg=45.0)
-    options = CalibrationOptions(held_out_mm=(10.0,), lens="paper", stage_scale_sigma=0.0)  # as the views are made
+    options = CalibrationOptions(held_out_mm=(10.0,), lens="paper")
     result = calibrate(staged_views(cameras), GRID, nominal_pair(), options)
     assert result.verdict.level == "warning"
     found = {s.camera: s for s in result.lens.structure if s.name == "decentring"}
