@@ -346,7 +346,7 @@ def _modern_rig(
 @pytest.mark.fault(32)
 def test_a_scale_that_a_wide_lens_hides_is_no_check_made_and_its_size_is_stated() -> None:
     # a lens of 12 mm on pixels of 3.45 um, five coefficients, OpenCV's projection: the stage reads 0.2 % too little
-    views, target, nominal, cameras = _modern_rig(12.0, (-0.1, 0.08, 0.0, 0.0, 0.0), long=1.002)
+    views, target, nominal, _ = _modern_rig(12.0, (-0.1, 0.08, 0.0, 0.0, 0.0), long=1.002)
     result = calibrate(views, target, nominal)
     assert result.verdict.level == "good", "no residual shows it"
     check = {c.name: c for c in result.checks}["scales"]
