@@ -174,9 +174,8 @@ class Known:
         # nor are 0 and 1 in a form, whose values are texts, another kind than true and false
         if wrong and isinstance(case.body, dict) and case.media_type != "application/json":
             case.body = {name: "half" if value in (0, 1, "0", "1") else value for name, value in case.body.items()}
-        if wrong:
-            # a colon in a path is another operation's address
-            case.path_parameters = {name: _no_verb(value) for name, value in (case.path_parameters or {}).items()}
+        # a colon in a path is another operation's address
+        case.path_parameters = {name: _no_verb(value) for name, value in (case.path_parameters or {}).items()}
         parts = case.meta.components if case.meta is not None else {}
         path = next((info for kind, info in parts.items() if kind.value == "path_parameters"), None)
         mutations = getattr(case.meta.phase.data, "mutations", ()) if case.meta is not None else ()
