@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from stereorig.core.errors import InputError
@@ -12,7 +13,7 @@ from stereorig.server.formats.prints.drawing import DRAWING_FORMS, Drawing
 from stereorig.server.formats.prints.measured import measured_print
 from stereorig.server.formats.prints.page import PAPER_HELP
 from stereorig.server.formats.prints.speckle import speckle_mm, speckle_page
-from stereorig.server.formats.prints.targets import target_drawing, target_text, title_of
+from stereorig.server.formats.prints.targets import UNMEASURED_SCALE_SIGMA, target_drawing, target_text, title_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -59,6 +60,8 @@ def run(args: argparse.Namespace) -> int:
     target = read_target(args.file)
     drawing = target_drawing(target, marks=args.marks, **page)
     _write(args.out, drawing)
+    if target.pitch_scale_sigma is None:
+        target = replace(target, pitch_scale_sigma=UNMEASURED_SCALE_SIGMA)
     beside = args.out.with_suffix(".toml")
     write_bytes(beside, target_text(target).encode())
     print(f"written: {beside}; measure the print's rulers, then: stereorig print measured {beside} ...")

@@ -13,6 +13,8 @@ from stereorig.core.target import LINE_GRID, GridTarget, invalid
 from stereorig.server.formats.prints.drawing import Discs, Drawing
 from stereorig.server.formats.prints.page import laid_out
 
+#: standard uncertainty of a print's scale until its rulers are measured: printers and paper change it by thousandths
+UNMEASURED_SCALE_SIGMA = 5e-3
 _DOT_SHARE = 0.5  # of the pitch, for a dot whose diameter is not stated
 
 

@@ -175,6 +175,7 @@ def test_a_print_is_made_and_its_measured_rulers_become_the_pitch(
     assert main(["print", "target", str(wanted), "--out", str(page)]) == 0
     assert page.read_bytes().startswith(b"%PDF")
     assert "not measured" in beside.read_text(encoding="utf-8")
+    assert read_target(beside).pitch_scale_sigma == 5e-3
     both = ["--printed-mm", "100", "200", "--measured-mm", "99.93", "200.4", "--u-mm", "0.05"]
     assert main(["print", "measured", *both, str(beside)]) == 0
     assert "directions differ by 0.27 %" in capsys.readouterr().out
