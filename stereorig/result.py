@@ -71,7 +71,7 @@ class Result:
         kind = "shape" if self.strain is None and not self.field.has_motion else "displacement"
         strain = "" if self.strain is None else f" with strain over {self.strain.options.window} points"
         count = f"{self.valid.sum()} of {self.valid.size} points"
-        return f"<Result of step {self.step}: {kind}{strain}, {count} valid, system frame: {self.frame}>"
+        return f"<Result of step {self.step}: {kind}{strain}, {count} valid, frame: {self.frame}>"
 
     def _repr_html_(self) -> str:
         from stereorig.server.formats.figures.figure import FigureData, draw  # slow to load

@@ -27,7 +27,7 @@ def result() -> Result:
 
 def test_a_result_is_shown_in_one_line(result: Result) -> None:
     assert repr(result) == (
-        "<Result of step 3: displacement with strain over 5 points, 179 of 180 points valid, system frame: target>"
+        "<Result of step 3: displacement with strain over 5 points, 179 of 180 points valid, frame: target>"
     )
 
 
