@@ -102,7 +102,8 @@ def history(files: Sequence[Path], gauge: Ends | Mean) -> History:
     frame = None
     if isinstance(gauge, Mean):
         asked = PlaneAlignment(kind="plane", x_direction="image_rows", x_line_px=gauge.x_line_px)
-        frame = lay(asked, read_field(files[0]), _shared(files[0], read_field(files[0])))
+        first = read_field(files[0])
+        frame = lay(asked, first, _shared(files[0], first))
     readings = [_reading(path, gauge, frame) for path in files]
     n = len(readings)
     moved = [k for k, one in enumerate(readings) if one is not None]

@@ -13,6 +13,6 @@ from tests.support.fuzz_verdict import check_fuzz
 @pytest.mark.filterwarnings("ignore:Generating overly large repr")
 @pytest.mark.fault(51)
 @pytest.mark.fault(52)
-@pytest.mark.parametrize(("each", "min_cases"), [(2, 100), pytest.param(130, 6_500, marks=pytest.mark.deep)])
+@pytest.mark.parametrize(("each", "min_cases"), [(4, 200), pytest.param(130, 6_500, marks=pytest.mark.deep)])
 def test_generated_requests(tmp_path: Path, each: int, min_cases: int) -> None:
     check_fuzz(tmp_path, phases=("fuzzing",), each=each, seed=20261123, min_cases=min_cases)

@@ -37,7 +37,7 @@ def test_nothing_goes_past_the_one_object_that_changes_the_folder(day: Recording
 
 
 @pytest.mark.timeout(1200)
-@pytest.mark.parametrize("every", [16, pytest.param(2, marks=pytest.mark.deep)])
+@pytest.mark.parametrize("every", [8, pytest.param(2, marks=pytest.mark.deep)])
 def test_no_state_loses_what_was_acknowledged(day: Recording, tmp_path: Path, every: int) -> None:
     states = crash_states(day, random.Random(1), STATES, every)
     found = look_at_all(day, tmp_path, states, print)

@@ -13,6 +13,7 @@ from stereorig.server.evaluations.door import Evaluated, Evaluation, evaluate
 
 FOLDER, NAME = "folder", "name"
 _MOST = 1000
+_REMEDY = "Give a CSV with the columns folder, name and those of settings, a measurement a row."
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -26,11 +27,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
     try:
         text = path.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
-        raise InputError(
-            f"{path} cannot be read: {error.strerror}.",
-            code="batch_invalid",
-            remedy="Give a CSV with the columns folder, name and those of settings, a measurement a row.",
-        ) from error
+        raise InputError(f"{path} cannot be read: {error.strerror}.", code="batch_invalid", remedy=_REMEDY) from error
     table = csv.DictReader(io.StringIO(text))
     rows = [{key.strip(): (cell or "").strip() for key, cell in row.items() if key} for row in table]
     named = [row.get(NAME) or Path(row.get(FOLDER, "")).name for row in rows]
@@ -42,11 +39,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
     if not why and any(name in ("", ".", "..") or "/" in name or "\\" in name for name in named):
         why = "has a name that is no file name"
     if why:
-        raise InputError(
-            f"{path.name} {why}.",
-            code="batch_invalid",
-            remedy="Give a CSV with the columns folder, name and those of settings, a measurement a row.",
-        )
+        raise InputError(f"{path.name} {why}.", code="batch_invalid", remedy=_REMEDY)
     return [{**row, NAME: name} for row, name in zip(rows, named, strict=True)]
 
 
