@@ -21,7 +21,7 @@ from stereorig.core.errors import ImageError
 from stereorig.server.formats.codecs.flat import PNG_HEAD, decode_bmp, decode_png
 from stereorig.server.formats.codecs.jpeg import decode_jpeg
 from stereorig.server.formats.codecs.refusals import too_large, unreadable, unsupported
-from stereorig.server.formats.codecs.tiff import MAGIC, decode_tiff
+from stereorig.server.formats.codecs.tiff import MAGIC, decode_tiff, orientation_of, upright
 from stereorig.server.formats.files import write_bytes
 from stereorig.server.formats.manifest import checked_bytes
 
@@ -120,7 +120,8 @@ def _samples(data: bytes, name: str) -> tuple[NDArray[Any], str, int]:
         elif data[:2] == b"BM":
             pixels = decode_bmp(data, name)
         elif data[:2] == b"\xff\xd8":
-            pixels = decode_jpeg(data, name)
+            pixels, exif = decode_jpeg(data, name)
+            pixels = upright(pixels, orientation_of(exif))
         else:
             raise unreadable(name, "it is none of TIFF, PNG, BMP, JPEG" if data else "it is empty")
     except OSError as error:  # of Pillow

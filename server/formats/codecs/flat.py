@@ -13,14 +13,17 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from stereorig.core.errors import ImageError
-from stereorig.server.formats.codecs.refusals import check_size, unreadable, unsupported
+from stereorig.server.formats.codecs.refusals import MAX_PIXELS, check_size, too_large, unreadable, unsupported
+from stereorig.server.formats.codecs.tiff import orientation_of, upright
 
 PNG_HEAD = b"\x89PNG\r\n\x1a\n"
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG's colour type
 _DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
 #: first row and column, then steps, of the seven parts of an interlaced PNG
 _ADAM7 = ((0, 0, 8, 8), (0, 4, 8, 8), (4, 0, 8, 4), (0, 2, 4, 4), (2, 0, 4, 2), (0, 1, 2, 2), (1, 0, 2, 1))
+MAX_PNG_BYTES = 4 * MAX_PIXELS  # colours of 16 bit in the largest image take its reader gigabytes
 _KEPT = (b"PLTE", b"tRNS")  # these chunks change pixels; texts, profiles and times do not reach the decoder
+_EXIF = b"eXIf"
 _AT_ONCE = 1 << 20
 _BMP_PLAIN, _BMP_MASKS = 0, 3
 _BMP_DEPTHS = (1, 4, 8, 16, 24, 32)
@@ -43,21 +46,22 @@ def decode_png(data: bytes, name: str) -> NDArray[Any]:
     check_size(name, width, height)
     if depth not in _DEPTHS.get(colour, ()) or head[10] or head[11] or interlaced > 1:
         raise unreadable(name, "PNG, its header is altered")
-    parts, packed = _chunks(data, name)
     bits = depth * _CHANNELS[colour]
     passes = _ADAM7 if interlaced else ((0, 0, 1, 1),)
     sizes = [(-(-(height - top) // down), -(-(width - left) // right)) for top, left, down, right in passes]
     expected = sum(rows * (1 + (cols * bits + 7) // 8) for rows, cols in sizes if rows > 0 and cols > 0)
+    if expected > MAX_PNG_BYTES:
+        raise too_large(f"The pixels of {name} have {expected} bytes; at most {MAX_PNG_BYTES} of a PNG are read.")
+    parts, packed = _chunks(data, name)
     if colour == 3 and b"PLTE" not in parts:
         raise unreadable(name, "PNG, its palette is missing")
     kept = [(kind, parts[kind]) for kind in _KEPT if kind in parts]
-    stored = _stored(packed, expected, name)
-    del packed
-    whole = b"".join([PNG_HEAD, *(_chunk(*one) for one in [(b"IHDR", head), *kept]), *stored, _chunk(b"IEND", b"")])
-    del stored
-    if depth == 16 and colour != 0:
-        return _deep_colour(whole, name)  # Pillow would cut it to 8 bit without a word
-    return _by_pillow(whole, name, "PNG")
+    whole = bytearray(b"".join([PNG_HEAD, *(_chunk(*one) for one in [(b"IHDR", head), *kept])]))
+    _store(packed, expected, name, whole)
+    whole += _chunk(b"IEND", b"")
+    # Pillow would cut colours of 16 bit to 8 without a word
+    pixels = _deep_colour(whole, name) if depth == 16 and colour != 0 else _by_pillow(whole, name, "PNG")
+    return upright(pixels, orientation_of(parts.get(_EXIF, b"")))
 
 
 def _chunks(data: bytes, name: str) -> tuple[dict[bytes, bytes], list[memoryview]]:
@@ -77,8 +81,8 @@ def _chunks(data: bytes, name: str) -> tuple[dict[bytes, bytes], list[memoryview
             if packed and last != b"IDAT":
                 raise unreadable(name, "PNG, its rows are parted by another chunk")
             packed.append(view[at + 8 : end - 4])
-        elif kind == b"IHDR" or kind in _KEPT:
-            if kind in parts or length > 1024:
+        elif kind in (b"IHDR", *_KEPT, _EXIF):
+            if kind in parts or (length > 1024 and kind != _EXIF):
                 raise unreadable(name, f"PNG, {kind.decode()} occurs twice or is too long")
             parts[kind] = data[at + 8 : end - 4]
         elif kind[0] & 32 == 0 and kind != b"IEND":
@@ -87,12 +91,13 @@ def _chunks(data: bytes, name: str) -> tuple[dict[bytes, bytes], list[memoryview
     return parts, packed
 
 
-def _stored(packed: list[memoryview], expected: int, name: str) -> list[bytes]:
-    """Return a PNG's rows as chunks without compression; exactly ``expected`` bytes of rows must be there."""
+def _store(packed: list[memoryview], expected: int, name: str, out: bytearray) -> None:
+    """Append a PNG's rows as chunks without compression; exactly ``expected`` bytes of rows must be there."""
     inflate, store = zlib.decompressobj(), zlib.compressobj(0)
-    out, found = [], 0
+    found = 0
     try:
-        for part in packed:
+        # in pieces: what is not decompressed yet is copied each time
+        for part in (one[k : k + _AT_ONCE] for one in packed for k in range(0, len(one), _AT_ONCE)):
             left: bytes | memoryview = part
             piece = bytes(_AT_ONCE)
             while (left or len(piece) == _AT_ONCE) and not inflate.eof:
@@ -102,12 +107,12 @@ def _stored(packed: list[memoryview], expected: int, name: str) -> list[bytes]:
                 if found > expected:
                     raise unreadable(name, f"PNG, it holds more than the {expected} bytes of its rows")
                 if piece:
-                    out.append(_chunk(b"IDAT", store.compress(piece)))
+                    out += _chunk(b"IDAT", store.compress(piece))
     except zlib.error as error:
         raise unreadable(name, f"PNG, its rows are damaged ({error})") from error
     if not inflate.eof or found != expected:
         raise unreadable(name, f"PNG, it holds {found} of the {expected} bytes of its rows")
-    return [*out, _chunk(b"IDAT", store.flush())]
+    out += _chunk(b"IDAT", store.flush())
 
 
 def _chunk(kind: bytes, content: bytes) -> bytes:
@@ -149,7 +154,7 @@ def decode_bmp(data: bytes, name: str) -> NDArray[Any]:
     return _by_pillow(data, name, "BMP")
 
 
-def _by_pillow(data: bytes, name: str, kind: str) -> NDArray[Any]:
+def _by_pillow(data: bytes | bytearray, name: str, kind: str) -> NDArray[Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own limit was checked before
@@ -170,7 +175,7 @@ def _by_pillow(data: bytes, name: str, kind: str) -> NDArray[Any]:
         raise unreadable(name, f"{type(error).__name__}, {error}") from error
 
 
-def _deep_colour(data: bytes, name: str) -> NDArray[Any]:
+def _deep_colour(data: bytearray, name: str) -> NDArray[Any]:
     """Return (rows, cols, 3 or 4) red, green, blue of a PNG in colour of 16 bit."""
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -178,5 +183,6 @@ def _deep_colour(data: bytes, name: str) -> NDArray[Any]:
         raise unreadable(name, "PNG, it cannot be decoded") from error
     if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
         raise unsupported(name, "it is a colour image of 16 bit that cannot be read")
-    order = [2, 1, 0] if pixels.shape[2] == 3 else [2, 1, 0, 3]
-    return np.asarray(pixels[..., order])
+    for row in pixels:  # in place, since an image may have a gigabyte
+        row[:, :3] = row[:, 2::-1].copy()
+    return np.asarray(pixels)

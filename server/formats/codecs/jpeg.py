@@ -19,31 +19,32 @@ _MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _FRAMES = (0xC0, 0xC1, 0xC2)  # baseline, extended, progressive: 8 bits, Huffman codes
 _PROGRESSIVE = 0xC2
 _OTHER_FRAMES = (0xC3, *range(0xC5, 0xC8), *range(0xC9, 0xCC), *range(0xCD, 0xD0))
-_SCAN, _END, _HEIGHT_LATER = 0xDA, 0xD9, 0xDC
+_SCAN, _END, _HEIGHT_LATER, _APP1 = 0xDA, 0xD9, 0xDC, 0xE1
+_EXIF = b"Exif\0\0"
 _BARE = (*range(0xD0, 0xD9), 0x00, 0x01)  # markers without a length
 _MAX_SCANS = 100
 _PIXELS_A_BYTE = 2048  # at most: each block of 64 pixels has a bit and more, of channels of a quarter of the pixels too
 
 
-def decode_jpeg(data: bytes, name: str) -> NDArray[Any]:
-    """Return (rows, cols) or (rows, cols, 3) uint8 of a JPEG file.
+def decode_jpeg(data: bytes, name: str) -> tuple[NDArray[Any], bytes]:
+    """Return (rows, cols) or (rows, cols, 3) uint8 of a JPEG as stored, and its EXIF data.
 
     Raises
     ------
     ImageError
         ``image_unreadable``, ``image_unsupported``, ``image_too_large``.
     """
-    components = _checked(data, name)
+    components, exif = _checked(data, name)
     try:
         pixels = simplejpeg.decode_jpeg(data, "GRAY" if components == 1 else "RGB", strict=True)
     except ValueError as error:
         raise unreadable(name, f"JPEG, {error}") from error
-    return np.asarray(pixels[..., 0] if components == 1 else pixels)
+    return np.asarray(pixels[..., 0] if components == 1 else pixels), exif
 
 
-def _checked(data: bytes, name: str) -> int:
-    """Return the number of components, once every marker and scan was found to be there."""
-    at, frame, scans = 2, None, 0
+def _checked(data: bytes, name: str) -> tuple[int, bytes]:
+    """Return the number of components and the EXIF data, once every marker and scan was found to be there."""
+    at, frame, scans, exif = 2, None, 0, b""
     missing: dict[int, NDArray[np.int8]] = {}  # by component, of each coefficient the bits that no scan has held so far
     while True:
         if data[at : at + 1] != b"\xff":
@@ -72,6 +73,8 @@ def _checked(data: bytes, name: str) -> int:
             if depth != 8 or components not in (1, 3):
                 raise unsupported(name, f"it is a JPEG of {components} channels of {depth} bit")
             missing = {body[6 + 3 * k]: np.full(64, 127, np.int8) for k in range(components)}
+        elif kind == _APP1 and body[:6] == _EXIF:
+            exif = exif or body[6:]
         elif kind in _OTHER_FRAMES or kind == _HEIGHT_LATER:
             raise unsupported(name, f"it is a JPEG of the rare kind {kind:02X}")
         elif kind == _SCAN:
@@ -85,7 +88,7 @@ def _checked(data: bytes, name: str) -> int:
             at = found.start()
     if frame is None or any(bits.any() for bits in missing.values()):
         raise unreadable(name, "JPEG, scans are missing")
-    return components
+    return components, exif
 
 
 def _take_scan(body: bytes, missing: dict[int, NDArray[np.int8]], name: str, *, progressive: bool) -> None:

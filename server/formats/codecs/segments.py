@@ -102,7 +102,7 @@ def _by_jpeg(part: memoryview, rows: int, row_bytes: int, name: str, tables: byt
         whole = tables.removesuffix(b"\xff\xd9") + whole[2:]
     if of_rgb:
         whole = whole[:2] + _NOT_YCBCR + whole[2:]
-    pixels = decode_jpeg(whole, name)
+    pixels, _ = decode_jpeg(whole, name)  # the tags of the TIFF turn it
     if pixels.shape[0] != rows or pixels.size != rows * row_bytes:
         raise unreadable(name, "TIFF, a part is a JPEG of another size")
     return pixels.tobytes()

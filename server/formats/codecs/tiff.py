@@ -111,25 +111,40 @@ def decode_tiff(data: bytes, name: str) -> tuple[NDArray[Any], str, int]:
     pixels = _assembled(data, tags, layout, name)
     if kind == PALETTE:
         pixels = _by_table(pixels, tags, layout, name)
-        return _upright(pixels, _one(tags, _ORIENTATION), name), "RGB", 8 * pixels.itemsize
+        return _turned(pixels, tags, name), "RGB", 8 * pixels.itemsize
     if kind == WHITE_IS_ZERO:
         pixels = ~pixels if layout.bits == 1 else (1 << layout.bits) - 1 - pixels
     space = (
         "RGB" if kind == RGB or (kind == YCBCR and _one(tags, _COMPRESSION) == JPEG) else str(_SPACES.get(kind, kind))
     )
-    return _upright(pixels, _one(tags, _ORIENTATION), name), space, layout.bits
+    return _turned(pixels, tags, name), space, layout.bits
 
 
-def _upright(pixels: NDArray[Any], orientation: int, name: str) -> NDArray[Any]:
-    """Return pixels whose first row is the top one and first column the left one, as other readers give them."""
+def _turned(pixels: NDArray[Any], tags: Tags, name: str) -> NDArray[Any]:
+    orientation = _one(tags, _ORIENTATION)
     if not 1 <= orientation <= 8:
         raise unreadable(name, f"TIFF, its orientation is {orientation}")
+    return upright(pixels, orientation)
+
+
+def upright(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """Return pixels whose first row is the top one and first column the left one, as other readers give them."""
     if orientation == _UPRIGHT:
         return pixels
     if orientation > 4:
         pixels = np.swapaxes(pixels, 0, 1)
     rows, cols = orientation in (3, 4, 7, 8), orientation in (2, 3, 6, 7)
     return np.ascontiguousarray(pixels[:: -1 if rows else 1, :: -1 if cols else 1])
+
+
+def orientation_of(exif: bytes) -> int:
+    """Return the orientation, 1 to 8, that the EXIF data of a JPEG or PNG state; 1 if they state none of these."""
+    try:
+        pages = _pages(exif) if exif[:4] in MAGIC else []
+    except (struct.error, IndexError, OverflowError):  # no more is needed of them, and the pixels are whole
+        pages = []
+    orientation = _one(pages[0], _ORIENTATION) if pages else _UPRIGHT
+    return orientation if 1 <= orientation <= 8 else _UPRIGHT
 
 
 def _pages(data: bytes) -> list[Tags]:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
-from PIL import Image
+from PIL import Image, ImageOps
 
 from stereorig.core.errors import ImageError, StorageError
 from stereorig.server.formats.images import decode, decode_image, encode_tiff, read_image, read_mask, write_image
@@ -105,6 +105,67 @@ def test_the_luminance_of_a_jpeg_and_of_a_palette_is_taken(tmp_path: Path) -> No
     assert np.abs(read_image(tmp_path / "a.png").astype(int) - expected).max() <= 1
 
 
+@pytest.mark.parametrize("orientation", range(10))
+@pytest.mark.parametrize("mark", [b"II", b"MM"])
+def test_jpeg_and_png_are_turned_as_their_exif_data_say(tmp_path: Path, orientation: int, mark: bytes) -> None:
+    """A second reader, Pillow, turns the same file; 0 and 9 are no orientations."""
+    exif = Image.Exif()
+    exif.endian = "<" if mark == b"II" else ">"
+    exif[0x0112] = orientation
+    deep = np.stack([GRAY16] * 3, axis=-1)
+    Image.fromarray(GRAY8).save(tmp_path / "a.png", exif=exif)
+    Image.fromarray(GRAY8).save(tmp_path / "a.jpg", exif=exif, quality=97)
+    Image.fromarray(COLOUR).save(tmp_path / "colour.jpg", exif=exif, quality=97)
+    for name in ("a.png", "a.jpg"):
+        with Image.open(tmp_path / name) as image:
+            assert image.getexif().endian == exif.endian
+            expected = np.asarray(ImageOps.exif_transpose(image))
+        np.testing.assert_array_equal(read_image(tmp_path / name), expected)
+    with Image.open(tmp_path / "colour.jpg") as image:
+        expected = np.asarray(ImageOps.exif_transpose(image))
+    np.testing.assert_allclose(read_image(tmp_path / "colour.jpg"), expected @ (0.299, 0.587, 0.114), atol=0.51)
+    chunk = b"eXIf" + exif.tobytes().removeprefix(b"Exif\0\0")
+    told = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    plain = cv2.imencode(".png", deep)[1].tobytes()
+    turned = Image.fromarray(GRAY16)
+    turned.getexif()[0x0112] = orientation
+    np.testing.assert_array_equal(
+        decode_image(plain[:33] + told + plain[33:]), np.asarray(ImageOps.exif_transpose(turned))
+    )
+
+
+@pytest.mark.parametrize("exif", [b"", b"II*", b"II*\0\xff\xff\xff\xff", b"MM\0*\0\0\0\x08\xff\xff", bytes(2000)])
+def test_exif_data_without_an_orientation_turn_nothing(exif: bytes) -> None:
+    segment = b"\xff\xe1" + struct.pack(">H", len(exif) + 8) + b"Exif\0\0" + exif
+    plain = cv2.imencode(".jpg", GRAY8)[1].tobytes()
+    np.testing.assert_array_equal(decode_image(plain[:2] + segment + plain[2:]), decode_image(plain))
+
+
+def test_the_rows_of_a_png_in_one_chunk_are_unpacked_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is given to zlib and not unpacked at once is copied: 1.3 GB in one chunk took minutes."""
+    noise = RNG.integers(0, 256, (2000, 2500), dtype=np.uint8)
+    plain = cv2.imencode(".png", noise, [cv2.IMWRITE_PNG_COMPRESSION, 0])[1].tobytes()
+    rows = zlib.compress(b"".join(b"\0" + row.tobytes() for row in noise), 0)
+    chunk = b"IDAT" + rows
+    one = plain[:33] + struct.pack(">I", len(rows)) + chunk + struct.pack(">I", zlib.crc32(chunk)) + plain[-12:]
+    inflate, given = zlib.decompressobj, []
+
+    class Counting:
+        def __init__(self) -> None:
+            self.inner = inflate()
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self.inner, name)
+
+        def decompress(self, data: bytes, most: int) -> bytes:
+            given.append(len(data))
+            return self.inner.decompress(data, most)
+
+    monkeypatch.setattr(zlib, "decompressobj", Counting)
+    np.testing.assert_array_equal(decode_image(one), noise)
+    assert sum(given) < 2 * len(rows)
+
+
 def test_planar_colour_and_other_colour_spaces(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "a.tif", np.moveaxis(COLOUR, -1, 0), photometric="rgb", planarconfig="separate")
     expected = cv2.cvtColor(COLOUR, cv2.COLOR_RGB2GRAY).astype(int)
@@ -163,6 +224,12 @@ def test_huge_headers_are_refused_before_decoding(tmp_path: Path) -> None:
     png += struct.pack(">I", len(idat) - 4) + idat + struct.pack(">I", zlib.crc32(idat))
     (tmp_path / "bomb.png").write_bytes(png)
     assert code_of(tmp_path / "bomb.png") == "image_too_large"
+    for depth, colour, refused in ((16, 6, True), (8, 6, False), (16, 0, False)):  # 12,600 px a side, of 8, 4, 2 bytes
+        header = struct.pack(">IIBBBBB", 12_600, 12_600, depth, colour, 0, 0, 0)
+        chunk = b"IHDR" + header
+        whole = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
+        (tmp_path / "deep.png").write_bytes(whole)
+        assert code_of(tmp_path / "deep.png") == ("image_too_large" if refused else "image_unreadable")
     small = bytearray(encode_tiff(GRAY8))
     for tag in (256, 257):  # ImageWidth, ImageLength
         at = (
