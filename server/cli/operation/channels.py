@@ -25,7 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("file", metavar="CSV", type=Path, help="table with a row of titles: times, then channels; units in brackets")
     add("--time-column", metavar="TITLE", help="title of the times' column, or its number (as titles say)")
     add("--decimal", choices=(".", ","), help="decimal mark of all numbers (as the cells decide it)")
-    add("--segment", type=int, metavar="N", help="which readings, from 1, if the record's clock falls")
+    add(
+        "--segment",
+        type=int,
+        metavar="N",
+        help="which readings, from 1, if the clock falls or a footer follows; 0: all",
+    )
     add("--date-order", choices=("dmy", "mdy"), help="of dates as 03/01/2026 (as the dates decide it)")
     add("--starts-utc", metavar="TIME", help="when the record's own clock was zero, as 2026-03-01T12:00:00Z")
     add("--at-step", type=int, metavar="N", help="or: this step was taken at the record's time --at")

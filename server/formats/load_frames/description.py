@@ -25,7 +25,7 @@ class RecordOptions:
     decimal
         Decimal mark of all numbers.
     segment
-        Number from 1 of the readings between two restarts of the clock.
+        Number from 1 of the readings between two restarts of the clock, or above a footer; 0 for all.
     date_order
         Of dates as 03/01/2026.
     """

@@ -28,6 +28,8 @@ from stereorig.server.formats.load_frames.times import clock_times, dates, past_
 
 _MAX_COLUMNS = 50
 _MOST_SEGMENTS = 100
+_MOST_FOOTER = 5  # rows of a footer
+_FAR = 20.0  # steps of the clock, the longest before it, from which on a last row may be a footer's
 #: seconds since 1904 are less; days of a spreadsheet since 1900 are more from 1982 on
 _MOST_S, _SHEET_DAYS = 1e10, 30_000
 Index = NDArray[np.intp]
@@ -217,6 +219,10 @@ class Reader:
         if falls.sum() > 1 and not (np.diff(time_s[kept]) > 0).any():
             self._doubts.append("The times fall throughout: the rows are taken from the last to the first.")
             kept, falls = kept[::-1], falls & False
+        footer = self._footer(time_s, kept[np.flatnonzero(np.r_[True, falls])[-1] :])
+        whole = bool(footer) and not falls.any()
+        if footer:
+            falls[-footer] = True
         parts = np.split(kept, np.flatnonzero(falls) + 1)
         segments = [
             RecordSegment(
@@ -229,6 +235,8 @@ class Reader:
             for part in parts
         ]
         wanted = self._options.segment
+        if wanted == 0 and whole:
+            return segments, kept
         if wanted is not None and not 0 < wanted <= len(parts):
             raise InputError(
                 f"There is no segment {wanted}; the record has {len(parts)}.",
@@ -241,10 +249,27 @@ class Reader:
                 for n, one in enumerate(segments[:MOST_SHOWN], 1)
             )
             more = ", ..." if len(parts) > MOST_SHOWN else ""
-            cause = f"The record has {len(parts)} segments, since its clock falls back ({named}{more})."
-            choices = [str(n) for n in range(1, min(len(parts), _MOST_SEGMENTS) + 1)]
+            why = "its clock falls back"
+            if footer:
+                why = f"the rows from line {segments[-1].first_line} on may be a footer's{', or readings: 0' * whole}"
+            cause = f"The record has {len(parts)} segments, since {why} ({named}{more})."
+            choices = [str(n) for n in range(1, min(len(parts), _MOST_SEGMENTS) + 1)] + ["0"] * whole
             self._ask(RecordQuestion(option="segment", cause=cause, choices=choices))
         return segments, parts[(wanted or 1) - 1]
+
+    def _footer(self, time_s: Float, rows: Index) -> int:
+        """Return how many of the last rows may be a footer's numbers rather than readings."""
+        cells = [one.values for one in self._cells.values()]
+        for count in range(1, min(_MOST_FOOTER, rows.size - 2) + 1):
+            first, before = rows[-count], rows[:-count]
+            lines, steps = self._numbers[before], np.diff(time_s[before])
+            blank = self._lines.keys().isdisjoint(range(lines[-1] + 1, self._numbers[first]))
+            after = self._numbers[first] - lines[-1] > max(1, np.abs(np.diff(lines)).max()) and blank
+            far = steps.size > 2 and time_s[first] - time_s[before[-1]] > _FAR * steps.max() > 0
+            counted = len(cells) > 1 and {one[first] for one in cells} == {before.size}
+            if after or far or (count == 1 and counted):
+                return count
+        return 0
 
     def _channels(self, at: int | None) -> dict[str, int]:
         """Return the columns of numbers by their channels' names."""

@@ -242,6 +242,44 @@ def test_segments_of_a_clock_that_restarts_are_asked_about_and_kept_apart() -> N
         read_channel_table(text.encode(), segment=3)
 
 
+@pytest.mark.parametrize(
+    ("footer", "asks"),
+    [
+        ("\n45.0,2250.0,0.45\n", True),  # a row of maxima below a blank line
+        ("\n45.2,2250.1,0.46\n", True),
+        ("2070.0,1125.0,0.225\n", True),  # a sum of times, means
+        ("91,91,91\n", True),  # their number
+        ("\n60,2250.0,0.45\n60.5,0,0\n70,1,1\n", True),
+        ("45.5,2275,0.455\n", False),  # the next reading
+        ("50,2275,0.455\n55.5,2280,0.46\n", False),  # after some seconds
+    ],
+)
+def test_a_footer_of_numbers_alone_is_asked_about(footer: str, asks: bool) -> None:
+    """91 readings each half second: what follows them is no reading for sure if it lies apart in lines or in time."""
+    rows = "".join(f"{t},{f},{x}\n" for t, f, x in ROWS)
+    text = f"Time (s),Force (N),X (mm)\n{rows}{footer}".encode()
+    table, read = read_record(text)
+    assert [one.option for one in read.questions] == ["segment"] * asks
+    if asks:
+        assert read.questions[0].choices == ["1", "2", "0"]
+        assert "may be a footer's" in read.questions[0].cause
+        assert read_channel_table(text, segment=1).time_s.size == len(ROWS)
+    everything = read_channel_table(text, segment=0) if asks else table
+    assert everything is not None
+    same = footer.startswith("\n45.0")  # no second reading at one time
+    assert everything.time_s.size == len(ROWS) + len(footer.split()) - same
+
+
+def test_readings_in_blocks_or_of_a_changing_rate_are_no_footer() -> None:
+    blocks = [f"{5 * k},{k}\n{5 * k + 1},{k}\n\n" for k in range(20)]
+    rates = [f"{t:.4f},{t:.4f}\n" for t in np.geomspace(0.1, 1e4, 40)]
+    for rows in (blocks, rates):
+        table, read = read_record(f"Time (s),Force (N)\n{''.join(rows)}".encode())
+        assert read.questions == []
+        assert table is not None
+        assert table.time_s.size == 40
+
+
 def test_two_tables_are_not_joined() -> None:
     rows = "".join(f"{t},{t},0.5\n" for t in range(20))
     with pytest.raises(StereorigError, match="two tables"):

@@ -37,7 +37,8 @@ def _record(
         Literal[".", ","] | None, Form(description="Decimal mark of all numbers; if left out, as the cells decide it.")
     ] = None,
     segment: Annotated[
-        int | None, Form(ge=1, le=9999, description="Which readings, numbered from 1, if the record's clock falls.")
+        int | None,
+        Form(ge=0, le=9999, description="Which readings, from 1, if the clock falls or a footer follows; 0: all."),
     ] = None,
     date_order: Annotated[
         Literal["dmy", "mdy"] | None, Form(description="Of dates as 03/01/2026; if left out, as the dates decide it.")
