@@ -9,6 +9,8 @@ derivatives: a subset away, where the noise is their own, of quadratic patches h
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from stereorig.core.arrays import Float
@@ -76,19 +78,17 @@ def patch_term(field: Field, pair: StereoPair, *, subset_px: int) -> Term:
     )
 
 
-def _measures(field: Field, pair: StereoPair) -> tuple[Float, Float]:
-    """(r, c, m) quantities that planes make linear in the image, and (r, c, 3, m) mm of the system frame per unit."""
+def _measures(field: Field, pair: StereoPair) -> tuple[Float, Callable[[Float], Float]]:
+    """(r, c, m) quantities that planes make linear in the image; and the errors (r, c, 3), mm, by errors of these."""
     camera = pair.cam1.cam_from_sys
     at = camera.apply(field.xyz_mm)
     w = 1.0 / at[..., 2:]
     ray = at * w
-    back = camera.rotation.T
     if field.uvw_mm is None:
-        return w, (back @ (-ray / w**2)[..., None])
+        return w, lambda off: off * (-ray / w**2) @ camera.rotation
     G = camera.apply(field.xyz_mm + field.uvw_mm) * w
     by_w = -(G - ray) / w**2
-    by_g = np.broadcast_to(np.eye(3), (*field.shape, 3, 3)) / w[..., None]
-    return np.concatenate([w, G], axis=-1), back @ np.concatenate([by_w[..., None], by_g], axis=-1)
+    return np.concatenate([w, G], axis=-1), lambda off: (off[..., :1] * by_w + off[..., 1:] / w) @ camera.rotation
 
 
 def _second(
@@ -104,7 +104,7 @@ def _second(
         bend += scale * _stencil(values, (1.0, -2.0, 1.0), axis, lag)
         noise += scale**2 * _stencil(own, (1.0, 0.0, 1.0), axis, lag)
     both = 2.0 * moment * sum(1.0 / (lag * s) ** 2 for lag, s in zip(lags, step, strict=True))
-    return (to_mm @ bend[..., None])[..., 0], noise + both**2 * own
+    return to_mm(bend), noise + both**2 * own
 
 
 def _fourth(
@@ -124,7 +124,7 @@ def _fourth(
     bend -= scale * _stencil(inner, (1.0, -2.0, 1.0), 0, lags[1])
     spread = _stencil(own, (1.0, 4.0, 1.0), 1, lags[0])
     noise += scale**2 * _stencil(spread, (1.0, 4.0, 1.0), 0, lags[1])
-    return (to_mm @ bend[..., None])[..., 0], noise
+    return to_mm(bend), noise
 
 
 def _own_variance(field: Field) -> Float:

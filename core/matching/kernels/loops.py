@@ -132,6 +132,22 @@ def lanes(builder: Any, indices: Any) -> list[Any]:
     return scalars
 
 
+def _taps_from(context: Any, builder: Any, sig: Any, args: Any, order: int) -> list[Any]:
+    """Pointers to the first tap for position (0, 0) in each row of taps; arguments as of ``compare_pixels``."""
+    rows = [at(builder, data(context, builder, sig, args, 0), args[1])]
+    for _ in range(order):
+        rows.append(at(builder, rows[-1], args[2]))
+    return rows
+
+
+def _place(builder: Any, warp: list[Vec], stride: Any, x: Vec, y: Vec) -> tuple[Any, Vec, Vec]:
+    """Index of the first tap of eight pixels, and their fractions, at offsets ``x``, ``y`` in the subset."""
+    xt, yt = _position(warp[:10], x, y), _position(warp[10:20], x, y)
+    xf, yf = xt.floor(), yt.floor()
+    k = builder.add(builder.mul(yf.to_int(), stride, flags=("nsw",)), xf.to_int(), flags=("nsw",))
+    return k, xt - xf, yt - yf
+
+
 def _sum_up(builder: Any, count: Any, n_sums: int, terms: Callable[[Any], list[Vec]], out: Any, slot: int) -> None:
     """Loop over ``count`` blocks; ``terms(offset)`` gives the block's summands; totals go to ``out`` as float64."""
     zero = ir.Constant(ir.VectorType(FLOAT, LANES), [0.0] * LANES)
@@ -189,22 +205,17 @@ def _comparison(order: int, degree: int) -> Any:
             warp = [spread(builder, builder.load(at(builder, p, LONG(i)))) for i in range(N_WARP)]
             gain = warp[20] * (1.0 / 36.0 if order == 3 else 1.0 / 14400.0)
             stride = spread(builder, builder.trunc(args[2], INT)).value
-            rows = [at(builder, data(context, builder, sig, args, 0), args[1])]
-            for _ in range(order):
-                rows.append(at(builder, rows[-1], args[2]))
-            ref = _reference_rows(context, builder, sig, args, 4)
+            rows, ref = _taps_from(context, builder, sig, args, order), _reference_rows(context, builder, sig, args, 4)
             vector = ir.VectorType(FLOAT, LANES)
             k_next = cgutils.alloca_once(builder, ir.VectorType(INT, LANES))
             tx_next, ty_next = (cgutils.alloca_once(builder, vector) for _ in range(2))
 
             def find_position(offset: Any) -> None:
                 x, y = (load(builder, at(builder, ref[r], offset)) for r in (X, Y))
-                xt, yt = _position(warp[:10], x, y), _position(warp[10:20], x, y)
-                xf, yf = xt.floor(), yt.floor()
-                k = builder.add(builder.mul(yf.to_int(), stride, flags=("nsw",)), xf.to_int(), flags=("nsw",))
+                k, tx, ty = _place(builder, warp, stride, x, y)
                 builder.store(k, k_next)
-                builder.store((xt - xf).value, tx_next)
-                builder.store((yt - yf).value, ty_next)
+                builder.store(tx.value, tx_next)
+                builder.store(ty.value, ty_next)
 
             def terms(offset: Any) -> list[Vec]:
                 first = lanes(builder, builder.load(k_next))
@@ -231,6 +242,32 @@ def _comparison(order: int, degree: int) -> Any:
 
     compare_pixels.__name__ = f"compare_{'cubic' if order == 3 else 'quintic'}_{degree}"
     return intrinsic(compare_pixels)
+
+
+def _sampling(order: int) -> Any:
+    def sample_pixels(
+        _typingctx: Any, c: Any, base: Any, stride: Any, warp: Any, ref: Any, blocks: Any, out: Any
+    ) -> Any:
+        """Sample an image over a subset into ``out``, float32; the others as of ``compare_pixels``."""
+        sig = types.void(c, base, stride, warp, ref, blocks, out)
+
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            p, out = data(context, builder, sig, args, 3), data(context, builder, sig, args, 6)
+            warp = [spread(builder, builder.load(at(builder, p, LONG(i)))) for i in range(N_WARP)]
+            stride = spread(builder, builder.trunc(args[2], INT)).value
+            rows, ref = _taps_from(context, builder, sig, args, order), _reference_rows(context, builder, sig, args, 4)
+            with cgutils.for_range(builder, args[5]) as loop:
+                offset = builder.mul(builder.sext(loop.index, LONG), LONG(LANES))
+                x, y = (load(builder, at(builder, ref[r], offset)) for r in (X, Y))
+                k, tx, ty = _place(builder, warp, stride, x, y)
+                value = spline(order, rows, lanes(builder, k), tx, ty)
+                store(value * (1.0 / 36.0 if order == 3 else 1.0 / 14400.0), at(builder, out, offset))
+            return context.get_dummy_value()
+
+        return sig, codegen
+
+    sample_pixels.__name__ = f"sample_{'cubic' if order == 3 else 'quintic'}"
+    return intrinsic(sample_pixels)
 
 
 def _powers(x: Vec, y: Vec, degree: int) -> list[Vec | None]:
@@ -315,4 +352,5 @@ def _reference_sums(degree: int) -> Any:
 
 compare_cubic = {degree: _comparison(3, degree) for degree in (1, 2)}
 compare_quintic = {degree: _comparison(5, degree) for degree in (1, 2)}
+sample_cubic, sample_quintic = _sampling(3), _sampling(5)
 sum_reference = {degree: _reference_sums(degree) for degree in (1, 2)}
