@@ -29,9 +29,11 @@ from stereorig.core.settings import single_sigma_px
 from stereorig.core.status import PointStatus
 
 _SAMPLE = 256
+_FIRST = 4  # every fourth point of the sample tells noise from the rest where it is noise
 _MIN_POINTS = 30  # size of a sample that represents a field
 _MEDIAN_OF_MEAN = 0.95  # ratio for a variance estimated from some twenty independent blocks
 AS_NOISE = (0.8, 1.25)  # ratio of a sample's variance to the reported one: within, nothing is corrected
+_SURELY_NOISE = (0.84, 1.2)  # the same from every fourth point, whose median is known to 5 %
 _MAX_DISAGREEMENT = 2.2  # 90 % quantile over median of white noise's own estimates is 1.5 (33 px) to 1.8 (15 px)
 _UNUSUAL = 1.5  # residual energy over the field's median
 _MOSTLY_NOT_NOISE = 2.0  # ratio of a sample's variance to the reported one: more than half of it is not noise
@@ -123,7 +125,12 @@ def residual_test(
     usual_energy = np.median(energy, axis=0)
     unusual: Bool = np.asarray((energy > _UNUSUAL * usual_energy).any(axis=1))
     usual = ok[~unusual]
-    sample = _robust(fitter, points, usual[np.unique(spread_indices(len(usual), _SAMPLE))], xy_px)
+    # the scatter of a larger motion's points shows their noise
+    few = shape is None or not can_be_observed(xy_px.reshape(*shape, 2), ok, fitter.options.subset_px)
+    sampled = usual[np.unique(spread_indices(len(usual), _SAMPLE))]
+    sample = _robust(fitter, points, sampled[:: 1 if few or fitter.comparisons == 1 else _FIRST], xy_px)
+    if len(sample.known) < len(sampled) and not _surely_noise(sample.ratio):
+        sample = _robust(fitter, points, sampled, xy_px)
     own = sample.ratio
     factor, one_by_one = nothing, unusual.copy()
     correction = np.ones(q)
@@ -141,8 +148,6 @@ def residual_test(
         unusual[:] = True
     noise = None
     testable = fitter.ref1.blur is None and len(own) >= _MIN_POINTS
-    # the scatter of a larger motion's points shows their noise
-    few = shape is None or not can_be_observed(xy_px.reshape(*shape, 2), ok, fitter.options.subset_px)
     if testable and fitter.comparisons == 3:
         if few and shows_lines(fitter, points, xy_px):
             noise = line_factor(fitter, points, sample.points, xy_px)
@@ -200,6 +205,17 @@ def residual_test(
         limits.as_observed(left)
         limits.reject_far(left)
     return limits.outcome(factor, len(alone))
+
+
+def _surely_noise(ratio: Float) -> bool:
+    """Return True if the variances (m, q) of some points over the reported ones leave no doubt that these hold."""
+    if len(ratio) < _MIN_POINTS:
+        return False
+    usual, most = np.quantile(ratio, (0.5, 0.9), axis=0)
+    low, high = np.tile(_MEDIAN_OF_MEAN * np.array(_SURELY_NOISE)[:, None], len(usual))
+    high[-1] = _MEDIAN_OF_MEAN * AS_NOISE[1]  # interpolation raises the offset's
+    alike = most < 0.9 * _MAX_DISAGREEMENT * np.maximum(usual, 1.0)
+    return bool(((usual > low) & (usual < high) & alike).all())
 
 
 def residual_factors(fitter: Fitter, points: PointFits, xy_px: Float) -> Float:

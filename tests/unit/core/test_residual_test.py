@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from stereorig.core.errors import InputError
+from stereorig.core.field.checks import residual_test as tested_module
 from stereorig.core.field.checks.residual_test import _Limits, residual_test
 from stereorig.core.field.checks.validity import ValidityOptions
 from stereorig.core.field.growth.field import fill_field
@@ -20,7 +21,7 @@ from stereorig.core.field.points.observed_scatter import bring_to_observed, obse
 from stereorig.core.field.points.scales import depth_per_px
 from stereorig.core.field.region.region import PointGrid
 from stereorig.core.matching import MatchOptions, fit_motion, fit_shape
-from stereorig.core.matching.cluster_robust import cluster_robust_covariance
+from stereorig.core.matching.cluster_robust import cluster_robust_covariance, cluster_robust_covariances
 from stereorig.core.matching.kernels.cluster_robust import blocks_across
 from stereorig.core.measure import MeasureOptions, ReferencePair
 from stereorig.core.status import PointStatus
@@ -164,6 +165,30 @@ def test_noise_alone_is_told_as_it_is():
     assert np.all(np.abs(factor[:4] - 1.0) < 0.2), factor
     assert 0.9 < factor[4] < 1.5  # across the epipolar line the interpolation's own error shows, too
     assert np.all(np.abs(reported_over_true(field, error) - 1.0) < 0.15)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.15])
+def test_only_a_motion_whose_first_points_show_noise_alone_is_judged_from_these(share, monkeypatch):
+    """With another pattern shining through all are looked at; the variances are the whole sample's."""
+    # with less noise the interpolation's own error shows in the offsets
+    reference, clean = (bench.take("block", load, MOTION, seed=int(load), noise=6.0) for load in (0.0, 1.0))
+    now = tuple(through(image, share) for image in clean)
+    examined = []
+
+    def counted(*given):
+        if len(given[1]) == 4:  # no shape
+            examined.append(len(given[2]))
+        return cluster_robust_covariances(*given)
+
+    monkeypatch.setattr(tested_module, "cluster_robust_covariances", counted)
+    field = measured(reference, now)[0]
+    first, *rest = examined
+    assert first < 70
+    assert max(rest, default=0) < 70 if share == 0.0 else max(rest) > 200
+    monkeypatch.setattr(tested_module, "_FIRST", 1)
+    whole = measured(reference, now)[0]
+    np.testing.assert_array_equal(field.covariance, whole.covariance)
+    np.testing.assert_array_equal(field.status, whole.status)
 
 
 def observed_factor(reference, now, field):
