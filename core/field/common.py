@@ -14,7 +14,7 @@ from stereorig.core.common.derivatives import Estimator, ReferenceView, lower_ro
 from stereorig.core.common.factor import Causes, FactorColumns, ParameterCovariance, sample_of
 from stereorig.core.field.points.result import Field
 
-_POINTS_AT_ONCE = 4096
+_POINTS_AT_ONCE = 1024
 # for larger fields the derivatives that all steps share are recomputed in each step: they take 0.5 kB a point
 _KEPT_POINTS = 100_000
 

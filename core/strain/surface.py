@@ -21,7 +21,7 @@ from stereorig.core.strain.result import StrainField, StrainStatus
 from stereorig.core.strain.tensors import pulls_of, strain_of, strain_of_stretch, strain_slopes
 from stereorig.core.strain.window import Slopes, window_slopes
 
-_POINTS_AT_ONCE = 4096  # points whose arrays stay in the processor's cache
+_POINTS_AT_ONCE = 1024  # points whose arrays stay in the processor's cache
 
 
 def surface_strain(field: Field, options: StrainOptions | None = None, *, subset_px: int) -> StrainField:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import time
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,7 @@ from stereorig.server.compute.tasks import Earlier, StepImages, files_of
 from stereorig.server.formats.calibrations.recognise import LoadedCalibration
 from stereorig.server.formats.calibrations.volume import rbe_of
 from stereorig.server.formats.files import make_folder, sha256_of, write_bytes
-from stereorig.server.formats.images import read_image
+from stereorig.server.formats.images import GrayImage, read_image
 from stereorig.server.formats.noise_json import LoadedNoise
 from stereorig.server.formats.results.folder import dense_result
 from stereorig.server.formats.results.reading import read_measured
@@ -135,9 +135,13 @@ class SequenceMeasurement:
 
     def read(self, step: StepImages) -> Pair:
         """Read both images of a step; everything derived from them is computed on the calling thread."""
+        return self.prepared(step, [read_image(path) for path in step.files])
+
+    def prepared(self, step: StepImages, pixels: Sequence[GrayImage]) -> Pair:
+        """Return both images of a step whose pixels were read, as :meth:`read` does."""
         one, two = (
-            MeasureImage(read_image(path), str(path), noise=None if model is None else model.averaged(*step.averages))
-            for path, model in zip(step.files, self._models, strict=True)
+            MeasureImage(grey, str(path), noise=None if model is None else model.averaged(*step.averages))
+            for grey, path, model in zip(pixels, step.files, self._models, strict=True)
         )
         for image in (one, two):
             image.prepared(self.options.interpolation, None, self.options.blur)

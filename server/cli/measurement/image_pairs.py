@@ -1,4 +1,4 @@
-"""The pairs of a series: read and checked once, so that hours of work do not end at a file that cannot be used."""
+"""The pairs of a series: each is decoded and checked once, when its turn comes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from stereorig.core.field.points.images import check_calibrated_size
 from stereorig.server.cli.measurement.image_lists import ImagePair
 from stereorig.server.compute.tasks import StepImages
 from stereorig.server.formats.calibrations.recognise import LoadedCalibration
-from stereorig.server.formats.images import decode, decode_image, read_file
+from stereorig.server.formats.images import GrayImage, decode, decode_image, read_file
 from stereorig.server.results.images.quality import saturated_share
 from stereorig.server.store.durable import read_json
 from stereorig.server.workflows.camera_identity import check_same_cameras
@@ -38,7 +38,7 @@ def checked_pairs(
             if alone and k == 0:
                 raise
             error.context |= {"cam1": str(pair.cam1), "cam2": str(pair.cam2)}
-            failed[k if pair.number is None else pair.number] = error
+            failed[number_of(pair, k)] = error
     if not steps:
         raise next(iter(failed.values()))
     return steps, failed
@@ -71,8 +71,27 @@ def checked_shapes(first: ImagePair, calibration: LoadedCalibration) -> tuple[tu
     return shapes[0], shapes[1]
 
 
+def number_of(pair: ImagePair, k: int) -> int:
+    """Return the number of the k-th pair's step."""
+    return k if pair.number is None else pair.number
+
+
 def check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[int, int]]) -> StepImages:
-    """Read both images of a step once, so that a bad one is found before hours of work on the others."""
+    """Check both images of a step."""
+    return read_pair(pair, step, shapes)[0]
+
+
+def read_pair(
+    pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[int, int]]
+) -> tuple[StepImages, list[GrayImage]]:
+    """Read and check both images of a step.
+
+    Raises
+    ------
+    ImageError, FileFormatError, InputError
+        An image cannot be read or is blank, has another size or another checksum than recorded; both are the same.
+    """
+    pixels: list[GrayImage] = []
     hashes, greys, saturated = [], [], []
     for path, recorded, shape in ((pair.cam1, pair.sha256_1, shapes[0]), (pair.cam2, pair.sha256_2, shapes[1])):
         data = read_file(path)
@@ -98,6 +117,7 @@ def check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[
                 code="image_blank",
                 remedy="Check exposure, lens cap and trigger, then take the step again.",
             )
+        pixels.append(image)
         greys.append(decoded.grey_from)
         saturated.append(saturated_share(image, decoded.bit_depth))
     if hashes[0] == hashes[1]:
@@ -106,11 +126,12 @@ def check_pair(pair: ImagePair, step: int, shapes: tuple[tuple[int, int], tuple[
             code="same_image",
             remedy="Give each camera its own images.",
         )
-    return StepImages(
-        n=step if pair.number is None else pair.number,
+    found = StepImages(
+        n=number_of(pair, step),
         files=(pair.cam1, pair.cam2),
         sha256=(hashes[0], hashes[1]),
         averages=pair.averages,
         grey_from=(greys[0] or pair.grey_from[0], greys[1] or pair.grey_from[1]),
         saturated=(saturated[0], saturated[1]),
     )
+    return found, pixels

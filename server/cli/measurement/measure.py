@@ -346,7 +346,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         mask=None if specimen is None else specimen.mask,
     )
     check_positions(calibration.pair, seeds or (), (shapes[1][1], shapes[1][0]))
-    steps, failed = checked_pairs(files, shapes, alone=not args.projected)
+    steps, failed = checked_pairs(files if args.projected else files[:1], shapes, alone=not args.projected)
     settings = StoredSettings.model_validate(
         {
             "region": region,
@@ -373,6 +373,8 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         calibration=calibration,
         calibration_file=calibration_file,
         steps=steps,
+        later=[] if args.projected else list(enumerate(files))[1:],
+        shapes=shapes,
         settings=settings,
         mask_file=mask_file,
         out=out,

@@ -9,7 +9,7 @@ import contextlib
 import hashlib
 import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,6 +23,8 @@ from stereorig.core.field.points.result import Field
 from stereorig.core.names import CAMERAS
 from stereorig.core.settings import StoredSettings
 from stereorig.server.base.problem import problem_of
+from stereorig.server.cli.measurement.image_lists import ImagePair
+from stereorig.server.cli.measurement.image_pairs import number_of, read_pair
 from stereorig.server.cli.terminal import ProgressLine, duration
 from stereorig.server.compute.background_compilation import BackgroundCompilation
 from stereorig.server.compute.overlap import ReadAhead, WriteBehind
@@ -84,7 +86,8 @@ def _uncertainty(summary: Mapping[str, Any]) -> str:
 class MeasureJob:
     """Everything that ``stereorig measure`` was asked to do, checked.
 
-    ``steps`` are the measurable ones, the reference first; ``failed`` has the errors of the others.
+    ``steps`` are the checked ones, the reference first; ``failed`` has the errors of the others. ``later`` pairs, with
+    their places in the series, are read and checked in their turn; ``shapes`` are the sizes that they must have.
     ``specimen`` was found if no region was given; its mask is then to be written to ``mask_file``.
     ``gauges`` are the recipe's: they are stored with the results, and the report reads them. ``carried`` is the
     calibration to be written to ``calibration_file``, if its own file does not hold all of it.
@@ -93,6 +96,8 @@ class MeasureJob:
     calibration: LoadedCalibration
     calibration_file: Path
     steps: list[StepImages]
+    later: list[tuple[int, ImagePair]]
+    shapes: tuple[tuple[int, int], tuple[int, int]]
     settings: StoredSettings
     mask_file: Path | None
     out: Path
@@ -105,7 +110,7 @@ class MeasureJob:
     @property
     def last(self) -> int:
         """Number of the last step, measured or not."""
-        return max(self.steps[-1].n, *self.failed, 0)
+        return max(self.steps[-1].n, *(number_of(pair, k) for k, pair in self.later), *self.failed, 0)
 
 
 def measure_sequence(job: MeasureJob, progress: ProgressLine) -> dict[str, Any]:
@@ -125,7 +130,7 @@ def measure_sequence(job: MeasureJob, progress: ProgressLine) -> dict[str, Any]:
 
     def on_compiling() -> None:
         progress.note(f"{COMPILING} ...")
-        if len(job.steps) > 1:
+        if job.later or len(job.steps) > 1:
             compilation.start()
 
     with (
@@ -162,14 +167,14 @@ def _measure_all(runner: _Runner, job: MeasureJob, compilation: BackgroundCompil
         runner.writer = writer
         if job.settings.pattern == "projected":
             for step in job.steps:
-                runner.measure(step, None)
+                runner.measure(step)
         else:
             runner.begin(job.steps[0])
-            with ReadAhead(runner.sequence.read, job.steps[1:]) as pairs:
-                runner.measure(job.steps[0], None)
+            with ReadAhead(runner.read, job.later) as read:
+                runner.measure(job.steps[0])
                 compilation.wait()
-                for step in job.steps[1:]:
-                    runner.measure(step, pairs)
+                for k, pair in job.later:
+                    runner.measure_later(k, pair, read)
         return writer.finish()
 
 
@@ -270,26 +275,44 @@ class _Runner:
             inputs=inputs,
         )
 
-    def measure(self, step: StepImages, images: Iterator[Pair] | None) -> None:
-        """Measure a step, the reference's shape first (no images), and have its file written.
+    def read(self, later: tuple[int, ImagePair]) -> tuple[StepImages, Pair]:
+        """Read and check a later step's images."""
+        k, pair = later
+        step, pixels = read_pair(pair, k, self.job.shapes)
+        return step, self.sequence.prepared(step, pixels)
 
-        Under a projected pattern every step is its own reference. An error of the step's own is kept; an error of the
-        reference, or one that ends the whole measurement, is raised.
+    def measure(self, step: StepImages) -> None:
+        """Measure the reference's shape; under a projected pattern every step is its own reference."""
+
+        def begun() -> tuple[StepImages, None]:
+            if self.job.settings.pattern == "projected":
+                self.begin(step)
+            return step, None
+
+        self._measure(step.n, step.files, begun)
+
+    def measure_later(self, k: int, pair: ImagePair, read: Iterator[tuple[StepImages, Pair]]) -> None:
+        """Measure the k-th step, which :meth:`read` gives next."""
+        self._measure(number_of(pair, k), (pair.cam1, pair.cam2), lambda: next(read))
+
+    def _measure(self, n: int, files: tuple[Path, Path], images: Callable[[], tuple[StepImages, Pair | None]]) -> None:
+        """Measure a step, and have its file written.
+
+        An error of the step's own is kept; an error of the reference, or one that ends the whole measurement, is
+        raised.
         """
         started = time.monotonic()
         alone = self.job.settings.pattern == "projected"
         try:
-            if alone:
-                self.begin(step)
-            pair = None if images is None else next(images)
-            result = self.sequence.measure(step, pair, previous=self._previous, progress=self._shower(step.n))
+            step, pair = images()
+            result = self.sequence.measure(step, pair, previous=self._previous, progress=self._shower(n))
         except StereorigError as error:
             own = alone or self.begun
             if not own or isinstance(error, Cancelled | StorageError):
                 raise
-            error.context |= dict(zip(("cam1", "cam2"), map(str, step.files), strict=True))
-            self.failed[step.n] = error
-            self._record_failure(step.n)
+            error.context |= dict(zip(("cam1", "cam2"), map(str, files), strict=True))
+            self.failed[n] = error
+            self._record_failure(n)
             return
         compute_s = round(time.monotonic() - started, 3)
         if not self.begun:

@@ -6,6 +6,7 @@ import argparse
 import json
 import re
 import shutil
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from stereorig.core.names import CAMERAS
 from stereorig.core.settings import SUBSET_PX
 from stereorig.server.cli import main
 from stereorig.server.cli.measurement import measure
+from stereorig.server.formats import images
 from stereorig.server.formats.images import read_image, write_image
 from stereorig.server.formats.results.reading import read_field, read_measured
 from stereorig.server.report.source import find_source
@@ -444,6 +446,23 @@ def test_a_bad_pair_is_a_failed_step_and_the_rest_is_measured(folder: Path, tmp_
         xr.open_dataset(tmp_path / "out" / "step_0002.nc") as among,
     ):
         np.testing.assert_array_equal(alone.w_mm, among.w_mm)
+
+
+def test_an_image_of_a_later_step_is_decoded_once(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: Counter[str] = Counter()
+
+    def counted(data: bytes, name: str) -> Any:
+        seen[Path(name).name] += 1
+        return samples(data, name)
+
+    samples = images._samples
+    monkeypatch.setattr(images, "_samples", counted)
+    assert main(command(folder, tmp_path / "out", roi="60,60,120,120", strain="off")) == 0
+    assert {name: seen[name] for name in seen if "_0" not in name} == {
+        f"{cam}_{n}.tif": 1 for cam in CAMERAS for n in (1, 2)
+    }
 
 
 @pytest.mark.parametrize("update", ["always", "auto"])
