@@ -40,7 +40,7 @@ def report_compiling(report: Callable[[], None]) -> Iterator[None]:
     report
         Called at most once, on the thread that compiles.
     """
-    _listen()
+    listen()
     reported = False
 
     def report_once() -> None:
@@ -64,7 +64,6 @@ def compile_elsewhere(compile_it: CompileElsewhere) -> Iterator[None]:
     compile_it
         Called on the thread that needs a kernel; if the kernel is not on disk after the call, it is compiled here.
     """
-    _listen()
     with _entered(_elsewhere, compile_it):
         yield
 
@@ -89,8 +88,9 @@ def _entered(callbacks: list[Any], one: Any) -> Iterator[None]:
 
 
 @cache
-def _listen() -> None:
-    from numba.core import event  # slow to load, and needed for any computation
+def listen() -> None:
+    """Hear of each compilation from now on."""
+    from numba.core import event  # slow to load: a process without kernels does without
 
     class Listener(event.Listener):
         def on_start(self, event: Any) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 from numba import njit
 
-from stereorig.core.compiling import ENTRIES, CompiledElsewhereError, compiling_here
+from stereorig.core.compiling import ENTRIES, CompiledElsewhereError, compiling_here, listen
 
 #: without numba's runtime a kernel can make no array, and counts no references: two atomic instructions a view, on
 #: counters that all threads share, were 5 us a point
@@ -77,6 +77,7 @@ def entry(function: Callable[..., Any], *, makes_arrays: bool = False) -> Any:
     A function that makes its own work space sets ``makes_arrays``; functions that it calls in its loops must not make
     any.
     """
+    listen()
     made = _Entry(function, {**_ALL, "_nrt": makes_arrays})
     ENTRIES[function.__module__, function.__qualname__] = made
     return made
