@@ -14,6 +14,8 @@ STANDA := $(VENV)/.standa
 PEERS := bench bench-aldic
 PEER_STAMPS := $(PEERS:%=.venv-%/.installed)
 ARGS ?=
+# containers often set it: each of some hundred processes, a virtual machine's too, would compile every module anew
+unexport PYTHONDONTWRITEBYTECODE
 # test files side by side, a process each: one more than there are cores, since devices make tests wait; more than four
 # only compile the same kernels again
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n > 3 ? 4 : n + 1)))

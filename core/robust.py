@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc, fdtrc, ndtri
 
 from stereorig.core.arrays import Float
 
@@ -51,11 +50,15 @@ def spread_indices(n: int, count: int) -> NDArray[np.int64]:
 
 def chi_square_tail(statistic: float, degrees: float) -> float:
     """Return the probability that a chi-square of so many degrees of freedom is larger; NaN without any."""
+    from scipy.special import chdtrc  # slow to load, and not every start needs it
+
     return float(chdtrc(degrees, np.maximum(statistic, 0.0))) if degrees > 0 else float("nan")
 
 
 def f_tail(statistic: float, degrees: float, degrees_left: float) -> float:
     """Return the probability that F of so many degrees of freedom, above and below, is larger; NaN without any."""
+    from scipy.special import fdtrc  # slow to load, and not every start needs it
+
     if not (degrees > 0 and degrees_left > 0):
         return float("nan")
     return float(fdtrc(degrees, degrees_left, np.maximum(statistic, 0.0)))
@@ -63,4 +66,6 @@ def f_tail(statistic: float, degrees: float, degrees_left: float) -> float:
 
 def two_sided_sigmas(probability: float) -> float:
     """Return how many standard deviations a normal error is farther off with this probability, to either side."""
+    from scipy.special import ndtri  # slow to load, and not every start needs it
+
     return float(-ndtri(probability / 2.0))

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from stereorig.core.arrays import Bool, Float
 from stereorig.core.cameras.camera import Camera
 from stereorig.core.cameras.stereo import StereoPair
-from stereorig.core.common.estimates import estimates
 from stereorig.core.names import CAMERAS
 
 #: of the comparisons camera 2 at t0, camera 1 and camera 2 at t: the inverse of noise I plus the reference's in all
@@ -184,6 +183,8 @@ class Estimator:
         pair: StereoPair, points_mm: Float, displaced_mm: Float | None = None, reference: ReferenceView | None = None
     ) -> Estimator:
         """Return the estimator at points; ``reference`` is theirs, if it is known."""
+        from stereorig.core.common.estimates import estimates  # slow to load, and not every start needs it
+
         seen = ReferenceView.of(pair, points_mm) if reference is None else reference
         if displaced_mm is None:
             return Estimator(seen, None, seen.by_image, None, ())

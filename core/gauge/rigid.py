@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stereorig.core.arrays import Bool, Float
 from stereorig.core.common.budget import Budget, budgets_through
@@ -105,6 +104,8 @@ def rigid_motion(
     MeasurementError
         ``too_few_points`` if fewer than three valid points, or points along one line, are left.
     """
+    from scipy.spatial.transform import Rotation  # slow to load, and not every start needs it
+
     if field.uvw_mm is None:
         raise InputError("A shape has no motion.", code="no_displacement", remedy="Use a step with displacements.")
     used = field.valid if chosen is None else field.valid & chosen
@@ -193,6 +194,8 @@ def without_rigid_motion(field: Field, motion: RigidMotion, *, shared: SharedPix
     Shape, normals and stretch stay; rotations become R^T times theirs. The covariance holds the points' own noise, the
     fitted motion's, and the covariance between both.
     """
+    from scipy.spatial.transform import Rotation  # slow to load, and not every start needs it
+
     assert field.uvw_mm is not None
     R, valid = motion.rotation, field.valid
     back = (field.xyz_mm + field.uvw_mm - motion.centre_mm - motion.translation_mm) @ R  # rows times R: R^T applied
@@ -246,6 +249,8 @@ def _fit_common(field: Field, gain: Float, R: Float) -> Float | None:
 
 def _unweighted(arm: Float, moved: Float) -> tuple[Float, Float]:
     """Kabsch's start."""
+    from scipy.spatial.transform import Rotation  # slow to load, and not every start needs it
+
     d = moved.mean(axis=0)
     R = Rotation.align_vectors(moved - d, arm)[0].as_matrix()
     return R, d

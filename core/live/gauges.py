@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,18 +23,11 @@ from stereorig.core.field.points.result import Field
 from stereorig.core.field.points.shared_pixels import SharedPixels, roots_of
 from stereorig.core.gauge.reading import Reading, readings_of
 from stereorig.core.gauge.sampling import sample
+from stereorig.core.names import UNITS, GaugeKind
 from stereorig.core.settings import StrainTensor
 from stereorig.core.status import PointStatus
 from stereorig.core.strain.surface import surface_frames
 from stereorig.core.strain.tensors import pulls_of, strain_of, strain_slopes
-
-GaugeKind = Literal["point", "extensometer", "area"]
-UNITS: Mapping[GaugeKind, Mapping[str, str]] = {
-    "point": {"u_mm": "mm", "v_mm": "mm", "w_mm": "mm"},
-    "extensometer": {"length0_mm": "mm", "length_mm": "mm", "elongation_mm": "mm", "strain": "1", "true_strain": "1"},
-    "area": {"u_mm": "mm", "v_mm": "mm", "w_mm": "mm", "exx": "1", "eyy": "1", "exy": "1"},
-}
-"""The quantities of each kind, with their units."""
 
 _ENOUGH = 0.5
 _MIN_POINTS = 3

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from stereorig.core.arrays import Bool, Float
 from stereorig.core.errors import InputError
@@ -193,6 +192,8 @@ class ModelSurface:
 
     @cached_property
     def _middles(self) -> Any:
+        from scipy.spatial import cKDTree  # slow to load, and not every start needs it
+
         return cKDTree(self.corners_mm.mean(axis=1))
 
     @cached_property
@@ -203,6 +204,8 @@ class ModelSurface:
     @cached_property
     def _classes(self) -> list[tuple[Any, Index, float]]:
         """Triangles of like size: a tree of their middles, their indices, the largest distance of a corner."""
+        from scipy.spatial import cKDTree  # slow to load, and not every start needs it
+
         middle, reach = self.corners_mm.mean(axis=1), self._reach
         level = np.floor(np.log2(np.maximum(reach, 1e-9 * reach.max()))).astype(int)
         out: list[tuple[Any, Index, float]] = []
@@ -224,7 +227,11 @@ def surface_of_cloud(nodes_mm: Float, displacement_mm: Float, towards: Float) ->
         ``model_invalid`` for fewer than three points or points on one line; ``model_not_a_surface`` if points are
         behind one another.
     """
-    from scipy.spatial import Delaunay, QhullError  # slow to load, and not every start needs it
+    from scipy.spatial import (  # slow to load, and not every start needs it
+        Delaunay,
+        QhullError,
+        cKDTree,  # slow to load, and not every start needs it
+    )
 
     axis = towards / np.linalg.norm(towards)
     plane = np.linalg.svd(axis[None])[2][1:]

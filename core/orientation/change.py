@@ -12,7 +12,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from stereorig.core.arrays import Float
 from stereorig.core.cameras.camera import Camera, RigidTransform
@@ -26,6 +25,8 @@ _STEP_RAD = 1e-5
 
 def changed(pair: StereoPair, change: Float) -> StereoPair:
     """Return the pair with camera 2 moved by a change (5,), :data:`CHANGE_NAMES`; camera 1 keeps its pose."""
+    from scipy.spatial.transform import Rotation  # slow to load, and not every start needs it
+
     change = np.asarray(change, dtype=np.float64)
     relative = pair.cam2_from_cam1
     rotation = Rotation.from_rotvec(change[:3]).as_matrix() @ relative.rotation
@@ -37,6 +38,8 @@ def changed(pair: StereoPair, change: Float) -> StereoPair:
 
 def changes_between(before: StereoPair, after: StereoPair) -> Float:
     """Return the change (5,) from one pair to another; a difference of the baselines' lengths is left out."""
+    from scipy.spatial.transform import Rotation  # slow to load, and not every start needs it
+
     turn = after.cam2_from_cam1.rotation @ before.cam2_from_cam1.rotation.T
     centre, axes = _baseline(before)
     unit = centre / np.linalg.norm(centre)

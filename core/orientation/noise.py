@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.spatial import cKDTree
 
 from stereorig.core.arrays import Float
 from stereorig.core.field.region.trend import smooth_terms
 from stereorig.core.orientation.matched import MatchedPoints
 from stereorig.core.robust import BIWEIGHT_REACH, MAD_TO_SIGMA, biweight, median, spread_indices
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
 
 _BLOCKS = 8
 _FLOOR_PX = 1e-6
@@ -50,6 +53,9 @@ class SharedNoise:
     @staticmethod
     def of(points: MatchedPoints) -> SharedNoise:
         """Look at points of one or several steps."""
+        from scipy.sparse import csr_array  # slow to load, and not every start needs it
+        from scipy.spatial import cKDTree  # slow to load, and not every start needs it
+
         n, width = len(points.xy1_px), points.subset_px
         some = np.arange(n) if n <= _PAIRED else np.unique(spread_indices(n, _PAIRED))
         # subsets of two steps get the distance of two subsets that do not overlap

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stereorig.core.cameras.stereo import StereoPair
 from stereorig.core.errors import RegionError
-from stereorig.core.field.seeding.epipolar_search import visible_depths
-from stereorig.core.field.seeding.seeds import Seed, seeds_of
 from stereorig.core.settings import AnalysisSettings
 from stereorig.server.formats.calibrations.recognise import load_calibration
+
+if TYPE_CHECKING:
+    from stereorig.core.field.seeding.seeds import Seed
+
 
 #: a click is good to some pixels; further from the epipolar line it is another point
 MAX_EPIPOLAR_PX = 8.0
@@ -37,6 +40,8 @@ def check_seeds(calibration: Path, settings: AnalysisSettings, size2_px: tuple[i
     RegionError
         ``seed_outside``, ``seed_off_epipolar``.
     """
+    from stereorig.core.field.seeding.seeds import seeds_of  # slow to load, and not every start needs it
+
     seeds = [s for s in seeds_of(settings) or [] if s.xy2_px is not None]
     if seeds:
         check_positions(load_calibration(calibration).pair, seeds, size2_px)
@@ -86,6 +91,8 @@ def distances_px(pair: StereoPair, seeds: Sequence[Seed]) -> np.ndarray:
 
 def epipolar_line(pair: StereoPair, xy_px: Position, size2_px: tuple[int, int]) -> list[list[float]]:
     """Return camera 2's possible positions of a point of camera 1, about 32 along the epipolar line; empty if none."""
+    from stereorig.core.field.seeding.epipolar_search import visible_depths  # slow to load
+
     position = np.asarray(xy_px, dtype=np.float64)
     depths = visible_depths(pair, position, (size2_px[1], size2_px[0]), spacing_px=max(*size2_px) / 32.0)
     if not len(depths):

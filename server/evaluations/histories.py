@@ -20,8 +20,6 @@ from stereorig.core.gauge.area import points_within
 from stereorig.core.gauge.extensometer import extensometer
 from stereorig.core.gauge.reading import MISSING, Reading, reading_of
 from stereorig.core.names import ALL_CAUSES
-from stereorig.core.strain import surface_strain
-from stereorig.core.strain.mean import mean_strain_variance
 from stereorig.server.formats.results.reading import read_field, read_head
 from stereorig.server.formats.results.strain import read_strain
 from stereorig.server.formats.results.variables import STRAIN_NAMES
@@ -148,6 +146,9 @@ def _reading(path: Path, gauge: Ends | Mean, frame: Alignment | None) -> Reading
 
 
 def _mean(path: Path, field: Field, gauge: Mean) -> Reading:
+    from stereorig.core.strain import surface_strain  # slow to load, and not every start needs it
+    from stereorig.core.strain.mean import mean_strain_variance  # slow to load, and not every start needs it
+
     measured, axis = read_strain(path), STRAIN_NAMES.index(gauge.component)
     if measured is None:
         raise InputError(

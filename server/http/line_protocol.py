@@ -31,7 +31,7 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
-from stereorig.core.live.gauges import UNITS
+from stereorig.core.names import UNITS
 from stereorig.server.config.rig_file import LiveSection
 from stereorig.server.formats.version import software_version
 from stereorig.server.http.shutout import ShutOut

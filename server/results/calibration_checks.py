@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereorig.core.arrays import Float
-from stereorig.core.boards import BoardTarget, detect_target
+from stereorig.core.boards import BoardTarget
 from stereorig.core.calibration.aspect_images import AspectMeasurement, measure_aspect_normal
 from stereorig.core.calibration.checks.compare import (
     CalibrationComparison,
@@ -151,6 +151,8 @@ def aspect_of_images(
     ImageError, TargetError
         As :func:`stereorig.core.boards.detect_target`, the image named.
     """
+    from stereorig.core.boards import detect_target  # slow to load, and not every start needs it
+
     if not isinstance(target, GridTarget):
         raise CalibrationInputError(
             f"The aspect ratio is measured on a line grid at 45 degrees, not on a target of kind {target.kind}.",

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stereorig.core.arrays import Float
 from stereorig.core.cameras.camera import POSE_NAMES, Camera, angles_from_rotation, rotation_derivatives
@@ -107,6 +106,8 @@ def find_changes(
     significant
         Probability below which a cause is refused.
     """
+    from scipy.spatial.transform import Rotation  # slow to load, and not every start needs it
+
     lenses = [[n for n in own if n.partition(".")[2] not in POSE_NAMES] for own in names]
     same_lens = lenses[0] == lenses[1]
     shown = lenses[0] if same_lens else [n for n in lenses[0] if n in lenses[1]]

@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stereorig.core.arrays import Float
 from stereorig.core.calibration.checks.changed import Changes, find_changes
@@ -349,6 +348,8 @@ def _measured(pair: StereoPair, images: Float) -> Float:
 
 def _best_motion(a: Float, b: Float) -> RigidTransform:
     """Rigid motion from points ``a`` (n, 3) to ``b``, least squares."""
+    from scipy.spatial.transform import Rotation  # slow to load, and not every start needs it
+
     middle_a, middle_b = a.mean(axis=0), b.mean(axis=0)
     R = Rotation.align_vectors(b - middle_b, a - middle_a)[0].as_matrix()
     return RigidTransform(R, middle_b - R @ middle_a)
@@ -407,6 +408,8 @@ def _aligned_in_images(
     Returns the points (n, 3), the image differences (4 n,), and an orthonormal basis (4 n, 6) of the changes by
     motions.
     """
+    from scipy.spatial.transform import Rotation  # slow to load, and not every start needs it
+
     moved = b_from_a.apply(points_mm)
 
     def at(points: Float) -> tuple[Float, Float]:

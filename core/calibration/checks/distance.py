@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
-from scipy.spatial.distance import pdist
 
 from stereorig.core.arrays import Bool, Float
 from stereorig.core.calibration.fit.dots import dot_offsets_px
@@ -257,11 +255,15 @@ def _similarity(board: Float, points: Float) -> tuple[float, RigidTransform, Flo
 
 
 def _nearest_mm(nominal: Float) -> float:
+    from scipy.spatial import cKDTree  # slow to load, and not every start needs it
+
     distances = np.asarray(cKDTree(nominal).query(nominal, k=2)[0])
     return float(np.median(distances[:, 1]))
 
 
 def _outermost_mm(nominal: Float) -> float:
+    from scipy.spatial.distance import pdist  # slow to load, and not every start needs it
+
     return float(pdist(nominal).max())
 
 

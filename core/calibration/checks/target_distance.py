@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereorig.core.arrays import Float
-from stereorig.core.boards import BoardTarget, BoardView, detect_target
+from stereorig.core.boards import BoardTarget, BoardView
 from stereorig.core.calibration.checks.distance import DistanceCheck, check_target_scale
 from stereorig.core.calibration.expect import correlation_of_lines
 from stereorig.core.calibration.inputs import nodes_of, pitch_scale_sigma
@@ -52,6 +52,8 @@ def check_target_images(
     CalibrationInputError
         As :func:`stereorig.core.calibration.checks.distance.check_target_scale`.
     """
+    from stereorig.core.boards import detect_target  # slow to load, and not every start needs it
+
     views = []
     for name, image in zip(CAMERAS, images, strict=True):
         try:

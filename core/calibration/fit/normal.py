@@ -13,7 +13,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 
 from stereorig.core.arrays import Bool, Float
 from stereorig.core.calibration.fit.layout import Layout, Priors, State
@@ -61,11 +60,15 @@ class NodeBlock:
 
     @cached_property
     def _factor(self) -> tuple[Float, bool]:
+        from scipy.linalg import cho_factor  # slow to load, and not every start needs it
+
         factor, lower = cho_factor(self.matrix)
         return np.asarray(factor), bool(lower)
 
     def solve(self, right: Float) -> Float:
         """Return the inverse times (n, k, p)."""
+        from scipy.linalg import cho_solve  # slow to load, and not every start needs it
+
         if not self.together:
             return np.asarray(np.linalg.solve(self.matrix, right))
         n, k, p = right.shape

@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereorig.core.arrays import Bool, Float
 from stereorig.core.errors import RegionError
-from stereorig.core.field.region.line_crossings import cross
 from stereorig.core.threads import run_ranges
 
 _AT_ONCE = 8192
@@ -65,6 +64,8 @@ def crosses(a_px: ArrayLike, b_px: ArrayLike, cuts: Cuts | None) -> Bool:
     NDArray
         (n,) or (...) bool. A line that only touches a cut meets it; NaN meets nothing.
     """
+    from stereorig.core.field.region.line_crossings import cross  # slow to load, and not every start needs it
+
     a, b = np.broadcast_arrays(np.asarray(a_px, dtype=np.float64), np.asarray(b_px, dtype=np.float64))
     out = np.zeros(a.shape[:-1], bool)
     if not cuts or out.size == 0:

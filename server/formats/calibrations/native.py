@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from stereorig.core.boards import BoardTarget
 from stereorig.core.calibration import COVARIANCE_NAMES, CalibrationResult, CheckMeasures, Measures, ViewResult
@@ -125,6 +124,8 @@ def view_record(view: ViewResult) -> dict[str, Any]:
 
 def pose_record(pose: RigidTransform) -> dict[str, list[float]]:
     """Return a pose as a rotation vector and a translation."""
+    from scipy.spatial.transform import Rotation  # slow to load, and not every start needs it
+
     return {
         "rotation_vector_rad": Rotation.from_matrix(pose.rotation).as_rotvec().tolist(),
         "translation_mm": pose.translation_mm.tolist(),

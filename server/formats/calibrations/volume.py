@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stereorig.core.arrays import Float
 from stereorig.core.boards.board import BOARD_KINDS, BoardTarget
@@ -80,6 +79,8 @@ def _points_mm(target: TargetRecord) -> Float | None:
 
 
 def _transform(pose: PoseRecord) -> RigidTransform:
+    from scipy.spatial.transform import Rotation  # slow to load, and not every start needs it
+
     rotation = Rotation.from_rotvec(pose.rotation_vector_rad).as_matrix()
     return RigidTransform(rotation, np.array(pose.translation_mm))
 

@@ -5,19 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
 from stereorig.core.arrays import Float
 from stereorig.core.errors import FileFormatError, InputError
-from stereorig.core.model.surface import ModelSurface, surface_of_cloud
 from stereorig.server.formats.manifest import checked_bytes
 from stereorig.server.formats.models.cells import triangles_of
 from stereorig.server.formats.models.mesh_file import DISPLACEMENT, MeshFile, is_displacement, unreadable
 from stereorig.server.formats.models.table import read_table
 from stereorig.server.formats.models.vtu import read_vtu
 from stereorig.server.formats.models.xdmf import read_xdmf
+
+if TYPE_CHECKING:
+    from stereorig.core.model.surface import ModelSurface
+
 
 Unit = Literal["um", "mm", "cm", "m", "in"]
 #: units of length that a model may be in
@@ -67,6 +70,11 @@ class ModelFile:
         InputError
             ``model_invalid``, ``model_no_surface``, ``model_not_a_surface``.
         """
+        from stereorig.core.model.surface import (  # slow to load, and not every start needs it
+            ModelSurface,
+            surface_of_cloud,
+        )
+
         if not self.mesh.cells:
             return replace(surface_of_cloud(self.nodes_mm, self.displacement_mm, towards), plane=self.plane)
         triangles, solid = triangles_of(self.mesh)

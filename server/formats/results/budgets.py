@@ -13,7 +13,6 @@ from stereorig.core.field.points.result import Field
 from stereorig.core.names import ALL_PARTS, BudgetName, Cause
 from stereorig.core.robust import median, spread_indices
 from stereorig.core.strain import StrainField
-from stereorig.core.strain.reference import reference_share
 from stereorig.server.formats.results.layout import COVARIANCE_NAMES
 from stereorig.server.formats.results.variables import STRAIN_NAMES
 
@@ -103,6 +102,8 @@ def strain_budgets(field: Field, strain: StrainField, points: Bool) -> dict[str,
     points
         (r, c) True at the points that are asked for.
     """
+    from stereorig.core.strain.reference import reference_share  # slow to load, and not every start needs it
+
     own = _diagonal(strain.covariance)[points]
     share = reference_share(field, strain, points)
     squares = _squares(strain.common, field.causes, points)

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from stereorig.core.common.factor import Causes
 from stereorig.core.field.points.result import Field, References, Rejected
 from stereorig.core.field.region.cuts import Cuts, as_arrays
-from stereorig.core.field.sequence.propagated import current_covariance
 from stereorig.core.names import CAUSES
 from stereorig.server.formats.results.layout import COLUMN_BY_COLUMN, ENTRIES, FROZEN, PROPAGATED_FROM, packed
 from stereorig.server.formats.results.variables import VARIABLES
@@ -142,6 +141,8 @@ def put_references(dataset: Any, references: References) -> None:
 
 def put_measured(dataset: Any, result: Field, measured: Field) -> None:
     """Write the start values of later steps, if they differ from the field that is shown."""
+    from stereorig.core.field.sequence.propagated import current_covariance  # slow to load
+
     if result.smoothing is not None and measured.uvw_mm is not None:
         for k, name in enumerate(("u", "v", "w")):
             put(

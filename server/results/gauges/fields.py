@@ -8,7 +8,6 @@ from pathlib import Path
 
 from stereorig.core.errors import InputError
 from stereorig.core.field.points.result import Field
-from stereorig.core.strain import surface_strain
 from stereorig.server.formats.files import make_folder
 from stereorig.server.formats.gauges.readings import FrameReading, RigidMotionReading
 from stereorig.server.formats.results.netcdf import rename_axes
@@ -69,6 +68,8 @@ class FieldWriter:
         motion: RigidMotionReading | None,
     ) -> None:
         """Write one step; strain, if the result has it, is computed again along the new axes."""
+        from stereorig.core.strain import surface_strain  # slow to load, and not every start needs it
+
         strain = read_strain(path) if self._with_strain else None
         if strain is not None:
             strain = surface_strain(field, strain.options, subset_px=strain.subset_px)

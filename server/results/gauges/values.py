@@ -13,7 +13,6 @@ from stereorig.core.gauge.extensometer import extensometer
 from stereorig.core.gauge.reading import Reading
 from stereorig.core.gauge.sampling import Samples, positions_along, sample
 from stereorig.core.names import ALL_PARTS
-from stereorig.core.strain.reference import reference_share
 from stereorig.core.strain.result import StrainField
 from stereorig.server.formats.gauges.readings import (
     AreaReading,
@@ -84,6 +83,8 @@ def _of_strain(
     variables: Variables, strain: StrainField, axis: int, positions: Samples, sigma: Float
 ) -> tuple[list[Budget], Float, Float | None]:
     """Budgets of a strain at positions, common parts and factors."""
+    from stereorig.core.strain.reference import reference_share  # slow to load, and not every start needs it
+
     common = None if strain.common is None else positions.of(strain.common[..., axis, :])
     part = np.full(len(sigma), np.nan) if common is None else np.linalg.norm(common, axis=-1)
     own = np.maximum(sigma**2 - np.nan_to_num(part) ** 2, 0.0)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,6 @@ from stereorig.core.arrays import Float, Floats
 from stereorig.core.errors import InputError
 from stereorig.core.field.points.result import Field
 from stereorig.core.field.points.shared_pixels import SharedPixels
-from stereorig.core.strain import surface_strain
-from stereorig.core.strain.mean import MeanStrainVariance, mean_strain_variance
 from stereorig.core.strain.result import StrainField
 from stereorig.server.base.errors import NotFoundError
 from stereorig.server.formats.results.derived import DERIVED, MAGNITUDE, magnitude
@@ -24,6 +23,9 @@ from stereorig.server.formats.results.layout import COVARIANCE_NAMES
 from stereorig.server.formats.results.strain import read_strain
 from stereorig.server.formats.results.variables import along_axes, field_variable
 from stereorig.server.results.reader import FileVariable, read_variable
+
+if TYPE_CHECKING:
+    from stereorig.core.strain.mean import MeanStrainVariance
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,8 @@ class Variables:
     @cached_property
     def strain(self) -> StrainField | None:
         """Strain along the axes that are read in; None where the file has none."""
+        from stereorig.core.strain import surface_strain  # slow to load, and not every start needs it
+
         strain = read_strain(self.path)
         if strain is None or not self._turned or not self.measured.has_motion:
             return strain
@@ -68,6 +72,8 @@ class Variables:
 
     def mean_strain_variance(self, inside: NDArray[np.bool_]) -> MeanStrainVariance | None:
         """Return the uncertainty of the means of exx, eyy, exy over an area; None without strain."""
+        from stereorig.core.strain.mean import mean_strain_variance  # slow to load, and not every start needs it
+
         strain = self.strain
         if strain is None:
             return None

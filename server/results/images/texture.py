@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from stereorig.core.arrays import Float
-from stereorig.core.field.seeding.specimen import Specimen
 from stereorig.core.settings import MAX_CORNERS, MAX_CUTS
 from stereorig.server.results.images.quality import gradients
+
+if TYPE_CHECKING:
+    from stereorig.core.field.seeding.specimen import Specimen
+
 
 #: noise for which errors are reported if it is not known, as a share of full scale: 2.55 grey levels of 255
 NOISE_SHARE = 0.01

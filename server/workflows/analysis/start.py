@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stereorig.core.errors import InputError, StateError
-from stereorig.core.field.region.lay_points import make_grid
 from stereorig.core.settings import AnalysisSettings, NoiseRecord, StoredSettings
 from stereorig.server.base.models import Ids
 from stereorig.server.cell.images import mask as read_mask
@@ -115,6 +114,8 @@ def check_region(
     service: Service, test_id: str, reference: int, settings: AnalysisSettings, mask: bytes | None
 ) -> None:
     """Refuse a region that leaves nothing to measure, before a job is made of it; see :func:`make_grid`."""
+    from stereorig.core.field.region.lay_points import make_grid  # slow to load, and not every start needs it
+
     image = read_image(service.tests.steps.read(test_id, reference).cam1)
     make_grid(settings, None if mask is None else read_mask(service.cell, mask), (image.shape[0], image.shape[1]))
 

@@ -6,7 +6,6 @@ from typing import Literal
 
 from stereorig.core.errors import StateError
 from stereorig.core.plan.settings import PlannedMeasurement, PlannedRig
-from stereorig.server.compute.calibration.expectation import PlannedCalibration, expectation_document, rig_as_planned
 from stereorig.server.store.folder import now_utc
 from stereorig.server.store.indexing.entries import calibration_entry
 from stereorig.server.workflows.calibration.sequence import CalibrationPlan, check_plan, rig_metadata, targets_of
@@ -35,6 +34,12 @@ def expectation(
     StateError
         If the stage cannot reach a position of the plan.
     """
+    from stereorig.server.compute.calibration.expectation import (  # slow to load, and not every start needs it
+        PlannedCalibration,
+        expectation_document,
+        rig_as_planned,
+    )
+
     check_plan(plan)
     as_it_is = rig == PlannedRig()
     if service.rig.config.stage is not None and as_it_is:

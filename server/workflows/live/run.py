@@ -16,8 +16,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from stereorig.core.errors import StereorigError
-from stereorig.core.live.gauges import UNITS
-from stereorig.core.names import CAMERAS
+from stereorig.core.names import CAMERAS, UNITS
 from stereorig.drivers.acquisition.pairing import Pair
 from stereorig.server.base.models import utc_text
 from stereorig.server.base.problem import JobProblem, problem_of

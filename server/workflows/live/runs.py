@@ -6,7 +6,6 @@ import threading
 from typing import Any
 
 from stereorig.core.errors import InputError, StateError
-from stereorig.core.field.region.lay_points import corners_px
 from stereorig.core.settings import NoiseRecord, Region, StoredSettings
 from stereorig.server.base.errors import NotFoundError
 from stereorig.server.compute.tasks import LiveTask
@@ -139,6 +138,8 @@ def _stored(asked: LiveSettings, size_px: tuple[int, int]) -> StoredSettings:
 
 
 def _about_gauges(asked: LiveSettings, size_px: tuple[int, int]) -> Region:
+    from stereorig.core.field.region.lay_points import corners_px  # slow to load, and not every start needs it
+
     corners = [xy for point in asked.points for xy in point.positions()]
     corners += [xy for one in asked.extensometers for xy in one.positions()]
     for area in asked.areas:

@@ -11,8 +11,9 @@ import pytest
 from tests.support.requirements import ROOT
 
 
-@pytest.mark.parametrize("name", ["stereorig.core.boards", "stereorig.core.grid", "stereorig.core.calibration"])
+@pytest.mark.parametrize("name", ["boards", "calibration", "grid", "matching", "orientation", "strain"])
 def test_every_name_is_found_where_it_lies(name):
+    name = f"stereorig.core.{name}"
     package = importlib.import_module(name)
     assert dir(package) == sorted(package.__all__)
     for one in package.__all__:

@@ -22,9 +22,10 @@ from stereorig.core.gauge.extensometer import extensometer
 from stereorig.core.gauge.sampling import sample
 from stereorig.core.live.clocks import clock_offset, value_at
 from stereorig.core.live.follow import Follower
-from stereorig.core.live.gauges import UNITS, GaugeSet, LiveGauge
+from stereorig.core.live.gauges import GaugeSet, LiveGauge
 from stereorig.core.live.measurement import LiveMeasurement, LiveOptions
 from stereorig.core.measure import ReferencePair
+from stereorig.core.names import UNITS
 from tests.support.gauge_field import SUBSET, make_field
 from tests.support.sequence_bench import GRID, OPTIONS, capture, plate, rig
 

@@ -10,10 +10,6 @@ from fastapi import APIRouter, Query
 from pydantic import Field, StringConstraints
 
 from stereorig.core.errors import InputError
-from stereorig.core.field.points.images import MeasureImage
-from stereorig.core.field.region.lay_points import make_grid
-from stereorig.core.field.seeding.scattered_matches import image_scale
-from stereorig.core.field.seeding.seeds import Seed
 from stereorig.core.settings import SPACING_PX, SUBSET_PX, AnalysisSettings, Pixel, Real, SpacingPx, SubsetPx, Whole
 from stereorig.server.api.models import Region, Reply, Request
 from stereorig.server.api.protocol.dependencies import ServiceDep, StepNumber, TestId
@@ -112,6 +108,8 @@ class ScaleReply(Reply):
 )
 def rate_texture(service: ServiceDep, test_id: TestId, n: StepNumber, body: TextureRequest) -> TextureReply:
     """Return the share of the region's subsets with an expected random error below 0.01 and 0.05 px, and a proposal."""
+    from stereorig.core.field.region.lay_points import make_grid  # slow to load, and not every start needs it
+
     if body.subset_px % 2 == 0:
         raise InputError(
             f"subset_px must be odd, got {body.subset_px}.",
@@ -142,6 +140,9 @@ def show_scale(
     step: Annotated[int, Query(ge=0, le=9999, description="Step whose images are looked at.")] = 0,
 ) -> ScaleReply:
     """Return the length of a pixel of camera 1 on the surface, from feature matches with camera 2."""
+    from stereorig.core.field.points.images import MeasureImage  # slow to load, and not every start needs it
+    from stereorig.core.field.seeding.scattered_matches import image_scale  # slow to load, and not every start needs it
+
     pair = load_calibration(service.tests.calibration_file(test_id)).pair
     images = service.tests.steps.verified(test_id, step)
     one, two = (
@@ -155,6 +156,8 @@ def show_scale(
 @router.post("/seeds:check", summary="Possible positions of seeds in camera 2", responses=errors(404, 409, 422))
 def check_seeds(service: ServiceDep, test_id: TestId, body: SeedsRequest) -> SeedsReply:
     """Return each seed's epipolar line in camera 2, and the distance of the position given there from it."""
+    from stereorig.core.field.seeding.seeds import Seed  # slow to load, and not every start needs it
+
     two = [None] * len(body.seeds) if body.seeds_cam2 is None else body.seeds_cam2
     if len(two) != len(body.seeds):
         raise InputError(

@@ -8,8 +8,6 @@ from typing import Annotated, Self
 from fastapi import APIRouter
 from pydantic import Field, model_validator
 
-from stereorig.core.field.points.images import MeasureImage
-from stereorig.core.field.seeding.specimen import find_specimen
 from stereorig.core.settings import SUBSET_PX, SubsetPx, Whole, require_odd
 from stereorig.server.api.models import Region, Reply, Request
 from stereorig.server.api.protocol.dependencies import ServiceDep, TestId
@@ -49,6 +47,9 @@ class FoundRegionReply(Reply):
 @router.post("/region:find", summary="Find the specimen, if no region is drawn yet", responses=errors(404, 409, 422))
 def find_region(service: ServiceDep, test_id: TestId, body: FindRegionRequest) -> FoundRegionReply:
     """Find the specimen by its texture: as far as camera 2 sees and matches it. Nothing is kept."""
+    from stereorig.core.field.points.images import MeasureImage  # slow to load, and not every start needs it
+    from stereorig.core.field.seeding.specimen import find_specimen  # slow to load, and not every start needs it
+
     pair = load_calibration(service.tests.calibration_file(test_id)).pair
     step = service.tests.steps.verified(test_id, body.reference)
     one, two = (
