@@ -1,3 +1,6 @@
 """Extensometers, lines, areas and rigid motions over result files."""
 
-FRAME_HELP = "axes of positions, displacements and strain: system, specimen, or JSON as of a gauge's align (system)"
+FRAME_HELP = (
+    "axes of positions, displacements and strain: system, specimen, or JSON as of a gauge's align (specimen, where "
+    "there is a test; else those of the files)"
+)

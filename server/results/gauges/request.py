@@ -188,7 +188,9 @@ class GaugeRequest(CoverageFields, Request):
         "left out.",
         examples=[["u_mm", "w_mm"]],
     )
-    align: Alignment | None = Field(None, description="Frame to express everything in; the system frame if left out.")
+    align: Alignment | None = Field(
+        None, description="Frame to express everything in; the specimen's if left out, where there is a test."
+    )
     remove_rigid: RigidRemoval | None = Field(None, description="Remove the rigid motion first; null keeps it.")
     steps: Annotated[list[StepNumber], Field(min_length=1, max_length=10_000)] | None = Field(
         None, description="Steps to read; all if left out."

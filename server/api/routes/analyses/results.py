@@ -204,4 +204,5 @@ def get_probe(
 ) -> ProbeReply:
     """Return every number of the nearest point, with its uncertainty."""
     path = result_in(service, test_id, analysis_id, step, frame)
-    return ProbeReply.model_validate({"step": step, **dict(probe_result(path, x_px, y_px, coverage))})
+    about = {"step": step, "frame": read_head(path).frame}
+    return ProbeReply.model_validate({**about, **dict(probe_result(path, x_px, y_px, coverage))})
