@@ -29,6 +29,8 @@ STRAIN_STATUS_MEANINGS: dict[StrainStatus, str] = {
     StrainStatus.ONE_SIDED: "the window's points lie too much on one side or on one line",
 }
 
+_NO_DIRECTION_RAD = 0.25
+
 
 @dataclass(frozen=True, eq=False)
 class StrainField:
@@ -119,13 +121,48 @@ class StrainField:
         return np.asarray(np.sqrt(one**2 - one * two + two**2))
 
     @property
+    def direction_rad(self) -> Float:
+        """(r, c) ``angle_rad``; NaN where it has no ``sigma_direction_rad``."""
+        return np.where(np.isnan(self.sigma_direction_rad), np.nan, self.angle_rad)
+
+    @cached_property
+    def sigma_direction_rad(self) -> Float:
+        """(r, c) standard deviation of ``angle_rad``, linearised; NaN above 0.25 rad: noise sets it."""
+        c, s = self._double_angle
+        across, shear = self._deviation(-0.5 * s, 0.5 * s, c), 2.0 * self.max_shear
+        known = (across <= _NO_DIRECTION_RAD * shear) & (shear > 0.0)
+        return np.where(known, across / np.where(known, shear, 1.0), np.nan)
+
+    @property
+    def sigma_max_shear(self) -> Float:
+        """(r, c) standard deviation of ``max_shear``, linearised."""
+        c, s = self._double_angle
+        return self._deviation(0.5 * c, -0.5 * c, s)
+
+    @property
+    def sigma_von_mises(self) -> Float:
+        """(r, c) standard deviation of ``von_mises``, linearised; NaN where it is zero."""
+        mean = 0.25 * (self.strain[..., 0] + self.strain[..., 1])
+        half = 0.75 * (self.strain[..., 0] - self.strain[..., 1])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return self._deviation(mean + half, mean - half, 3.0 * self.strain[..., 2]) / self.von_mises
+
+    @property
+    def _double_angle(self) -> tuple[Float, Float]:
+        return np.cos(2.0 * self.angle_rad), np.sin(2.0 * self.angle_rad)
+
+    def _deviation(self, *by: Float) -> Float:
+        """(r, c) standard deviation of a quantity with these derivatives by exx, eyy, exy."""
+        gradient = np.stack(by, axis=-1)
+        variance = np.einsum("...i,...ij,...j", gradient, self.total_covariance, gradient)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+    @property
     def sigma_principal(self) -> Float:
         """(r, c, 2) standard deviations of the principal strains, linearised: they hold where e1 - e2 exceeds these."""
         c, s = np.cos(self.angle_rad), np.sin(self.angle_rad)
-        along = np.stack([c**2, s**2, 2.0 * c * s], axis=-1)
-        across = np.stack([s**2, c**2, -2.0 * c * s], axis=-1)
-        variance = [np.einsum("...i,...ij,...j", j, self.total_covariance, j) for j in (along, across)]
-        return np.asarray(np.sqrt(np.maximum(np.stack(variance, axis=-1), 0.0)))
+        along = self._deviation(c**2, s**2, 2.0 * c * s)
+        return np.stack([along, self._deviation(s**2, c**2, -2.0 * c * s)], axis=-1)
 
 
 def principal_of(strain: Float) -> Float:

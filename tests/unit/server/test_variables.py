@@ -46,13 +46,18 @@ def test_every_displacement_strain_and_position_is_listed_under_its_heading(head
     assert found["Standard uncertainty"] == {name for name in heads if name.startswith("sigma_")}
 
 
+def test_every_displacement_strain_and_position_has_its_standard_deviation(heads: dict[str, FieldVariable]) -> None:
+    numbers = [one.name for one in heads.values() if one.group in ("Displacement", "Strain", "Shape")]
+    assert [name for name in numbers if f"sigma_{name}" not in heads] == []
+
+
 def test_strains_are_shown_in_micrometres_per_metre_and_are_zero_at_the_reference(
     heads: dict[str, FieldVariable],
 ) -> None:
     strains = {"exx", "eyy", "exy", "e1", "e2", "max_shear", "von_mises"}
     in_microstrain = {one.name for one in heads.values() if one.kind == "strain"}
     patches = {f"{name}_patch" for name in ("exx", "eyy", "exy")} & set(heads)
-    assert in_microstrain == strains | patches | {f"sigma_{name}" for name in ("exx", "eyy", "exy", "e1", "e2")}
+    assert in_microstrain == strains | patches | {f"sigma_{name}" for name in strains}
     assert described("expanded_exx").kind == "strain"
     assert heads["strain_angle_rad"].kind == "angle"
     assert {one.name for one in heads.values() if one.relative} == strains | {"u_mm", "v_mm", "w_mm", "d_mm"}
