@@ -14,10 +14,10 @@ import numpy as np
 from stereorig.core.arrays import Float
 from stereorig.core.cameras.stereo import StereoPair
 from stereorig.core.dense.kernels.finish import AtPoints, Limits, Shape
-from stereorig.core.dense.prediction import predict
 from stereorig.core.dense.windows import Windows, finish_windows, measure_windows, node_positions
 from stereorig.core.errors import InputError
 from stereorig.core.field.points.images import MeasureImage
+from stereorig.core.field.points.prediction import predict
 from stereorig.core.field.points.result import Field
 from stereorig.core.field.points.smoothing_record import DenseRecord
 from stereorig.core.field.region.region import PointGrid

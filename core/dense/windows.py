@@ -15,7 +15,7 @@ from stereorig.core.cameras.stereo import StereoPair
 from stereorig.core.dense.kernels import drivers
 from stereorig.core.dense.kernels.finish import AtPoints, Limits, Shape
 from stereorig.core.dense.kernels.given import DenseGiven, DenseOut, Lattice
-from stereorig.core.dense.prediction import Prediction
+from stereorig.core.field.points.prediction import Prediction
 from stereorig.core.field.region.cuts import Cuts
 from stereorig.core.matching.arguments import flat, lens_of, own, reference_of, setting_of
 from stereorig.core.matching.image import ImageData

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereorig.core.arrays import Float
+from stereorig.core.arrays import Float, Float32
 from stereorig.core.cameras.camera import Camera
 from stereorig.core.cameras.stereo import StereoPair
 from stereorig.core.errors import InputError
 from stereorig.core.matching.image import PAD, ImageData
-from stereorig.core.matching.kernels.given import ComparedImage, Given, ReferenceImage, Setting
+from stereorig.core.matching.kernels.given import ComparedImage, Given, ReferenceImage, Setting, Warped
+from stereorig.core.matching.kernels.motion import n_kept
 from stereorig.core.matching.options import SPLINE_ORDER, MatchOptions
 from stereorig.core.threads import run_ranges
 
@@ -40,6 +41,48 @@ class VisiblePixels:
 
     patches: NDArray[np.uint8]
     of_point: Int
+
+
+@dataclass(frozen=True, eq=False)
+class WarpedImages:
+    """The images compared with the reference, interpolated at one predicted place for each of its pixels.
+
+    Attributes
+    ----------
+    values
+        Three (rows, width) float32: grey levels of camera 2's reference and both cameras' current images, over the
+        pixels of camera 1's reference, with rows filled up to a width that is a multiple of eight.
+    bends_px
+        (N, 3, 2, 3) the prediction's terms of second order about each point: x^2, x y and y^2 of an image's position
+        along x and y, px, for offsets over half the subset's width.
+    epipolar_px
+        (N,) the prediction's epipolar offset.
+    memory
+        (M, k) of :func:`empty_memory`; filled by the fits. Later steps of the sequence, whose prediction of camera 2's
+        reference image is the same, then do not compare that image again.
+    number
+        (N,) the points' rows in it.
+    """
+
+    values: tuple[Float32, Float32, Float32]
+    bends_px: Float
+    epipolar_px: Float
+    memory: Float
+    number: NDArray[np.intp]
+
+    def take(self, index: NDArray[np.intp]) -> WarpedImages:
+        """Return the same for some of the points."""
+        return WarpedImages(self.values, self.bends_px[index], self.epipolar_px[index], self.memory, self.number[index])
+
+
+def empty_memory(n: int) -> Float:
+    """Return a memory of n points of which no step was measured yet."""
+    return np.full((n, n_kept(1)), np.nan)
+
+
+_NOT_WARPED = Warped(
+    (np.empty((0, 0), np.float32),) * 3, np.zeros((1, 3, 2, 3)), np.zeros((1, n_kept(1))), np.zeros(1, np.intp)
+)
 
 
 def one_a_thread(make: Callable[[int], Any], subset: int) -> Callable[[], Any]:
@@ -88,6 +131,7 @@ def given_to_kernels(
     *,
     G: Float | None = None,
     epipolar_px: Float | None = None,
+    warped: WarpedImages | None = None,
 ) -> Given:
     """Return the kernels' arguments for n points with unknowns ``w`` and, for a motion, ``G``."""
     n, pose = len(xy), pair.cam2_from_cam1
@@ -105,6 +149,9 @@ def given_to_kernels(
         w=w,
         G=np.zeros((n, 3, w.shape[1])) if G is None else G,
         e=np.zeros(n) if epipolar_px is None else epipolar_px,
+        warped=_NOT_WARPED
+        if warped is None
+        else Warped(warped.values, own(warped.bends_px), warped.memory, warped.number),
         setting=setting_of(options, images),
     )
 

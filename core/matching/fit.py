@@ -15,9 +15,11 @@ from stereorig.core.errors import ImageError, InputError
 from stereorig.core.matching.arguments import (
     Int,
     VisiblePixels,
+    WarpedImages,
     assumed_variance,
     degree_of,
     given_to_kernels,
+    own,
     points_of,
     run_kernel,
     starts_of,
@@ -191,6 +193,7 @@ def fit_motion(
     start_G: ArrayLike | None = None,
     options: MatchOptions | None = None,
     visible: VisiblePixels | None = None,
+    warped: WarpedImages | None = None,
 ) -> MotionFit:
     """Measure shape and motion at points of camera 1 from three comparisons at once.
 
@@ -210,6 +213,9 @@ def fit_motion(
         Defaults to ``MatchOptions()``.
     visible
         Which pixels of the points' subsets count; all of them when left out.
+    warped
+        The images at the places that the starts predict. Then a single step is made from these, with images that are
+        not interpolated again; a point that is further from its prediction gets the status NOT_CONVERGED.
 
     Raises
     ------
@@ -237,7 +243,8 @@ def fit_motion(
     w = starts_of("start_w", start_w, (n,), terms)
     G = starts_of("start_G", no_motion(pair, xy) if start_G is None else start_G, (n, 3), terms)
     out = np.full((n, n_motion_out(terms)), np.nan)
-    given = given_to_kernels(pair, images, xy, w, options, visible, G=G)
+    e = None if warped is None else own(warped.epipolar_px)
+    given = given_to_kernels(pair, images, xy, w, options, visible, G=G, epipolar_px=e, warped=warped)
     status, iterations = run_kernel(run_points["motion"][degree], work_space["motion"][degree], given, out)
     failed, at = status != 0, 4 * terms
     out[failed, : at + 1] = np.nan

@@ -27,10 +27,10 @@ class DenseGiven(NamedTuple):
     """Images, cameras, prediction and settings.
 
     ``blocked`` (rows, cols) uint8 of camera 1's image, 1 where a pixel does not count, or empty. ``nodes``, ``seen``,
-    ``cells``: see :class:`stereorig.core.dense.prediction.Prediction`. ``state`` (r, c, 8) at the points: w0, G00, G10,
-    G20, the epipolar offset; camera 2's normalised shift for a pixel across the epipolar line, x and y, and its pixels
-    for a unit of w0. ``levels`` (1 + images,) grey levels that are taken off the images, so that sums keep their
-    digits. ``variances``: of the images' noise at weight 1, or all one.
+    ``cells``: see :class:`stereorig.core.field.points.prediction.Prediction`. ``state`` (r, c, 8) at the points: w0,
+    G00, G10, G20, the epipolar offset; camera 2's normalised shift for a pixel across the epipolar line, x and y, and
+    its pixels for a unit of w0. ``levels`` (1 + images,) grey levels that are taken off the images, so that sums keep
+    their digits. ``variances``: of the images' noise at weight 1, or all one.
     """
 
     reference: ReferenceImage

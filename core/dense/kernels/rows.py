@@ -1,4 +1,4 @@
-"""Whole rows of pixels, eight at a time: their interpolation, and their products added to the sums of columns.
+"""Whole rows of pixels, eight at a time: their products, added to the sums of columns.
 
 Rows are float32, sums double. An intrinsic passes LLVM the fact, unknown to the compiler, that numba's arrays do not
 overlap.
@@ -13,8 +13,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from stereorig.core.matching.kernels.loops import data, lanes, spline
-from stereorig.core.matching.kernels.vectors import DOUBLE, FLOAT, INT, LANES, LONG, Vec, at, load, spread, store
+from stereorig.core.matching.kernels.vectors import DOUBLE, FLOAT, LANES, LONG, Vec, at, load, spread, store
 
 COUNT, P, F, FF, GXX, GXY, GYY, GX, GY, FGX, FGY = range(11)
 """Sums of a column of pixels: how many count, weights, and weighted products of f and of its gradients."""
@@ -33,50 +32,6 @@ along x and y times the weight, and one over the weight, zero where a pixel does
 def columns_of(images: int) -> int:
     """Return the number of sums that a column of pixels has."""
     return FIRST + EACH * images
-
-
-def _interpolation(order: int) -> Any:
-    def interpolate(_typingctx: Any, c: Any, stride: Any, tap: Any, tx: Any, ty: Any, blocks: Any, out: Any) -> Any:
-        """Interpolate an image at a row of places.
-
-        Parameters
-        ----------
-        c
-            Padded coefficients, flat float32.
-        stride
-            int64 row length of ``c``.
-        tap
-            int32 flat index of the first tap of each place.
-        tx, ty
-            float32 fractions of the places.
-        blocks
-            int64 number of places over eight.
-        out
-            float32 out.
-        """
-        sig = types.void(c, stride, tap, tx, ty, blocks, out)
-
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            image, taps, x, y, to = (data(context, builder, sig, args, i) for i in (0, 2, 3, 4, 6))
-            rows = [image]
-            for _ in range(order):
-                rows.append(at(builder, rows[-1], args[1]))
-            with cgutils.for_range(builder, args[5]) as loop:
-                offset = builder.mul(builder.sext(loop.index, LONG), LONG(LANES))
-                first = lanes(builder, load(builder, at(builder, taps, offset), LANES, INT).value)
-                value = spline(
-                    order, rows, first, load(builder, at(builder, x, offset)), load(builder, at(builder, y, offset))
-                )
-                store(value * (1.0 / 36.0 if order == 3 else 1.0 / 14400.0), at(builder, to, offset))
-            return context.get_dummy_value()
-
-        return sig, codegen
-
-    interpolate.__name__ = f"interpolate_row_{order}"
-    return intrinsic(interpolate)
-
-
-interpolate_cubic, interpolate_quintic = _interpolation(3), _interpolation(5)
 
 
 def _adding(images: int) -> Any:

@@ -19,8 +19,8 @@ import numpy as np
 from stereorig.core.dense.kernels import rows as q
 from stereorig.core.dense.kernels.cameras import factor, invert_lower, positions
 from stereorig.core.dense.kernels.given import DenseSpace
-from stereorig.core.dense.kernels.rows import N_ROWS, add_row, columns_of, interpolate_cubic, interpolate_quintic
-from stereorig.core.matching.image import PAD
+from stereorig.core.dense.kernels.rows import N_ROWS, add_row, columns_of
+from stereorig.core.matching.kernels.lattice import cubic, interpolate_cubic, interpolate_quintic, places
 from stereorig.core.matching.kernels.naming import inner, kernel
 from stereorig.core.matching.kernels.noise import CONTRAST, DENSITY, N_LEVELS, joint_weights
 from stereorig.core.matching.kernels.point import LOW_TEXTURE, OK, OUTSIDE_IMAGE, SINGULAR
@@ -30,7 +30,6 @@ from stereorig.core.status import PointStatus
 
 MASKED = int(PointStatus.MASKED)
 _MIN_CONTRAST2 = 1e-6
-_OFF_IMAGE = 1.0 / 4096.0  # weight of a pixel that another image does not show: the window's sum then reveals it
 
 
 class DenseKernels(NamedTuple):
@@ -38,63 +37,6 @@ class DenseKernels(NamedTuple):
 
     band: Any
     space: Callable[[int, int, int, int], DenseSpace]
-
-
-@inner
-def _along_row(nodes, row, t, image, cols, line):
-    """Values and slopes along x of one image's two coordinates at the points of a lattice row, ``t`` below ``row``."""
-    tt = t * t
-    h01 = tt * (3.0 - 2.0 * t)
-    h00 = 1.0 - h01
-    h10 = t * (1.0 - t) * (1.0 - t)
-    h11 = tt * (t - 1.0)
-    for c in range(cols):
-        for i in range(2):
-            top, low = nodes[row, c, 2 * image + i], nodes[row + 1, c, 2 * image + i]
-            line[2 * i, c] = h00 * top[0] + h01 * low[0] + h10 * top[2] + h11 * low[2]
-            line[2 * i + 1, c] = h00 * top[1] + h01 * low[1] + h10 * top[3] + h11 * low[3]
-
-
-@inner
-def _cubic(a, b, c, e, u):
-    """Value of the cubic with values a, c and slopes b, e at 0 and 1."""
-    return a + u * (b + u * (3.0 * (c - a) - 2.0 * b - e + u * (2.0 * (a - c) + b + e)))
-
-
-@inner
-def _places(y, lattice, nodes, seen, image, size, lead, lines, row, tap, tx, ty):
-    """First taps and fractions of one image along a row of pixels; ``row[0]`` marks the pixels that count."""
-    _, high, wide, stride = image
-    k, cols = size
-    along = (y - lattice.y0) / lattice.spacing + lattice.rim
-    top = math.floor(along)
-    n_cells = seen.shape[1]
-    _along_row(nodes, top, along - top, k, n_cells + 1, lines)
-    begin, per_spacing = 0, 1.0 / lattice.spacing
-    for cell in range(n_cells):
-        x_here = lattice.x0 + (cell - lattice.rim) * lattice.spacing
-        last = min(max(math.ceil(x_here + lattice.spacing), begin), cols)
-        first = min(max(math.ceil(x_here), begin), last)
-        if seen[top, cell] == 0:
-            first = last
-        for x in range(begin, first):
-            tap[x], row[0, x] = 0, 0.0
-        begin = last
-        ax, bx, cx, ex = lines[0, cell], lines[1, cell], lines[0, cell + 1], lines[1, cell + 1]
-        ay, by, cy, ey = lines[2, cell], lines[3, cell], lines[2, cell + 1], lines[3, cell + 1]
-        for x in range(first, last):
-            u = (x - x_here) * per_spacing
-            px, py = _cubic(ax, bx, cx, ex, u), _cubic(ay, by, cy, ey, u)
-            if px >= 0.0 and py >= 0.0 and px <= wide - 1.0 and py <= high - 1.0:
-                ix, iy = int(px), int(py)
-                tap[x] = (iy + PAD - lead) * stride + ix + PAD - lead
-                tx[x], ty[x] = px - ix, py - iy
-            else:
-                tap[x] = 0
-                if row[0, x] == 1.0:
-                    row[0, x] = _OFF_IMAGE
-    for x in range(begin, cols):
-        tap[x], row[0, x] = 0, 0.0
 
 
 @inner
@@ -114,7 +56,7 @@ def _row_of_pixels(y, reference, blocked, images, lattice, nodes, seen, grey, or
     lead = 1 if order == 3 else 2
     blocks = np.int64((cols + LANES - 1) // LANES)
     for k in range(n_images):
-        _places(y, lattice, nodes, seen, images[k], (k, cols), lead, lines, row, tap, tx, ty)
+        places(y, lattice, nodes, seen, images[k], (k, cols), lead, lines, row, tap, tx, ty)
         coefficients, stride, grey_row = images[k].coefficients, np.int64(images[k].stride), row[N_ROWS + k]
         if order == 3:
             interpolate_cubic(coefficients, stride, tap, tx, ty, blocks, grey_row)
@@ -222,8 +164,8 @@ def make_windows(images: int) -> DenseKernels:
                 corner = small[3]
                 for m in range(2):
                     top, low = nodes[cell_r, cell_c + m, 2 * k + j], nodes[cell_r + 1, cell_c + m, 2 * k + j]
-                    corner[m] = _cubic(top[0], top[2], low[0], low[2], v)
-                    corner[2 + m] = _cubic(top[1], top[3], low[1], low[3], v)
+                    corner[m] = cubic(top[0], top[2], low[0], low[2], v)
+                    corner[2 + m] = cubic(top[1], top[3], low[1], low[3], v)
                     d = low[0] - top[0]
                     small[4, m] = (
                         top[2]
@@ -237,13 +179,13 @@ def make_windows(images: int) -> DenseKernels:
                         + v * v * (3.0 * (top[3] + low[3]) - 6.0 * d)
                     )
                 d = corner[1] - corner[0]
-                predicted[j] = _cubic(corner[0], corner[2], corner[1], corner[3], u)
+                predicted[j] = cubic(corner[0], corner[2], corner[1], corner[3], u)
                 turn[2 * j] = (
                     corner[2]
                     + u * (6.0 * d - 4.0 * corner[2] - 2.0 * corner[3])
                     + u * u * (3.0 * (corner[2] + corner[3]) - 6.0 * d)
                 )
-                turn[2 * j + 1] = _cubic(small[4, 0], small[4, 2], small[4, 1], small[4, 3], u)
+                turn[2 * j + 1] = cubic(small[4, 0], small[4, 2], small[4, 1], small[4, 3], u)
             for j in range(4):
                 turn[j] *= per_px
             measured[2 * k] = predicted[0] + turn[0] * sx + turn[1] * sy

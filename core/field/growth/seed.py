@@ -16,6 +16,7 @@ from stereorig.core.field.growth.check import check
 from stereorig.core.field.growth.grow import fit_in_batches
 from stereorig.core.field.growth.patch import keep_patch, refit_curved
 from stereorig.core.field.growth.state import SAMPLE_FAR_PX, FieldInputs, GrowthState
+from stereorig.core.field.growth.warped import fit_on_warped_images
 from stereorig.core.field.points.features import Box
 from stereorig.core.field.points.fitter import PointFits
 from stereorig.core.field.points.images import features_of
@@ -81,7 +82,7 @@ def seed_motion(
         w, G = previous.starts.w.reshape(n, -1), previous.starts.G.reshape(n, 3, -1)
         tried = _sample_holds(inputs, state, w, G)
         if len(tried):
-            return _from_previous(inputs, state, w, G, tried)
+            return _from_previous(inputs, state, w, G, shape, tried)
     inputs.progress("seeds", 0, 1)
     if seeds is not None:
         state = _given_motion(inputs, state, as_seeds(seeds))
@@ -148,7 +149,9 @@ def _match_seeds_at(
     return found
 
 
-def _from_previous(inputs: FieldInputs, state: GrowthState, w: Float, G: Float, tried: NDArray[np.intp]) -> GrowthState:
+def _from_previous(
+    inputs: FieldInputs, state: GrowthState, w: Float, G: Float, shape: Field, tried: NDArray[np.intp]
+) -> GrowthState:
     """Start all points from the previous step's values; a fitted sample of them is valid already.
 
     Points near those of the sample ``tried`` that failed are probably hidden: they are left to growth.
@@ -157,12 +160,15 @@ def _from_previous(inputs: FieldInputs, state: GrowthState, w: Float, G: Float, 
         state = refit_curved(inputs, state)
     points = state.points
     sample = np.flatnonzero(points.ok)
+    w, G = w[:, : state.fitter.terms], G[:, :, : state.fitter.terms]  # a few points may have had curved patches
     if points.G.shape == G.shape:
         G = predict(inputs.pair, inputs.xy_px, G, sample, points.w[sample], points.G[sample])
     known = np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2))
     known &= ~_amid_failed(inputs.xy_px, tried, points.ok[tried])
     index = np.flatnonzero(inputs.usable & known & ~points.ok)
     inputs.progress("previous", 0, len(index))
+    if state.fitter.terms == 3:
+        index = fit_on_warped_images(inputs, state, w, G, shape, sample, index)
     fitter = state.fitter.converging(points.rate[sample])
     fit_in_batches(
         fitter,

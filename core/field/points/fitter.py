@@ -12,7 +12,7 @@ from stereorig.core.arrays import Bool, Float
 from stereorig.core.cameras.stereo import StereoPair
 from stereorig.core.field.points.scales import far_from_start, plausible
 from stereorig.core.field.region.visibility import Visibility
-from stereorig.core.matching.arguments import VisiblePixels
+from stereorig.core.matching.arguments import VisiblePixels, WarpedImages
 from stereorig.core.matching.fit import fit_motion, fit_shape
 from stereorig.core.matching.image import ImageData
 from stereorig.core.matching.options import MatchOptions
@@ -224,8 +224,11 @@ class Fitter:
         """Return the same matcher for points that converge as a sample (m,) of them did, see :func:`learned_rate`."""
         return replace(self, options=replace(self.options, first_rate=learned_rate(rate, None, self.options)))
 
-    def fit(self, xy_px: Float, w: Float, G: Float | None) -> PointFits:
-        """Refine points from start values and reject those that fail the checks of a single point."""
+    def fit(self, xy_px: Float, w: Float, G: Float | None, warped: WarpedImages | None = None) -> PointFits:
+        """Refine points from start values and reject those that fail the checks of a single point.
+
+        With ``warped`` images of a motion the starts are the prediction that these show.
+        """
         n = len(xy_px)
         visible = self.visible(xy_px)
         w, G = self._terms_of(w), None if G is None else self._terms_of(G)
@@ -244,7 +247,8 @@ class Fitter:
                 np.full(n, np.nan),
             )
         else:
-            m = fit_motion(self.pair, self.ref1, self.ref2, self.cur1, self.cur2, xy_px, w, G, self.options, visible)
+            images = self.ref1, self.ref2, self.cur1, self.cur2
+            m = fit_motion(self.pair, *images, xy_px, w, G, self.options, visible, warped)
             fits = PointFits(
                 m.w,
                 m.G,

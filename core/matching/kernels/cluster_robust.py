@@ -123,7 +123,9 @@ def make_cluster_robust(degree: int, images: int, parts: PointKernels, freeze: A
         return total * total / squares
 
     @kernel(f"{degree}_{images}", inline="always")
-    def cluster_robust_point(reference, patches, which, shown, lens1, lens2, R, t, xy, w, g, e, setting, space, out):
+    def cluster_robust_point(
+        reference, patches, which, shown, lens1, lens2, R, t, xy, w, g, e, _values, _bends, _kept, setting, space, out
+    ):
         """Compute the covariance of a fitted point's last unknowns; return status, and 0.
 
         ``out`` has two of ``last`` squared numbers: with independent blocks, and with neighbouring blocks correlated.

@@ -35,7 +35,8 @@ def _entry(name: str, kernel: Any, stamp: int) -> Any:
     def run(first, last, given, space, out, status, iterations):
         if stamp < 0:  # never; it makes the stamp part of the function
             return
-        reference, patches, which, images, lens1, lens2, R, t, xy, w, G, e, setting = given
+        reference, patches, which, images, lens1, lens2, R, t, xy, w, G, e, warped, setting = given
+        before = warped.values[0].shape[0] > 0
         for i in range(first, last):
             status[i], iterations[i] = _point(
                 reference,
@@ -50,6 +51,9 @@ def _entry(name: str, kernel: Any, stamp: int) -> Any:
                 w[i],
                 G[i],
                 e[i],
+                warped.values,
+                warped.bends[i if before else 0],
+                warped.memory[warped.number[i] if before else 0],
                 setting,
                 space,
                 out[i],

@@ -40,13 +40,28 @@ class Setting(NamedTuple):
     rigid: bool
 
 
+class Warped(NamedTuple):
+    """The compared images as they were interpolated before, at one predicted place for each pixel of the reference.
+
+    ``values`` three (rows, cols) float32, of no rows if they were not. ``bends`` (n, 3, 2, 3): the prediction's terms
+    of second order about each point, x^2, x y and y^2 of image k's position along x and y, px, for offsets over the
+    subset's half width. ``memory`` (m, ``n_kept``) and ``number`` (n,), each point's row of it: what is the same in
+    every step, the reference's sums and the first image's comparison; NaN where no step was measured before.
+    """
+
+    values: Any
+    bends: Any
+    memory: Any
+    number: Any
+
+
 class Given(NamedTuple):
     """Images, cameras, n points and settings.
 
     ``patches`` (k, subset, subset) uint8 are zero where a pixel does not count, ``which`` (n,) is the index of a
     point's, -1 = none. Images compared with the reference: camera 2's reference and, for a motion, both cameras'
     current images. ``xy`` (n, 2) px; ``w`` (n, M), ``G`` (n, 3, M) starts, or with ``e`` (n,) px the results whose
-    covariance is computed.
+    covariance is computed. With images warped before, the starts with ``e`` are the prediction that they show.
     """
 
     reference: ReferenceImage
@@ -61,6 +76,7 @@ class Given(NamedTuple):
     w: Any
     G: Any
     e: Any
+    warped: Warped
     setting: Setting
 
 
@@ -86,6 +102,8 @@ class ReferenceSpace(NamedTuple):
 class Subset(NamedTuple):
     """A point's subset in the reference.
 
+    ``mean``: grey levels taken off it.
+
     ``inside``: True if it is inside the image and the lens model's domain; the point's ray ``xc, yc``, the weights' sum
     ``p``, the remaining mean of f, the sum of squares of f about it, the differences of neighbours relative to it (1
     for white noise), the number of pixels that count, and the grey level that is subtracted from an image before it is
@@ -101,6 +119,7 @@ class Subset(NamedTuple):
     white: float
     n_pixels: float
     first_shift: float
+    mean: float
 
 
 class WarpSpace(NamedTuple):

@@ -9,7 +9,8 @@ taps of these eight are loaded, so that no load waits for an address. No bounds 
 
 The reference subset is a (6, width) float32 array with the rows X and Y (offsets from the subset's centre over its half
 width, -1 to 1), f (grey levels, mean taken out), weight, and the derivatives of f with respect to the pixel's position
-along x and y. ``width`` is the number of pixels rounded up to eight, and eight more; the surplus is zero.
+along x and y. ``width`` is the number of pixels rounded up to eight, and eight more; the surplus is zero. A seventh
+row has the grey levels of another image, where that was interpolated before.
 """
 
 from __future__ import annotations
@@ -36,10 +37,12 @@ from stereorig.core.matching.kernels.vectors import (
     transpose4,
 )
 
-X, Y, F, WEIGHT, GX, GY = range(6)
+X, Y, F, WEIGHT, GX, GY, WARPED = range(7)
 N_ROWS = 6
 N_WARP = 22
 """Ten coefficients of the position along x, ten along y, gain and shift of the grey levels."""
+X_BENDS, Y_BENDS = 3, 13
+"""First coefficients of second order, x^2, x y and y^2, of the positions along x and y."""
 
 
 def monomials(degree: int) -> list[tuple[int, int]]:
@@ -168,10 +171,10 @@ def data(context: Any, builder: Any, sig: Any, args: Any, i: int) -> Any:
     return context.make_array(sig.args[i])(context, builder, args[i]).data
 
 
-def _reference_rows(context: Any, builder: Any, sig: Any, args: Any, i: int) -> list[Any]:
+def _reference_rows(context: Any, builder: Any, sig: Any, args: Any, i: int, count: int = N_ROWS) -> list[Any]:
     array = context.make_array(sig.args[i])(context, builder, args[i])
     width = builder.extract_value(array.shape, 1)
-    return [at(builder, array.data, builder.mul(width, LONG(r))) for r in range(N_ROWS)]
+    return [at(builder, array.data, builder.mul(width, LONG(r))) for r in range(count)]
 
 
 def _comparison(order: int, degree: int) -> Any:
@@ -223,16 +226,7 @@ def _comparison(order: int, degree: int) -> Any:
                 find_position(builder.add(offset, LONG(LANES)))
                 x, y, f, weight, gx, gy = (load(builder, at(builder, row, offset)) for row in ref)
                 d = spline(order, rows, first, tx, ty) * gain - (warp[21] + f)
-                a = weight * d
-                bx, by = a * gx, a * gy
-                columns = _powers(x, y, degree)
-                return [
-                    a,
-                    a * f,
-                    a * d,
-                    *(bx * m if m else bx for m in columns),
-                    *(by * m if m else by for m in columns),
-                ]
+                return _summands(x, y, f, weight * d, d, (gx, gy), degree)
 
             find_position(LONG(0))
             _sum_up(builder, args[5], 3 + 2 * len(monomials(degree)), terms, data(context, builder, sig, args, 6), 0)
@@ -268,6 +262,50 @@ def _sampling(order: int) -> Any:
 
     sample_pixels.__name__ = f"sample_{'cubic' if order == 3 else 'quintic'}"
     return intrinsic(sample_pixels)
+
+
+def _warped_comparison(degree: int) -> Any:
+    def compare_warped(_typingctx: Any, warp: Any, ref: Any, blocks: Any, out: Any) -> Any:
+        """Compare the grey levels in the row ``WARPED`` with the reference subset.
+
+        They were interpolated at the place of the pixel plus a motion of second order, which is taken off with the
+        reference's gradient.
+
+        Parameters
+        ----------
+        warp
+            (22,) float32: that motion of x and of y, reference px, from ``X_BENDS`` and ``Y_BENDS`` on; gain and shift.
+        ref, blocks, out
+            As in ``compare_pixels``.
+        """
+        sig = types.void(warp, ref, blocks, out)
+
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            p = data(context, builder, sig, args, 0)
+            warp = [spread(builder, builder.load(at(builder, p, LONG(i)))) for i in range(N_WARP)]
+            ref = _reference_rows(context, builder, sig, args, 1, WARPED + 1)
+
+            def terms(offset: Any) -> list[Vec]:
+                x, y, f, weight, gx, gy, g = (load(builder, at(builder, row, offset)) for row in ref)
+                dx, dy = (x * (warp[i] * x + warp[i + 1] * y) + warp[i + 2] * (y * y) for i in (X_BENDS, Y_BENDS))
+                d = (g * warp[20] - (warp[21] + f)) - (gx * dx + gy * dy)
+                return _summands(x, y, f, weight * d, d, (gx, gy), degree)
+
+            n_sums = 3 + 2 * len(monomials(degree))
+            _sum_up(builder, args[2], n_sums, terms, data(context, builder, sig, args, 3), 0)
+            return context.get_dummy_value()
+
+        return sig, codegen
+
+    compare_warped.__name__ = f"compare_warped_{degree}"
+    return intrinsic(compare_warped)
+
+
+def _summands(x: Vec, y: Vec, f: Vec, a: Vec, d: Vec, gradient: tuple[Vec, Vec], degree: int) -> list[Vec]:
+    """Summands of a comparison: a, a f, a d, and a times each gradient times each monomial up to the degree."""
+    bx, by = (a * g for g in gradient)
+    columns = _powers(x, y, degree)
+    return [a, a * f, a * d, *(bx * m if m else bx for m in columns), *(by * m if m else by for m in columns)]
 
 
 def _powers(x: Vec, y: Vec, degree: int) -> list[Vec | None]:
@@ -353,4 +391,5 @@ def _reference_sums(degree: int) -> Any:
 compare_cubic = {degree: _comparison(3, degree) for degree in (1, 2)}
 compare_quintic = {degree: _comparison(5, degree) for degree in (1, 2)}
 sample_cubic, sample_quintic = _sampling(3), _sampling(5)
+compare_warped = {degree: _warped_comparison(degree) for degree in (1, 2)}
 sum_reference = {degree: _reference_sums(degree) for degree in (1, 2)}

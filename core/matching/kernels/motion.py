@@ -12,10 +12,12 @@ import numpy as np
 from stereorig.core.matching.kernels.cluster_robust import make_cluster_robust
 from stereorig.core.matching.kernels.given import FitKernels
 from stereorig.core.matching.kernels.linear import covariance_of_last, solve
+from stereorig.core.matching.kernels.loops import monomials
 from stereorig.core.matching.kernels.naming import kernel
 from stereorig.core.matching.kernels.noise import (
     CONTRAST,
     GAIN,
+    N_LEVELS,
     SHIFT,
     ZNCC,
     joint_weights,
@@ -24,6 +26,7 @@ from stereorig.core.matching.kernels.noise import (
     unlike_noise,
 )
 from stereorig.core.matching.kernels.point import (
+    FROM_PREDICTION_PX,
     LOW_TEXTURE,
     NOT_CONVERGED,
     NOT_SEEDED,
@@ -39,6 +42,7 @@ from stereorig.core.matching.kernels.point import (
     shortened,
     texture_status,
 )
+from stereorig.core.matching.kernels.reference import first_pixel, n_kept_reference
 from stereorig.core.matching.kernels.rigid import N_RIGID, nearest_rotation, rigid_chain, rigid_columns, rotate
 from stereorig.core.matching.kernels.vectors import LANES
 from stereorig.core.matching.kernels.warp import lens_jacobian
@@ -53,14 +57,21 @@ def n_motion_out(terms: int) -> int:
     return 4 * terms + 32
 
 
+def n_kept(degree: int) -> int:
+    """Numbers of a row of the memory of :class:`stereorig.core.matching.kernels.given.Warped`."""
+    return n_kept_reference(degree) + N_LEVELS + 2 * len(monomials(degree))
+
+
 def make_motion(degree: int) -> FitKernels:
     """Compile the fit for plane (degree 1, stretch or rigid) or curved (2) patches."""
     parts = make_point(degree, 3)
     set_up_reference, compare, image_matrices = parts.set_up_reference, parts.compare, parts.image_matrices
+    compare_before, keep, recall_reference = parts.compare_before, parts.keep, parts.recall_reference
     jacobian, assemble, factor = parts.jacobian, parts.assemble, parts.factor
     gradient, moves_of, predict = parts.gradient, parts.moves_of, parts.predict
     texture, few = parts.texture, parts.few
     unknowns = 4 * few + 1
+    n_reference = n_kept_reference(degree)
 
     @kernel(f"{degree}")
     def compare_all(images, lenses, M, order, ref, known, of_reference, warp_space, levels, rhs):
@@ -70,6 +81,33 @@ def make_motion(degree: int) -> FitKernels:
             if not compare(images[k], lens, M[k], order, ref, known, of_reference, warp_space, levels[k], rhs[k]):
                 return OUTSIDE_IMAGE
         for k in range(3):
+            if levels[k, CONTRAST] == 0.0:
+                return LOW_TEXTURE
+        return OK
+
+    @kernel(f"{degree}")
+    def compare_all_before(
+        values, bends, corner, first, images, lenses, M, order, ref, known, of_reference, warp_space, levels, rhs
+    ):
+        """The comparisons from ``first`` on with images warped before; status."""
+        for k in range(first, 3):
+            lens = lenses[0] if k == 1 else lenses[1]
+            if not compare_before(
+                values[k],
+                bends[k],
+                corner,
+                images[k],
+                lens,
+                M[k],
+                order,
+                ref,
+                known,
+                of_reference,
+                warp_space,
+                levels[k],
+                rhs[k],
+            ):
+                return OUTSIDE_IMAGE
             if levels[k, CONTRAST] == 0.0:
                 return LOW_TEXTURE
         return OK
@@ -99,16 +137,41 @@ def make_motion(degree: int) -> FitKernels:
 
     @kernel(f"{degree}", inline="always")
     def motion_point(
-        reference, patches, which, images, lens1, lens2, R, t, xy, start_w, start_g, _e, setting, space, out
+        reference,
+        patches,
+        which,
+        images,
+        lens1,
+        lens2,
+        R,
+        t,
+        xy,
+        start_w,
+        start_g,
+        start_e,
+        values,
+        bends,
+        kept,
+        setting,
+        space,
+        out,
     ):
-        """Fit one point, ``out`` as in ``n_motion_out``. Returns status and iterations."""
+        """Fit one point, ``out`` as in ``n_motion_out``. Returns status and iterations.
+
+        With images warped before, it is one step from the prediction, and the correlations after it are predicted.
+        """
         order, tolerance, variances = setting.order, setting.tolerance, setting.variances
         ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, rotation, chain, work = (
             space
         )
         gram, columns, normal = of_reference.gram, equations.columns, equations.normal
         subset = setting.subset
-        seen = set_up_reference(reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference)
+        before = values[0].shape[0] > 0
+        known_before = before and kept[0] == kept[0]  # not NaN
+        if known_before:
+            seen = recall_reference(reference, patches, xy[0], xy[1], subset, kept, ref, of_reference)
+        else:
+            seen = set_up_reference(reference, patches, which, lens1, xy[0], xy[1], subset, ref, of_reference)
         xc, yc, p, offset, f2 = seen.xc, seen.yc, seen.p, seen.offset, seen.f2
         if not seen.inside:
             return OUTSIDE_IMAGE, 0
@@ -141,7 +204,9 @@ def make_motion(degree: int) -> FitKernels:
         slopes = lens_jacobian(lens1, xc, yc)
         blocks_of_pixels = np.int64((subset * subset + LANES - 1) // LANES)
         known = (blocks_of_pixels, p, offset, f2)
-        e = 0.0
+        half = 0.5 * (subset - 1)
+        corner = first_pixel(xy[1], half), first_pixel(xy[0], half), subset
+        e = start_e if before else 0.0
         for k in range(3):
             levels[k, GAIN], levels[k, SHIFT] = 1.0, seen.first_shift
         moved, previous, last, share = np.inf, 0.0, np.inf, 1.0
@@ -149,7 +214,38 @@ def make_motion(degree: int) -> FitKernels:
         iterations = 0
         while iterations < setting.max_iterations:
             image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M)
-            result = compare_all(images, lenses, M, order, ref, known, of_reference, warp_space, levels, rhs)
+            if before:
+                first = 0
+                if known_before:
+                    first = 1
+                    for i in range(N_LEVELS):
+                        levels[0, i] = kept[n_reference + i]
+                    for i in range(2 * few):
+                        rhs[0, i] = kept[n_reference + N_LEVELS + i]
+                result = compare_all_before(
+                    values,
+                    bends,
+                    corner,
+                    first,
+                    images,
+                    lenses,
+                    M,
+                    order,
+                    ref,
+                    known,
+                    of_reference,
+                    warp_space,
+                    levels,
+                    rhs,
+                )
+                if result == OK and not known_before:
+                    keep(seen, of_reference, kept)
+                    for i in range(N_LEVELS):
+                        kept[n_reference + i] = levels[0, i]
+                    for i in range(2 * few):
+                        kept[n_reference + N_LEVELS + i] = rhs[0, i]
+            else:
+                result = compare_all(images, lenses, M, order, ref, known, of_reference, warp_space, levels, rhs)
             if result != OK:
                 return result, iterations
             iterations += 1
@@ -192,11 +288,11 @@ def make_motion(degree: int) -> FitKernels:
             e += cut * step[unknowns - 1]
             last = cut * motion
             moved += last
-            if settled(last, previous, tolerance, setting.first_rate):
-                status = OK
+            if before or settled(last, previous, tolerance, setting.first_rate):
+                status = OK if last < FROM_PREDICTION_PX or not before else NOT_CONVERGED
                 break
             previous = last
-        if last < PREDICTED_PX:
+        if before or last < PREDICTED_PX:
             predict(moves, rhs, gram, f2, levels)
         else:
             image_matrices(R, t, xc, yc, w, G, e, nu_x, nu_y, M)

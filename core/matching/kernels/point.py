@@ -26,7 +26,18 @@ import numpy as np
 
 from stereorig.core.matching.kernels.given import Equations, ReferenceSpace, WarpSpace, WorkSpace
 from stereorig.core.matching.kernels.linear import QUAD, invert3, make_factor, make_product
-from stereorig.core.matching.kernels.loops import N_WARP, compare_cubic, compare_quintic, monomials
+from stereorig.core.matching.kernels.loops import (
+    N_WARP,
+    WARPED,
+    WEIGHT,
+    X_BENDS,
+    Y_BENDS,
+    F,
+    compare_cubic,
+    compare_quintic,
+    compare_warped,
+    monomials,
+)
 from stereorig.core.matching.kernels.naming import inner, kernel
 from stereorig.core.matching.kernels.noise import (
     CONTRAST,
@@ -40,7 +51,7 @@ from stereorig.core.matching.kernels.noise import (
     ZNCC,
     interpolated_noise,
 )
-from stereorig.core.matching.kernels.reference import make_reference, subset_array
+from stereorig.core.matching.kernels.reference import copy, make_reference, subset_array
 from stereorig.core.matching.kernels.warp import N_NODES, lens_jacobian, set_up_warp
 from stereorig.core.status import PointStatus
 
@@ -54,6 +65,7 @@ LOW_CORRELATION = int(PointStatus.LOW_CORRELATION)
 
 REFREEZE_PX = 0.5  # corner motion after which the frozen normal equations are computed again
 PREDICTED_PX = 0.05  # last corner motion up to which the correlation at its end is predicted instead of compared again
+FROM_PREDICTION_PX = 0.2  # corner motion up to which one step from a prediction that images were warped by will do
 STEADY_FROM = 6  # iteration from which a step that passes the minimum shortens the next ones: most points end before
 OVERSHOT = 0.5  # share of the last step that the next one goes back
 FLAT = 1e-6  # squared contrast below which an image has no texture
@@ -139,29 +151,44 @@ def make_sum_pixels(degree: int) -> Any:
     return sum_pixels
 
 
+@inner
+def _grey_scale(ref, subset, warp):
+    """Set gain and shift that bring the row ``WARPED`` to the reference's grey levels, from a ninth of the pixels."""
+    n, f, ff, g, gg = 0.0, 0.0, 0.0, 0.0, 0.0
+    for r in range(1, subset, 3):
+        for c in range(1, subset, 3):
+            i = r * subset + c
+            if ref[WEIGHT, i] > 0.0:
+                a, b = float(ref[F, i]), float(ref[WARPED, i])
+                n += 1.0
+                f += a
+                ff += a * a
+                g += b
+                gg += b * b
+    warp[20], warp[21] = 1.0, 0.0
+    if n > 0.0:
+        of_f, of_g = ff - f * f / n, gg - g * g / n
+        if of_g > FLAT * of_f and of_f > 0.0:
+            warp[20] = math.sqrt(of_f / of_g)
+        warp[21] = (warp[20] * g - f) / n
+
+
 @cache
-def make_compare(degree: int) -> Any:
-    """Compile the comparison of one image with the reference; shape and motion use the same."""
-    sum_pixels = make_sum_pixels(degree)
+def make_compare(degree: int) -> tuple[Any, Any]:
+    """Compile the comparison of one image with the reference, and that of one warped before.
+
+    Shape and motion use the same.
+    """
+    sum_pixels, sum_warped = make_sum_pixels(degree), compare_warped[degree]
     n_columns = 2 * len(monomials(degree))
     made_for = f"{degree}"
 
     @kernel(made_for)
-    def compare(image, lens, m, order, ref, known, of_reference, space, levels, rhs):
-        """Compare one image with the reference at the warp ``m``; False if the patch leaves the image.
-
-        Fills ``rhs`` (2 M,), the sums of the zero-mean normalised residual times the columns, and updates ``levels``.
-        """
-        coefficients, rows, cols, stride = image
-        blocks, p, offset, f2 = known
+    def judge(known, of_reference, order, space, levels, rhs):
+        """Fill ``rhs`` and ``levels`` from the sums over the pixels."""
+        _, p, offset, f2 = known
         sum_g, sum_fg = of_reference.sum_g, of_reference.sum_fg
-        warp, positions, sums = space
-        base = set_up_warp(lens, m, of_reference.powers, rows, cols, stride, 1 if order == 3 else 2, positions, warp)
-        if base < 0:
-            return False
-        warp[20] = levels[GAIN]
-        warp[21] = levels[SHIFT]
-        sum_pixels(coefficients, order, base, stride, warp, ref, blocks, sums)
+        warp, _, sums = space
         # the loop used y = gain g - shift, d = y - f, with the float32 of gain and shift
         gain, shift = float(warp[20]), float(warp[21])
         mean = sums[0] / p
@@ -170,7 +197,7 @@ def make_compare(degree: int) -> Any:
         if not y2 > FLAT * gain * gain * f2:
             levels[ZNCC] = 0.0
             levels[CONTRAST] = 0.0
-            return True
+            return
         c = math.sqrt(y2 / f2)
         for i in range(n_columns):
             rhs[i] = (sums[3 + i] - mean * sum_g[i] + sum_fg[i]) / c - sum_fg[i]
@@ -182,17 +209,61 @@ def make_compare(degree: int) -> Any:
         half = of_reference.middle[2]
         levels[SMOOTHED] = interpolated_noise(warp, half, order)
         levels[DENSITY] = min(max(abs(warp[1] * warp[12] - warp[2] * warp[11]) / (half * half), 0.01), 100.0)
+
+    @kernel(made_for)
+    def compare(image, lens, m, order, ref, known, of_reference, space, levels, rhs):
+        """Compare one image with the reference at the warp ``m``; False if the patch leaves the image.
+
+        Fills ``rhs`` (2 M,), the sums of the zero-mean normalised residual times the columns, and updates ``levels``.
+        """
+        coefficients, rows, cols, stride = image
+        warp, positions, sums = space
+        base = set_up_warp(lens, m, of_reference.powers, rows, cols, stride, 1 if order == 3 else 2, positions, warp)
+        if base < 0:
+            return False
+        warp[20] = levels[GAIN]
+        warp[21] = levels[SHIFT]
+        sum_pixels(coefficients, order, base, stride, warp, ref, known[0], sums)
+        judge(known, of_reference, order, space, levels, rhs)
         return True
 
-    return compare
+    @kernel(made_for)
+    def compare_before(values, bends, corner, image, lens, m, order, ref, known, of_reference, space, levels, rhs):
+        """Compare one image warped before, ``values`` (rows, cols); as ``compare``, whose warp is ``m``.
+
+        ``bends`` (2, 3) of :class:`stereorig.core.matching.kernels.given.Warped`; ``corner`` the subset's first row and
+        column and its width.
+        """
+        _, rows, cols, stride = image
+        warp, positions, sums = space
+        if set_up_warp(lens, m, of_reference.powers, rows, cols, stride, 2, positions, warp) < 0:
+            return False
+        top, left, subset = corner
+        copy(values, top, left, subset, ref, np.int64(WARPED))
+        _grey_scale(ref, subset, warp)
+        # the prediction's motion within the patch, from px of this image to px of the reference
+        half = of_reference.middle[2]
+        xx, xy, yx, yy = float(warp[1]), float(warp[2]), float(warp[11]), float(warp[12])
+        over = half / (xx * yy - xy * yx)
+        for i in range(3):
+            a, b = bends[0, i] - warp[X_BENDS + i], bends[1, i] - warp[Y_BENDS + i]
+            warp[X_BENDS + i], warp[Y_BENDS + i] = over * (yy * a - xy * b), over * (xx * b - yx * a)
+        sum_warped(warp, ref, known[0], sums)
+        judge(known, of_reference, order, space, levels, rhs)
+        return True
+
+    return compare, compare_before
 
 
 class PointKernels(NamedTuple):
     """The compiled parts of a fit, the maker of its work space, and the number of its patch's monomials."""
 
     set_up_reference: Any
+    keep: Any
+    recall_reference: Any
     work_space: Callable[[int], WorkSpace]
     compare: Any
+    compare_before: Any
     image_matrices: Any
     jacobian: Any
     assemble: Any
@@ -210,8 +281,8 @@ def make_point(degree: int, images: int) -> PointKernels:
     each = 4 if images == 3 else 1  # unknowns a monomial: w_j, and G_0j, G_1j, G_2j
     unknowns = each * few + 1
     row = (unknowns + QUAD - 1) // QUAD * QUAD
-    set_up_reference, n_columns, n_raw = make_reference(degree)
-    compare = make_compare(degree)
+    set_up_reference, (keep, recall_reference), n_columns, n_raw = make_reference(degree)
+    compare, compare_before = make_compare(degree)
     product, factor = make_product(row), make_factor(row)
     made_for = f"{degree}_{images}"
 
@@ -401,8 +472,11 @@ def make_point(degree: int, images: int) -> PointKernels:
 
     return PointKernels(
         set_up_reference=set_up_reference,
+        keep=keep,
+        recall_reference=recall_reference,
         work_space=work_space,
         compare=compare,
+        compare_before=compare_before,
         image_matrices=image_matrices,
         jacobian=jacobian,
         assemble=assemble,

@@ -21,10 +21,10 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from stereorig.core.matching.kernels.given import Subset
-from stereorig.core.matching.kernels.loops import GX, GY, N_ROWS, WEIGHT, F, X, Y, monomials, sum_reference
+from stereorig.core.matching.kernels.loops import GX, GY, WARPED, WEIGHT, F, X, Y, monomials, sum_reference
 from stereorig.core.matching.kernels.naming import inner, kernel
 from stereorig.core.matching.kernels.vectors import LANES, LONG, at, load, store
-from stereorig.core.matching.kernels.warp import set_up_nodes, undistort
+from stereorig.core.matching.kernels.warp import N_NODES, set_up_nodes, undistort
 
 LARGE_MEAN = 100.0
 """Mean of a subset over its contrast from which on an image's sums start from the mean. A float32 sum of squares has
@@ -34,7 +34,7 @@ six digits and must hold the contrast's square: up to here it has two of them, w
 def subset_array(subset: int) -> np.ndarray:
     """Return an array for the reference subset, its rows that all points share filled; the surplus is zero."""
     width = (subset * subset + LANES - 1) // LANES * LANES + LANES
-    ref = np.zeros((N_ROWS, width), np.float32)
+    ref = np.zeros((WARPED + 1, width), np.float32)
     coordinate = np.linspace(-1.0, 1.0, subset)
     n = subset * subset
     ref[X, :n], ref[Y, :n] = (axis.ravel() for axis in np.meshgrid(coordinate, coordinate))
@@ -70,13 +70,20 @@ def _copy_square(_typingctx: Any, image: Any, top: Any, left: Any, subset: Any, 
 
 
 @inner
-def _copy(image, top, left, subset, ref, row):
+def copy(image, top, left, subset, ref, row):
+    """Copy a square of an image into one row of the reference subset's array."""
     if subset >= LANES:
         _copy_square(image, np.int64(top), np.int64(left), np.int64(subset), ref, np.int64(row))
         return
     for r in range(subset):
         for c in range(subset):
             ref[row, r * subset + c] = image[top + r, left + c]
+
+
+@inner
+def first_pixel(middle_px, half):
+    """First pixel, along an axis, of a subset nearest to a position."""
+    return int(np.floor(middle_px - half + 0.5))
 
 
 @inner
@@ -98,6 +105,15 @@ def _count_visible(patches, which, subset, weighted, ref):
                 if not weighted:
                     ref[WEIGHT, r * subset + c] = 1.0
     return count
+
+
+_AFTER_SUBSET = 9  # numbers of a Subset in a row of the memory
+
+
+def n_kept_reference(degree: int) -> int:
+    """Numbers that the memory has of a reference subset."""
+    few = len(monomials(degree))
+    return _AFTER_SUBSET + 3 + few * N_NODES + few * few + 4 * few * (few + 1)
 
 
 def _product_table(degree: int) -> np.ndarray:
@@ -131,10 +147,10 @@ def make_reference(degree: int) -> Any:
         """
         pixels, grad_x, grad_y, weights = reference
         raw, node_work, powers, basis, middle, sum_g, sum_fg, gram = space
-        nothing = Subset(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        nothing = Subset(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         rows, cols = pixels.shape
         half = 0.5 * (subset - 1)
-        left, top = int(np.floor(x_px - half + 0.5)), int(np.floor(y_px - half + 0.5))
+        left, top = first_pixel(x_px, half), first_pixel(y_px, half)
         if left < 0 or top < 0 or left + subset > cols or top + subset > rows:
             return nothing
         xc, yc = undistort(lens, x_px, y_px)
@@ -143,11 +159,11 @@ def make_reference(degree: int) -> Any:
         middle[0], middle[1], middle[2] = left + half - x_px, top + half - y_px, half
         if not set_up_nodes(lens, middle[0], middle[1], half, xc, yc, node_work, powers):
             return nothing
-        _copy(pixels, top, left, subset, ref, np.int64(F))
-        _copy(grad_x, top, left, subset, ref, np.int64(GX))
-        _copy(grad_y, top, left, subset, ref, np.int64(GY))
+        copy(pixels, top, left, subset, ref, np.int64(F))
+        copy(grad_x, top, left, subset, ref, np.int64(GX))
+        copy(grad_y, top, left, subset, ref, np.int64(GY))
         if weights.shape[0] > 0:
-            _copy(weights, top, left, subset, ref, np.int64(WEIGHT))
+            copy(weights, top, left, subset, ref, np.int64(WEIGHT))
         count = subset * subset
         if patches.shape[0] > 0:
             count = _count_visible(patches, which, subset, weights.shape[0] > 0, ref)
@@ -184,9 +200,57 @@ def make_reference(degree: int) -> Any:
         first_shift = float(mean / subset)
         if first_shift * first_shift * p <= LARGE_MEAN * LARGE_MEAN * f2:
             first_shift = 0.0
-        return Subset(True, xc, yc, p, offset, f2, 0.5 * raw[3] / f2, float(count), first_shift)
+        mean_used = np.float64(np.float32(mean / subset))
+        return Subset(True, xc, yc, p, offset, f2, 0.5 * raw[3] / f2, float(count), first_shift, mean_used)
 
-    return set_up_reference, n_columns, first_gg + 3 * many
+    @kernel(f"{degree}")
+    def keep(seen, space, kept):
+        """Write what :func:`recall_reference` needs of a whole subset to a row of the memory."""
+        _, _, powers, basis, middle, sum_g, sum_fg, gram = space
+        _, kept[0], kept[1], kept[2], kept[3], kept[4], kept[5], kept[6], kept[7], kept[8] = seen
+        at = _AFTER_SUBSET
+        for i in range(3):
+            kept[at + i] = middle[i]
+        at += 3
+        for values in (powers, basis, gram):
+            for r in range(values.shape[0]):
+                for c in range(values.shape[1]):
+                    kept[at] = values[r, c]
+                    at += 1
+        for i in range(n_columns):
+            kept[at + i], kept[at + n_columns + i] = sum_g[i], sum_fg[i]
+
+    @kernel(f"{degree}")
+    def recall_reference(reference, patches, x_px, y_px, subset, kept, ref, space):
+        """Set up a whole subset as ``set_up_reference`` does, with the sums of a row of the memory."""
+        pixels, grad_x, grad_y, weights = reference
+        _, _, powers, basis, middle, sum_g, sum_fg, gram = space
+        at = _AFTER_SUBSET
+        for i in range(3):
+            middle[i] = kept[at + i]
+        at += 3
+        for values in (powers, basis, gram):
+            for r in range(values.shape[0]):
+                for c in range(values.shape[1]):
+                    values[r, c] = kept[at]
+                    at += 1
+        for i in range(n_columns):
+            sum_g[i], sum_fg[i] = kept[at + i], kept[at + n_columns + i]
+        left, top = first_pixel(x_px, middle[2]), first_pixel(y_px, middle[2])
+        copy(pixels, top, left, subset, ref, np.int64(F))
+        copy(grad_x, top, left, subset, ref, np.int64(GX))
+        copy(grad_y, top, left, subset, ref, np.int64(GY))
+        mean = np.float32(kept[8])
+        for i in range(subset * subset):
+            ref[F, i] -= mean
+        if weights.shape[0] > 0:
+            copy(weights, top, left, subset, ref, np.int64(WEIGHT))
+        elif patches.shape[0] > 0:
+            for i in range(subset * subset):
+                ref[WEIGHT, i] = 1.0
+        return Subset(True, kept[0], kept[1], kept[2], kept[3], kept[4], kept[5], kept[6], kept[7], kept[8])
+
+    return set_up_reference, (keep, recall_reference), n_columns, first_gg + 3 * many
 
 
 @inner

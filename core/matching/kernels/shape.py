@@ -64,7 +64,26 @@ def make_shape(degree: int) -> FitKernels:
         return OK if factor(normal, n) else LOW_TEXTURE
 
     @kernel(f"{degree}", inline="always")
-    def shape_point(reference, patches, which, images, lens1, lens2, R, t, xy, start, _G, _e, setting, space, out):
+    def shape_point(
+        reference,
+        patches,
+        which,
+        images,
+        lens1,
+        lens2,
+        R,
+        t,
+        xy,
+        start,
+        _G,
+        _e,
+        _values,
+        _bends,
+        _kept,
+        setting,
+        space,
+        out,
+    ):
         """Fit one point, ``out`` as in ``n_shape_out``. Returns status and iterations."""
         order, tolerance, variances = setting.order, setting.tolerance, setting.variances
         ref, of_reference, warp_space, rhs, levels, M, equations, moves, vectors, inverse, G, rotation, _, work = space

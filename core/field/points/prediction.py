@@ -17,7 +17,7 @@ from stereorig.core.arrays import Bool, Float
 from stereorig.core.field.region.cuts import Cuts
 from stereorig.core.field.region.window import fit_terms, steps_of, ways_cut, window_offsets
 
-_WIDTHS = (1.5, 1.0, 0.7)
+WIDTHS = (1.5, 1.0, 0.7)
 """Half widths of the windows that quadratics are fitted to, in subsets. The wider has less noise in its curvature,
 which is the only part that reaches a vector: a vector's value is measured. It is taken if its curvature differs from
 the narrowest one's by less than the narrowest one's noise, as the field's rms; and the narrower serve at points that it
@@ -53,7 +53,15 @@ class Prediction:
     rim: int
 
 
-def predict(xy_px: Float, positions: Float, measured: Bool, cuts: Cuts | None, *, subset_px: int) -> Prediction:
+def predict(
+    xy_px: Float,
+    positions: Float,
+    measured: Bool,
+    cuts: Cuts | None,
+    *,
+    subset_px: int,
+    widths: tuple[float, ...] = WIDTHS,
+) -> Prediction:
     """Return the prediction of a field.
 
     Parameters
@@ -68,10 +76,12 @@ def predict(xy_px: Float, positions: Float, measured: Bool, cuts: Cuts | None, *
         Lines that no window crosses.
     subset_px
         Width of the subset; the prediction reaches half of it beyond the outermost points.
+    widths
+        Half widths of the windows, subsets, the widest first.
     """
     rows, cols, m = positions.shape
     spacing = min(steps_of(xy_px))
-    halves = sorted({max(int(np.ceil(width * subset_px / spacing)), _MIN_HALF) for width in _WIDTHS}, reverse=True)
+    halves = sorted({max(int(np.ceil(width * subset_px / spacing)), _MIN_HALF) for width in widths}, reverse=True)
     rim = int(np.ceil((subset_px // 2 + 1) / spacing))
     wide = ((rim, rim), (rim, rim))
     shown = np.pad(np.where(measured[..., None], positions, np.nan), (*wide, (0, 0)), constant_values=np.nan)
