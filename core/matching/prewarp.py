@@ -90,8 +90,8 @@ def project_nodes(pair: StereoPair, rays: Float, state: Float, lattice: NodeLatt
     rays
         (r, c, 2) x and y of camera 1's normalised rays through the nodes.
     state
-        (r, c, 5, 4): inverse depth, current position over depth, epipolar offset, each with its slopes along columns
-        and rows and the mixed derivative, a spacing.
+        (r, c, 5, 4): inverse depth, current position over depth less the ray, epipolar offset, each with its slopes
+        along columns and rows and the mixed derivative, a spacing.
     lattice
         The nodes.
 
@@ -142,16 +142,16 @@ def _entries(stamp: int):  # type: ignore[no-untyped-def]
         for r in range(first, last):
             for c in range(rays.shape[1]):
                 xc, yc, of = rays[r, c, 0], rays[r, c, 1], state[r, c]
-                if not (np.isfinite(xc + yc) and of[0, 0] > 0.0 and of[3, 0] > 0.0):
+                if not (np.isfinite(xc + yc) and of[0, 0] > 0.0 and of[3, 0] > -1.0):
                     continue
                 j11, j12, j21, j22 = lens_jacobian(lens1, xc, yc)
                 nu_x, nu_y, _ = epipolar_shift(lens2, R, t, xc, yc, of[0, 0])
                 # slopes over the ray from slopes over the image
                 for i in range(4):
                     a, b = of[i, 1] / spacing, of[i, 2] / spacing
-                    unknowns[r, c, i, 0] = of[i, 0]
-                    unknowns[r, c, i, 1] = a * j11 + b * j21
-                    unknowns[r, c, i, 2] = a * j12 + b * j22
+                    unknowns[r, c, i, 0] = of[i, 0] + (xc if i == 1 else yc if i == 2 else 1.0 if i == 3 else 0.0)
+                    unknowns[r, c, i, 1] = a * j11 + b * j21 + (1.0 if i == 1 else 0.0)
+                    unknowns[r, c, i, 2] = a * j12 + b * j22 + (1.0 if i == 2 else 0.0)
                 over = spacing / (j11 * j22 - j12 * j21)
                 for d in range(4):
                     s[0, d] = s[1, d] = s[2, d] = 0.0
@@ -160,11 +160,12 @@ def _entries(stamp: int):  # type: ignore[no-untyped-def]
                 s[2, 0] = 1.0
                 for k in range(_IMAGES):
                     for d in range(4):
+                        moved = 0.0 if k == 0 else 1.0
+                        g0, g1, g2 = s[0, d] + moved * of[1, d], s[1, d] + moved * of[2, d], s[2, d] + moved * of[3, d]
                         for i in range(3):
                             if k == 1:
-                                q[i, d] = of[1 + i, d]
+                                q[i, d] = s[i, d] + of[1 + i, d]
                             else:
-                                g0, g1, g2 = (s[0, d], s[1, d], s[2, d]) if k == 0 else (of[1, d], of[2, d], of[3, d])
                                 q[i, d] = R[i, 0] * g0 + R[i, 1] * g1 + R[i, 2] * g2 + t[i] * of[0, d]
                     z = q[2, 0]
                     lens = lens1 if k == 1 else lens2

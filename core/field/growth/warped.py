@@ -17,7 +17,8 @@ LEAST_POINTS = 1000
 LARGEST_SPACING = 0.6
 """Fewer points, or points further apart (subsets), take less time by themselves: a warp's time is its pixels'."""
 _MIN_JUDGES = 20
-_RMS_SIGMA, _WORST_SIGMA = 0.15, 0.75  # differences from a point's own fit, over its standard deviation
+_FAR_PX = 0.1  # from the prediction; one step from there is no longer a point's own fit
+_RMS_SIGMA, _WORST_SIGMA = 0.1, 0.4  # differences from a point's own fit, over its standard deviation
 
 
 def fit_on_warped_images(
@@ -49,6 +50,9 @@ def fit_on_warped_images(
     worth = len(index) >= LEAST_POINTS and inputs.grid.spacing_px <= LARGEST_SPACING * options.subset_px
     if known_w is None or not worth or inputs.options.blur is not None or options.patch != "affine":
         return index
+    own = state.points.take(judges)
+    if np.mean(fitter.far_from_start(inputs.xy_px[judges], own, w[judges], G[judges], _FAR_PX)) > 0.5:
+        return index
     known = inputs.usable & np.isfinite(w).all(axis=1) & np.isfinite(G).all(axis=(1, 2))
     found = warp_to_prediction(fitter, inputs.grid, (known_w[:, 0], shape.epipolar_px.ravel()), w, G, known)
     if found is None:
@@ -59,8 +63,8 @@ def fit_on_warped_images(
     def fit(some: NDArray[np.intp]) -> PointFits:
         return fitter.fit(inputs.xy_px[some], found.w[some], found.G[some], found.warped.take(some))
 
-    judges = judges[whole[judges]]
-    if len(judges) < _MIN_JUDGES or not _agree(fit(judges), state.points.take(judges)):
+    inside = np.flatnonzero(whole[judges])
+    if len(inside) < _MIN_JUDGES or not _agree(fit(judges[inside]), own.take(inside)):
         return index
     left, index = [index[~whole[index]]], index[whole[index]]
     for first in range(0, len(index), MAX_BATCH):
@@ -78,7 +82,6 @@ def _agree(fits: PointFits, own: PointFits) -> bool:
     both = fits.ok & own.ok
     if both.sum() < _MIN_JUDGES:
         return False
-    change = np.concatenate([fits.w[both, :1] - own.w[both, :1], fits.G[both, :, 0] - own.G[both, :, 0]], axis=1)
-    sigma = np.sqrt(np.diagonal(own.covariance[both], axis1=1, axis2=2)[:, :4])
-    share = change / sigma
+    sigma = np.sqrt(np.diagonal(own.covariance[both], axis1=1, axis2=2)[:, 1:4])
+    share = (fits.G[both, :, 0] - own.G[both, :, 0]) / sigma
     return bool(np.sqrt(np.mean(share**2)) < _RMS_SIGMA and np.abs(share).max() < _WORST_SIGMA)

@@ -28,7 +28,7 @@ from stereorig.core.matching.arguments import WarpedImages, empty_memory
 from stereorig.core.matching.image import ImageData
 from stereorig.core.matching.prewarp import NodeLattice, project_nodes, warp_image
 
-_WIDTHS = (0.7,)
+_WIDTHS = (1.0,)
 _BEND_REACH = 0.6  # of half a subset: distance of the nodes whose second difference is a subset's curvature
 
 
@@ -109,13 +109,15 @@ def warp_to_prediction(
         return None
     rows, cols = grid.shape
     subset_px, pair, lattice = fitter.options.subset_px, fitter.pair, of.lattice
-    rays = pair.cam1.rays_cam(grid.xy_px.reshape(-1, 2)[known]).xyz_mm
-    scale = float(np.nanmedian(px_per_ray(pair, rays)[:, 0] / G[known, 2, 0]))  # px, as the prediction's limits are
-    # the same current positions, about the shape's inverse depths
-    moved = (scale * G[:, :, 0] * (shape[0] / w[:, 0])[:, None]).reshape(rows, cols, 3)
+    middle = slice(lattice.rim, lattice.rim + rows), slice(lattice.rim, lattice.rim + cols)
+    rays = of.rays[middle].reshape(-1, 3)
+    # px, as the prediction's limits are
+    scale = float(np.nanmedian(px_per_ray(pair, rays[known])[:, 0] / G[known, 2, 0]))
+    # the same current positions, about the shape's inverse depths; less the rays, which the lens bends
+    moved = (scale * (G[:, :, 0] * (shape[0] / w[:, 0])[:, None] - rays)).reshape(rows, cols, 3)
     smooth = predict(grid.xy_px, moved, known.reshape(rows, cols), grid.cuts, subset_px=subset_px, widths=_WIDTHS)
     state = np.concatenate([of.state[:, :, :1], smooth.nodes / scale, of.state[:, :, 1:]], axis=2)
-    nodes, unknowns = project_nodes(pair, of.rays, state, lattice)
+    nodes, unknowns = project_nodes(pair, of.rays[..., :2], state, lattice)
     seen = of.seen & smooth.seen & _between(np.isfinite(nodes).all(axis=(2, 3)))
     if not seen.any():
         return None
@@ -124,7 +126,6 @@ def warp_to_prediction(
     size, nodes = fitter.ref1.shape, np.nan_to_num(nodes)
     cur1, inside1 = warp_image(fitter.cur1, size, lattice, nodes[:, :, 2:4], seen)
     cur2, inside2 = warp_image(fitter.cur2, size, lattice, nodes[:, :, 4:], seen)
-    middle = slice(lattice.rim, lattice.rim + rows), slice(lattice.rim, lattice.rim + cols)
     own = unknowns[middle].reshape(-1, 4, 3)
     bends = np.concatenate([of.bends, _bends(nodes[:, :, 2:, 0], subset_px, lattice)], axis=2)
     bends = bends[middle].reshape(-1, 3, 2, 3)
@@ -174,7 +175,6 @@ def _predict_reference(fitter: Fitter, grid: PointGrid, w: Float, epipolar_px: F
     everywhere = pair.cam1.rays_cam(np.stack(np.meshgrid(x, y), axis=-1)).xyz_mm
     of_shape = smooth.nodes / scale[:, None]
     still = np.zeros((*of_shape.shape[:2], 3, 4))
-    still[..., 0] = everywhere
     nodes, _ = project_nodes(
         pair, everywhere[..., :2], np.concatenate([of_shape[:, :, :1], still, of_shape[:, :, 1:]], axis=2), lattice
     )
@@ -189,7 +189,7 @@ def _predict_reference(fitter: Fitter, grid: PointGrid, w: Float, epipolar_px: F
         subset_px=subset_px,
         grid_px=xy_px,
         lattice=lattice,
-        rays=everywhere[..., :2],
+        rays=everywhere,
         state=of_shape,
         seen=seen,
         bends=_bends(nodes[:, :, :2, 0], subset_px, lattice),

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, spline_filter
 
 from stereorig.core.cameras.stereo import StereoPair
-from stereorig.core.field.points.prediction import Prediction, predict
 from stereorig.core.dense.windows import Windows, measure_windows, node_positions
 from stereorig.core.errors import InputError
+from stereorig.core.field.points.prediction import Prediction, predict
 from stereorig.core.field.region.cuts import Cuts
 from stereorig.core.matching import MatchOptions, prepare
 from stereorig.core.matching.geometry import covariance_xyz, covariance_xyzuvw, motion_geometry, shape_geometry
