@@ -43,8 +43,8 @@ def curved() -> None:
 def dense() -> None:
     """The windows of dense fields, over one cell of a prediction that moves nothing."""
     from stereorig.core.dense.kernels.finish import AtPoints, Limits, Shape
-    from stereorig.core.field.points.prediction import Prediction
     from stereorig.core.dense.windows import finish_windows, measure_windows, node_positions
+    from stereorig.core.field.points.prediction import Prediction
     from stereorig.core.matching.image import prepare
     from stereorig.core.matching.options import MatchOptions
     from tests.support.matching_scene import paper_pair
