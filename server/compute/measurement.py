@@ -23,6 +23,7 @@ from stereorig.core.compiling import NotCompiledError, refuse_compiling, report_
 from stereorig.core.field.points.result import Field
 from stereorig.core.field.region.region import PointGrid
 from stereorig.core.field.seeding.seeds import Seed
+from stereorig.core.matching.prewarp import NodeLattice, project_nodes, warp_image
 from stereorig.core.measure import MeasureOptions, ReferencePair
 from stereorig.core.progress import CancelToken, Progress
 from stereorig.core.systematic.interpolation import SmoothSlopes, interpolation_term
@@ -213,3 +214,7 @@ def measure_small_steps(before_motion: Callable[[], None] = lambda: None, *, mot
     if motion:
         before_motion()
         reference.motion(left.copy(), right.copy(), grid, options, shape=shape)
+        # a step of this few points does not need them, steps of a sequence do
+        lattice, state = NodeLattice(40.0, 40.0, 8.0, 0), np.full((2, 2, 5, 4), 0.01)
+        nodes, _ = project_nodes(pair, np.zeros((2, 2, 2)), state, lattice)
+        warp_image(one, one.shape, lattice, np.nan_to_num(nodes[:, :, 2:4]), np.ones((1, 1), bool))
