@@ -16,6 +16,8 @@ from stereorig.core.names import CameraName
 Moves = Literal["cameras", "target", "both_cameras", "free"]
 MOVES: tuple[Moves, ...] = get_args(Moves)
 
+#: relative scale error of a stage of which nothing is stated: a screw's lead
+ASSUMED_SCALE_SIGMA = 1e-4
 _MIN_SPREAD_PX = 5.0  # rms over the narrower direction
 
 
@@ -229,7 +231,7 @@ class CalibrationOptions:
         moves cx by 12 px at the same RBE), so it must be declared; it is carried into the covariance. 0 holds the axis
         fixed. Default 1 mrad, as a careful alignment reaches.
     stage_scale_sigma
-        Prior on a stage's relative scale error; 0: exact. Default 1e-4, a screw's lead without a certificate.
+        Prior on a stage's relative scale error; 0: exact. None: not stated, 1e-4 is assumed.
     stage_step_sigma_mm
         Prior on the error of each position read back; 0: exact.
     aspect_sigma
@@ -253,7 +255,7 @@ class CalibrationOptions:
     hold_out_tolerance_mm: float = 0.02
     centre_sigma_px: float = 20.0
     axis_tilt_sigma_rad: float = 1e-3
-    stage_scale_sigma: float = 1e-4
+    stage_scale_sigma: float | None = None
     stage_step_sigma_mm: float = 0.0
     aspect_sigma: float | None = None
     estimate_nodes: bool | None = None
@@ -261,6 +263,11 @@ class CalibrationOptions:
     max_centre_sigma_px: float = 3.0
     max_standoff_sigma: float = 0.02
     max_iterations: int = 60
+
+    @property
+    def scale_sigma(self) -> float:
+        """Prior on a stage's relative scale error, stated or assumed."""
+        return ASSUMED_SCALE_SIGMA if self.stage_scale_sigma is None else self.stage_scale_sigma
 
 
 def nodes_of(target: AnyTarget) -> Float:

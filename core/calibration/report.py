@@ -10,6 +10,7 @@ from stereorig.core.arrays import Float
 from stereorig.core.calibration.checks.agreement import share_of_own_poses
 from stereorig.core.calibration.checks.measures import CheckMeasures, Measures, mean_of_cameras, measure_points, pooled
 from stereorig.core.calibration.checks.positions import PositionCheck
+from stereorig.core.calibration.choice.declared import AXES, POSITIONS, SCALE, SCALE_GROUPS
 from stereorig.core.calibration.choice.held_out import HeldOutView, held_out_view
 from stereorig.core.calibration.choice.lens import Chosen
 from stereorig.core.calibration.choice.screening import points_mm
@@ -22,6 +23,7 @@ from stereorig.core.calibration.result import CalibrationResult, LensChosen, Sta
 from stereorig.core.calibration.uncertainty import (
     VolumeUncertainty,
     image_derivatives,
+    point_derivatives,
     shape_of,
     triangulated,
     volume_uncertainty,
@@ -29,8 +31,9 @@ from stereorig.core.calibration.uncertainty import (
 from stereorig.core.calibration.verdict import assess, checks_made
 from stereorig.core.cameras.stereo import StereoPair
 from stereorig.core.errors import CalibrationError
-from stereorig.core.names import CAMERAS
+from stereorig.core.names import CAMERAS, Cause
 
+UNCERTIFIED_SCALE = 2e-3  # relative error of a travel by a rolled thread, a belt or a rack without certificate
 _PER_POSE = 4  # nodes each way of a free pose that represent the volume
 _FEW_LOST = 0.05  # share of the points; a lens that has no ray for more of them cannot be the lens of these views
 
@@ -75,8 +78,13 @@ def build_result(
     pair = StereoPair(*(camera_of(layout, state.x, c) for c in range(2)))
     names = parameter_names(layout, adjustment.priors)
     covariance = named_covariance(layout, adjustment.priors, state.x, adjustment.covariance)
+    by_cause = named_by_cause(layout, adjustment.priors, state.x, adjustment.covariance, adjustment.by_prior)
     volume = None if problem.staged else _points_of_poses(chosen, points)
-    uncertainty = volume_uncertainty(pair, covariance, target, names, volume)
+    uncertainty = fitted_only = volume_uncertainty(pair, covariance, target, names, volume)
+    if found := _errors_found(chosen):
+        for cause, moment in found.items():
+            covariance, by_cause[cause] = covariance + moment, by_cause[cause] + moment
+        uncertainty = volume_uncertainty(pair, covariance, target, names, volume)
     free_nodes = adjustment.priors.nodes_free
     corrections = state.nodes_mm[:, :free_nodes].reshape(*problem.nodes_mm.shape[:2], free_nodes)
     finite = (state.x, covariance, adjustment.noise_px, state.nodes_mm, uncertainty.sigma_mm)
@@ -88,6 +96,8 @@ def build_result(
         held_out=held_out,
         views=results,
         uncertainty=uncertainty,
+        fitted_shape_mm=fitted_only.shape_rms_mm,
+        unseen_scale=_unseen_scale(chosen, pair, uncertainty.points_mm),
         # for a target declared exact, the finding itself reports the corrections
         node_corrections_mm=corrections if free_nodes and target.node_tolerance_mm > 0.0 else None,
         node_tolerance_mm=(target.node_tolerance_mm, flatness_mm(target)),
@@ -104,9 +114,7 @@ def build_result(
         pair=pair,
         names=names,
         covariance=covariance,
-        covariance_by_cause=named_by_cause(
-            layout, adjustment.priors, state.x, adjustment.covariance, adjustment.by_prior
-        ),
+        covariance_by_cause=by_cause,
         lens=LensChosen(chosen.model, chosen.reasons, chosen.structure),
         stage=_stage(adjustment),
         pitch_scale=float(state.x[layout.pitch_scale]),
@@ -137,6 +145,53 @@ def build_result(
         options=options,
         iterations=adjustment.iterations,
     )
+
+
+def _errors_found(chosen: Chosen) -> dict[Cause, Float]:
+    """Return second moments of the named parameters' errors by errors of stage and target that the fit lacks, by cause.
+
+    Those of a lens are no errors of parameters alone, and shift the images that are measured, too.
+    """
+    adjustment = chosen.screened.adjustment
+    layout, priors, x = adjustment.layout, adjustment.priors, adjustment.state.x
+    D = named_derivatives(layout, priors, x)
+    pulled: dict[Cause, Float] = {}
+    for found in chosen.structure:
+        if found.camera is not None:
+            continue
+        cause: Cause = "stage" if found.name in (POSITIONS, AXES, *SCALE_GROUPS) else "target"
+        if found.name in SCALE_GROUPS:
+            own = _by_scale(adjustment) * found.terms.get(SCALE, (0.0, 0.0))[0]
+        elif found.freed is not None:
+            own = found.freed.pulled
+        else:
+            continue
+        pulled[cause] = pulled.get(cause, 0.0) + D @ own
+    return {cause: np.outer(own, own) for cause, own in pulled.items()}
+
+
+def _by_scale(adjustment: Adjustment) -> Float:
+    """Return the errors (m,) of the unknowns for a unit of a relative error that all stages' scales have."""
+    scales = sorted({adjustment.layout.stage_scale(axis) for axis, _ in adjustment.layout.steps})
+    # a fit follows the mean of its priors
+    return np.asarray(adjustment.covariance[:, scales] @ adjustment.priors.weight[scales])
+
+
+def _unseen_scale(chosen: Chosen, pair: StereoPair, points_mm: Float) -> tuple[float, float] | None:
+    """Return an error of the stages' scale that the views do not show, and the shape's rms error by it, mm.
+
+    None if the scale is stated, or if nothing moves by a stage.
+    """
+    adjustment = chosen.screened.adjustment
+    if chosen.stage_over_pitch is None or chosen.screened.problem.options.stage_scale_sigma is not None:
+        return None
+    layout, priors = adjustment.layout, adjustment.priors
+    size = float((UNCERTIFIED_SCALE**-2 + chosen.stage_over_pitch[1] ** -2) ** -0.5)
+    names = parameter_names(layout, priors)
+    moved = point_derivatives(pair, points_mm, names).reshape(-1, len(names)) @ (
+        named_derivatives(layout, priors, adjustment.state.x) @ _by_scale(adjustment)
+    )
+    return size, size * float(np.sqrt(np.mean(shape_of(points_mm, moved[:, None]) ** 2)))
 
 
 def _moved_mm(

@@ -30,6 +30,8 @@ STRUCTURE_SHARE = 0.2
 MOVED_SHARE = 0.6
 #: of all views; with more of them left out something is wrong with the way they were taken
 DROPPED_SHARE = 0.4
+#: times the reported error of the shape; a scale of the stage that no certificate states must not make more of it
+UNSEEN_FACTOR = 2.0
 _ORDER: tuple[Level, Level, Level] = ("good", "warning", "failed")
 _AT_REST = "Take the views again, sharp, with cameras, stage and target at rest; check the target's description."
 _MORE_VIEWS = "Take more views, farther apart."
@@ -55,6 +57,8 @@ def assess(
     held_out: CheckMeasures | None,
     views: Sequence[ViewResult],
     uncertainty: VolumeUncertainty,
+    fitted_shape_mm: float,
+    unseen_scale: tuple[float, float] | None = None,
     node_corrections_mm: Float | None,
     node_tolerance_mm: tuple[float, float],
     options: CalibrationOptions,
@@ -69,7 +73,8 @@ def assess(
 
     By the held-out RBE of each camera, the predicted uncertainty, the node corrections, structure left in the residuals
     and views that were dropped; what passes is a reason of a good verdict only. ``structure`` pairs each structure with
-    its shift of measured points, (3 n,) mm without a rigid motion, or None. ``own_poses``: see
+    its shift of measured points, (3 n,) mm without a rigid motion, or None; ``fitted_shape_mm`` is the shape's error
+    without them. ``unseen_scale`` is an error of the stage's scale that may be, with its shift. ``own_poses``: see
     :func:`stereorig.core.calibration.checks.agreement.share_of_own_poses`. ``remarks`` are further warnings.
     """
     level: Level = "good"
@@ -163,9 +168,9 @@ def assess(
         if faults:
             text = f"{name} has a lens that no lens is: {', and '.join(faults)}."
             note("failed" if folded else "warning", text, _ANOTHER_LENS)
-    moves = [moved for _, moved in structure if moved is not None]
+    moves = [moved for one, moved in structure if moved is not None and one.name not in DECLARED]
     together_mm = _rms(np.sum(moves, axis=0)) if moves else 0.0
-    least_mm = min(uncertainty.shape_rms_mm, max((_rms(m) for m in moves), default=0.0))
+    least_mm = min(fitted_shape_mm, max((_rms(m) for m in moves), default=0.0))
     for one, moved in structure:
         if one.name in DECLARED:
             off = abs(one.terms.get(SCALE, (np.inf, 0.0))[0])
@@ -175,8 +180,18 @@ def assess(
             if one.rms_px > STRUCTURE_SHARE * min(p.rbe_px for p in fitted.per_camera):
                 note("warning", one.text)
         # a misfit that moves points by less than is reported does not mislead
-        elif together_mm > uncertainty.shape_rms_mm and _rms(moved) >= least_mm:
+        elif together_mm > fitted_shape_mm and _rms(moved) >= least_mm:
             note("warning", f"{one.text} The shape is off by {1e3 * together_mm:.2g} um for it.")
+    if unseen_scale is not None and level == "good":
+        scale, shift_mm = unseen_scale
+        if np.hypot(shift_mm, fitted_shape_mm) > UNSEEN_FACTOR * fitted_shape_mm:
+            note(
+                "warning",
+                f"A stage whose travel is off by {100.0 * scale:.2g} % would hardly show in these views and move the "
+                f"shape by {1e3 * shift_mm:.2g} um; {1e3 * fitted_shape_mm:.2g} um are reported, since "
+                f"{100.0 * options.scale_sigma:.2g} % is assumed. State stage_scale_sigma by the stage's certificate, "
+                "take views over a longer travel, or add free poses of the tilted target.",
+            )
     if dropped:
         note("good", f"Left out of the fit: {', '.join(view.name for view in dropped)}.")
         if len(dropped) > DROPPED_SHARE * (len(views) + len(dropped)):

@@ -432,7 +432,7 @@ class CalibrationSection(_Closed):
         1e-3, description="Prior on the angle between stage axis and optical axis; carried into the covariance."
     )
     stage_scale_sigma: Annotated[float, Field(ge=0.0, le=0.1)] = Field(
-        1e-4, description="Prior on the relative error of the stage's scale; 0: exact."
+        1e-4, description="Prior on the relative error of the stage's scale; 0: exact. Left out, it is assumed."
     )
     stage_step_sigma_mm: Annotated[float, Field(ge=0.0, le=1.0)] | None = Field(
         None, description="Prior on the error of each position read back; left out: by the stage's resolution_mm."

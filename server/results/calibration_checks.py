@@ -23,6 +23,7 @@ from stereorig.core.calibration.checks.compare import (
 )
 from stereorig.core.calibration.checks.distance import MARK_SIGMA_PX, DistanceCheck, check_known_distance
 from stereorig.core.calibration.checks.target_distance import check_target_images
+from stereorig.core.calibration.inputs import ASSUMED_SCALE_SIGMA
 from stereorig.core.calibration.result import COVARIANCE_NAMES
 from stereorig.core.errors import CalibrationInputError, FileFormatError, InputError, StereorigError
 from stereorig.core.grid import GridView
@@ -76,6 +77,9 @@ def _shared(a: LoadedCalibration, b: LoadedCalibration) -> set[str]:
         found.add("target")
     if all(isinstance(s, Mapping) for s in settings):
         one, two = ({k: s.get(k) for k in of_stage} for s in settings if isinstance(s, Mapping))
+        for stated in (one, two):
+            if stated["stage_scale_sigma"] is None:
+                stated["stage_scale_sigma"] = ASSUMED_SCALE_SIGMA
         found |= {"stage"} if one == two else set()
     aspects = [[v for n, v in c.pair.values().items() if n.endswith(".aspect")] for c in (a, b)]
     return found | ({"aspect"} if aspects[0] == aspects[1] else set())

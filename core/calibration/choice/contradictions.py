@@ -116,8 +116,10 @@ def scale_seen(groups: Sequence[Group], score: Score) -> tuple[float, float] | N
 def in_words(screened: Screened, found: Sequence[tuple[Structure, Group]], score: Score) -> list[Structure]:
     """Return contradictions with their amounts, each as a sentence; scales by a fit that frees them."""
     out = []
-    for k, (structure, group) in enumerate(found):
-        given = [g for _, g in found[:k]]
+    groups = [g for _, g in found]
+    freed = score.freed(groups, [score.weights(g, groups[:k]) for k, g in enumerate(groups)], ())
+    for k, ((named, group), terms) in enumerate(zip(found, freed, strict=True)):
+        given, structure = groups[:k], replace(named, freed=terms)
         if group.name in SCALE_GROUPS:
             stated = _scale(screened, structure)
             off, sigma = stated.terms.get(SCALE, (np.inf, 0.0))

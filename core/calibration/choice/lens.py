@@ -133,6 +133,8 @@ def choose_lens(problem: FitData, held: Sequence[CalibrationView]) -> Chosen:
     if any(found.name == POSITIONS for found in chosen.structure):
         with suppress(CalibrationError):
             fit = with_open_steps(fit, *_Candidate(fit, ()).asked)
+            open_steps = [replace(s, freed=None) if s.name == POSITIONS else s for s in chosen.structure]
+            chosen = replace(chosen, structure=tuple(open_steps))
     fit = replace(fit, adjustment=with_smooth_errors(fit), dropped=(*fit.dropped, *lost))
     return replace(chosen, screened=fit)
 
@@ -255,7 +257,7 @@ def _choose(problem: FitData, begun: _FitStart) -> Chosen:
         f"{best.model}: a tilted sensor would leave the same residuals and move the shape by {1e3 * moved_mm:.2g} um: "
         "its tilt and those of the stages are unknowns."
     )
-    seen = [s for s in in_words(best.screened, best.contradicted, best.asked[1]) if s.name == AXES]
+    seen = [replace(s, freed=None) for s in in_words(best.screened, best.contradicted, best.asked[1]) if s.name == AXES]
     result = _result(_Candidate(tilted, held), tuple(reasons))
     return replace(result, structure=(*seen, *result.structure))
 
@@ -371,5 +373,5 @@ def _result(best: _Candidate, reasons: tuple[str, ...], known: Sequence[Structur
     if not wrong:  # the terms' names mean nothing for a rig that contradicts itself
         found += find_structure(groups, score, [group for _, group in best.contradicted])
     names = {f.name for f in known}
-    structure = (*known, *(f for f in found if f.name not in names))
+    structure = (*(replace(f, freed=None) for f in known), *(f for f in found if f.name not in names))
     return Chosen(best.screened, tuple(best.held), structure, reasons, scale_seen(groups, score))

@@ -265,7 +265,7 @@ def priors(
     sigma[layout.direction] = _DIRECTION_SIGMA_RAD if staged and layout.moves != "cameras" else 0.0
     for axis in range(2):
         used = any(step[0] == axis for step in layout.steps)
-        sigma[layout.stage_scale(axis)] = options.stage_scale_sigma if used else 0.0
+        sigma[layout.stage_scale(axis)] = options.scale_sigma if used else 0.0
     sigma[layout.pitch_scale] = pitch_scale_sigma
     sigma[layout.motion + 5 : layout.motion + 5 + len(layout.steps)] = options.stage_step_sigma_mm
     free = sigma > 0.0

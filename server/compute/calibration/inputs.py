@@ -49,7 +49,7 @@ def options_of(
         lens=rig.get("lens", _DEFAULTS.lens),
         held_out_mm=held_out_mm,
         axis_tilt_sigma_rad=rig["axis_tilt_sigma_rad"],
-        stage_scale_sigma=rig.get("stage_scale_sigma", _DEFAULTS.stage_scale_sigma),
+        stage_scale_sigma=rig.get("stage_scale_sigma"),
         stage_step_sigma_mm=rig.get("stage_step_sigma_mm", 0.0),
         aspect_sigma=rig.get("aspect_sigma"),
     )

@@ -39,7 +39,7 @@ class NominalRig:
     moves: Moves = DEFAULTS.moves
     lens: LensChoice = DEFAULTS.lens
     axis_tilt_sigma_rad: float = DEFAULTS.axis_tilt_sigma_rad
-    stage_scale_sigma: float = DEFAULTS.stage_scale_sigma
+    stage_scale_sigma: float | None = DEFAULTS.stage_scale_sigma
     stage_step_sigma_mm: float = DEFAULTS.stage_step_sigma_mm
     aspect_sigma: float | None = DEFAULTS.aspect_sigma
 
@@ -204,7 +204,7 @@ def read_rig(path: Path) -> NominalRig:
         moves=moves,
         lens=lens,
         axis_tilt_sigma_rad=_number(plan, "axis_tilt_sigma_rad", where, default=DEFAULTS.axis_tilt_sigma_rad),
-        stage_scale_sigma=_number(plan, "stage_scale_sigma", where, default=DEFAULTS.stage_scale_sigma),
+        stage_scale_sigma=_prior(plan, "stage_scale_sigma", where),
         stage_step_sigma_mm=_number(plan, "stage_step_sigma_mm", where, default=_least_count_sigma(content, path)),
         aspect_sigma=_prior(plan, "aspect_sigma", where),
     )

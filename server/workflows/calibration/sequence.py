@@ -29,7 +29,7 @@ from stereorig.server.workflows.waiting import run_task
 
 SAME_POSITION_MM = 1e-6
 #: settings of ``[calibration]`` that the fit needs
-_SETTINGS = ("moves", "lens", "axis_tilt_sigma_rad", "stage_scale_sigma", "aspect_sigma")
+_SETTINGS = ("moves", "lens", "axis_tilt_sigma_rad", "aspect_sigma")
 
 
 @dataclass(frozen=True)
@@ -243,11 +243,14 @@ def way_back(service: Service) -> dict[str, object] | None:
 
 def rig_metadata(config: RigConfig) -> dict[str, Any]:
     """Entries of the rig file that the fit needs."""
+    given = config.calibration
     return {
         "name": config.rig.name,
         "simulated": config.simulated,
         "target": config.target.plain(),
-        **{name: getattr(config.calibration, name) for name in _SETTINGS},
+        **{name: getattr(given, name) for name in _SETTINGS},
+        # that the default is assumed, and not stated, lowers a verdict
+        "stage_scale_sigma": given.stage_scale_sigma if "stage_scale_sigma" in given.model_fields_set else None,
         "stage_step_sigma_mm": _step_sigma_mm(config),
         "cam1": config.cam1.model_dump(mode="json"),
         "cam2": config.cam2.model_dump(mode="json"),

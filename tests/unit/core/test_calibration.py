@@ -25,7 +25,15 @@ from stereorig.core.cameras.lens import LensModel, OpenCVLens, SeidelLens
 from stereorig.core.errors import CalibrationError, CalibrationInputError
 from stereorig.core.names import CAMERAS
 from stereorig.core.target import GridTarget
-from tests.support.calibration_rigs import TrueCamera, aligned_rms_um, flat, observed, ordinary_pair
+from tests.support.calibration_rigs import (
+    TrueCamera,
+    aligned_rms_um,
+    flat,
+    hand_held,
+    observed,
+    ordinary_pair,
+    views_of_poses,
+)
 from tests.support.calibration_rigs import shape_error_um as rig_shape_error_um
 from tests.support.calibration_truth import HELD, NOISE_PX, NOMINAL, PAPER, Array, Grid, make_views, nodes, project
 
@@ -325,6 +333,8 @@ def _modern_rig(
     long: float = 1.0,
     step_mm: float = 0.0,
     axis_rad: tuple[float, float] = (0.0, 0.0),
+    bow_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    seed: int = 1,
 ) -> tuple[list[CalibrationView], GridTarget, tuple[NominalValues, NominalValues], tuple[TrueCamera, TrueCamera]]:
     """Six positions of two stages before pixels of 3.45 um, with errors of the travel; OpenCV's projection."""
     focal_px, size, pitch_mm = focal_mm / 0.00345, (2448, 2048), 8.0
@@ -332,7 +342,9 @@ def _modern_rig(
     cameras = ordinary_pair(lens, focal_px=focal_px, standoff_mm=standoff_mm)
     at = (np.arange(11) - 5.0) * pitch_mm
     points = flat(np.stack(np.meshgrid(at, at, indexing="ij"), axis=-1))
-    rng = np.random.default_rng(1)
+    x, y = np.moveaxis(points[..., :2] / at.max(), -1, 0)
+    points[..., 2] = np.stack([x * x, x * y, y * y], axis=-1) @ bow_mm
+    rng = np.random.default_rng(seed)
     along = np.array([*axis_rad, np.sqrt(1.0 - np.square(axis_rad).sum())])
     views = []
     for name, camera in zip(CAMERAS, cameras, strict=True):
@@ -344,11 +356,28 @@ def _modern_rig(
 
 
 @pytest.mark.fault(32)
-def test_a_scale_that_a_wide_lens_hides_is_no_check_made_and_its_size_is_stated() -> None:
+def test_a_scale_that_a_wide_lens_hides_is_good_only_where_it_is_stated_and_its_amount_is_named() -> None:
     # a lens of 12 mm on pixels of 3.45 um, five coefficients, OpenCV's projection: the stage reads 0.2 % too little
-    views, target, nominal, _ = _modern_rig(12.0, (-0.1, 0.08, 0.0, 0.0, 0.0), long=1.002)
+    views, target, nominal, cameras = _modern_rig(12.0, (-0.1, 0.08, 0.0, 0.0, 0.0), long=1.002)
     result = calibrate(views, target, nominal)
-    assert result.verdict.level == "good", "no residual shows it"
+    assert (
+        rig_shape_error_um(result.pair, cameras, result.uncertainty.points_mm) > 4e3 * result.uncertainty.shape_rms_mm
+    )
+    assert result.verdict.level == "warning"
+    (reason,) = result.verdict.reasons
+    said = re.search(r"off by ([0-9.]+) % would hardly show in these views and move the shape by ([0-9.]+) um", reason)
+    assert said is not None, reason
+    assert "State stage_scale_sigma" in reason
+    # the same noise on a stage that is right: what the scale alone moves
+    right = calibrate(_modern_rig(12.0, (-0.1, 0.08, 0.0, 0.0, 0.0))[0], target, nominal)
+    points = right.uncertainty.points_mm
+    seen = [camera.project(points).xy for camera in (right.pair.cam1, right.pair.cam2)]
+    moved_um = aligned_rms_um(result.pair.triangulate(*seen).xyz_mm, points)
+    assert float(said[2]) == pytest.approx(moved_um * float(said[1]) / 0.2, rel=0.1)
+    # a certificate of 1e-4 is evidence, the same assumption is none
+    certified = calibrate(views, target, nominal, CalibrationOptions(stage_scale_sigma=1e-4))
+    assert certified.verdict.level == "good", "no residual shows it"
+    np.testing.assert_array_equal(certified.covariance, result.covariance)
     check = {c.name: c for c in result.checks}["scales"]
     assert not check.made
     hidden = re.search(r"wrong by up to ([0-9.]+) % would not show", check.text)
@@ -372,9 +401,37 @@ def test_the_scatter_of_a_stages_positions_is_named_by_its_size_and_reported(
     assert true_um < 1.5e3 * result.uncertainty.shape_rms_mm
 
 
+def test_free_poses_show_the_scale_that_a_stage_alone_hides() -> None:
+    views, target, nominal, cameras = _modern_rig(12.0, (-0.1, 0.08, 0.0, 0.0, 0.0))
+    assert calibrate(views, target, nominal).verdict.level == "warning"
+    rng = np.random.default_rng(4)
+    nodes_mm = target.inner_points_mm()
+    poses = hand_held(rng, cameras, flat(nodes_mm), 6, span_mm=20.0, least_share=0.6)
+    free = views_of_poses(cameras, flat(nodes_mm), poses, rng, 0.02)
+    result = calibrate([*views, *free], target, nominal)
+    assert result.verdict.level == "good", result.verdict.reasons
+
+
+@pytest.mark.parametrize("lens", [(-0.05, 0.1, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0)])
+def test_a_bow_that_is_named_is_in_the_reported_error(lens: tuple[float, ...]) -> None:
+    ratios = []
+    for seed in range(4):
+        bow_mm = 0.02 * np.random.default_rng(seed).uniform(-1.0, 1.0, 3)
+        views, target, nominal, cameras = _modern_rig(25.0, lens, bow_mm=tuple(bow_mm), seed=seed)
+        result = calibrate(views, target, nominal)
+        assert any("hold structure (bow:" in reason for reason in result.verdict.reasons), result.verdict.reasons
+        assert result.verdict.level == "warning"
+        true_um = rig_shape_error_um(result.pair, cameras, result.uncertainty.points_mm)
+        ratios.append(true_um / (1e3 * result.uncertainty.shape_rms_mm))
+        total = np.sum(list(result.covariance_by_cause.values()), axis=0)
+        np.testing.assert_allclose(total, result.covariance, rtol=1e-6, atol=1e-12 * np.abs(total).max())
+    # the named amount is known to a tenth; 3 to 18 without it
+    assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1.0, abs=0.2)
+
+
 def test_stages_off_their_axes_near_the_limit_of_the_prior_are_no_wrong_aspect_ratio() -> None:
     views, target, nominal, cameras = _modern_rig(25.0, (-0.05, 0.1, 0.0, 0.0, 0.0), axis_rad=(0.003, -0.0015))
-    result = calibrate(views, target, nominal)
+    result = calibrate(views, target, nominal, CalibrationOptions(stage_scale_sigma=1e-4))
     assert result.verdict.level == "good", result.verdict.reasons
     true_um = rig_shape_error_um(result.pair, cameras, result.uncertainty.points_mm)
     assert true_um < 1e3 * result.uncertainty.shape_rms_mm
@@ -404,9 +461,11 @@ def test_stage_and_target_that_err_are_named(how: str, words: str) -> None:
             tilt = (0.02, 0.0) if how == "tilted" else (0.0, 0.0)
             xy = project(camera, X + shift, Y, dz + error, bow, tilt=tilt)
             views.append(CalibrationView(name, dz, xy + 0.0045 * rng.standard_normal(xy.shape)))
-    verdict = calibrate(views, Grid(), NOMINAL).verdict
-    assert verdict.level == "warning"
-    assert any(words in reason for reason in verdict.reasons), verdict.reasons
+    result = calibrate(views, Grid(), NOMINAL)
+    assert result.verdict.level == "warning"
+    assert any(words in reason for reason in result.verdict.reasons), result.verdict.reasons
+    # one draw each; what is named was 1.5 to 18 times beyond the report
+    assert shape_error_um(result) < 1.5e3 * result.uncertainty.shape_rms_mm
 
 
 def test_default_priors_are_in_the_covariance_and_a_zero_is_exact() -> None:
