@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from stereorig.server.base.priority import go_on, hurry
 from tests.support.container import unmount_leftovers
 from tests.support.patience import busy
 from tests.support.requirements import ROOT, missing
@@ -34,6 +35,10 @@ pytest.register_assert_rewrite("tests.support.page_bench")  # its assertions pri
 
 
 TESTS = Path(__file__).parent
+
+# Every process loads all tests, and with them the whole program: the garbage collector took a third of that time, and
+# went through all of it again later
+hurry()
 
 # What waits longest begins first, and the many short files fill the workers up at the end
 ORDER = ("contract", "crash", "service", "browser", "accuracy", "page", "unit")
@@ -94,6 +99,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Compile the kernels before the first long test of a service: a child that compiles for minutes is no failure."""
+    go_on()
     if "PYTEST_XDIST_WORKER" in os.environ or session.config.option.collectonly:
         return  # `make test-deep` has them compiled
     tiers = {item.path.relative_to(TESTS).parts[0] for item in session.items if item.get_closest_marker("deep")}
