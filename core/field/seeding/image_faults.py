@@ -172,8 +172,9 @@ def field_shift_px(pixels: Pixels) -> float:
     wide = pixels[:, : cols // 2 * 2]
     lines: Float = np.stack([wide[first + k] for k in (0, 1, 2)]).astype(np.float64)
     lines -= lines.mean(axis=-1, keepdims=True)
-    spectra = np.fft.rfft(lines * np.hanning(lines.shape[-1]), axis=-1)
-    peaks, energy = [], float((np.fft.irfft(np.abs(spectra) ** 2).sum(axis=1)[:, 0]).mean())
+    lines *= np.hanning(lines.shape[-1])
+    spectra = np.fft.rfft(lines, axis=-1)
+    peaks, energy = [], float((lines**2).sum()) / 3.0
     for k in (0, 1):
         score = np.fft.irfft((np.conj(spectra[k]) * spectra[k + 1]).sum(axis=0))
         score = np.roll(score, _MOST_SHIFT_PX)[: 2 * _MOST_SHIFT_PX + 1]

@@ -180,7 +180,7 @@ def summarise(
     if result.common is not None:
         causes = Causes.unseparated(result.common.shape[-1]) if result.causes is None else result.causes
         if "calibration" in causes.separate:
-            of_calibration = causes.of_calibration(result.common[valid])
+            of_calibration = causes.of_calibration(result.common)[valid]
     summary = StepSummary(
         kind="displacement" if result.has_motion else "shape",
         points=points,
