@@ -19,15 +19,14 @@ from stereorig.server.workflows.camera_identity import check_same_cameras
 
 
 def checked_pairs(
-    files: Sequence[ImagePair], shapes: tuple[tuple[int, int], tuple[int, int]], *, alone: bool
+    files: Sequence[ImagePair], shapes: tuple[tuple[int, int], tuple[int, int]]
 ) -> tuple[list[StepImages], dict[int, StereorigError]]:
-    """Check every pair; return the ones that can be measured, and the errors of the others, by number.
+    """Check pairs; return the ones that can be measured, and the errors of the others, by number.
 
-    Parameters
-    ----------
-    alone
-        True if the first pair is the only reference: then an error in it is raised. With a projected pattern each pair
-        is its own.
+    Raises
+    ------
+    InputError
+        The first of these errors, if none can be measured.
     """
     steps: list[StepImages] = []
     failed: dict[int, StereorigError] = {}
@@ -35,8 +34,6 @@ def checked_pairs(
         try:
             steps.append(check_pair(pair, k, shapes))
         except InputError as error:
-            if alone and k == 0:
-                raise
             error.context |= {"cam1": str(pair.cam1), "cam2": str(pair.cam2)}
             failed[number_of(pair, k)] = error
     if not steps:

@@ -350,7 +350,7 @@ def _prepare(args: argparse.Namespace, progress: ProgressLine) -> MeasureJob:
         mask=None if specimen is None else specimen.mask,
     )
     check_positions(calibration.pair, seeds or (), (shapes[1][1], shapes[1][0]))
-    steps, failed = checked_pairs(files if args.projected else files[:1], shapes, alone=not args.projected)
+    steps, failed = checked_pairs(files if args.projected else files[:1], shapes)
     settings = StoredSettings.model_validate(
         {
             "region": region,
