@@ -45,7 +45,11 @@ class NewDataset(netCDF4.Dataset):
         while waiting:
             variable, values = waiting.pop(0)
             variable.set_auto_maskandscale(False)  # they are as the file is to hold them
-            variable[...] = values
+            if values.ndim < 4:
+                variable[...] = values
+                continue
+            for k in range(values.shape[2]):  # a part that the cache holds: its chunks are gathered from all of it
+                variable[:, :, k] = values[:, :, k]
 
     def _redef(self) -> None:
         """Stay in the definitions, which a new file begins with; the base class calls it before each of them."""
