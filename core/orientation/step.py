@@ -19,10 +19,14 @@ from stereorig.core.field.settings import MeasureOptions
 from stereorig.core.matching.fit import fit_shape
 from stereorig.core.matching.slopes import SlopeFilter
 from stereorig.core.orientation.matched import MatchedPoints, seen_by_camera2
-from stereorig.core.robust import spread_indices
+from stereorig.core.robust import MAD_TO_SIGMA, median, spread_indices
 from stereorig.core.status import PointStatus
 
 SAMPLE = 1000
+_LEAST = 256
+#: of the mean over the points, by noise: a quarter of the smallest smooth errors between two steps
+_NOISE_PX = 5e-4
+_ALONE = 1.5  # noise of a pair's own offset over that of two pairs together
 _LARGE_PIXELS = 8_000_000  # from here on an image's gradients are made for this match alone: 12 bytes a pixel
 
 
@@ -60,7 +64,7 @@ def step_points(
     index = np.flatnonzero(field.valid.ravel())
     if len(index) == 0:
         return None
-    index = index[np.unique(spread_indices(len(index), SAMPLE))]
+    index = index[np.unique(spread_indices(len(index), enough_points(field, options.subset_px)))]
     w = field.starts.w.reshape(len(field.x_px.ravel()), -1)[index, :3]
     G = field.starts.G.reshape(len(field.x_px.ravel()), 3, -1)[index][..., :3]
     xy, start = current_plane(pair, w, G)
@@ -87,6 +91,18 @@ def step_points(
     return MatchedPoints.of(
         xy[good], seen_by_camera2(pair, rays, xyz, fit.epipolar_px[good]), subset_px=options.subset_px
     )
+
+
+def enough_points(field: Field, subset_px: int) -> int:
+    """Return from how many of a field's points, :data:`SAMPLE` at most, noise is small beside offsets that count."""
+    x, offset = field.x_px, field.epipolar_px
+    apart = int(np.ceil(subset_px / float(x[0, 1] - x[0, 0]))) if x.shape[1] > 1 else x.shape[1]
+    change = (offset[:, apart:] - offset[:, :-apart]).ravel()  # of points that share no pixel, and nearly all else
+    change = change[np.isfinite(change)]
+    if len(change) < _LEAST:
+        return SAMPLE
+    noise_px = _ALONE * MAD_TO_SIGMA / np.sqrt(2.0) * median(np.abs(change - median(change)))
+    return int(np.clip((noise_px / _NOISE_PX) ** 2, _LEAST, SAMPLE))
 
 
 def current_plane(pair: StereoPair, w: Float, G: Float) -> tuple[Float, Float]:
