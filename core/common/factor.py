@@ -74,7 +74,7 @@ class Causes:
         if not any(cause in CAUSES for cause in self.separate):
             return np.full(factor.shape[:-1], np.nan)
         own = factor[..., : len(self.columns) - self.columns.count("sensor")]
-        return np.sqrt(np.einsum("...k,...k->...", own, own))
+        return np.asarray(np.sqrt(np.einsum("...k,...k->...", own, own)))
 
     def aligned(self, factor: Float, other: Causes) -> Float:
         """Return a factor (..., k) as (..., q) with the columns of both, zero in columns that it does not have."""
