@@ -101,7 +101,7 @@ def history(files: Sequence[Path], gauge: Ends | Mean) -> History:
     if isinstance(gauge, Mean):
         asked = PlaneAlignment(kind="plane", x_direction="image_rows", x_line_px=gauge.x_line_px)
         first = read_field(files[0])
-        frame = lay(asked, first, _shared(files[0], first))
+        frame = lay(asked, first, shared_pixels(files[0], first))
     readings = [_reading(path, gauge, frame) for path in files]
     n = len(readings)
     moved = [k for k, one in enumerate(readings) if one is not None]
@@ -123,7 +123,8 @@ def history(files: Sequence[Path], gauge: Ends | Mean) -> History:
     return History(value, own, shared, complete)
 
 
-def _shared(path: Path, field: Field) -> SharedPixels:
+def shared_pixels(path: Path, field: Field) -> SharedPixels:
+    """Return the correlation of a field's points; raises ``settings_missing`` without the subset's width."""
     subset = read_head(path).settings.get("subset_px")
     if not isinstance(subset, int | float):
         raise InputError(
@@ -142,7 +143,7 @@ def _reading(path: Path, gauge: Ends | Mean, frame: Alignment | None) -> Reading
     if isinstance(gauge, Mean):
         assert frame is not None
         return _mean(path, aligned(field, frame), gauge)
-    return extensometer(field, gauge.a_px, gauge.b_px, shared=_shared(path, field)).strain
+    return extensometer(field, gauge.a_px, gauge.b_px, shared=shared_pixels(path, field)).strain
 
 
 def _mean(path: Path, field: Field, gauge: Mean) -> Reading:

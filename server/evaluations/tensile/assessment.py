@@ -8,10 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stereorig.core.arrays import Float
+from stereorig.server.evaluations.cards import Lack, Mark
 from stereorig.server.evaluations.tensile.checks import doubts, doubts_of_load
 from stereorig.server.evaluations.tensile.curve import Curve
-from stereorig.server.evaluations.tensile.events import Mark, course_of
-from stereorig.server.evaluations.tensile.planning import Asked, Lack, planned
+from stereorig.server.evaluations.tensile.events import course_of
+from stereorig.server.evaluations.tensile.planning import Asked, planned
 from stereorig.server.evaluations.tensile.profiles import Profile
 from stereorig.server.evaluations.tensile.propagate import Uncertain, uncertain_numbers
 

@@ -8,8 +8,9 @@ import numpy as np
 from scipy.stats import chi2, spearmanr
 
 from stereorig.core.arrays import Float
+from stereorig.server.evaluations.cards import Mark
 from stereorig.server.evaluations.tensile.curve import AXIAL, LATERAL, STRESS, Curve
-from stereorig.server.evaluations.tensile.events import Course, Mark
+from stereorig.server.evaluations.tensile.events import Course
 from stereorig.server.evaluations.tensile.numbers import Plan
 from stereorig.server.evaluations.tensile.profiles import UNITS, Profile
 from stereorig.server.evaluations.tensile.propagate import Uncertain

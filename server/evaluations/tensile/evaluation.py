@@ -9,22 +9,15 @@ import numpy as np
 from stereorig.core.arrays import Float
 from stereorig.core.errors import InputError, MeasurementError
 from stereorig.core.progress import Progress
+from stereorig.server.evaluations.cards import CardNumber, MarkFound, number_found, number_missing
 from stereorig.server.evaluations.door import Evaluated, Results
 from stereorig.server.evaluations.histories import Ends, History, Mean
 from stereorig.server.evaluations.tensile.assessment import Assessed, Found, assessed
 from stereorig.server.evaluations.tensile.batch import over_specimens, table_over
 from stereorig.server.evaluations.tensile.curve import AXIAL, LATERAL, STRESS, Curve, with_load_errors
-from stereorig.server.evaluations.tensile.document import (
-    CardNumber,
-    CurveFound,
-    MarkFound,
-    MaterialCardFound,
-    page_of,
-    table_of,
-)
+from stereorig.server.evaluations.tensile.document import CurveFound, MaterialCardFound, page_of, table_of
 from stereorig.server.evaluations.tensile.planning import Asked
 from stereorig.server.evaluations.tensile.profiles import PROFILES, UNITS, Profile
-from stereorig.server.evaluations.tensile.propagate import COVERAGE
 from stereorig.server.evaluations.tensile.settings import TensileSettings
 from stereorig.server.formats.channel_units import FORCE_N, known_unit
 from stereorig.server.results.channels import Recorded
@@ -211,19 +204,8 @@ def _number(key: str, found: Found) -> CardNumber:
     units, one = UNITS[key], found.number
     if one is None:
         why = "" if found.lack is None else f"{found.lack.code}: {found.lack.text}"
-        return CardNumber(key=key, value=None, units=units, state="missing", why=why)
-    reach = COVERAGE * one.u
-    return CardNumber(
-        key=key,
-        value=one.value,
-        units=units,
-        u=one.u,
-        lower=one.value - reach,
-        upper=one.value + reach,
-        state="doubtful" if found.doubts else "good",
-        why=", ".join(found.doubts),
-        parts=dict(one.parts),
-    )
+        return number_missing(key, units, why)
+    return number_found(key, one.value, units, one.parts, found.doubts)
 
 
 def _curve(curve: Curve) -> CurveFound:

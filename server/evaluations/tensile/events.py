@@ -6,34 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stereorig.server.evaluations.cards import Mark
 from stereorig.server.evaluations.tensile.curve import AXIAL, STRESS, Curve, Indices
 
 _FAILED = 0.3  # share of the largest stress below which a specimen is broken
 _SLACK = 0.01  # share of the largest stress below which a specimen hangs in its grips
 _BEYOND = 4.0  # standard deviations that noise does not exceed
 _AT_ONCE = 1  # a grip slips between two steps, a machine takes more of them to take the load off
-
-
-@dataclass(frozen=True)
-class Mark:
-    """Something that the data show.
-
-    Attributes
-    ----------
-    code
-        What it is.
-    text
-        In words.
-    steps
-        Numbers of the steps.
-    spoils
-        Numbers of the card that are doubtful for it.
-    """
-
-    code: str
-    text: str
-    steps: tuple[int, ...] = ()
-    spoils: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from stereorig.core.arrays import Float
+from stereorig.server.evaluations.cards import Lack, Mark
 from stereorig.server.evaluations.tensile.curve import AXIAL, STRESS, Curve, Indices
-from stereorig.server.evaluations.tensile.events import Course, Mark
+from stereorig.server.evaluations.tensile.events import Course
 from stereorig.server.evaluations.tensile.numbers import PROOF, Local, Plan, numbers_of
 from stereorig.server.evaluations.tensile.profiles import Profile
 
@@ -22,13 +22,6 @@ _MIN_SIDE = 3  # steps to each side of it
 _MOST = 40
 _PLATEAU = 0.99  # share of the largest stress that belongs to its plateau
 _YIELDS_BY = 0.05  # strain at which yielding is over
-
-
-class Lack(NamedTuple):
-    """Why there is no number."""
-
-    code: str
-    text: str
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ from stereorig.core.arrays import Float
 from stereorig.server.evaluations.tensile.curve import AXIAL, LATERAL, STRESS, Curve
 from stereorig.server.evaluations.tensile.numbers import Plan, numbers_of
 
-COVERAGE = 1.959963984540054  # of a normal distribution, 95 %
 _AT_ONCE = 2_000_000  # readings of the curves that are evaluated at once
 
 
