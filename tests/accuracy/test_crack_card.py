@@ -208,7 +208,7 @@ def test_a_kinked_crack_is_refused_as_drawn_and_named_where_it_was_drawn_straigh
         ({}, {"tip": "first"}, "crack_outside"),
         ({}, {"inner_mm": 1.0}, "crack_ring_invalid"),
         ({}, {"outer_mm": 4.0}, "crack_ring_invalid"),
-        ({}, {"inner_mm": 2.5, "outer_mm": 5.0}, "too_few_points"),
+        ({}, {"inner_mm": 1.6, "outer_mm": 3.2}, "too_few_points"),
         ({}, {"cycles_channel": "count"}, "cycles_missing"),
         ({"smoothing": SMOOTHED}, {}, "crack_smoothed"),
         ({"uvw_mm": None}, {}, "no_displacement"),

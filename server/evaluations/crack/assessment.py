@@ -27,8 +27,7 @@ _APART = 0.02  # share by which J and K may differ
 _PATHS = 0.01  # share by which J may differ from ring to ring
 _CHANCE = 1e-3
 _BUCKLED = 0.05  # share of the strain in the plane that the slope out of it may make
-_PARTS = 3  # of the ring, on which J is compared
-_OPENINGS = 12
+_PARTS, _OPENINGS = 3, 12  # rings on which J is compared, and places where the opening is read
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,10 +231,7 @@ def _doubts(found: Assessed, of: Problem, total: RingIntegral | None) -> list[Ma
         across, u_across = found.opening.value[:, 1], found.opening_u[:, 1]
         worst = int(np.argmin(across / np.maximum(u_across, 1e-300)))
         if across[worst] < -_BEYOND * u_across[worst]:
-            text = (
-                f"The faces overlap by {-across[worst]:.3g} mm {found.opening.behind_mm[worst]:.3g} mm behind the tip."
-            )
-            out.append(Mark("faces_closed", text, spoils=every))
+            out.append(Mark("faces_closed", f"The faces overlap by {-across[worst]:.3g} mm.", spoils=every))
     share = 0.5 * total.slope**2 / max(total.strain, 1e-300)
     if share > _BUCKLED:
         text = f"The surface's slope out of its plane, {total.slope:.3g}, makes {share:.0%} of the strain: it buckled."
