@@ -127,7 +127,8 @@ def assessed(step: Field, of: Problem, start_mm: Float) -> Assessed | Lack:
 def parts_of(found: Assessed, key: str) -> dict[str, float]:
     """Return the standard uncertainties of a number by cause."""
     k, spread, points = list(found.numbers).index(key), found.spread, found.points
-    own = found.fit.excess**2 * float(spread.own[k, k]) + found.numbers[key].square
+    square = found.numbers[key].square
+    own = max(found.fit.excess**2 * float(spread.own[k, k]) - square, square)
     frozen = None if spread.frozen is None else float(spread.frozen[k, k])
     parts = budget_of(own, frozen, None if spread.common is None else spread.common[k], points.causes).document()
     return {cause: u for cause, u in {**parts, **found.numbers[key].stated}.items() if u > 0.0}
@@ -206,7 +207,8 @@ def _add_stated(
 
 
 def _u_of(points: Points, gain: Float, square: float, excess: float) -> float:
-    return float(np.sqrt(points.spread(gain[None]).whole(excess)[0, 0] + square))
+    # noise is in the derivatives of a square too, and adds twice its own variance to the linear part
+    return float(np.sqrt(max(points.spread(gain[None]).whole(excess)[0, 0] - square, square)))
 
 
 def _doubts(found: Assessed, of: Problem, total: RingIntegral | None) -> list[Mark]:
@@ -246,9 +248,8 @@ def _paths(found: Assessed) -> list[Mark]:
     mean = values.mean()
     gains = np.stack([one.gain for one in parts])
     spread = found.points.spread((gains - gains.mean(axis=0))[1:])
-    covariance = spread.whole(found.fit.excess) + np.diag([one.square for one in parts[1:]])
     away = (values - mean)[1:]
-    chance = chi_square_tail(float(away @ np.linalg.solve(covariance, away)), len(away))
+    chance = chi_square_tail(float(away @ np.linalg.solve(spread.whole(found.fit.excess), away)), len(away))
     if chance > _CHANCE or np.ptp(values) <= _PATHS * abs(mean):
         return []
     text = f"J differs from ring to ring by {np.ptp(values) / abs(mean):.1%}, beyond its uncertainty."
