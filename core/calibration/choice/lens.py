@@ -36,6 +36,7 @@ from stereorig.core.calibration.choice.structure import (
 from stereorig.core.calibration.choice.target_errors import check_flatness, find_target_errors
 from stereorig.core.calibration.choice.target_shape import with_smooth_errors
 from stereorig.core.calibration.choice.tilted import (
+    LIKE_A_TILT,
     TILTED,
     UNTILTED,
     as_tilts,
@@ -252,7 +253,8 @@ def _choose(problem: FitData, begun: _FitStart) -> Chosen:
         best = trial
     moved_mm, tilted = _with_tilt(best, fit)
     if tilted is None:
-        return _or_tilted(_result(best, tuple(reasons)), fit)
+        result = _result(best, tuple(reasons))
+        return _tilted_throughout(result, held, fit) or _or_tilted(result, fit)
     reasons.append(
         f"{best.model}: a tilted sensor would leave the same residuals and move the shape by {1e3 * moved_mm:.2g} um: "
         "its tilt and those of the stages are unknowns."
@@ -274,6 +276,30 @@ def _with_tilt(best: _Candidate, fit: Callable[..., Screened]) -> tuple[float, S
             if moved_mm is not None:
                 return moved_mm, tilted
     return 0.0, None
+
+
+def _tilted_throughout(result: Chosen, held: Sequence[CalibrationView], fit: Callable[..., Screened]) -> Chosen | None:
+    """Return the choice with tilted sensors if these explain all structure of the residuals."""
+    found, model = result.screened, TILTED.get(result.model)
+    names = {s.name for s in result.structure}
+    if model is None or not has_own_stages(found) or not names or not names <= LIKE_A_TILT:
+        return None
+    groups, score = scored(
+        found.adjustment, found.rows, found.problem.flat_nodes_mm, found.problem.nominals, tilted=True
+    )
+    # a sheared grid is one tilt of both sensors
+    if not no_target(groups, score, lens_significance(groups, score, (), (_TILT,))[1], staged=True):
+        return None
+    with suppress(CalibrationError):
+        tilted = _Candidate(fit(model, with_open_axes(found.problem, found)), held)
+        before, after = _Candidate(found, held).held_out_rbe_px, tilted.held_out_rbe_px
+        if before is not None and after is not None and after > before:
+            return None
+        reason = f"{result.model}: a tilted sensor explains all that it leaves ({', '.join(sorted(names))})."
+        chosen = _result(tilted, (*result.reasons, reason))
+        if not chosen.structure:
+            return chosen
+    return None
 
 
 def _or_tilted(result: Chosen, fit: Callable[..., Screened]) -> Chosen:

@@ -34,6 +34,8 @@ TILTED: dict[LensName, LensName] = {
 }
 #: the same lenses without the tilt
 UNTILTED: dict[LensName, LensName] = {"opencv5_tilted": "opencv5", "opencv14": "opencv12"}
+#: structure that a tilted sensor may leave under a lens without one
+LIKE_A_TILT = {"decentring", "radial", "higher radial", "thin prism", "aspect", "skew", "unequal pitch", "smooth"}
 _BY_HAND_RAD = 0.02  # a stage put up by eye is within about a degree of the optical axis
 _MOUNTED_RAD = 0.01  # makers of cameras state half a degree for a sensor in its mount
 _ALIGNED_RAD = 4e-3  # four standard deviations of a careful alignment, independent of the declared one

@@ -334,23 +334,33 @@ def _modern_rig(
     step_mm: float = 0.0,
     axis_rad: tuple[float, float] = (0.0, 0.0),
     bow_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    shear: float = 0.0,
+    tau_rad: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (0.0, 0.0)),
+    noise_px: float = 0.02,
+    roll_deg: float = 2.0,
     seed: int = 1,
 ) -> tuple[list[CalibrationView], GridTarget, tuple[NominalValues, NominalValues], tuple[TrueCamera, TrueCamera]]:
     """Six positions of two stages before pixels of 3.45 um, with errors of the travel; OpenCV's projection."""
     focal_px, size, pitch_mm = focal_mm / 0.00345, (2448, 2048), 8.0
     standoff_mm = focal_px * 10.0 * pitch_mm / 1.05 / size[1]
-    cameras = ordinary_pair(lens, focal_px=focal_px, standoff_mm=standoff_mm)
+    one, two = ordinary_pair(lens, focal_px=focal_px, standoff_mm=standoff_mm, roll_deg=roll_deg)
+    if np.any(tau_rad):
+        one, two = (
+            dataclasses.replace(c, lens=(*lens, *np.zeros(7), *tau)) for c, tau in zip((one, two), tau_rad, strict=True)
+        )
+    cameras = one, two
     at = (np.arange(11) - 5.0) * pitch_mm
     points = flat(np.stack(np.meshgrid(at, at, indexing="ij"), axis=-1))
     x, y = np.moveaxis(points[..., :2] / at.max(), -1, 0)
     points[..., 2] = np.stack([x * x, x * y, y * y], axis=-1) @ bow_mm
+    points[..., 0] += shear * points[..., 1]
     rng = np.random.default_rng(seed)
     along = np.array([*axis_rad, np.sqrt(1.0 - np.square(axis_rad).sum())])
     views = []
     for name, camera in zip(CAMERAS, cameras, strict=True):
         for dz in np.linspace(0.0, 0.1 * standoff_mm, 6):
             moved = camera.moved((long * dz + step_mm * rng.standard_normal()) * along)
-            views.append(CalibrationView(name, float(dz), observed(moved, points, rng, 0.02)))
+            views.append(CalibrationView(name, float(dz), observed(moved, points, rng, noise_px)))
     nominal = NominalValues(size, focal_px, standoff_mm, -12.5), NominalValues(size, focal_px, standoff_mm, 12.5)
     return views, GridTarget(pitch_mm=pitch_mm, lines=(13, 13), line_width_mm=0.8), nominal, cameras
 
@@ -427,6 +437,36 @@ def test_a_bow_that_is_named_is_in_the_reported_error(lens: tuple[float, ...]) -
         np.testing.assert_allclose(total, result.covariance, rtol=1e-6, atol=1e-12 * np.abs(total).max())
     # the named amount is known to a tenth; 3 to 18 without it
     assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("tau_rad", "roll_deg"),
+    [
+        (((0.002, -0.001), (-0.0005, 0.0012)), 2.0),
+        (((0.002, -0.001), (-0.0005, 0.0012)), 45.0),
+        (((0.001, 0.001), (-0.001, 0.002)), 45.0),
+    ],
+)
+def test_sensors_tilted_by_a_few_milliradians_are_no_prism_and_no_error_of_the_grid(
+    tau_rad: tuple[tuple[float, float], tuple[float, float]], roll_deg: float
+) -> None:
+    views, target, nominal, cameras = _modern_rig(
+        25.0, (-0.5, 1.0, 0.0, 0.0, 0.0), tau_rad=tau_rad, roll_deg=roll_deg, noise_px=0.006
+    )
+    result = calibrate(views, target, nominal, CalibrationOptions(stage_scale_sigma=1e-4))
+    assert (result.verdict.level, result.lens.model) == ("good", "opencv5_tilted"), result.verdict.reasons
+    # 5.3 times as much as reported where it was called a prism
+    true_um = rig_shape_error_um(result.pair, cameras, result.uncertainty.points_mm)
+    assert true_um < 2e3 * result.uncertainty.shape_rms_mm
+
+
+@pytest.mark.parametrize("roll_deg", [2.0, 45.0])
+def test_a_sheared_grid_is_no_tilted_sensor(roll_deg: float) -> None:
+    lens = (-0.5, 1.0, 0.0, 0.0, 0.0)
+    views, target, nominal, _ = _modern_rig(25.0, lens, shear=3e-4, roll_deg=roll_deg, noise_px=0.006)
+    result = calibrate(views, target, nominal, CalibrationOptions(stage_scale_sigma=1e-4))
+    assert result.verdict.level != "good"
+    assert result.lens.model != "opencv5_tilted"
 
 
 def test_stages_off_their_axes_near_the_limit_of_the_prior_are_no_wrong_aspect_ratio() -> None:
