@@ -99,7 +99,7 @@ def test_axes_are_chosen_by_clicks_and_kept_with_the_test(page: Watched, bench: 
     at = opened(page, bench, strip, "exx")
     # what the axes are now comes after the first press: it does not stand in the place of what to click
     at.route("**/frame", lambda route: (time.sleep(1.0), route.continue_()), times=1)
-    at.get_by_text("Axes of the specimen", exact=True).click()
+    at.locator('[data-role="frame"] > summary').click()
     at.get_by_role("button", name="X along a line").click()
     at.wait_for_timeout(1500)
     state = at.locator('[data-role="frame-state"]')

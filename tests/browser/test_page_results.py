@@ -549,7 +549,7 @@ def test_settings_checks_and_files(page: Watched, bench: Bench) -> None:
     expect(at.get_by_role("heading", name="plate <b>&")).to_be_visible()
     at.get_by_role("link", name=bench.analysis_id).click()
     drawn(at, "2 w_mm reference")
-    at.get_by_text("Settings, checks and warnings").click()
+    at.get_by_text("Settings and checks").click()
     about = at.locator('[data-role="about"]')
     expect(about.get_by_text("rectangle 60, 60, 180, 170")).to_be_visible()
     expect(about.locator("tbody tr")).to_have_count(3)
@@ -727,7 +727,7 @@ def test_a_plot_is_saved_as_numbers_and_as_pictures_and_starts_at_the_reference(
     for words in ("stroke (mm)", "strain (µm/m)", "E1", "k = 1"):
         assert words in drawing
     # wide enough to read
-    box, panel = chart.bounding_box(), at.locator("details", has=at.get_by_label(ENDS[0])).bounding_box()
+    box, panel = chart.bounding_box(), at.locator(".tabs").bounding_box()
     assert box is not None
     assert panel is not None
     assert box["width"] > 0.9 * panel["width"]
@@ -997,7 +997,7 @@ def test_a_step_is_compared_with_a_model_on_the_page(page: Watched, bench: Bench
     for name, head in (("model.csv", "x_mm,y_mm,z_mm,u_mm,v_mm,w_mm"), ("bare.csv", "x,y,z,u,v,w")):
         np.savetxt(tmp_path / name, rows, delimiter=",", header=head, comments="")
     at = shown(page, bench)
-    at.get_by_text("Comparison with a model", exact=True).click()
+    at.locator('[data-role="models"] > summary').click()
     panel = at.locator('[data-role="models"]')
     panel.get_by_label("File", exact=True).set_input_files(tmp_path / "bare.csv")
     panel.get_by_role("button", name="Keep with the test").click()

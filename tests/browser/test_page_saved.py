@@ -197,7 +197,7 @@ def test_a_dense_field_is_seen_and_saved_where_one_was_measured(page: Watched, b
     assert wait_for_job(bench.client, made["job"])["state"] == "succeeded"
     analysis_id = made["analysis_id"]
     at = shown(page, bench, analysis_id=analysis_id)
-    at.get_by_text("Settings, checks and warnings").click()
+    at.get_by_text("Settings and checks").click()
     (figures,) = [one for one in bench.client.get(f"{path}/{analysis_id}").json()["summary"]["steps"] if one["n"] == 2]
     assert figures["dense"]["valid"] > 200
     row = at.locator('[data-role="about"] tbody tr').nth(1)

@@ -1,12 +1,15 @@
 // Colour maps and scales: numbers to colours, the same for the map, the surface and the bar.
 
-// every eighth entry of matplotlib's maps of these names (CC0)
+// every eighth entry of matplotlib's maps of these names (CC0; turbo: A. Mikhailov, Apache 2.0)
 const VIRIDIS =
   "440154470d6048186a482374472d7b4537814240863e49893b528b375b8d33638d2f6b8e2c728e297a8e26828e23898e21918c1f978b1f9f8821a68527ad8131b57b3dbc744cc26c5cc8636ece5881d34d95d840aadc32c0df25d5e21aeae51afde725";
 const CIVIDIS =
   "00224e00285b002e6a0533711a386f273e6e32436d3b496c434e6c4b546c535a6d5a5f6e61656f686a716f70737676767d7c788381798b8778928d789a9376a29975aaa073b3a670bbad6dc3b369ccba64d4c15fddc858e6d051efd748f8df3cfee838";
 
-/** @typedef {"viridis" | "cividis" | "diverging" | "grey"} MapName */
+const TURBO =
+  "30123b392a734040a24456c7466be34680f64294ff37a8fa28bceb1ccdd818ddc21fe9af32f2984ef97d6dfe628bff4ba4fc3cb9f635cdec34dfdf37eecf3af8be39fdac34fe962bfb7e21f46617eb500edf3f08d02f05be2102a91601920b017a0403";
+
+/** @typedef {"viridis" | "cividis" | "turbo" | "diverging" | "grey"} MapName */
 
 /** @param {string} hex */
 const points = (hex) => (hex.match(/.{6}/g) ?? []).map((one) => [0, 2, 4].map((k) => parseInt(one.slice(k, k + 2), 16)));
@@ -46,11 +49,12 @@ function diverging() {
 const grey = () => Array.from({ length: 33 }, (_, k) => okLab(0.12 + (0.86 * k) / 32, 0, 0));
 
 /** @type {Record<MapName, number[][]>} */
-const CONTROL = { viridis: points(VIRIDIS), cividis: points(CIVIDIS), diverging: diverging(), grey: grey() };
+const CONTROL = { viridis: points(VIRIDIS), cividis: points(CIVIDIS), turbo: points(TURBO), diverging: diverging(), grey: grey() };
 export const MAPS = [
   ["auto", "Automatic"],
   ["viridis", "Viridis"],
   ["cividis", "Cividis"],
+  ["turbo", "Turbo"],
   ["diverging", "Blue to brown"],
   ["grey", "Grey"],
 ];

@@ -135,8 +135,14 @@ export function num(value, digits = 4) {
       .replace("e", "\u00a0e")
       .replaceAll("-", "−");
   const decimals = Math.max(0, digits - 1 - Math.floor(Math.log10(size)));
-  return value.toFixed(Math.min(decimals, 6)).replace("-", "−");
+  return apart(value.toFixed(Math.min(decimals, 6)).replace("-", "−"));
 }
+
+/**
+ * A number with narrow spaces, that no line breaks at, between thousands, from five digits before the point on.
+ * @param {string} text
+ */
+export const apart = (text) => text.replace(/^\D?\d{5,}/, (whole) => whole.replace(/\B(?=(\d{3})+$)/g, "\u202f"));
 
 /**
  * A whole number with narrow spaces, that no line breaks at, between thousands.

@@ -1,8 +1,9 @@
-// Units and digits of the numbers that are shown: µm below 0.1 mm, strain in µm/m or %, digits by the standard uncertainty.
-import { count, num, tick } from "./dom.js";
+// Units and digits of the numbers that are shown: µm below 0.1 mm, strain in µm/m, or % from 1 % on, digits by the standard uncertainty.
+import { apart, count, num, tick } from "./dom.js";
 
 const MINUS = "−";
 const SMALL_MM = 0.1;
+const LARGE_STRAIN = 1e4; // µm/m: 1 %
 const KEPT = "strainUnit";
 
 /** @typedef {"µm/m" | "%"} StrainUnit */
@@ -33,7 +34,7 @@ export function useStrainUnit(unit) {
  */
 export function shown(unit, size = null) {
   if (unit === "mm" && size !== null && Math.abs(size) < SMALL_MM) return { unit: "µm", factor: 1000 };
-  if (unit === "µm/m" && strain === "%") return { unit: "%", factor: 1e-4 };
+  if (unit === "µm/m" && (strain === "%" || (size !== null && Math.abs(size) >= LARGE_STRAIN))) return { unit: "%", factor: 1e-4 };
   return { unit, factor: 1 };
 }
 
@@ -45,7 +46,7 @@ export function shown(unit, size = null) {
 function fixed(value, decimals) {
   const rounded = decimals < 0 ? Math.round(value * 10 ** decimals) / 10 ** decimals : value;
   const text = rounded.toFixed(Math.max(Math.min(decimals, 12), 0));
-  return Number(text) === 0 ? text.replace("-", "") : text.replace("-", MINUS);
+  return apart(Number(text) === 0 ? text.replace("-", "") : text.replace("-", MINUS));
 }
 
 /**

@@ -7,7 +7,7 @@ import { Scale } from "../widgets/scale.js";
 import { about } from "./results/about.js";
 import { camerasNote } from "./results/cameras.js";
 import { controlsBar } from "./results/controls.js";
-import { files } from "./results/export.js";
+import { NEW_TAB, files, reportLink } from "./results/export.js";
 import { gauges } from "./results/gauges.js";
 import { frames } from "./results/frame.js";
 import { Workspace, keptDisplay } from "./results/kept.js";
@@ -21,6 +21,7 @@ import { live } from "./results/live.js";
 import { evaluations } from "./results/evaluations.js";
 import { models } from "./results/models.js";
 import { views } from "./results/views.js";
+import { choose, tabs } from "../widgets/tabs.js";
 import { stateBadge, warningsBox } from "./results/warnings.js";
 import { strainUnit, useStrainUnit } from "../lib/units.js";
 import { h, replace, select, notify, problemText } from "../lib/dom.js";
@@ -189,12 +190,13 @@ async function show(root, testId, analysisId, query) {
     await refresh();
   });
   const empty = h("div", { "data-role": "empty" });
-  const pictured = h("div", view.stage, screen.overlay.root, message, cameras);
+  const pictured = h("div.pictured", h("div.stage", view.stage, scale.legend, scale.flagList), screen.overlay.root, message, cameras);
   const numbers = numbersPanel(screen, figures.root, strainChoice(screen, bar.fields, redraw));
-  const below = h("div");
+  const panels = tabs(h("div", numbers));
+  const keep = [h("button", { type: "button", onclick: () => choose(filesPanel).scrollIntoView({ block: "nearest" }) }, "Export"), reportLink(result, "Report", NEW_TAB)];
   const title = h("h1", "Results: ", h("a", { href: `#/results/${testId}` }, result.test.name || testId), ` · ${result.analysis.label || analysisId}`);
-  const side = h("div.grid.side.measured", pictured, numbers, below);
-  replace(root, h("div.spread", title, status, view.modes), warned, following.root, empty, bar.root, side);
+  const side = h("div.grid.measured", pictured, panels);
+  replace(root, h("div.spread", title, status, h("div.row", view.modes, keep)), warned, following.root, empty, bar.root, side);
 
   drawStatus();
   screen.drawn.add(() => mark(screen));
@@ -211,8 +213,8 @@ async function show(root, testId, analysisId, query) {
   const modelsPanel = models(screen);
   const evaluationsPanel = evaluations(screen);
   const point = pointHistory(screen);
-  below.append(point.root, gaugePanels, axes.root, modelsPanel, evaluationsPanel, filesPanel, aboutPanel.root);
-  const dependent = [view.modes, bar.root, pictured, numbers, point.root, gaugePanels, axes.root, modelsPanel, evaluationsPanel, filesPanel]; // on a finished step
+  panels.append(gaugePanels, point.root, axes.root, modelsPanel, evaluationsPanel, filesPanel, aboutPanel.root);
+  const dependent = [view.modes, ...keep, bar.root, pictured, numbers, point.root, gaugePanels, axes.root, modelsPanel, evaluationsPanel, filesPanel]; // on a finished step
 
   /** Without a finished step there is nothing to choose: only the reason is shown. */
   function nothing() {
@@ -253,15 +255,16 @@ const noStep = (testId, running) =>
  */
 const numbersPanel = ({ scale, interval, probe }, figures, strain) =>
   h(
-    "section.panel.figures",
-    { "aria-label": "Figures" },
-    scale.root,
-    h("h2", "Statistics"),
+    "details.panel.figures",
+    { open: true },
+    h("summary", "Statistics"),
     figures,
     h("div.row", h("span", "Strain in"), strain),
     interval.root,
     h("h2", "Probe"),
     probe,
+    h("h2", "Colours"),
+    scale.root,
   );
 
 /** @param {Viewer} screen */
@@ -293,7 +296,10 @@ async function overSteps(result, key) {
  * @param {() => Promise<void>} redraw
  */
 function strainChoice(screen, fields, redraw) {
-  const units = ["µm/m", "%"].map((unit) => [unit, unit]);
+  const units = [
+    ["µm/m", "µm/m, % from 1 % on"],
+    ["%", "%"],
+  ];
   const choice = select(units, strainUnit(), { "aria-label": "Unit of strain", "data-role": "strain-unit" });
   choice.addEventListener("change", async () => {
     useStrainUnit(choice.value === "%" ? "%" : "µm/m");

@@ -37,6 +37,22 @@ test("strain is in um/m or % by choice", () => {
   useStrainUnit("µm/m");
 });
 
+test("strain is in % from 1 % on, all of a column", () => {
+  assert.equal(plain(amount(9999, "µm/m")), "9999 µm/m");
+  assert.equal(plain(amount(-48122, "µm/m")), "−4.812 %");
+  assert.equal(plain(uncertain(-48115, 121, "µm/m")), "−4.812 ± 0.012 %");
+  assert.equal(plain(uncertain(300, 20, "µm/m", 52039)), "0.0300 ± 0.0020 %");
+});
+
+test("thousands stand apart from five digits on", () => {
+  const narrow = "\u202f";
+  assert.equal(plain(amount(-48115.2, "N", 5)), `−48${narrow}115 N`);
+  assert.equal(plain(amount(123456.78, "N", 8)), `123${narrow}456.78 N`);
+  assert.equal(plain(uncertain(-123456, 121, "grey")), `−123${narrow}460 ± 120 grey`);
+  assert.equal(plain(amount(4811.25, "N", 6)), "4811.25 N");
+  assert.deepEqual(evenMarks([-20000, 0, 20000]), [`−20${narrow}000`, "0", `20${narrow}000`]);
+});
+
 test("a scale's marks have the same decimals", () => {
   assert.deepEqual(evenMarks([-0.538, -0.269, 0, 0.269, 0.538]), ["−0.54", "−0.27", "0.00", "0.27", "0.54"]);
   assert.deepEqual(evenMarks([-116, -104, -92.1, -79.9, -67.8]), ["−116", "−104", "−92", "−80", "−68"]);

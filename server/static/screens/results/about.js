@@ -14,7 +14,7 @@ import { amount, inUnits } from "../../lib/units.js";
  */
 export function about(screen) {
   const { result } = screen;
-  const root = h("details.panel", { "data-role": "about" }, h("summary", "Settings, checks and warnings"));
+  const root = h("details.panel", { "data-role": "about" }, h("summary", "Settings and checks"));
   const body = h("div");
   root.append(body);
 

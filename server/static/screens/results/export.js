@@ -29,10 +29,11 @@ const FIELDS = [
   ["all", "all"],
   ["seen", "the one shown"],
 ];
+export const NEW_TAB = { target: "_blank", rel: "noopener" };
 const ACTIVE = ["queued", "running", "cancelling"];
 /** @type {Record<string, string>} */
 const PHASES = { waiting: "waiting", reading: "reading the steps", drawing: "drawing", writing: "writing" };
-const MAPS = /** @type {const} */ ({ viridis: "viridis", cividis: "cividis", diverging: "blue to brown", grey: "grey" });
+const MAPS = /** @type {const} */ ({ viridis: "viridis", cividis: "cividis", turbo: "turbo", diverging: "blue to brown", grey: "grey" });
 
 /**
  * The export's parameters for the same picture as the view: field, colours, limits, image and axes.
@@ -297,24 +298,32 @@ async function slowly(result, course, asked) {
 }
 
 /**
+ * A link to the report, in the axes that are shown once it is followed.
+ * @param {Result} result
+ * @param {string} text
+ * @param {import("#dom").Attributes} more
+ */
+export function reportLink(result, text, more) {
+  const address = () => api.address(`${result.path}/report`, { frame: result.frame });
+  const link = h("a.button", { href: address(), ...more }, text);
+  link.addEventListener("click", () => link.setAttribute("href", address()));
+  return link;
+}
+
+/**
  * The report in a tab of its own. It is computed on request, which takes a while: a message states so.
  * @param {Result} result
  */
 function report(result) {
-  const address = () => api.address(`${result.path}/report`, { frame: result.frame });
   const note = h("p.quiet", { role: "status" }, "One HTML page with all results, to file or print.");
-  const announce = (/** @type {MouseEvent} */ event) => {
-    /** @type {HTMLAnchorElement} */ (event.currentTarget).href = address();
+  const onclick = () => {
     note.textContent = "The report is computed from the steps' files: some seconds, longer for many steps. It is shown when it is complete.";
   };
+  const name = `${result.testId}_${result.analysisId}_report.html`;
   return h(
     "div",
     h("h3", "Report"),
-    h(
-      "div.row",
-      h("a.button", { href: address(), target: "_blank", rel: "noopener", onclick: announce }, "Open the report"),
-      h("a.button", { href: address(), download: `${result.testId}_${result.analysisId}_report.html`, onclick: announce }, "Save the report"),
-    ),
+    h("div.row", reportLink(result, "Open the report", { ...NEW_TAB, onclick }), reportLink(result, "Save the report", { download: name, onclick })),
     note,
   );
 }

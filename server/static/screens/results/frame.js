@@ -63,7 +63,7 @@ export function frames(screen, reread) {
   const root = h(
     "details.panel",
     { "data-role": "frame" },
-    h("summary", "Axes of the specimen"),
+    h("summary", "Axes"),
     h(
       "p.quiet",
       { id: "frame-hint" },

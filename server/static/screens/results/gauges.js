@@ -7,6 +7,7 @@ import { extensometersPanel } from "./gauges/extensometers.js";
 import { linePanel } from "./gauges/line.js";
 import { keptGauges } from "./kept.js";
 import { lines } from "./lines.js";
+import { choose as unfold } from "../../widgets/tabs.js";
 
 /** @import { Viewer } from "../results.js" */
 /** @import { Gauges, Kind, Request, State, Tool } from "./gauges/shared.js" */
@@ -38,7 +39,7 @@ export function gauges(screen) {
     changed(tool) {
       my.draw();
       fill();
-      panels[tool].root.open = true;
+      unfold(panels[tool].root);
       return panels[tool].read().catch(notify);
     },
   };
@@ -62,11 +63,9 @@ export function gauges(screen) {
     my.draw();
     if (first) {
       fill();
-      if (state.extensometers.length) {
-        panels.extensometer.root.open = true;
-        panels.extensometer.read().catch(notify);
-      }
-      for (const name of /** @type {const} */ (["line", "area"])) panels[name].root.open = Boolean(state[name]);
+      if (state.extensometers.length) panels.extensometer.read().catch(notify);
+      const kept = state.extensometers.length ? "extensometer" : state.line ? "line" : state.area ? "area" : null;
+      if (kept) unfold(panels[kept].root);
     }
     first = false;
     const now = `${screen.step} ${screen.info?.key} ${result.frame}`;
@@ -79,7 +78,7 @@ export function gauges(screen) {
   screen.landed.add(() => Promise.all([panels.extensometer.read(), panels.area.read()]).catch(notify)); // histories of all steps
   screen.ends.push(() => each.forEach((one) => one.close()));
   return h(
-    "div",
+    "div.gauges",
     h("label.check.apart", rigid, "Gauges without the rigid motion of the whole field"),
     each.map((one) => one.root),
   );
@@ -111,7 +110,7 @@ function tools(my, panelOf) {
     } else screen.message.textContent = screen.info ? aboutText(screen.info) : "";
     for (const button of buttons) button.setAttribute("aria-pressed", String(button.dataset.tool === name));
     view.frame.style.cursor = name === "probe" ? "" : "cell";
-    if (name !== "probe") panelOf(name).root.open = true;
+    if (name !== "probe") unfold(panelOf(name).root);
     my.draw();
   }
   view.onleave = () => choose("probe");

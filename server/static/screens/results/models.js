@@ -180,7 +180,7 @@ export function models(screen) {
   const root = h(
     "details.panel",
     { "data-role": "models" },
-    h("summary", "Comparison with a model"),
+    h("summary", "Model"),
     h(
       "p.quiet",
       "A finite element result with displacements at its nodes, in the calibration's axes or laid onto the measured shape. Its unit must be stated.",

@@ -23,7 +23,7 @@ export function pointHistory(screen) {
   const root = h(
     "details.panel",
     { "data-role": "point" },
-    h("summary", "Point"),
+    h("summary", "History"),
     h("div.row", field("History against", against.choice)),
     text,
     plot.box,

@@ -86,7 +86,7 @@ export function areaPanel(my) {
   }
   const root = h(
     "details.panel",
-    h("summary", "Area"),
+    h("summary", "Areas"),
     h("p.quiet", "Choose the tool Area and drag a rectangle, or give its corners."),
     h("div.row", inputs.row, field("Area against", against.choice), clear(my, "area", close, [plot.box, box])),
     plot.box,
