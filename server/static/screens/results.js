@@ -193,10 +193,11 @@ async function show(root, testId, analysisId, query) {
   const pictured = h("div.pictured", h("div.stage", view.stage, scale.legend, scale.flagList), screen.overlay.root, message, cameras);
   const numbers = numbersPanel(screen, figures.root, strainChoice(screen, bar.fields, redraw));
   const panels = tabs(h("div", numbers));
-  const keep = [h("button", { type: "button", onclick: () => choose(filesPanel).scrollIntoView({ block: "nearest" }) }, "Export"), reportLink(result, "Report", NEW_TAB)];
+  const exported = h("button", { type: "button", onclick: () => choose(filesPanel).scrollIntoView({ block: "nearest" }) }, "Export");
+  const reported = reportLink(result, "Report", NEW_TAB);
   const title = h("h1", "Results: ", h("a", { href: `#/results/${testId}` }, result.test.name || testId), ` · ${result.analysis.label || analysisId}`);
   const side = h("div.grid.measured", pictured, panels);
-  replace(root, h("div.spread", title, status, h("div.row", view.modes, keep)), warned, following.root, empty, bar.root, side);
+  replace(root, h("div.spread", title, status, h("div.row", view.modes, exported, reported)), warned, following.root, empty, bar.root, side);
 
   drawStatus();
   screen.drawn.add(() => mark(screen));
@@ -214,7 +215,7 @@ async function show(root, testId, analysisId, query) {
   const evaluationsPanel = evaluations(screen);
   const point = pointHistory(screen);
   panels.append(gaugePanels, point.root, axes.root, modelsPanel, evaluationsPanel, filesPanel, aboutPanel.root);
-  const dependent = [view.modes, ...keep, bar.root, pictured, numbers, point.root, gaugePanels, axes.root, modelsPanel, evaluationsPanel, filesPanel]; // on a finished step
+  const dependent = [view.modes, exported, reported, bar.root, pictured, numbers, point.root, gaugePanels, axes.root, modelsPanel, evaluationsPanel, filesPanel]; // on a finished step
 
   /** Without a finished step there is nothing to choose: only the reason is shown. */
   function nothing() {
