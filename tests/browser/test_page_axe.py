@@ -167,7 +167,7 @@ def test_the_report_and_its_facts(page: Watched, bench: Bench) -> None:
     at.get_by_role("button", name="Save the metadata").click()
     expect(at.get_by_text("The metadata are saved.")).to_be_visible()
     shown(page, bench)
-    at.get_by_text("Export and report").click()
+    at.get_by_role("button", name="Export", exact=True).click()
     with at.context.expect_page(timeout=200_000) as opened:
         at.get_by_role("link", name="Open the report").click()
         expect(at.get_by_text("The report is computed")).to_be_visible()

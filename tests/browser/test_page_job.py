@@ -332,7 +332,7 @@ def export_opens(shown: Page, client: httpx.Client, test_id: str) -> None:
     analysis = client.get(f"{API}/tests/{test_id}").json()["analyses"][-1]["id"]
     shown_w = client.get(f"{API}/tests/{test_id}/analyses/{analysis}/steps/2/fields/w_mm?frame=specimen").json()
     w = np.array(shown_w["values"], float)
-    shown.get_by_text("Export and report").click()
+    shown.get_by_role("button", name="Export", exact=True).click()
     files = {}
     for form in ("nc", "csv"):
         shown.get_by_label("Form", exact=True).select_option(form)

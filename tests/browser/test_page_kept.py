@@ -110,6 +110,7 @@ def test_region_and_settings_outlive_screen_reload_browser_and_service(chromium:
             box.fill(value)
             box.press("Enter")
         shown.get_by_label("Subset", exact=True).fill("21")
+        shown.get_by_text("Advanced", exact=True).click()
         shown.get_by_label("Smoothing window").fill("5")
         shown.get_by_label("Tensor").select_option("hencky")
         shown.get_by_role("textbox", name="Steps", exact=True).fill("0")

@@ -557,7 +557,7 @@ def test_settings_checks_and_files(page: Watched, bench: Bench) -> None:
     of_step = bench.client.get(bench.path()).json()["summary"]["steps"][2]
     expect(about.locator("tbody tr").nth(2)).to_contain_text(f"{of_step['sigma_median_mm']['w_mm'] * 1e3:.2g}\u00a0µm")
     expect(about).not_to_contain_text("e−5")
-    at.get_by_text("Export and report").click()
+    at.get_by_role("button", name="Export", exact=True).click()
     # what is saved is in the axes that are shown, unless others are asked for
     with at.expect_download() as saved:
         at.get_by_role("button", name="Save the file").click()
@@ -661,7 +661,7 @@ def test_a_failed_check_stands_at_the_head_of_the_results_and_in_the_lists(page:
 def test_what_is_shown_is_what_is_saved(page: Watched, bench: Bench) -> None:
     at = shown(page, bench, name="exx")
     panel = at.locator('[data-role="files"]')
-    at.get_by_text("Export and report").click()
+    at.get_by_role("button", name="Export", exact=True).click()
     for label, value in (("Colours", "diverging"), ("Limits", "given")):
         at.get_by_label(label, exact=True).select_option(value)
     for label, text in (("Lower limit", "-300"), ("Upper limit", "300"), ("Levels", "6")):
@@ -734,6 +734,27 @@ def test_a_plot_is_saved_as_numbers_and_as_pictures_and_starts_at_the_reference(
     given(at, ("Area left", "Area top", "Area right", "Area bottom"), (90, 90, 150, 140))
     at.locator("details", has=at.get_by_label("Area left")).get_by_role("button", name="Use").click()
     expect(at.locator('[data-role="area-chart"] canvas')).to_be_visible()
+    page.sound()
+
+
+def test_picture_and_numbers_stand_on_one_screen_a_tab_at_a_time(page: Watched, bench: Bench) -> None:
+    at = shown(page, bench, name="exx")
+    for size in ((1440, 900), (1024, 768)):
+        at.set_viewport_size({"width": size[0], "height": size[1]})
+        expect(at.locator('[data-role="colourbar"]')).to_be_in_viewport(ratio=1)
+        expect(at.locator(".view .frame")).to_be_in_viewport(ratio=1)
+        assert at.evaluate("document.documentElement.scrollHeight") <= size[1]
+    picture_box, bar = (at.locator(where).bounding_box() for where in (".stage", '[data-role="colourbar"]'))
+    assert picture_box is not None
+    assert bar is not None
+    assert picture_box["y"] < bar["y"] < picture_box["y"] + picture_box["height"] - bar["height"]
+    for name in ("Line", "Extensometers", "Areas", "History", "Statistics", "Statistics"):
+        at.locator("summary").get_by_text(name, exact=True).click()
+        open_ = at.locator(".tabs details.panel[open] > summary")
+        expect(open_).to_have_text([name])
+    at.get_by_role("button", name="Export", exact=True).click()
+    expect(at.get_by_role("button", name="Save the file")).to_be_visible()
+    expect(at.locator('[data-role="statistics"]')).to_be_hidden()
     page.sound()
 
 

@@ -76,7 +76,7 @@ def bar_below(at: Page, picture: np.ndarray, times: int = 1) -> None:
 
 def test_a_deformed_picture_is_saved_as_it_is_seen_with_its_bar(page: Watched, bench: Bench) -> None:
     at = shown(page, bench)
-    at.get_by_text("Export and report").click()
+    at.get_by_role("button", name="Export", exact=True).click()
     at.get_by_label("Image", exact=True).select_option("cam2")
     at.wait_for_selector('canvas[data-role="map"][data-shown="2 w_mm cam2"]', state="attached")
     at.get_by_label("contour lines, about").check()
@@ -107,7 +107,7 @@ def test_the_surface_is_saved_with_its_axes_and_its_bar(page: Watched, bench: Be
     own, mirrored = difference(at, space, picture, named=True, times=2)
     assert own < 0.4 * mirrored, (own, mirrored)
     bar_below(at, picture, times=2)
-    at.get_by_text("Export and report").click()
+    at.get_by_role("button", name="Export", exact=True).click()
     expect(at.locator('[data-role="seen"]')).to_contain_text("as it is seen, in space")
     drawing = saved(at, at.get_by_role("button", name="Save as SVG").last).read_text()
     unit = at.locator('[data-role="colourbar"] .of').inner_text()
@@ -120,7 +120,7 @@ def test_both_views_are_saved_side_by_side_and_their_difference_with_a_bar_of_it
     page: Watched, bench: Bench
 ) -> None:
     at = shown(page, bench)
-    at.get_by_text("Export and report").click()
+    at.get_by_role("button", name="Export", exact=True).click()
     at.get_by_role("button", name="Side by side").click()
     expect(at.locator('canvas[data-role="map-other"]')).to_have_attribute("data-shown", "2 w_mm reference")
     expect(at.locator('[data-role="seen"]')).to_contain_text("both views side by side")
@@ -189,7 +189,7 @@ def test_a_calibrations_plots_are_saved_as_numbers_and_pictures(page: Watched, b
 
 def test_a_dense_field_is_seen_and_saved_where_one_was_measured(page: Watched, bench: Bench) -> None:
     at = shown(page, bench)
-    at.get_by_text("Export and report").click()
+    at.get_by_role("button", name="Export", exact=True).click()
     expect(at.get_by_label("the dense field")).to_have_count(0)  # none was asked for
     path = f"{API}/tests/{bench.test_id}/analyses"
     asked = {"region": {"rectangle": [70, 70, 150, 150]}, "subset_px": 25, "spacing_px": 10, "dense_step_px": 4}
@@ -202,7 +202,7 @@ def test_a_dense_field_is_seen_and_saved_where_one_was_measured(page: Watched, b
     assert figures["dense"]["valid"] > 200
     row = at.locator('[data-role="about"] tbody tr').nth(1)
     expect(row).to_contain_text(f"{figures['dense']['valid']} of {figures['dense']['vectors']}")
-    at.get_by_text("Export and report").click()
+    at.get_by_role("button", name="Export", exact=True).click()
     at.get_by_label("the dense field").check()
     expect(at.locator('[data-role="seen"]')).to_contain_text("its dense field, a vector every 4 px")
     picture = at.locator('[data-role="dense-map"] img')

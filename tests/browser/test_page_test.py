@@ -130,7 +130,7 @@ def test_the_path_leads_back_to_the_test_and_its_parts_and_ticks_what_is_done(pa
     for cam in ("cam1", "cam2"):
         live = shown.get_by_alt_text(f"Live view of {cam}", exact=True)
         shown.wait_for_function("image => image.naturalWidth > 0", arg=live.element_handle())
-    # a part of the screen is brought into view, and what was drawn on it stays
+    # each part is a screen of its own, and what was drawn on it stays
     Editor(shown).drag((90, 80), (170, 160))
     drawn = shown.get_by_text("Draw a region to rate its speckle quality")
     expect(drawn).to_have_count(0)
@@ -140,6 +140,15 @@ def test_the_path_leads_back_to_the_test_and_its_parts_and_ticks_what_is_done(pa
     screens.get_by_role("link", name="Measure", exact=True).click()
     expect(shown.get_by_role("button", name="Measure", exact=True)).to_be_in_viewport()
     expect(drawn).to_have_count(0)
+    own = {"Capture": "Live view", "Region": "Seed", "Measure": "Advanced"}
+    for name in own:
+        screens.get_by_role("link", name=name, exact=True).click()
+        for other, text in own.items():
+            part = shown.get_by_text(text, exact=True).first
+            expect(part).to_be_visible() if other == name else expect(part).to_be_hidden()
+        for width in (1440, 1024, 390):
+            shown.set_viewport_size({"width": width, "height": 844})
+            assert shown.evaluate("document.documentElement.scrollWidth") <= width
     # from elsewhere it is the test that was open, not the list
     screens.get_by_role("link", name="Rig", exact=True).click()
     expect(shown.get_by_role("heading", level=1, name="tiny rig")).to_be_visible()
@@ -332,6 +341,7 @@ def test_the_region_that_is_posted_is_the_one_drawn(page: Watched, plate: str, p
             shown.wait_for_timeout(350)
         editor.key("Enter")
     shown.get_by_label("Subset", exact=True).fill("15")
+    shown.get_by_text("Advanced", exact=True).click()
     shown.get_by_label("Dense field, a vector every", exact=True).fill("3")
     shown.get_by_role("textbox", name="Steps", exact=True).fill("0")
     sent = asked(shown, "/analyses", lambda: shown.get_by_role("button", name="Measure", exact=True).click())
@@ -409,6 +419,7 @@ def test_each_field_of_a_measurement_says_its_error_beside_itself_and_nothing_is
     def beside(label: str) -> Locator:
         return measure.locator(".field", has=shown.get_by_label(label, exact=True)).get_by_role("alert")
 
+    measure.get_by_text("Advanced", exact=True).click()
     # the limits are those of the settings
     expect(measure.get_by_label("Largest sigma of a match", exact=True)).to_have_value(str(DEFAULT_MAX_SIGMA_PX))
     for label, limits in (

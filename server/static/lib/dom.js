@@ -138,10 +138,7 @@ export function num(value, digits = 4) {
   return apart(value.toFixed(Math.min(decimals, 6)).replace("-", "−"));
 }
 
-/**
- * A number with narrow spaces, that no line breaks at, between thousands, from five digits before the point on.
- * @param {string} text
- */
+/** A number with narrow spaces between thousands, from five digits before the point on. @param {string} text */
 export const apart = (text) => text.replace(/^\D?\d{5,}/, (whole) => whole.replace(/\B(?=(\d{3})+$)/g, "\u202f"));
 
 /**

@@ -74,6 +74,7 @@ export const correct = (input) => input.value !== "" && input.checkValidity();
  */
 export function allRight(rules) {
   const wrong = rules.filter(([, check]) => !check());
+  wrong[0]?.[0].closest("details")?.setAttribute("open", ""); // what is folded takes no focus
   wrong[0]?.[0].focus();
   return !wrong.length;
 }

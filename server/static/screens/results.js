@@ -7,10 +7,10 @@ import { Scale } from "../widgets/scale.js";
 import { about } from "./results/about.js";
 import { camerasNote } from "./results/cameras.js";
 import { controlsBar } from "./results/controls.js";
-import { NEW_TAB, files, reportLink } from "./results/export.js";
+import { files } from "./results/export.js";
 import { gauges } from "./results/gauges.js";
 import { frames } from "./results/frame.js";
-import { Workspace, keptDisplay } from "./results/kept.js";
+import { keptDisplay } from "./results/kept.js";
 import { list } from "./results/list.js";
 import { overlay } from "./results/overlay.js";
 import { pointHistory } from "./results/point_history.js";
@@ -23,6 +23,7 @@ import { models } from "./results/models.js";
 import { views } from "./results/views.js";
 import { choose, tabs } from "../widgets/tabs.js";
 import { stateBadge, warningsBox } from "./results/warnings.js";
+import { Workspace } from "../lib/workspace.js";
 import { strainUnit, useStrainUnit } from "../lib/units.js";
 import { h, replace, select, notify, problemText } from "../lib/dom.js";
 
@@ -193,11 +194,13 @@ async function show(root, testId, analysisId, query) {
   const pictured = h("div.pictured", h("div.stage", view.stage, scale.legend, scale.flagList), screen.overlay.root, message, cameras);
   const numbers = numbersPanel(screen, figures.root, strainChoice(screen, bar.fields, redraw));
   const panels = tabs(h("div", numbers));
-  const exported = h("button", { type: "button", onclick: () => choose(filesPanel).scrollIntoView({ block: "nearest" }) }, "Export");
-  const reported = reportLink(result, "Report", NEW_TAB);
+  const address = () => api.address(`${result.path}/report`, { frame: result.frame });
+  const report = h("a.button", { href: address(), target: "_blank", rel: "noopener", title: "Some seconds; longer for many steps" }, "Open the report");
+  report.addEventListener("click", () => report.setAttribute("href", address())); // in the axes that are shown
+  const exported = h("button", { type: "button", onclick: () => choose(filesPanel, true) }, "Export");
   const title = h("h1", "Results: ", h("a", { href: `#/results/${testId}` }, result.test.name || testId), ` · ${result.analysis.label || analysisId}`);
   const side = h("div.grid.measured", pictured, panels);
-  replace(root, h("div.spread", title, status, h("div.row", view.modes, exported, reported)), warned, following.root, empty, bar.root, side);
+  replace(root, h("div.spread", title, status, h("div.row.top", view.modes, exported, report)), warned, following.root, empty, bar.root, side);
 
   drawStatus();
   screen.drawn.add(() => mark(screen));
@@ -215,12 +218,11 @@ async function show(root, testId, analysisId, query) {
   const evaluationsPanel = evaluations(screen);
   const point = pointHistory(screen);
   panels.append(gaugePanels, point.root, axes.root, modelsPanel, evaluationsPanel, filesPanel, aboutPanel.root);
-  const dependent = [view.modes, exported, reported, bar.root, pictured, numbers, point.root, gaugePanels, axes.root, modelsPanel, evaluationsPanel, filesPanel]; // on a finished step
 
   /** Without a finished step there is nothing to choose: only the reason is shown. */
   function nothing() {
     const none = state.step === null;
-    for (const part of dependent) part.hidden = none;
+    root.classList.toggle("without", none);
     replace(empty, none ? noStep(testId, following.running()) : null);
   }
   await refresh();

@@ -22,9 +22,6 @@ const STEPS = [
   ["measure", "Measure", "the test is measured"],
   ["results", "Results", "results were looked at"],
 ];
-/** Where a part of the test's screen is. @type {Record<string, string>} */
-const PLACES = { capture: '[aria-label="Capture"]', region: '[aria-label="Region and analysis"]', measure: '[data-role="progress"]' };
-
 /** The test that was open last, in this browser. */
 export const lastTest = () => localStorage.getItem(KEPT);
 
@@ -58,17 +55,11 @@ async function look() {
   };
 }
 
-/** Bring a part of the test's screen into view once it is drawn. */
+/** Show one part of a test as a screen of its own, capture, region or measure; all of it without one. */
 export function goTo(at = "") {
-  const place = PLACES[at];
-  if (!place) return;
-  /** @param {number} left tries */
-  const go = (left) => {
-    const node = document.querySelector(`[data-screen="test"] ${place}`);
-    if (node) node.scrollIntoView({ block: at === "measure" ? "center" : "start" });
-    else if (left) setTimeout(() => go(left - 1), 100);
-  };
-  go(20);
+  const screen = /** @type {HTMLElement | null} */ (document.querySelector('main > [data-screen="test"]'));
+  if (screen) screen.dataset.at = at;
+  window.scrollTo({ top: 0 });
 }
 
 /** @param {HTMLElement} others links that follow the steps */
@@ -141,7 +132,7 @@ export function path(others) {
     ),
     others,
   );
-  // a part of the screen that is open is only brought into view: nothing drawn on it is lost
+  // a part of the test that is open is only shown: nothing drawn on it is lost
   root.addEventListener("click", (event) => {
     const link = /** @type {Element} */ (event.target).closest("a");
     if (!link || here?.screen !== "test") return;
@@ -151,8 +142,7 @@ export function path(others) {
     history.replaceState(null, "", link.hash);
     here = { ...here, query: new URLSearchParams(query ?? "") };
     draw();
-    if (query) goTo(here.query.get("at") ?? "");
-    else window.scrollTo({ top: 0 });
+    goTo(here.query.get("at") ?? "");
   });
   /** @param {Here} now */
   const moved = (now) => {

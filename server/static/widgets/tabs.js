@@ -3,11 +3,11 @@
 /**
  * Open one of the panels, and fold the others.
  * @param {HTMLDetailsElement} panel
- * @returns {HTMLElement} its name
+ * @param {boolean} [seen] bring it into view
  */
-export function choose(panel) {
+export function choose(panel, seen = false) {
   for (const one of panel.closest(".tabs")?.querySelectorAll("details.panel") ?? []) /** @type {HTMLDetailsElement} */ (one).open = one === panel;
-  return /** @type {HTMLElement} */ (panel.firstElementChild);
+  if (seen) panel.closest(".tabs")?.scrollIntoView({ block: "nearest" });
 }
 
 /**

@@ -1,4 +1,4 @@
-// Export: the picture as it is shown, a film of it, the numbers for other programs, the report.
+// Export: the picture as it is shown, a film of it, the numbers for other programs.
 import * as api from "../../lib/api.js";
 import { h, replace, action, badge, field, number, select, notify, problemText, tick } from "../../lib/dom.js";
 import { pngOf, saveAs, svgFile } from "../../widgets/saving.js";
@@ -29,7 +29,6 @@ const FIELDS = [
   ["all", "all"],
   ["seen", "the one shown"],
 ];
-export const NEW_TAB = { target: "_blank", rel: "noopener" };
 const ACTIVE = ["queued", "running", "cancelling"];
 /** @type {Record<string, string>} */
 const PHASES = { waiting: "waiting", reading: "reading the steps", drawing: "drawing", writing: "writing" };
@@ -60,7 +59,7 @@ export function seen(screen, over) {
 }
 
 /**
- * Pictures, films, files and the report of an analysis.
+ * Pictures, films and files of an analysis.
  * @param {Viewer} screen
  */
 export function files(screen) {
@@ -81,7 +80,7 @@ export function files(screen) {
   const root = h(
     "details.panel",
     { "data-role": "files" },
-    h("summary", "Export and report"),
+    h("summary", "Export"),
     h("h3", "The picture that is shown"),
     picture.text,
     h(
@@ -106,7 +105,6 @@ export function files(screen) {
           ` of the analysis, ${result.analysisId}, in the layout of the ordinary ones; strain, normals and rotation are the ordinary field's alone.`,
         )
       : "",
-    report(result),
   );
   function tell() {
     const asked = seen(screen, over.checked);
@@ -295,35 +293,4 @@ async function slowly(result, course, asked) {
   const name = String(job.result?.file ?? "export");
   saveAs(api.address(`/jobs/${id}/file`), name);
   replace(course, h("p.quiet", "Saved as ", h("a", { href: api.address(`/jobs/${id}/file`), download: name }, name), "."));
-}
-
-/**
- * A link to the report, in the axes that are shown once it is followed.
- * @param {Result} result
- * @param {string} text
- * @param {import("#dom").Attributes} more
- */
-export function reportLink(result, text, more) {
-  const address = () => api.address(`${result.path}/report`, { frame: result.frame });
-  const link = h("a.button", { href: address(), ...more }, text);
-  link.addEventListener("click", () => link.setAttribute("href", address()));
-  return link;
-}
-
-/**
- * The report in a tab of its own. It is computed on request, which takes a while: a message states so.
- * @param {Result} result
- */
-function report(result) {
-  const note = h("p.quiet", { role: "status" }, "One HTML page with all results, to file or print.");
-  const onclick = () => {
-    note.textContent = "The report is computed from the steps' files: some seconds, longer for many steps. It is shown when it is complete.";
-  };
-  const name = `${result.testId}_${result.analysisId}_report.html`;
-  return h(
-    "div",
-    h("h3", "Report"),
-    h("div.row", reportLink(result, "Open the report", { ...NEW_TAB, onclick }), reportLink(result, "Save the report", { download: name, onclick })),
-    note,
-  );
 }

@@ -16,30 +16,14 @@ async function channelsOf(result) {
   return found;
 }
 
+/** Unit of the ending of a channel's name. @type {Record<string, string>} */
+const UNITS = { um: "µm", c: "°C", degc: "°C", nm: "N m", deg: "°", percent: "%" };
+for (const unit of ["kPa", "MPa", "Pa", "bar", "N", "kN", "mm", "V", "mV", "s", "K", "Hz"]) UNITS[unit.toLowerCase()] = unit;
+
 /** "pressure_kpa" -> "pressure (kPa)": the unit that a channel's name ends in. @param {string} name */
 export function channelText(name) {
-  const units = /** @type {Record<string, string>} */ ({
-    kpa: "kPa",
-    mpa: "MPa",
-    pa: "Pa",
-    bar: "bar",
-    n: "N",
-    kn: "kN",
-    mm: "mm",
-    um: "µm",
-    v: "V",
-    mv: "mV",
-    s: "s",
-    c: "°C",
-    degc: "°C",
-    k: "K",
-    nm: "N m",
-    hz: "Hz",
-    deg: "°",
-    percent: "%",
-  });
   const found = /^(.+)_([a-z]+)$/.exec(name);
-  const unit = found ? units[found[2]] : undefined;
+  const unit = found ? UNITS[found[2]] : undefined;
   return found && unit ? `${found[1].replaceAll("_", " ")} (${unit})` : name.replaceAll("_", " ");
 }
 

@@ -82,5 +82,3 @@ export function keptDisplay(workspace, scale, state) {
   }
   return { keep, chosen };
 }
-
-export { Workspace };

@@ -51,10 +51,7 @@ export function liveField(testId) {
   view.canvas.style.opacity = "0.8";
   const scale = new Scale(() => {}, false);
   scale.legend.style.marginTop = "0.6rem";
-  const component = select(
-    COMPONENTS.map(([key, text]) => [key, text]),
-    "w_mm",
-  );
+  const component = select(COMPONENTS, "w_mm");
   const root = h("div", { hidden: true }, h("div.row", field("Displacement", component)), scale.legend, view.root);
 
   /**

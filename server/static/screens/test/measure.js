@@ -349,30 +349,46 @@ async function measure(my, jobs, done) {
 function layout({ views, editor, form, reference, asked, finder }, { sample, texture, gauge, end }) {
   const seedsHint =
     "Seeds are searched for automatically if none are given. On a periodic texture, click three points that are not on one line, each in both views.";
-  const region = h("fieldset", h("legend", "Region and seeds"), h("div.row", finder.find, finder.found), finder.missing, editor.list, h("p.hint", seedsHint));
+  const region = h(
+    "fieldset",
+    { "data-on": "region" },
+    h("legend", "Region and seeds"),
+    h("div.row", finder.find, finder.found),
+    finder.missing,
+    editor.list,
+    h("p.hint", seedsHint),
+  );
   const zoom = h("button", { type: "button", onclick: () => views[0].centreOn(...editor.middle(), 6) }, "Zoom to the subsets");
   const subsets = h(
     "fieldset",
     h("legend", "Subsets and texture"),
     h("div.fields", field("Subset", form.subset_px, "px", "odd"), field("Spacing", form.spacing_px, "px", "distance of neighbouring points")),
-    h("div.row", h("label.check", sample.shown, "draw them to scale"), zoom, h("label.check", texture.showMap, "texture map"), texture.legend),
+    h(
+      "div.row",
+      { "data-on": "region" },
+      h("label.check", sample.shown, "draw them to scale"),
+      zoom,
+      h("label.check", texture.showMap, "texture map"),
+      texture.legend,
+    ),
     texture.rating,
   );
+  const pictured = (/** @type {View} */ view, /** @type {number} */ k) => h("div", h("h3", `cam${k + 1}`), view.root);
   const steps = h("div.fields", field("Steps", asked.which, "", "such as 1-5, 8; empty: all"), field("Label", asked.label));
   return [
-    h("div.row", h("label", { for: "reference-step" }, "Reference step"), reference, editor.bar),
-    editor.more,
-    editor.hint,
     h(
-      "div.grid.two.views",
-      { style: { marginTop: "0.5rem" } },
-      views.map((view, k) => h("div", h("h3", `cam${k + 1}`), view.root)),
+      "div",
+      { "data-on": "region" },
+      h("div.row", h("label", { for: "reference-step" }, "Reference step"), reference, editor.bar),
+      editor.more,
+      editor.hint,
+      h("div.grid.two.views", { style: { marginTop: "0.5rem" } }, views.map(pictured)),
     ),
     h(
       "div.grid.two",
       { style: { marginTop: "var(--gap)" } },
       h("div", region, subsets),
-      h("div", settingsFields(form, gauge), steps, h("label.check", asked.follow, "continue with each new step"), end),
+      h("div", { "data-on": "measure" }, settingsFields(form, gauge), steps, h("label.check", asked.follow, "continue with each new step"), end),
     ),
   ];
 }

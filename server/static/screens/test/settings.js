@@ -134,16 +134,19 @@ export function showSettings(form, set) {
 }
 
 /**
- * The fields of correlation and strain.
+ * The fields of strain and correlation: the strain's window, and what is seldom changed folded.
  * @param {Form} form
  * @param {HTMLElement[]} gauge
  */
 export const settingsFields = (form, gauge) => [
+  h("fieldset", h("legend", "Strain"), h("label.check", form.strain, "compute strain"), h("div.fields", field("Window", form.window, "points", "odd")), gauge),
   h(
-    "fieldset",
-    h("legend", "Correlation"),
+    "details.advanced",
+    h("summary", "Advanced"),
     h(
       "div.fields",
+      field("Strain fit", form.order),
+      field("Tensor", form.tensor),
       field("Measure", form.kind),
       field("Shape function", form.patch),
       field("Interpolation", form.interpolation),
@@ -154,13 +157,6 @@ export const settingsFields = (form, gauge) => [
       field("Smoothing window", form.smoothing_window, "points", "odd; empty: none"),
       field("Dense field, a vector every", form.dense_step_px, "px", "in addition to the ordinary field; empty: none"),
     ),
-  ),
-  h(
-    "fieldset",
-    h("legend", "Strain"),
-    h("label.check", form.strain, "compute strain"),
-    h("div.fields", field("Window", form.window, "points", "odd"), field("Fit", form.order), field("Tensor", form.tensor)),
-    gauge,
   ),
 ];
 
