@@ -106,8 +106,8 @@ export function linePanel(my, more) {
     h("p.quiet", "Choose the tool Line above the picture and drag, or give its ends."),
     inputs.row,
     h("div.row", field("Along", along), clear(my, "line", close, [plot.box, text])),
-    text,
     plot.box,
+    text,
     more.root,
   );
   return { root, fill: () => state.line && inputs.fill(state.line.flat()), read, draw, close };
