@@ -980,6 +980,7 @@ def test_gauges_field_limits_and_colours_are_there_again_and_go_into_the_report(
     at.get_by_text("Extensometers", exact=True).click()
     given(at, ENDS, (80.0, 100.0, 160.0, 110.0))
     at.locator("details", has=at.get_by_label(ENDS[0])).get_by_role("button", name="Use").click()
+    at.locator("summary").get_by_text("Statistics", exact=True).click()
     at.get_by_label("Colours", exact=True).select_option("cividis")
     at.get_by_label("Limits", exact=True).select_option("given")
     given(at, ("Lower limit", "Upper limit"), (-0.02, 0.03))
