@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from stereorig.core.arrays import Bool, Float
 from stereorig.core.field.points.fitter import PointFits
@@ -159,23 +160,30 @@ def _displaced(points: PointFits, rays: Float, change: Float) -> tuple[Float, Fl
 
 
 def change_of_bend(
-    points: PointFits, *, shape: tuple[int, int], rays: Float, spacing_px: float, subset_px: int
+    points: PointFits,
+    *,
+    shape: tuple[int, int],
+    rays: Float,
+    spacing_px: float,
+    subset_px: int,
+    widths_px: NDArray[np.intp] | None = None,
 ) -> LocalBias | None:
     """Return the difference of the bends of curved patches of a motion from those about them, as a plane patch's bias.
 
     A kink within the subset bends its curved patch, but not those about it: the patch's error is then up to this bias.
-    With smooth strain the error is a tenth of it, and less. Parameters are as in :func:`local_bias`; None without
-    curved patches.
+    With smooth strain the error is a tenth of it, and less. Parameters are as in :func:`local_bias`, with the points'
+    own widths (n,) where some are narrower; None without curved patches.
     """
     k = max(1, round(_ASIDE * subset_px / spacing_px))
     curved = points.ok & ~points.plane
     if points.w.shape[1] < 6 or not curved.any() or min(shape) < 2 * k + 1:
         return None
     bend = np.zeros((len(curved), 4))
+    width2 = subset_px**2 if widths_px is None else widths_px**2
     for axis, term in ((0, 3), (1, 5)):
         px = float(np.median(np.diff(rays[:, axis].reshape(shape), axis=1 - axis))) / spacing_px
         for q in range(4):
-            bend[:, q] += (subset_px**2 - 1) / 12.0 * px**2 * (points.w if q == 0 else points.G[:, q - 1])[:, term]
+            bend[:, q] += (width2 - 1) / 12.0 * px**2 * (points.w if q == 0 else points.G[:, q - 1])[:, term]
     known = np.where(points.ok[:, None], bend, np.nan).reshape(*shape, 4)
     change, share = np.zeros((len(curved), 4)), np.zeros(len(curved))
     for axis in (0, 1):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from stereorig.core.field.growth.local_bias import (
     without,
     worth_curving,
 )
-from stereorig.core.field.growth.state import SAMPLE_FAR_PX, FieldInputs, GrowthState, fresh_attempts
+from stereorig.core.field.growth.state import SAMPLE_FAR_PX, FieldInputs, GrowthState, fresh_attempts, place_of
 from stereorig.core.field.points.patch import format_length
 from stereorig.core.field.points.result import Field
 from stereorig.core.robust import spread_indices
@@ -72,8 +71,9 @@ def take_off_bias(inputs: FieldInputs, state: GrowthState) -> GrowthState:
     """Subtract the mean bias of a motion's plane patches, and add the rest to the covariances if it counts."""
     if state.fitter.comparisons == 1 or state.patch.patch == "rigid":  # slopes of rigid patches show no strain
         return state
-    place, points = _place(inputs), state.points
-    bias, bend = local_bias(points, rays=inputs.rays, **place), change_of_bend(points, rays=inputs.rays, **place)
+    place, points = place_of(inputs), state.points
+    bias = local_bias(points, rays=inputs.rays, **place)
+    bend = change_of_bend(points, rays=inputs.rays, widths_px=state.widths_px, **place)
     if bias is not None:
         known = points.ok & points.plane & ~worth_curving(points, bias, **place)
         if inputs.visibility is not None:  # across a cut slopes differ without a bend
@@ -89,14 +89,10 @@ def take_off_bias(inputs: FieldInputs, state: GrowthState) -> GrowthState:
     return state
 
 
-def _place(inputs: FieldInputs) -> dict[str, Any]:
-    return {"shape": inputs.grid.shape, "spacing_px": inputs.grid.spacing_px, "subset_px": inputs.options.subset_px}
-
-
 def _curved_in_places(inputs: FieldInputs, state: GrowthState) -> GrowthState:
     """Measure with curved patches where strain is localised; points lost to plane ones are tried again."""
     flat = state.points
-    place = _place(inputs)
+    place = place_of(inputs)
     if state.fitter.comparisons == 1 or (bias := local_bias(flat, rays=inputs.rays, **place)) is None:
         return state
     chosen = worth_curving(flat, bias, **place)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from stereorig.core.arrays import Bool, Float
 from stereorig.core.cameras.stereo import StereoPair
@@ -218,6 +219,8 @@ class GrowthState:
         (x, y) of the seeds that were given and did not match.
     unsure
         The usual match's standard deviation and the limit if it is above it, else None.
+    widths_px
+        (n,) widths of the points' subsets where some are narrower than the field's, else None.
     """
 
     fitter: Fitter
@@ -227,6 +230,7 @@ class GrowthState:
     checked: bool
     failed_seeds_px: tuple[tuple[float, float], ...] = ()
     unsure: Unsure | None = None
+    widths_px: NDArray[np.intp] | None = None
 
 
 def begin(inputs: FieldInputs) -> GrowthState:
@@ -247,3 +251,8 @@ def fresh_attempts(inputs: FieldInputs) -> Attempts:
     attempts = Attempts.on(inputs.grid.shape, inputs.visibility)
     attempts.left[inputs.usable & ~inputs.hoped_for] = 1
     return attempts
+
+
+def place_of(inputs: FieldInputs) -> dict[str, Any]:
+    """Return the grid's shape, its spacing and the subset, by their names, for estimates of bias."""
+    return {"shape": inputs.grid.shape, "spacing_px": inputs.grid.spacing_px, "subset_px": inputs.options.subset_px}

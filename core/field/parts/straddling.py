@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import cv2
 import numpy as np
@@ -23,7 +22,7 @@ from stereorig.core.arrays import Bool, Float
 from stereorig.core.field.checks.block_median import SIGMAS_OF_QUARTER, SIGMAS_OF_TENTH, least_about, reach_of
 from stereorig.core.field.parts.near_edges import near_edges
 from stereorig.core.field.parts.subset_parts import Pull, outside_centre, pixels_without, pull_of_parts
-from stereorig.core.field.points.fitter import Fitter, PointFits
+from stereorig.core.field.points.fitter import NOT_KEPT, Fitter, PointFits
 from stereorig.core.field.points.scales import depth_per_px, px_per_ray
 from stereorig.core.field.points.subset_residuals import SubsetResiduals, subset_residuals, subset_visible
 from stereorig.core.field.region.visibility import MIN_SHARE, Visibility
@@ -50,7 +49,6 @@ _OF_USUAL_CENTRE = 4.0  # times the loss of the centre at the field's usual poin
 _FAR_PX = 1.0  # no part that is left out was seen to pull by half of it: another match
 # share of the change without a part: its border is not the edge's, and a remainder above this still pulls
 _BORDER = 0.2
-_NOT_KEPT: dict[str, Any] = dict.fromkeys(("rejected_w", "rejected_g", "rejected_epipolar_px", "rejected_zncc"))
 # unknown, comparison counted from the last, direction in it
 _SHAPE, _MOTION = ((0, -1, 0), (1, -1, 1)), ((1, -2, 0), (2, -2, 1), (3, -1, 0))
 
@@ -157,7 +155,7 @@ def _measure_again(
         sd = np.sqrt(fits.covariance[ok, 0, 0]) * _unit_px(fitter, fits, ok, ray)[:, 0]
         kept = ok[~off & (sd < limit[ok])]
         found = fits.take(kept)
-        points.put(index[kept], replace(found, w=found.w[:, :terms], G=found.G[..., :terms], **_NOT_KEPT))
+        points.put(index[kept], replace(found, w=found.w[:, :terms], G=found.G[..., :terms], **NOT_KEPT))
         bad[index[kept]] = False
 
 

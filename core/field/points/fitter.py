@@ -21,6 +21,8 @@ from stereorig.core.status import PointStatus
 MAX_EPIPOLAR_PX = 3.0
 _RATE_FROM, _RATE_QUANTILE = 30, 0.9
 _KEPT = ("w", "G", "epipolar_px", "zncc")
+#: of a point that is measured again: nothing of what was rejected before
+NOT_KEPT: dict[str, Any] = dict.fromkeys(f"rejected_{name.lower()}" for name in _KEPT)
 
 
 @dataclass(eq=False)
