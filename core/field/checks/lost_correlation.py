@@ -33,7 +33,6 @@ _FINE = 2.0
 _SHAPE_FACTOR, _SHAPE_LOSS = 12.0, 0.04
 _WIDER = 3  # so far about a point that a crack is in a small part of it
 _SWEEPS = 4  # of the robust smooth course
-_COURSE_SCATTER = 0.2  # scatter of the logarithm about a course caused by defocus: twice the scatter of textures
 _FEW = 12
 _LEAST = 1e-7
 _LOST = 0.25  # share of the points about a point from which on the others are no measure
@@ -144,7 +143,7 @@ def _loses_as_smoothly(
             ).value.ravel()
             scatter = MAD_TO_SIGMA * float(np.median(np.abs(values - course)[ok]))
             weights = ok * biweight(((values - course) / max(BIWEIGHT_REACH * scatter, 1e-9)) ** 2)
-        if scatter > _COURSE_SCATTER:
+        if limits.sigmas * scatter > np.log(limits.max_factor):  # about such a course as much is allowed as anywhere
             return np.zeros_like(ok)
         off = ok & (values > course + max(limits.sigmas * scatter, np.log(limits.min_factor)))
         width = 2 * reach + 1

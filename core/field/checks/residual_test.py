@@ -50,6 +50,7 @@ OF_USUAL = 2.5  # times the standard deviation of the field's usual point: up to
 _WIDER = 3
 _ONE_KIND = 0.6  # least share: patterns over parts of the subsets leave a tenth at 0.1 to 0.3, noise and blur at 0.9
 _ALL_ALIKE = 0.75  # share of the usual standard deviation: a tenth of one kind's own estimates is below
+_USUAL_OF_MOTION_PX = 0.125  # half a pixel is four of it
 _SCATTERS = (1 / 1.4, 1.4)  # a scatter's variance is known to a fifth from 40 neighbouring subsets
 _AT_ONCE = 4096
 
@@ -340,7 +341,7 @@ class _Limits:
     """The limits on a field's standard deviations, and the points that they reject.
 
     A shape may state any standard deviation up to the limit that was asked for: wrong matches have larger ones. A
-    motion's usual point must be as sure as a single one, so that half a pixel, which would be taken for one, is five of
+    motion's usual point must be nearly as sure as a single one: half a pixel, which would be taken for one, is four of
     it.
     """
 
@@ -398,7 +399,8 @@ class _Limits:
         sigma[ok] = self._sigma_px(np.flatnonzero(ok), estimated=estimated)
         middle = median(sigma[ok])
         # nine in ten of one kind's own estimates are within its usual one over _ALL_ALIKE
-        ceiling = self._single if self._fitter.comparisons == 3 else max(self._single, _ALL_ALIKE * self._most)
+        usual_px = min(_USUAL_OF_MOTION_PX, self._most) if self._fitter.comparisons == 3 else _ALL_ALIKE * self._most
+        ceiling = max(self._single, usual_px)
         if self._shape is not None and self._most > self._single:
             reach = _WIDER * reach_of(self._fitter.options.subset_px, spacing_of(self._xy_px, self._shape))
             usual = block_medians(sigma, ok, self._shape, reach)

@@ -65,7 +65,7 @@ def measure_narrower(inputs: FieldInputs, state: GrowthState) -> GrowthState:
     points.put(index, replace(found.take(index), **NOT_KEPT))
     widths = np.full(len(before), options.subset_px)
     widths[index] = width
-    check(inputs, points)
+    check(inputs, points, correlation=False)
     kept = int(points.ok[index].sum())
     patch = replace(state.patch, reason=f"{state.patch.reason}; subsets of {width} px at {kept} of them")
     return replace(state, patch=patch, widths_px=widths)
