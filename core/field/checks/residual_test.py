@@ -50,7 +50,7 @@ OF_USUAL = 2.5  # times the standard deviation of the field's usual point: up to
 _WIDER = 3
 _ONE_KIND = 0.6  # least share: patterns over parts of the subsets leave a tenth at 0.1 to 0.3, noise and blur at 0.9
 _ALL_ALIKE = 0.75  # share of the usual standard deviation: a tenth of one kind's own estimates is below
-_USUAL_OF_MOTION_PX = 0.125  # half a pixel is four of it
+_IN_DEPTH = 0.8  # of a motion's usual point, share of its sd along the depth: half a pixel is four of it
 _SCATTERS = (1 / 1.4, 1.4)  # a scatter's variance is known to a fifth from 40 neighbouring subsets
 _AT_ONCE = 4096
 
@@ -341,8 +341,8 @@ class _Limits:
     """The limits on a field's standard deviations, and the points that they reject.
 
     A shape may state any standard deviation up to the limit that was asked for: wrong matches have larger ones. A
-    motion's usual point must be nearly as sure as a single one: half a pixel, which would be taken for one, is four of
-    it.
+    motion's usual point must be as sure as a single one, so that half a pixel, which would be taken for one, is five of
+    it; along the depth four, since blur of one camera is worst there and wrong matches are off in the plane, too.
     """
 
     def __init__(
@@ -398,20 +398,24 @@ class _Limits:
         sigma = np.where(ok, 1.0, np.nan)
         sigma[ok] = self._sigma_px(np.flatnonzero(ok), estimated=estimated)
         middle = median(sigma[ok])
+        motion, counted = self._fitter.comparisons == 3, sigma
         # nine in ten of one kind's own estimates are within its usual one over _ALL_ALIKE
-        usual_px = min(_USUAL_OF_MOTION_PX, self._most) if self._fitter.comparisons == 3 else _ALL_ALIKE * self._most
-        ceiling = max(self._single, usual_px)
+        ceiling = self._single if motion else max(self._single, _ALL_ALIKE * self._most)
         if self._shape is not None and self._most > self._single:
             reach = _WIDER * reach_of(self._fitter.options.subset_px, spacing_of(self._xy_px, self._shape))
             usual = block_medians(sigma, ok, self._shape, reach)
-            of_kind = usual
-            if self._fitter.comparisons == 3:
+            of_kind, within = usual, usual <= ceiling
+            if motion:
                 # another pattern over a part of each subset leaves points that have nothing else in common
                 least = block_medians(sigma, ok, self._shape, reach, quantile=_TRIMMED)
                 of_kind = np.minimum(usual, least / _ONE_KIND)
+                if not within[ok].all():
+                    counted = sigma.copy()
+                    counted[ok] = self._sigma_px(np.flatnonzero(ok), estimated=estimated, in_depth=_IN_DEPTH)
+                    within = block_medians(counted, ok, self._shape, reach) <= ceiling
             raised = np.clip(OF_USUAL * of_kind, self._single, self._most)
-            self._px = np.where(usual <= ceiling, raised, self._single)
-        self._unsure = Unsure(middle, ceiling) if middle > ceiling else None
+            self._px = np.where(within, raised, self._single)
+        self._unsure = Unsure(middle, ceiling) if median(counted[ok]) > ceiling else None
         if estimated and self._unsure is not None and np.quantile(sigma[ok], _TRIMMED) > _ALL_ALIKE * ceiling:
             self._px[:] = 0.0  # all are of one kind: those within the limit are so by chance
 
@@ -427,8 +431,11 @@ class _Limits:
         """Return the outcome of the test."""
         return TestedResiduals(factor, one_by_one, self.rejected, self._px, self._unsure)
 
-    def _sigma_px(self, index: NDArray[np.intp], sd: Float | None = None, *, estimated: bool = True) -> Float:
-        return np.maximum(*_sigma_px(self._fitter, self._points, index, self._xy_px, sd, estimated))
+    def _sigma_px(
+        self, index: NDArray[np.intp], sd: Float | None = None, *, estimated: bool = True, in_depth: float = 1.0
+    ) -> Float:
+        plane, depth = _sigma_px(self._fitter, self._points, index, self._xy_px, sd, estimated)
+        return np.maximum(plane, in_depth * depth)
 
 
 def _shared_texture(points: PointFits, index: NDArray[np.intp]) -> Float:
