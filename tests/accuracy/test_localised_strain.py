@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import pytest
 
 from stereorig.core.field.points.images import MeasureImage
 from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.cuts import Cuts
 from stereorig.core.field.region.region import PointGrid
 from stereorig.core.field.sequence.reference_steps import PreviousStep
 from stereorig.core.measure import MeasureOptions, ReferencePair
@@ -43,6 +46,8 @@ SCENES: dict[str, Motion | None] = {
     "notch": notch(0.05),
     "kink 6 %, steep": kink(0.06, 3.0),
     "kink 3 %, steep": kink(0.03, 3.0),
+    "neck 60 %": necking(0.54),
+    "band 20 %, wide": band(0.2, 2.0, 55.0),
 }
 
 
@@ -74,9 +79,11 @@ def measured(name: str, patch: str = "auto") -> tuple[Field, np.ndarray]:
         ("neck 6 %", 0.99, 0.75),
         ("neck 28 %", 0.98, 0.65),
         ("kink 2 %", 0.99, 0.75),
-        ("kink 10 %", 0.95, 0.6),  # on the line itself a subset shows two motions
+        ("neck 60 %", 0.98, 0.5),
+        ("kink 10 %", 0.98, 0.6),  # on the line itself a subset shows two motions
         ("band 5 %", 0.99, 0.6),
-        ("band 20 %", 0.85, 0.5),  # the band is as wide as a subset
+        ("band 20 %", 0.98, 0.6),  # the band is as wide as a subset: where it has two borders, narrower ones measure it
+        ("band 20 %, wide", 0.98, 0.55),
         ("notch", 0.97, 0.65),  # its strain reaches over the whole of so small a field: more than any noise scatters
     ],
 )
@@ -152,6 +159,27 @@ def test_away_from_a_kink_patches_stay_plane_and_as_precise_and_the_file_says_wh
     read = read_field(tmp_path / "step_0001.nc").patch_degree
     assert read is not None
     np.testing.assert_array_equal(read, degree)
+
+
+@pytest.mark.parametrize("cut", [None, Cuts([[(115.0, 60.0), (115.0, 170.0)]])])
+def test_points_of_narrower_subsets_are_said_and_none_is_where_the_user_asked_for_a_patch(cut: Cuts | None) -> None:
+    points = replace(POINTS, cuts=cut)
+    reference, found = ReferencePair(PAIR, *take("reference")), {}
+    for patch in ("auto", "quadratic"):
+        options = MeasureOptions(subset_px=SUBSET, patch=patch, keep_rejected=True)  # type: ignore[arg-type]
+        found[patch] = reference.motion(*take("band 20 %"), points, options)
+    narrower, asked = found["auto"], found["quadratic"]
+    assert narrower.patch is not None
+    said = re.search(r"subsets of 13 px at (\d+) of them", narrower.patch.reason)
+    assert said is not None
+    assert int(said[1]) >= 10
+    assert asked.patch is not None
+    assert "subsets of" not in asked.patch.reason
+    assert narrower.valid.mean() > 0.97 > asked.valid.mean()
+    # a point has numbers once: as a valid or as a rejected one
+    assert narrower.rejected is not None
+    assert not np.isfinite(narrower.rejected.zncc[narrower.valid]).any()
+    assert np.isfinite(narrower.covariance[narrower.valid]).all()
 
 
 def test_quadratic_patches_under_strain_are_not_reported_twice_too_wide() -> None:

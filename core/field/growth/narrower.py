@@ -98,7 +98,12 @@ def _texture(inputs: FieldInputs, fitter: Fitter, width: int) -> Float:
 
 def _test(inputs: FieldInputs, fitter: Fitter, points: PointFits) -> None:
     """Test the residuals of the points and of parts of their subsets, as all points' were."""
-    shared: dict[str, Any] = {"xy_px": inputs.xy_px, "texture": inputs.texture, "shape": inputs.grid.shape, "cancel": inputs.cancel}
+    shared: dict[str, Any] = {
+        "xy_px": inputs.xy_px,
+        "texture": inputs.texture,
+        "shape": inputs.grid.shape,
+        "cancel": inputs.cancel,
+    }
     tested = residual_test(fitter, points, max_sigma_px=inputs.options.validity.max_sigma_px, **shared)
     reject_straddling(
         fitter,

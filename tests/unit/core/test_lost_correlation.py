@@ -74,3 +74,34 @@ def test_what_is_left_where_most_is_lost_is_no_measure_of_what_is_usual() -> Non
     points.status[rng.uniform(size=len(XY)) < 0.6] = PointStatus.NOT_SEEDED
     assert points.ok.sum() > 50
     assert lost()[points.ok].all()
+
+
+def test_defocus_by_height_is_no_loss_of_its_crest_though_coarse_texture_scatters_it_and_a_flake_on_it_is() -> None:
+    """Coarse speckle scatters the logarithm of what blur takes by 0.23; from 0.2 on the crest was refused."""
+    rng = np.random.default_rng(6)
+    points = PointFits.empty(len(XY), 3)
+    points.status[:] = PointStatus.OK
+    points.w[:] = plane_w(0.0, 0.0)
+    points.G[:] = 0.0
+    points.G[:, :, 0], points.G[:, 0, 1], points.G[:, 1, 2] = RAYS, 1.0, 1.0
+    column, row = np.arange(len(XY)) % GRID.shape[1], np.arange(len(XY)) // GRID.shape[1]
+    middle = (np.array(GRID.shape[::-1]) - 1) / 2
+    away = np.hypot(column - middle[0], row - middle[1]) / middle.min()
+    course = 0.001 * np.exp(3.0 * np.exp(-(away**2)))  # twenty times as much on the crest
+    loss = course * np.exp(0.23 * rng.standard_normal(len(XY)))
+    flake = (np.abs(column - round(middle[0])) < 2) & (np.abs(row - round(middle[1])) < 2)
+    for spoiled in (False, True):
+        points.zncc[:, 0] = 1.0 - 0.0005
+        points.zncc[:, 1:] = 1.0 - np.where(flake & spoiled, 12.0 * course, loss)[:, None]
+        lost = lost_correlation(
+            points,
+            pair=pair(),
+            shape=GRID.shape,
+            xy_px=XY,
+            rays=RAYS,
+            texture=np.full(len(XY), 900.0),
+            subset_px=33,
+            limits=CorrelationLimits(6.0, 2.0, 6.0),
+        )
+        assert lost[flake].all() == spoiled
+        assert spoiled or not lost.any()
