@@ -365,13 +365,22 @@ def test_scatter_is_told_by_what_no_linear_motion_explains():
 
 
 @pytest.mark.fault(37)
-@pytest.mark.parametrize(("middle", "scatter", "most"), [(0.09, 0.05, 0.25), (0.09, 1.2, 0.1), (0.11, 0.5, 0.1)])
-def test_limits_of_a_motion_rise_for_one_kind_of_points_alone(middle, scatter, most):
+@pytest.mark.parametrize(
+    ("middle", "scatter", "depth", "most"),
+    [
+        (0.09, 0.05, False, 0.25),
+        (0.09, 1.2, False, 0.1),
+        (0.11, 0.5, False, 0.1),
+        (0.115, 0.1, True, 0.25),  # along the depth, of camera 2 blurred by 2 px
+        (0.135, 0.1, True, 0.1),
+    ],
+)
+def test_limits_of_a_motion_rise_for_one_kind_of_points_alone(middle, scatter, depth, most):
     """Another pattern in parts of the subsets: its points are unsure each by another amount, and one was 0.7 px off."""
 
     class Known(_Limits):
-        def _sigma_px(self, index, sd=None, *, estimated=True):
-            return sigma[index]
+        def _sigma_px(self, index, sd=None, *, estimated=True, in_depth=1.0):
+            return (in_depth if depth else 1.0) * sigma[index]
 
     shape = (30, 30)
     xy = np.stack(np.meshgrid(10.0 * np.arange(30), 10.0 * np.arange(30)), axis=-1).reshape(-1, 2)
