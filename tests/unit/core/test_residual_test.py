@@ -372,7 +372,7 @@ def test_scatter_is_told_by_what_no_linear_motion_explains():
         (0.09, 1.2, False, 0.1),
         (0.11, 0.5, False, 0.1),
         (0.115, 0.1, True, 0.25),  # along the depth, of camera 2 blurred by 2 px
-        (0.135, 0.1, True, 0.1),
+        (0.15, 0.6, True, 0.1),
     ],
 )
 def test_limits_of_a_motion_rise_for_one_kind_of_points_alone(middle, scatter, depth, most):
