@@ -84,7 +84,6 @@ def apply_validity_checks(
     subset_px: int,
     options: ValidityOptions,
     visibility: Visibility | None = None,
-    correlation: bool = True,
 ) -> int:
     """Apply all checks, rejecting points in place.
 
@@ -106,8 +105,6 @@ def apply_validity_checks(
         Limits.
     visibility
         Which points are neighbours across cuts and mask; None: all.
-    correlation
-        False: without the check of the loss of correlation.
 
     Returns
     -------
@@ -116,7 +113,7 @@ def apply_validity_checks(
     """
     before = int(points.ok.sum())
     few = before < _FEW
-    if correlation and not few:
+    if not few:
         lost = lost_correlation(
             points,
             pair=pair,

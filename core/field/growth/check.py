@@ -17,8 +17,8 @@ from stereorig.core.field.points.fitter import PointFits
 from stereorig.core.field.points.result import Unsure
 
 
-def check(inputs: FieldInputs, points: PointFits, *, correlation: bool = True) -> None:
-    """Apply the validity checks, or those without the loss of correlation; points that fail are rejected."""
+def check(inputs: FieldInputs, points: PointFits) -> None:
+    """Apply the validity checks; points that fail are rejected."""
     apply_validity_checks(
         points,
         pair=inputs.pair,
@@ -29,7 +29,6 @@ def check(inputs: FieldInputs, points: PointFits, *, correlation: bool = True) -
         subset_px=inputs.options.subset_px,
         options=inputs.options.validity,
         visibility=inputs.visibility,
-        correlation=correlation,
     )
 
 
@@ -102,8 +101,8 @@ def check_residuals(inputs: FieldInputs, state: GrowthState) -> Unsure | None:
         limit_px=tested.limit_px,
         cancel=inputs.cancel,
     )
-    if rejected:  # isolated points fail the neighbour check; the surest ones that are left are no measure of a loss
-        check(inputs, state.points, correlation=False)
+    if rejected:
+        check(inputs, state.points)  # isolated points fail the neighbour check
     mark_outside(state.fitter, state.points, inputs.xy_px, inputs.usable, however_far=True)
     if inputs.options.blur is not None:
         reject_near_edges(state.fitter, state.points, inputs.xy_px, inputs.options.blur)

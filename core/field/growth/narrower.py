@@ -21,6 +21,7 @@ from stereorig.core.field.growth.state import FieldInputs, GrowthState, fresh_at
 from stereorig.core.field.parts.straddling import reject_straddling
 from stereorig.core.field.points.fitter import NOT_KEPT, Fitter, PointFits
 from stereorig.core.matching.arguments import VisiblePixels
+from stereorig.core.settings import single_sigma_px
 from stereorig.core.status import PointStatus
 
 _NARROWER = 0.6
@@ -65,7 +66,7 @@ def measure_narrower(inputs: FieldInputs, state: GrowthState) -> GrowthState:
     points.put(index, replace(found.take(index), **NOT_KEPT))
     widths = np.full(len(before), options.subset_px)
     widths[index] = width
-    check(inputs, points, correlation=False)
+    check(inputs, points)
     kept = int(points.ok[index].sum())
     patch = replace(state.patch, reason=f"{state.patch.reason}; subsets of {width} px at {kept} of them")
     return replace(state, patch=patch, widths_px=widths)
@@ -97,14 +98,15 @@ def _texture(inputs: FieldInputs, fitter: Fitter, width: int) -> Float:
 
 
 def _test(inputs: FieldInputs, fitter: Fitter, points: PointFits) -> None:
-    """Test the residuals of the points and of parts of their subsets, as all points' were."""
+    """Test the residuals of the points and of parts of their subsets; none may be less sure than a single point."""
     shared: dict[str, Any] = {
         "xy_px": inputs.xy_px,
         "texture": inputs.texture,
         "shape": inputs.grid.shape,
         "cancel": inputs.cancel,
     }
-    tested = residual_test(fitter, points, max_sigma_px=inputs.options.validity.max_sigma_px, **shared)
+    most_px = single_sigma_px(inputs.options.validity.max_sigma_px)
+    tested = residual_test(fitter, points, max_sigma_px=most_px, **shared)
     reject_straddling(
         fitter,
         points,
