@@ -175,7 +175,8 @@ def test_points_of_narrower_subsets_are_said_and_none_is_where_the_user_asked_fo
     assert int(said[1]) >= 10
     assert asked.patch is not None
     assert "subsets of" not in asked.patch.reason
-    assert narrower.valid.mean() > 0.97 > asked.valid.mean()
+    assert narrower.valid.mean() > 0.94  # some subsets are cut by more than half
+    assert narrower.valid.sum() > asked.valid.sum() + 10
     # a point has numbers once: as a valid or as a rejected one
     assert narrower.rejected is not None
     assert not np.isfinite(narrower.rejected.zncc[narrower.valid]).any()
