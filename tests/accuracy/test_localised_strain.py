@@ -170,7 +170,7 @@ def test_points_of_narrower_subsets_are_said_and_none_is_where_the_user_asked_fo
         found[patch] = reference.motion(*take("band 20 %"), points, options)
     narrower, asked = found["auto"], found["quadratic"]
     assert narrower.patch is not None
-    said = re.search(r"subsets of 13 px at (\d+) of them", narrower.patch.reason)
+    said = re.search(r"subsets of 13 px at (\d+) points", narrower.patch.reason)
     assert said is not None
     assert int(said[1]) >= 10
     assert asked.patch is not None

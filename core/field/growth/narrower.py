@@ -68,7 +68,7 @@ def measure_narrower(inputs: FieldInputs, state: GrowthState) -> GrowthState:
     widths[index] = width
     check(inputs, points)
     kept = int(points.ok[index].sum())
-    patch = replace(state.patch, reason=f"{state.patch.reason}; subsets of {width} px at {kept} of them")
+    patch = replace(state.patch, reason=f"{state.patch.reason}; subsets of {width} px at {kept} points")
     return replace(state, patch=patch, widths_px=widths)
 
 
