@@ -45,7 +45,7 @@ from stereorig.core.calibration.choice.tilted import (
     moved_by_tilt,
     with_open_axes,
 )
-from stereorig.core.calibration.fit.layout import State
+from stereorig.core.calibration.fit.layout import Layout, State
 from stereorig.core.calibration.fit.lens_form import LensName
 from stereorig.core.calibration.fit.problem import FitData, converted, started, unfolded
 from stereorig.core.calibration.inputs import CalibrationView
@@ -185,12 +185,7 @@ def _choose(problem: FitData, begun: _FitStart) -> Chosen:
     def fit(model: LensName, problem: FitData = problem) -> Screened:
         layout = problem.layout(model)
         first = start if model == "paper" else unfolded(problem, layout, converted(start, paper, layout))
-        if "tau_x_rad" not in layout.form.distortion_names:
-            return fit_screened(problem, layout, first, begun.apart)
-        # poses, centres and decentring make room for a tilt along a curved valley
-        patient = replace(problem, options=replace(problem.options, max_iterations=_ITERATIONS))
-        fitted = fit_screened(patient, layout, first, begun.apart)
-        return replace(fitted, problem=replace(fitted.problem, options=problem.options))
+        return fit_lens(problem, layout, first, begun.apart)
 
     wanted = problem.options.lens
     if wanted != "auto":
@@ -213,15 +208,8 @@ def _choose(problem: FitData, begun: _FitStart) -> Chosen:
     best = _Candidate(fit("paper"), held)
     while True:
         name = best.model
-        model, level = _RICHER.get(name, (name, 0.0))
-        probability, worst = best.significance if model != name else (1.0, None)
-        models = [model]
-        names: Sequence[str] = LENS_TERMS
-        bent = best.bent if probability > level or name != "paper" else []
-        if bent and bent[0].probability < (probability if probability <= level else 1.0):
-            probability, worst, level = bent[0].probability, bent[0], _BENT_LEVEL
-            models, names = [_BENT[name][b.name] for b in bent], tuple(b.name for b in bent)
-        elif worst is None or probability > level:
+        models, names, probability, level, worst = best.richer
+        if worst is None:
             reasons.append(f"{name}: more lens terms would explain no more than chance does (p = {probability:.2g}).")
             break
         if found := best.no_lens(level, names):
@@ -262,6 +250,21 @@ def _choose(problem: FitData, begun: _FitStart) -> Chosen:
     seen = [replace(s, freed=None) for s in in_words(best.screened, best.contradicted, best.asked[1]) if s.name == AXES]
     result = _result(_Candidate(tilted, held), tuple(reasons))
     return replace(result, structure=(*seen, *result.structure))
+
+
+def fit_lens(problem: FitData, layout: Layout, start: State, apart: Sequence[int] = ()) -> Screened:
+    """Return the fit under a layout's lens; that of a tilted sensor may take many iterations."""
+    if "tau_x_rad" not in layout.form.distortion_names:
+        return fit_screened(problem, layout, start, apart)
+    # poses, centres and decentring make room for a tilt along a curved valley
+    patient = replace(problem, options=replace(problem.options, max_iterations=_ITERATIONS))
+    fitted = fit_screened(patient, layout, start, apart)
+    return replace(fitted, problem=replace(fitted.problem, options=problem.options))
+
+
+def richer_lenses(screened: Screened) -> list[LensName]:
+    """Return the lens models with further terms that the residuals of a fit ask for, one of which is the right one."""
+    return _Candidate(screened, ()).richer[0]
 
 
 def _with_tilt(best: _Candidate, fit: Callable[..., Screened]) -> tuple[float, Screened | None]:
@@ -350,9 +353,18 @@ class _Candidate:
                     found.append(best)
         return sorted(found, key=lambda b: b.probability)
 
-    @property
-    def significance(self) -> tuple[float, Structure]:
-        return lens_significance(*self.asked)
+    @cached_property
+    def richer(self) -> tuple[list[LensName], Sequence[str], float, float, Structure | None]:
+        """Lens models that the residuals ask for, their terms, probability, its level, and the most certain term."""
+        model, level = _RICHER.get(self.model, (self.model, 0.0))
+        probability, worst = lens_significance(*self.asked) if model != self.model else (1.0, None)
+        bent = self.bent if probability > level or self.model != "paper" else []
+        if bent and bent[0].probability < (probability if probability <= level else 1.0):
+            models = [_BENT[self.model][b.name] for b in bent]
+            return models, tuple(b.name for b in bent), bent[0].probability, _BENT_LEVEL, bent[0]
+        if probability > level:
+            return [], (), probability, level, None
+        return [model], LENS_TERMS, probability, level, worst
 
     @cached_property
     def contradicted(self) -> list[tuple[Structure, Group]]:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stereorig.core.arrays import Float
-from stereorig.core.calibration.choice.lens import LENS_LEVELS
-from stereorig.core.calibration.choice.screening import DroppedView, fit_screened
-from stereorig.core.calibration.choice.structure import lens_significance, scored
+from stereorig.core.calibration.choice.lens import fit_lens, richer_lenses
+from stereorig.core.calibration.choice.screening import DroppedView, Screened, fit_screened
 from stereorig.core.calibration.fit.adjust import NOISE_ROUNDS
 from stereorig.core.calibration.fit.free_start import MIN_POSES, pose_of
 from stereorig.core.calibration.fit.layout import Layout, Priors, State, camera_of
@@ -148,21 +148,7 @@ def _adjusted(problem: FitData, previous: Estimate | None) -> Estimate:
     screened = fit_screened(turned, other, begin, odd, noise_px=noise, rounds=rounds)
     frames = len(screened.problem.frames)
     if problem.options.lens == "auto" and frames >= _LEAST_FOR_LENS and (frames - _LEAST_FOR_LENS) % _LENS_EVERY == 0:
-        for richer, level in LENS_LEVELS:
-            adjustment = screened.adjustment
-            if not _comes_after(richer, adjustment.layout.form.model):
-                continue
-            probability, _ = lens_significance(
-                *scored(adjustment, screened.rows, screened.problem.flat_nodes_mm, problem.nominals)
-            )
-            if probability > level:
-                break
-            into = screened.problem.layout(richer)
-            try:
-                trial = fit_screened(screened.problem, into, converted(adjustment.state, adjustment.layout, into))
-            except CalibrationError:
-                break  # these views do not determine it yet
-            screened = replace(trial, dropped=(*screened.dropped, *trial.dropped))
+        screened = _with_terms(screened)
     adjustment = screened.adjustment
     cam1 = camera_of(adjustment.layout, adjustment.state.x, 0).cam_from_sys
     poses = {k: cam1 @ p for k, p in adjustment.state.sys_from_target.items()}
@@ -182,9 +168,19 @@ def _adjusted(problem: FitData, previous: Estimate | None) -> Estimate:
     )
 
 
-def _comes_after(richer: LensName, model: LensName) -> bool:
-    order = ("paper", *(name for name, _ in LENS_LEVELS))
-    return order.index(richer) > order.index(model)
+def _with_terms(screened: Screened) -> Screened:
+    """Return the fit with all lens terms that the residuals ask for and the views determine."""
+    while models := richer_lenses(screened):
+        start, trials = screened.adjustment, []
+        for model in models:
+            into = screened.problem.layout(model)
+            with suppress(CalibrationError):  # these views do not determine it yet
+                trials.append(fit_lens(screened.problem, into, converted(start.state, start.layout, into)))
+        if not trials:
+            break
+        best = min(trials, key=lambda t: float(np.sum(t.adjustment.noise_px**2)))
+        screened = replace(best, dropped=(*screened.dropped, *best.dropped))
+    return screened
 
 
 def _turned_frames(problem: FitData, turned: FitData) -> frozenset[int]:

@@ -9,6 +9,7 @@ import pytest
 
 from stereorig.core.calibration import CalibrationOptions, CalibrationView, calibrate
 from stereorig.core.calibration.checks.agreement import lens_faults
+from stereorig.core.calibration.guide.estimate import Estimate, estimate
 from stereorig.core.cameras.opencv_full import OpenCVFullLens
 from tests.support.board_points import CHECKERBOARD, SIZE_PX, free_views, nominal_pair, shape_error_um, true_pair
 from tests.support.calibration_rigs import aligned_rms_um
@@ -48,6 +49,23 @@ def test_free_poses_show_a_prism_or_a_tilt_and_blame_no_board(
     assert isinstance(found, OpenCVFullLens)
     if not noise_px:
         np.testing.assert_allclose(list(found.prism.values()), [*lens[8:], 0.0, 0.0][:6], atol=2e-5)
+
+
+@pytest.mark.parametrize(("lens", "model"), [(PRISM, "opencv5_prism"), (TILTED, "opencv5_tilted")])
+def test_a_guided_acquisition_finds_a_prism_or_a_tilt_and_keeps_it(lens: tuple[float, ...], model: str) -> None:
+    one, two = true_pair()
+    cameras = replace(one, distortion=lens), replace(two, distortion=lens)
+    drawn = free_views(cameras, count=12, noise_px=0.02, seed=1)
+    found: Estimate | None = None
+    models = []
+    for count in (9, 10, 11, 12):
+        views = [v for v in drawn.views if v.frame is not None and v.frame < count]
+        found = estimate(views, CHECKERBOARD, nominal_pair(None), CalibrationOptions(moves="free"), found)
+        models.append(found.layout.form.model)
+    assert models[-2:] == [model, model]  # further terms are asked for with every second view
+    assert found is not None
+    assert not found.dropped
+    np.testing.assert_allclose(found.noise_px, 0.02, rtol=0.15)
 
 
 def test_a_stage_shows_a_tilted_sensor() -> None:
