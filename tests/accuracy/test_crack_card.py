@@ -11,11 +11,14 @@ import numpy as np
 import pytest
 
 from stereorig.core.arrays import Float
+from stereorig.core.cameras.stereo import StereoPair
 from stereorig.core.errors import StereorigError
 from stereorig.core.field.points.result import Field
 from stereorig.core.field.points.shared_pixels import SharedPixels
 from stereorig.core.field.points.smoothing_record import Smoothing
 from stereorig.core.field.region.cuts import Cuts
+from stereorig.core.field.region.region import PointGrid
+from stereorig.core.measure import MeasureOptions, ReferencePair
 from stereorig.core.progress import no_progress
 from stereorig.server.evaluations.crack.assessment import ROOT_M, Assessed, Problem, assessed, parts_of
 from stereorig.server.evaluations.crack.document import CrackCardFound, CrackStepFound
@@ -24,8 +27,13 @@ from stereorig.server.evaluations.crack.evaluation import CrackCard
 from stereorig.server.evaluations.crack.settings import CrackSettings
 from stereorig.server.evaluations.door import evaluate
 from stereorig.server.formats.results.writing import Provenance, write_field
+from stereorig.sim.catalog import make_scene
+from stereorig.sim.panel import CrackedPanel
+from stereorig.sim.render import RenderOptions, render
+from stereorig.sim.rig import SimRig
 from tests.support.cracked_sheet import E_MPA, MM_PER_PX, NU, Sheet, View, drawn, seen
 from tests.support.gauge_field import SUBSET
+from tests.support.requirements import ROOT
 
 SHEET = Sheet(half_mm=12.0, tension=100.0, shear=40.0, along=10.0)
 VIEW = View(rows=37, cols=37, tip_px=(166.3, 186.4))
@@ -276,3 +284,30 @@ def test_stated_uncertainties_are_in_the_intervals(tmp_path: Path, mixed: Field)
     assert k2.value is not None
     assert k2.parts["direction"] == pytest.approx(abs(turned - k2.value), rel=0.15)
     assert one.load_n == 1000.0
+
+
+def test_k_of_the_rendered_panel_is_its_formulas() -> None:
+    """The panel of the paper's third experiment in stereo images, before it buckles; 0.4 mm a pixel, 2 grey levels."""
+    rig, panel, load_kn = SimRig.from_toml(ROOT / "config" / "sim_panel.toml"), CrackedPanel(), 30.0
+    pair = StereoPair(rig.cam1.camera, rig.cam2.camera)
+
+    def images(load: float, seed: int) -> list[Any]:
+        rng, how = np.random.default_rng(seed), RenderOptions(blur_px=rig.blur_px)
+        scene = make_scene(rig, "panel", load=load)
+        seen_by = [render(scene, camera, rig.cam1.size_px, options=how) for camera in (pair.cam1, pair.cam2)]
+        return [np.clip(np.rint(255.0 * i + rng.normal(0.0, 2.0, i.shape)), 0, 255).astype(np.uint8) for i in seen_by]
+
+    along = np.linspace(-panel.half_crack_mm, panel.half_crack_mm, 21) * np.sqrt(0.5)  # it hangs upright
+    line = pair.cam1.project(np.stack([along, -along, np.full_like(along, -panel.bow_mm)], axis=-1)).xy
+    grid = PointGrid.rectangle(200, 80, 481, 400, spacing_px=10).with_cracks([line])
+    reference, options = ReferencePair(pair, *images(0.0, 1)), MeasureOptions(subset_px=SUBSET)
+    found = numbers_of(reference.motion(*images(load_kn, 2), grid, options, shape=reference.shape(grid, options)))
+    # the simulated field is that of a wide sheet: no width correction
+    true = panel.stress_mpa(load_kn) * np.sqrt(1e-3 * np.pi * panel.half_crack_mm)
+    j = 1e3 * true**2 / panel.youngs_modulus_mpa
+    # 1 % is two standard uncertainties of K; beyond four of any of these lies one draw in 16,000
+    for key, value, share in (("k1", true, 0.02), ("j", j, 0.1), ("tip_x", 0.0, 0.0), ("k2", 0.0, 0.0)):
+        u = np.sqrt(sum(part**2 for part in parts_of(found, key).values()))
+        assert abs(found.numbers[key].value - value) < 4.0 * u, (key, found.numbers[key].value, value, u)
+        assert u < share * value or share == 0.0, (key, u)
+    assert not found.doubts
