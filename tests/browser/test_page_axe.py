@@ -121,6 +121,7 @@ def test_results(page: Watched, bench: Bench, audit: Audit) -> None:
     given(at, AREA, (90, 90, 150, 140))
     for button in at.get_by_role("button", name="Use").all():
         button.click()
+        unfold(at)  # what is read comes to the front, alone
     for role in ("line-chart", "extensometer-chart"):
         expect(at.locator(f'[data-role="{role}"] canvas')).to_be_visible()
     expect(at.locator('[data-role="area"] table').first).to_be_visible()

@@ -731,6 +731,7 @@ def test_a_plot_is_saved_as_numbers_and_as_pictures_and_starts_at_the_reference(
     assert box is not None
     assert panel is not None
     assert box["width"] > 0.9 * panel["width"]
+    at.locator("summary").get_by_text("Areas", exact=True).click()
     given(at, ("Area left", "Area top", "Area right", "Area bottom"), (90, 90, 150, 140))
     at.locator("details", has=at.get_by_label("Area left")).get_by_role("button", name="Use").click()
     expect(at.locator('[data-role="area-chart"] canvas')).to_be_visible()

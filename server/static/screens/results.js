@@ -193,7 +193,7 @@ async function show(root, testId, analysisId, query) {
   const empty = h("div", { "data-role": "empty" });
   const pictured = h("div.pictured", h("div.stage", view.stage, scale.legend, scale.flagList), screen.overlay.root, message, cameras);
   const numbers = numbersPanel(screen, figures.root, strainChoice(screen, bar.fields, redraw));
-  const panels = tabs(h("div", numbers));
+  const panels = tabs(h("div", h("h2.unseen", "Numbers and plots"), numbers));
   const address = () => api.address(`${result.path}/report`, { frame: result.frame });
   const report = h("a.button", { href: address(), target: "_blank", rel: "noopener", title: "Some seconds; longer for many steps" }, "Open the report");
   report.addEventListener("click", () => report.setAttribute("href", address())); // in the axes that are shown
