@@ -306,6 +306,7 @@ def check_gauges(shown: Page) -> None:
         shown.mouse.move(*on_screen(canvas, *end), steps=3)
         shown.mouse.up()
         expect(shown.locator(f'[data-role="{role}"]')).to_have_attribute("data-answer", re.compile("value|mean"))
+    shown.locator("summary").get_by_text("Extensometers", exact=True).click()
     shown.get_by_label("Against", exact=True).select_option("load")
     answer = json.loads(shown.locator('[data-role="extensometer-chart"]').get_attribute("data-answer") or "null")
     assert answer["x"] == [load for _, load in STEPS]

@@ -661,12 +661,12 @@ def test_a_failed_check_stands_at_the_head_of_the_results_and_in_the_lists(page:
 def test_what_is_shown_is_what_is_saved(page: Watched, bench: Bench) -> None:
     at = shown(page, bench, name="exx")
     panel = at.locator('[data-role="files"]')
-    at.get_by_role("button", name="Export", exact=True).click()
     for label, value in (("Colours", "diverging"), ("Limits", "given")):
         at.get_by_label(label, exact=True).select_option(value)
     for label, text in (("Lower limit", "-300"), ("Upper limit", "300"), ("Levels", "6")):
         at.get_by_label(label, exact=True).fill(text)
         at.get_by_label(label, exact=True).press("Tab")
+    at.get_by_role("button", name="Export", exact=True).click()
     said = panel.locator('[data-role="seen"]')
     expect(said).to_contain_text("blue to brown from \N{MINUS SIGN}300 to 300 µm/m, 6 levels")
     expect(said).to_contain_text("axes of the specimen")

@@ -131,6 +131,7 @@ async function show(root, testId, analysisId, query) {
     state.pinned = i;
     const answer = await api.get(`${result.path}/probe`, { x_px: Math.max(grid.x[i], 0), y_px: Math.max(grid.y[i], 0), step: state.step, frame: result.frame });
     pinned(screen, answer);
+    choose(point.root.open ? point.root : numbers);
     point.draw();
   };
   unpin(screen);
@@ -201,7 +202,6 @@ async function show(root, testId, analysisId, query) {
   const title = h("h1", "Results: ", h("a", { href: `#/results/${testId}` }, result.test.name || testId), ` · ${result.analysis.label || analysisId}`);
   const side = h("div.grid.measured", pictured, panels);
   replace(root, h("div.spread", title, status, h("div.row.top", view.modes, exported, report)), warned, following.root, empty, bar.root, side);
-
   drawStatus();
   screen.drawn.add(() => mark(screen));
   screen.drawn.add(display.keep);
