@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import tempfile
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -211,14 +212,30 @@ class Result:
         return Result(field, strain, settings, self.step, self.frame, self.calibration_sha256)
 
 
-def read_result(path: str | Path) -> Result:
-    """Read a result file, ``step_*.nc``, in the frame that it states.
+def read_result(path: str | Path, *, frame: str | None = None) -> Result:
+    """Read a result file, ``step_*.nc``.
+
+    Parameters
+    ----------
+    path
+        The file.
+    frame
+        ``system``, as a test's results are stored; ``specimen``; or a frame as JSON. None: the specimen's frame of
+        the test whose folder holds the file, else as the file is.
 
     Raises
     ------
     StereorigError
-        ``file_missing``, ``file_unreadable`` or ``format_too_new``.
+        ``file_missing``, ``file_unreadable``, ``format_too_new`` or ``frame_invalid``.
     """
+    from stereorig.server.results.gauges.framed import asked_at, in_frame  # gauges are slow to load
+
+    asked = asked_at(frame, Path(path))
+    with tempfile.TemporaryDirectory() as folder:
+        return _read(in_frame([Path(path)], asked, Path(folder) / "frame")[0])
+
+
+def _read(path: Path) -> Result:
     head = read_head(path)
     return Result(
         read_field(path),
