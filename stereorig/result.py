@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import tempfile
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -53,8 +52,7 @@ class Result:
     step
         Number of the load step, 0 = the reference.
     frame
-        Frame of positions, displacements and strain: ``target`` or ``camera1`` for the system frame, or as a file
-        states it.
+        Meaning of the system frame: ``target`` or ``camera1``.
     """
 
     field: Field
@@ -212,30 +210,14 @@ class Result:
         return Result(field, strain, settings, self.step, self.frame, self.calibration_sha256)
 
 
-def read_result(path: str | Path, *, frame: str | None = None) -> Result:
+def read_result(path: str | Path) -> Result:
     """Read a result file, ``step_*.nc``.
-
-    Parameters
-    ----------
-    path
-        The file.
-    frame
-        ``system``, as a test's results are stored; ``specimen``; or a frame as JSON. None: the specimen's frame of
-        the test whose folder holds the file, else as the file is.
 
     Raises
     ------
     StereorigError
-        ``file_missing``, ``file_unreadable``, ``format_too_new`` or ``frame_invalid``.
+        ``file_missing``, ``file_unreadable`` or ``format_too_new``.
     """
-    from stereorig.server.results.gauges.framed import asked_at, in_frame  # gauges are slow to load
-
-    asked = asked_at(frame, Path(path))
-    with tempfile.TemporaryDirectory() as folder:
-        return _read(in_frame([Path(path)], asked, Path(folder) / "frame")[0])
-
-
-def _read(path: Path) -> Result:
     head = read_head(path)
     return Result(
         read_field(path),

@@ -33,15 +33,13 @@ def _xarray() -> Any:
 
 def stacked(files: Mapping[int, bytes]) -> xarray.Dataset:
     """Return the steps' NetCDF files as one data set with the dimension ``step``; NaN where a step lacks one."""
-    from stereorig.server.formats.results.dataset import with_frame  # its libraries are slow to load
-
     xr = _xarray()
     steps = []
     with tempfile.TemporaryDirectory() as folder:
         for n, content in files.items():
             path = Path(folder) / f"{n}.nc"
             path.write_bytes(content)
-            steps.append(with_frame(xr.load_dataset(path, engine="netcdf4")).assign_coords(step=n))
+            steps.append(xr.load_dataset(path, engine="netcdf4").assign_coords(step=n))
     channels = {name for one in steps for name in one.data_vars if str(name).startswith("channel_")}
     steps = [one.set_coords([name for name in channels if name in one]) for one in steps]
     if len(steps) == 1:
@@ -54,7 +52,8 @@ def stacked(files: Mapping[int, bytes]) -> xarray.Dataset:
 
 def array_of(files: Mapping[int, bytes], name: str) -> xarray.DataArray:
     """Return a variable of the steps as :func:`stacked` does, with the frame that it is given in."""
-    return stacked(files)[name]
+    data = stacked(files)
+    return data[name].assign_attrs({key: data.attrs[key] for key in ("frame",) if key in data.attrs})
 
 
 def _of_other_shape(one: Any, last: Any) -> list[str]:

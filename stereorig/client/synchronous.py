@@ -348,8 +348,8 @@ class Analysis:
     def dataset(self, step: int | None = None, *, frame: str | None = None) -> xarray.Dataset:
         """Return one step's result, or all of them along ``step``; needs xarray.
 
-        ``frame`` is that of positions, displacements and strain: None or ``specimen``, the test's own, in which the
-        page shows them; ``system``, as stored. The attribute ``frame`` of each array states it.
+        ``frame`` is that of positions, displacements and strain: None or ``system``, as stored; ``specimen``, the
+        test's own, in which the page shows them. The attribute ``frame`` of each array states it.
         """
         return datasets.stacked(self._client._run(operations.netcdf_of(self._path, None, step, frame)))
 

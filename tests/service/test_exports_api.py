@@ -104,7 +104,7 @@ def test_dense_fields_are_exported_on_request(client: httpx.Client, service: Ser
         shutil.copy(folder / f"step_000{n}.nc", folder / "dense" / f"step_000{n}.nc")
     every = client.get(url, params={"format": "csv", "dense": "true"})
     assert sorted(name[-13:] for name in _content(every.content)) == ["step_0000.csv", "step_0001.csv"]
-    one = client.get(url, params={"format": "nc", "step": 1, "dense": "true", "frame": "system"})
+    one = client.get(url, params={"format": "nc", "step": 1, "dense": "true"})
     assert one.content == (folder / "dense" / "step_0001.nc").read_bytes()
     assert client.get(url, params={"step": 2, "dense": "true"}).json()["code"] == "dense_missing"
 
@@ -193,12 +193,11 @@ def test_gauges_come_as_a_table_and_for_matlab(client: httpx.Client, url: str) -
         "points": [{"name": "p", "xy_px": [61.0, 81.0]}, {"xy_px": [40.0 + 7 * 25, 60.0 + 7 * 3]}],
         "variables": ["w_mm"],
     }
-    where = {"frame": "system"}
-    read = client.post(gauges, json=body, params=where)
+    read = client.post(gauges, json=body)
     assert read.status_code == 200, read.text
-    table = client.post(gauges, json=body, params={"format": "csv", **where})
+    table = client.post(gauges, json=body, params={"format": "csv"})
     lines = [line.split(",") for line in table.text.splitlines() if not line.startswith("#")]
-    mat = client.post(gauges, json=body, params={"format": "mat", **where})
+    mat = client.post(gauges, json=body, params={"format": "mat"})
     found = scipy.io.loadmat(io.BytesIO(mat.content), simplify_cells=True)
     assert list(found["gauges"]) == lines[0]
     assert list(found["gauges"]["gauge"]) == [line[lines[0].index("gauge")] for line in lines[1:]]

@@ -81,7 +81,7 @@ def pages(client: httpx.Client, body: dict[str, Any], **asked: Any) -> list[dict
 
 
 def test_an_answer_holds_a_hundred_steps_and_leads_to_the_next(client: httpx.Client) -> None:
-    found = pages(client, GAUGES, frame="system")
+    found = pages(client, GAUGES)
     assert [len(page["steps"]) for page in found] == [100, STEPS - 100]
     steps = [step for page in found for step in page["steps"]]
     assert [step["n"] for step in steps] == list(range(1, STEPS + 1))
@@ -103,7 +103,7 @@ def test_a_frame_and_positions_in_mm_are_laid_through_the_first_step_on_every_pa
 
 def test_a_difference_is_from_its_step_on_every_page(client: httpx.Client) -> None:
     body = {**GAUGES, "difference_from": 7, "steps": list(range(20, 40))}
-    for page in pages(client, body, limit=8, frame="system"):
+    for page in pages(client, body, limit=8):
         for step in page["steps"]:
             (found,) = [one["values"] for one in step["differences"] if one["kind"] == "point"]
             assert found["w_mm"]["value"] == pytest.approx(drift_mm(step["n"]) - drift_mm(7), abs=1e-6)
@@ -125,7 +125,7 @@ def test_the_client_puts_the_pages_together(client: httpx.Client, monkeypatch: p
 
 
 def test_a_history_is_columns_with_what_the_probe_says(client: httpx.Client) -> None:
-    where = {"x_px": 121.0, "y_px": 99.0, "frame": "system"}
+    where = {"x_px": 121.0, "y_px": 99.0}
     first = client.get(f"{PATH}/history/w_mm", params={**where, "limit": 90}).json()
     second = client.get(f"{PATH}/history/w_mm", params={**where, "cursor": first["next_cursor"]}).json()
     assert (len(first["n"]), len(second["n"]), second["next_cursor"]) == (90, STEPS - 90, None)

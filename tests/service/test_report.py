@@ -212,7 +212,7 @@ def answered(plate: Measurement) -> Answered:
 @pytest.fixture(scope="module")
 def page(plate: Measurement, tmp_path_factory: pytest.TempPathFactory) -> Page:
     out = tmp_path_factory.mktemp("page") / "report.html"
-    assert main(["report", str(plate.data), "--frame", "system", "--out", str(out)]) == 0
+    assert main(["report", str(plate.data), "--out", str(out)]) == 0
     return Page(out.read_text())
 
 

@@ -290,7 +290,6 @@ class ProbeReply(Probe):
     """Everything known about the measurement point nearest to a pixel."""
 
     step: int = Field(description="Step.")
-    frame: str = Field(description="Frame of positions, displacements and strain.")
 
 
 class GaugeStep(Reply):

@@ -118,7 +118,6 @@ class LiveReply(Reply):
     since_utc: str = Field(description="When it was begun.")
     settings: dict[str, Any] = Field(description="As they were asked for, with the region.")
     problem: JobProblem | None = Field(None, description="Why it failed.")
-    frame: Literal["system"] = Field("system", description="Frame of displacements and strain: as of `frame=system`.")
     reference_points: int | None = Field(None, description="Points that the reference has; null before it is measured.")
     values: LiveValues = Field(description="The newest values.")
     account: LiveAccount = Field(description="Counters of the frames by their fate.")

@@ -64,9 +64,9 @@ FrameText = Annotated[
     str | None,
     Query(
         max_length=2000,
-        description="Frame of positions, displacements and strain: `specimen`, the test's (the default); `system`, as "
-        "stored; or one written out in JSON, as a gauge's `align`.",
-        examples=["system"],
+        description="Frame of positions, displacements and strain: `system`, as stored (the default); `specimen`, the "
+        "test's; or one written out in JSON, as a gauge's `align`.",
+        examples=["specimen"],
     ),
 ]
 StepNumber = Annotated[int, Path(ge=0, le=9999, description="Number of a step.")]

@@ -55,10 +55,11 @@ from stereorig.server.formats.files import write_bytes
 from stereorig.server.formats.images import read_mask
 from stereorig.server.formats.noise_json import load_noise
 from stereorig.server.formats.object_storage import copied
-from stereorig.server.formats.results.folder import dense_result
 from stereorig.server.formats.results.reading import read_head
 from stereorig.server.formats.results.summary import to_json
+from stereorig.server.results.gauges import FRAME_HELP
 from stereorig.server.results.images.projected_pattern import check_settings
+from stereorig.server.store.durable import known_json
 
 if TYPE_CHECKING:
     from stereorig.server.results.gauges.request import Alignment
@@ -176,11 +177,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the pattern is projected and does not move with the surface: the shape of each pair is measured by "
         "itself, no displacement",
     )
-    add(
-        "--frame",
-        metavar="FRAME",
-        help="axes that the files are written in: system, specimen, or JSON as of a gauge's align (system)",
-    )
+    add("--frame", metavar="FRAME", help=f"{FRAME_HELP}; the files are written in it")
     add("--out", metavar="DIR", help="for step_0000.nc (shape), step_0001.nc ... (displacement) and summary.json")
 
 
@@ -197,6 +194,8 @@ def run(args: argparse.Namespace) -> int:
         summary = measure_sequence(job, progress)
         files = [job.out / one["file"] for one in summary["steps"]]
         frame = read_head(files[-1]).frame if asked is None else _put_into(asked, files)
+        if asked is not None and job.settings.dense_step_px is not None:
+            progress.note("note: dense fields stay in the system frame")
         write_bytes(job.out / "summary.json", to_json({**summary, "frame": frame}))
         progress.note(f"frame of the files: {frame}")
     finally:
@@ -205,21 +204,18 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _frame(args: argparse.Namespace) -> Alignment | None:
-    """Return the frame that is asked for; None: the system frame, as the service stores results."""
+    """Return the frame that is asked for; None: the system frame."""
     if args.frame is None:
         return None
-    from stereorig.server.results.gauges.framed import frame_in  # gauges are slow to load
-    from stereorig.server.results.gauges.frames import frame_asked
+    from stereorig.server.results.gauges.frames import frame_asked, frame_of_test  # gauges are slow to load
 
-    return frame_asked(args.frame, None if args.folder is None else frame_in(Path(args.folder)))
+    kept = None if args.folder is None else known_json(Path(args.folder) / "test.json").get("frame")
+    return frame_asked(args.frame, frame_of_test(kept if isinstance(kept, dict) else None))
 
 
 def _put_into(asked: Alignment, files: list[Path]) -> str:
     from stereorig.server.results.gauges.framed import put_into_frame
 
-    dense = [file for file in map(dense_result, files) if file.is_file()]
-    if dense:  # first: the reference's result, in the system frame, defines theirs
-        put_into_frame(dense, asked)
     return put_into_frame(files, asked)
 
 

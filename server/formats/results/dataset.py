@@ -10,7 +10,6 @@ from stereorig.core.errors import InputError
 from stereorig.core.field.points.result import Field
 from stereorig.core.strain import StrainField
 from stereorig.server.formats.results.netcdf import dataset_bytes, library
-from stereorig.server.formats.results.variables import described
 from stereorig.server.formats.results.writing import Provenance, fill
 
 if TYPE_CHECKING:
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def as_dataset(result: Field, provenance: Provenance, strain: StrainField | None = None) -> xarray.Dataset:
-    """Return the dataset that ``xarray.open_dataset`` reads from the field's result file; each array has its frame.
+    """Return the dataset that ``xarray.open_dataset`` reads from the field's result file.
 
     Raises
     ------
@@ -34,12 +33,4 @@ def as_dataset(result: Field, provenance: Provenance, strain: StrainField | None
         ) from error
     data = dataset_bytes(lambda dataset: fill(dataset, result, provenance, strain))
     with library, netCDF4.Dataset("field.nc", memory=data) as held:
-        return with_frame(xarray.open_dataset(NetCDF4DataStore(held)).load())  # type: ignore[no-untyped-call]
-
-
-def with_frame(data: xarray.Dataset) -> xarray.Dataset:
-    """Write a data set's frame into the attributes of each array over the points that depends on it."""
-    for name, values in data.data_vars.items():
-        if "row" in values.dims and described(str(name)).part != "none":
-            values.attrs["frame"] = data.attrs["frame"]
-    return data
+        return xarray.open_dataset(NetCDF4DataStore(held)).load()  # type: ignore[no-untyped-call]

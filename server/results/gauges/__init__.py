@@ -1,6 +1,3 @@
 """Extensometers, lines, areas and rigid motions over result files."""
 
-FRAME_HELP = (
-    "axes of positions, displacements and strain: system, specimen, or JSON as of a gauge's align (specimen, where "
-    "there is a test; else those of the files)"
-)
+FRAME_HELP = "axes of positions, displacements and strain: system, specimen, or JSON as of a gauge's align (system)"

@@ -20,7 +20,7 @@ from stereorig.server.results.gauges.request import GaugeRequest
 
 #: ending of the axes' names in another frame, as X_sys is of the system
 AXES = "_frame"
-_CARRIED = ("created", "label", "load_n", "test_step", "reference_step", "cam1_file", "cam2_file")
+_CARRIED = ("label", "load_n", "test_step", "reference_step", "cam1_file", "cam2_file")
 
 
 class FieldWriter:

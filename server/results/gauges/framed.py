@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -52,33 +51,22 @@ def put_into_frame(files: Sequence[Path], asked: Alignment) -> str:
 
 
 def asked_at(text: str | None, result: Path) -> Alignment | None:
-    """Return the frame that is named for a result file and its neighbours, None to leave it as it is.
-
-    Without a name it is the specimen's, where the file is one of a test's and in the system frame.
+    """Return the frame that a command names for a result file and its neighbours, None for the system frame.
 
     Raises
     ------
     InputError
         ``frame_invalid``.
     """
-    of_test = frame_in(home_of(result.absolute()).parent.parent)
-    if text is None and json.loads(str(read_head(result).attributes.get("transformation", "{}"))).get("align"):
-        return None  # the file is in a frame of its own
-    return frame_asked(text, of_test)
-
-
-def frame_in(folder: Path) -> Alignment | None:
-    """Return the specimen's frame of the test in a folder; None if there is no test."""
-    test = known_json(folder / "test.json")
-    kept = test.get("frame")
-    return frame_of_test(kept if isinstance(kept, dict) else None) if test else None
+    kept = known_json(home_of(result.absolute()).parent.parent / "test.json").get("frame")
+    return frame_asked(text, frame_of_test(kept if isinstance(kept, dict) else None))
 
 
 def in_frame(files: Sequence[Path], asked: Alignment | None, out: Path, *, strain: bool = True) -> list[Path]:
     """Return result files in a frame, written into a folder; they themselves for the system frame.
 
-    The frame is defined by the reference's result, where there is one, also for dense fields. Without ``strain`` strain
-    is not computed again, for callers that read none.
+    The frame is defined by the reference's result, if its file is among the measurement's; for dense fields by the
+    ordinary result of the reference. Without ``strain`` strain is not computed again, for callers that read none.
 
     Raises
     ------
@@ -87,4 +75,8 @@ def in_frame(files: Sequence[Path], asked: Alignment | None, out: Path, *, strai
     """
     if asked is None:
         return list(files)
-    return write_framed(files, asked, out, strain=strain)
+    n = read_head(files[-1]).reference_step
+    reference = None if n is None else home_of(files[-1]) / f"step_{n:04d}.nc"
+    if reference is None or reference in files or not reference.is_file():
+        reference = None
+    return write_framed(files, asked, out, strain=strain, laid_through=reference)

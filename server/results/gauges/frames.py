@@ -42,30 +42,27 @@ def frame_of_test(document: Mapping[str, object] | None) -> Asked:
         ) from error
 
 
-def frame_asked(text: str | None, of_test: Asked | None) -> Asked | None:
-    """Return the frame that a text names; None: as the results are stored, for a test in the system frame.
+def frame_asked(text: str | None, of_test: Asked) -> Asked | None:
+    """Return the frame that a text names; None: the system frame, in which results are stored.
 
     Parameters
     ----------
     text
-        ``system``, ``specimen``, or a frame as JSON, with the entries of a gauge request's `align`; None: the
-        specimen's, of a test.
+        ``system``, ``specimen``, or a frame as JSON, with the entries of a gauge request's `align`.
     of_test
-        The specimen's; None for results that belong to no test.
+        The specimen's.
 
     Raises
     ------
     InputError
         ``frame_invalid`` for anything else.
     """
-    if text == "system":
+    if text in (None, "system"):
         return None
-    if text is None:
-        return of_test
     if text == "specimen":
-        return of_test or SPECIMEN
+        return of_test
     remedy = 'Give system, specimen, or JSON such as {"kind": "plane", "x_direction": [1, -1, 0]}.'
-    return asked_in(text, _ASKED, named="frame", code="frame_invalid", remedy=remedy)
+    return asked_in(text or "", _ASKED, named="frame", code="frame_invalid", remedy=remedy)
 
 
 def lay(asked: Asked, field: Field, shared: SharedPixels) -> Alignment:

@@ -91,8 +91,7 @@ def read_gauges(
         Steps to be read of those that are asked for, as of a page; None: all. The first of those that are asked for is
         read in any case: it defines the frame, and positions in mm are found on it.
     laid_through
-        Result file that defines the frame; the reference's of the same measurement if left out, and the first that
-        is read where that is not measured.
+        Result file that defines the frame, if that is none of `files`.
 
     Raises
     ------
@@ -110,8 +109,6 @@ def read_gauges(
         needed = {*only, request.difference_from, number_of(chosen[0])}
         chosen = [path for path in chosen if number_of(path) in needed]
     alignment: Alignment | None = None
-    if request.align is not None:
-        laid_through = laid_through or _reference_of(chosen[0])
     if request.align is not None and laid_through is not None:
         base = _read(laid_through)
         alignment = lay(request.align, base.field, base.shared)
@@ -176,12 +173,6 @@ def read_gauges(
         statement=statement,
         steps=steps,
     )
-
-
-def _reference_of(path: Path) -> Path | None:
-    """Return the result file of a measurement's reference; None if it is the one given, or there is none."""
-    reference = home_of(path) / f"step_{read_head(path).settings.get('reference', 0):04d}.nc"
-    return reference if reference != path and reference.is_file() else None
 
 
 def _calibration(path: Path, head: ResultHead) -> dict[str, str | None]:

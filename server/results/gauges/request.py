@@ -188,9 +188,7 @@ class GaugeRequest(CoverageFields, Request):
         "left out.",
         examples=[["u_mm", "w_mm"]],
     )
-    align: Alignment | None = Field(
-        None, description="Frame to express everything in; the specimen's if left out, where there is a test."
-    )
+    align: Alignment | None = Field(None, description="Frame to express everything in; the system frame if left out.")
     remove_rigid: RigidRemoval | None = Field(None, description="Remove the rigid motion first; null keeps it.")
     steps: Annotated[list[StepNumber], Field(min_length=1, max_length=10_000)] | None = Field(
         None, description="Steps to read; all if left out."

@@ -66,8 +66,8 @@ class FramedResults:
 
 
 def asked_of(service: Service, test_id: str, frame: str | None) -> Alignment | None:
-    """Return the frame that a request names, the specimen's without a name; None for the system frame."""
-    if frame == "system":
+    """Return the frame that a request names, None for the system frame; see :func:`frame_asked`."""
+    if frame in (None, "system"):
         return None
     kept = service.tests.read(test_id).plain().get("frame")
     return frame_asked(frame, frame_of_test(kept if isinstance(kept, dict) else None))

@@ -161,7 +161,7 @@ async def export(
     """
     wanted, frame = asked.request, asked.frame
     files, headers = await run_in_threadpool(_prepared, service, test_id, analysis_id, asked.steps, asked.dense)
-    as_stored = wanted.variables is None and wanted.coverage.factor == 1.0 and frame == "system"
+    as_stored = wanted.variables is None and wanted.coverage.factor == 1.0 and frame in (None, "system")
     home = home_of(files[0])
     as_stored &= wanted.format == "nc" and len(files) == 1
     if as_stored and not await run_in_threadpool(has_more, files[0], home):

@@ -42,10 +42,8 @@ def field(
     analysis_id: AnalysisId,
     body: GaugeRequest,
     step: Annotated[int, Query(ge=0, le=9999, description="Number of the step.")],
-    frame: FrameText = None,
 ) -> Response:
     """Answer with a result file (NetCDF-4) of the step as `align` and `remove_rigid` ask for; nothing is stored."""
-    body = _aligned(service, test_id, body, frame)
     source = service.tests.analyses.result_file(test_id, analysis_id, step)
     reference = service.tests.analyses.read(test_id, analysis_id).steps[0]
     # the reference's shape defines a frame
@@ -87,7 +85,12 @@ def read(
     file with all of them.
     """
     steps = service.tests.analyses.finished_steps(test_id, analysis_id)
-    body = _aligned(service, test_id, body, frame)
+    asked = asked_of(service, test_id, frame)
+    if asked is not None and body.align is not None:
+        raise InputError(
+            "The frame is given twice, in `align` and in frame=.", code="option_conflict", remedy="Give one of them."
+        )
+    body = body if asked is None else body.model_copy(update={"align": asked})
     if format == "json":
         return _page(service, test_id, analysis_id, steps, body, page)
     readings = read_gauges([service.tests.analyses.result_file(test_id, analysis_id, n) for n in steps], body)
@@ -95,17 +98,6 @@ def read(
     if format == "csv":
         return Response(gauges_csv(readings), media_type="text/csv; charset=utf-8", headers=headers)
     return Response(gauges_mat(readings), media_type=_MATLAB, headers=headers)
-
-
-def _aligned(service: Service, test_id: str, body: GaugeRequest, frame: str | None) -> GaugeRequest:
-    """Return a request with the frame that it names in one way or the other; without any, with the specimen's."""
-    if body.align is None:
-        return body.model_copy(update={"align": asked_of(service, test_id, frame)})
-    if frame is not None:
-        raise InputError(
-            "The frame is given twice, in `align` and in frame=.", code="option_conflict", remedy="Give one of them."
-        )
-    return body
 
 
 def _page(

@@ -12,8 +12,6 @@ from stereorig.server.api.protocol.paging import PageDep
 from stereorig.server.api.protocol.problems import errors
 from stereorig.server.api.routes.analyses.results import FieldName
 from stereorig.server.base.models import Listing
-from stereorig.server.formats.results.reading import read_head
-from stereorig.server.formats.results.variables import described
 from stereorig.server.results.point_history import nearest_point, point_history
 from stereorig.server.workflows.analysis.framed import result_in
 
@@ -32,7 +30,6 @@ class HistoryReply(Listing):
     value: list[float | None] = Field(description="Values; null where the point failed, or the step lacks it.")
     sigma: list[float | None] = Field(description="Standard uncertainties; null where not known.")
     status: list[str] = Field(description="Status of the point in each step.")
-    frame: str = Field("", description="Frame of the values; empty if they are the same in every frame.")
 
 
 @router.get("/history/{name}", summary="One variable of one point over the steps", responses=errors(404, 409, 422))
@@ -56,5 +53,4 @@ def get_history(
     columns = {"value": found.value, "sigma": found.sigma, "status": found.status}
     where = {"row": place.row, "col": place.col, "distance_px": place.distance_px}
     about = {"variable": name, "units": found.units, "n": chosen, "next_cursor": page.next_cursor}
-    about["frame"] = "" if described(name).part == "none" else read_head(files[-1] if files else first).frame
     return HistoryReply.model_validate({**where, **about, **columns})

@@ -204,5 +204,4 @@ def get_probe(
 ) -> ProbeReply:
     """Return every number of the nearest point, with its uncertainty."""
     path = result_in(service, test_id, analysis_id, step, frame)
-    about = {"step": step, "frame": read_head(path).frame}
-    return ProbeReply.model_validate({**about, **dict(probe_result(path, x_px, y_px, coverage))})
+    return ProbeReply.model_validate({"step": step, **dict(probe_result(path, x_px, y_px, coverage))})
