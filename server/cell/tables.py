@@ -74,6 +74,12 @@ def record(cell: Cell, content: bytes, **options: Any) -> tuple[ChannelTable | N
     return ChannelTable(time_s, bool(absolute), values, units, unread), read
 
 
+def warm_up() -> None:
+    """Load what the readers load when they first need it: behind the walls nothing can be loaded."""
+    import numpy.ma  # noqa: F401  # np.unique asks for it
+    import scipy.spatial.transform  # noqa: F401
+
+
 def _calibration(files: list[BinaryIO], unit: str | None) -> tuple[dict[str, object], dict[str, Any]]:
     data, name = files[0].read(), "The file"
     checked = asdict(check_calibration(parse_calibration(data, name=name, unit=unit)))

@@ -45,7 +45,7 @@ class NewDataset(netCDF4.Dataset):
         while waiting:
             variable, values = waiting.pop(0)
             variable.set_auto_maskandscale(False)  # they are as the file is to hold them
-            if values.ndim < 4:
+            if np.ndim(values) < 4:
                 variable[...] = values
                 continue
             for k in range(values.shape[2]):  # a part that the cache holds: its chunks are gathered from all of it
