@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import netCDF4
+import numpy as np
 
 from stereorig.core.errors import FileFormatError
 from stereorig.server.formats.files import written_temporary
