@@ -563,6 +563,8 @@ def test_the_protocol_library_reads_what_the_fake_kinesis_controller_answers() -
     ask(theirs.mot_move_absolute(*there, 1, 400_000))
     state = ask(theirs.mot_req_dcstatusupdate(*there, 1))["mot_get_dcstatusupdate"]
     assert state.moving_forward
+    while state.moving_forward and state.position == 0:  # a count takes it a moment
+        state = ask(theirs.mot_req_dcstatusupdate(*there, 1))["mot_get_dcstatusupdate"]
     assert state.position > 0
     assert "mot_move_stopped" in ask(theirs.mot_move_stop(*there, 1, 2))
     speeds = ask(theirs.mot_req_velparams(*there, 1))["mot_get_velparams"]

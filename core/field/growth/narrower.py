@@ -75,7 +75,7 @@ def measure_narrower(inputs: FieldInputs, state: GrowthState) -> GrowthState:
 def _tried(inputs: FieldInputs, state: GrowthState) -> Bool:
     """(n,) True at points that the match lost where strain is localised."""
     points = state.points
-    lost = inputs.usable & np.isin(points.status, _BY_THE_MATCH)
+    lost = inputs.usable & inputs.hoped_for & np.isin(points.status, _BY_THE_MATCH)  # others were tried once already
     curved = state.fitter.comparisons == 3 and state.fitter.terms == 6 and inputs.options.patch == "auto"
     if not curved or inputs.options.blur is not None or not lost.any():
         return np.zeros_like(lost)

@@ -196,8 +196,11 @@ async function show(root, testId, analysisId, query) {
   const numbers = numbersPanel(screen, figures.root, strainChoice(screen, bar.fields, redraw));
   const panels = tabs(h("div", h("h2.unseen", "Numbers and plots"), numbers));
   const address = () => api.address(`${result.path}/report`, { frame: result.frame });
-  const report = h("a.button", { href: address(), target: "_blank", rel: "noopener", title: "Some seconds; longer for many steps" }, "Open the report");
-  report.addEventListener("click", () => report.setAttribute("href", address())); // in the axes that are shown
+  const report = h("a.button", { href: address(), target: "_blank", rel: "noopener" }, "Open the report");
+  report.addEventListener("click", () => {
+    report.setAttribute("href", address()); // in the axes that are shown
+    notify("The report is computed from the steps' files: some seconds, longer for many steps.", "ok");
+  });
   const exported = h("button", { type: "button", onclick: () => choose(filesPanel, true) }, "Export");
   const title = h("h1", "Results: ", h("a", { href: `#/results/${testId}` }, result.test.name || testId), ` · ${result.analysis.label || analysisId}`);
   const side = h("div.grid.measured", pictured, panels);
