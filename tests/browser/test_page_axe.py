@@ -127,7 +127,9 @@ def test_results(page: Watched, bench: Bench, audit: Audit) -> None:
     expect(at.locator('[data-role="area"] table').first).to_be_visible()
     expect(at.get_by_role("button", name="Save the file")).to_be_visible()
     at.locator(".view .frame").first.click()
-    unfold(at)  # the probe comes to the front, alone
+    at.locator('[data-role="probe"] table').first.wait_for(state="attached")
+    at.wait_for_timeout(500)
+    unfold(at)  # what is read comes to the front, alone
     expect(at.locator('[data-role="probe"] table').first).to_be_visible()
     audit("a field with gauges, a probe and everything open")
     shown(page, bench, name="status")
