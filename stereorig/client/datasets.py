@@ -43,7 +43,7 @@ def stacked(files: Mapping[int, bytes]) -> xarray.Dataset:
     channels = {name for one in steps for name in one.data_vars if str(name).startswith("channel_")}
     steps = [one.set_coords([name for name in channels if name in one]) for one in steps]
     if len(steps) == 1:
-        return steps[0]
+        return steps[0]  # type: ignore[no-any-return]
     positions = [name for name in ("x_px", "y_px") if name in steps[-1]]
     varying = [one.drop_vars([*positions, *_of_other_shape(one, steps[-1])], errors="ignore") for one in steps]
     together = xr.concat(varying, dim="step", data_vars="all", coords="minimal", compat="override", join="outer")
