@@ -99,6 +99,8 @@ def _begin(message: bytes, descriptors: list[int], children: dict[int, _Child]) 
     answer, *passed = descriptors
     function, args, limits = pickle.loads(message)  # from the service alone; loads the reader's modules
     if function.__module__ not in _warm:
+        import numpy.ma  # noqa: F401  # np.unique asks for it, and behind the walls nothing can be loaded
+
         _warm.add(function.__module__)
         getattr(sys.modules[function.__module__], "warm_up", int)()
     gc.freeze()

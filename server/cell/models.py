@@ -72,8 +72,6 @@ def _through(
 
 def warm_up() -> None:
     """Load the parts of the libraries that they load with their first file only."""
-    import numpy.ma  # noqa: F401  # np.unique asks for it
-
     content = dataset_bytes(lambda data: data.createDimension("n", 1))
     with opened(Path("n.nc"), content):
         pass

@@ -75,8 +75,7 @@ def record(cell: Cell, content: bytes, **options: Any) -> tuple[ChannelTable | N
 
 
 def warm_up() -> None:
-    """Load what the readers load when they first need it: behind the walls nothing can be loaded."""
-    import numpy.ma  # noqa: F401  # np.unique asks for it
+    """Load the part of scipy that the readers load with their first file only."""
     import scipy.spatial.transform  # noqa: F401
 
 

@@ -116,7 +116,8 @@ def test_points_on_warped_images_are_those_of_their_own_fits(
         assert np.abs(change).max() < 0.6
         assert (one.status != other.status).mean() <= 1e-3
         ratio = np.sqrt(np.diagonal(one.covariance, axis1=2, axis2=3))[..., 3:][both] / sigma
-        assert abs(np.median(ratio) - 1.0) < 0.02  # the sample that corrects it may differ by a point
+        assert abs(np.median(ratio) - 1.0) < 0.02  # the field's own scatter corrects it, which differs a little
+        assert abs(np.median(one.noise_grey[both] / other.noise_grey[both]) - 1.0) < 0.002
         np.testing.assert_allclose(one.zncc[both], other.zncc[both], atol=2e-4)
         truth = state("even", number).position(start) - Strained().position(start)
         error = (one.uvw_mm - truth)[both] / sigma
