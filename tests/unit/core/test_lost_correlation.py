@@ -16,6 +16,20 @@ XY = GRID.xy_px.reshape(-1, 2)
 RAYS = pair().cam1.rays_cam(XY).xyz_mm
 
 
+def lost_of(points: PointFits) -> Bool:
+    """Return (n,) True at the points that lose more correlation than their neighbours explain, at the usual limits."""
+    return lost_correlation(
+        points,
+        pair=pair(),
+        shape=GRID.shape,
+        xy_px=XY,
+        rays=RAYS,
+        texture=np.full(len(XY), 900.0),
+        subset_px=33,
+        limits=CorrelationLimits(6.0, 2.0, 6.0),
+    )
+
+
 def test_a_slope_keeps_its_points_and_a_spot_in_the_plane_does_not() -> None:
     rng = np.random.default_rng(4)
     points = PointFits.empty(len(XY), 1)
@@ -31,16 +45,7 @@ def test_a_slope_keeps_its_points_and_a_spot_in_the_plane_does_not() -> None:
     spot = (np.abs(column - 8) < 2) & (np.abs(row - 8) < 2)
     loss[spot] *= 15.0  # what loses less is judged by the parts of its subset
     points.zncc[:, 0] = 1.0 - loss
-    lost = lost_correlation(
-        points,
-        pair=pair(),
-        shape=GRID.shape,
-        xy_px=XY,
-        rays=RAYS,
-        texture=np.full(len(XY), 900.0),
-        subset_px=33,
-        limits=CorrelationLimits(6.0, 2.0, 6.0),
-    )
+    lost = lost_of(points)
     assert lost[spot].all()
     assert not lost[~spot].any()
 
@@ -56,24 +61,12 @@ def test_what_is_left_where_most_is_lost_is_no_measure_of_what_is_usual() -> Non
     usual = np.array([0.002, 0.2, 0.2])
     points.zncc[:] = 1.0 - usual * np.exp(0.1 * rng.standard_normal(points.zncc.shape))
 
-    def lost() -> Bool:
-        return lost_correlation(
-            points,
-            pair=pair(),
-            shape=GRID.shape,
-            xy_px=XY,
-            rays=RAYS,
-            texture=np.full(len(XY), 900.0),
-            subset_px=33,
-            limits=CorrelationLimits(6.0, 2.0, 6.0),
-        )
-
     # as a blur does: every point is there, and may
-    assert not lost().any()
+    assert not lost_of(points).any()
     # as another pattern does: most are lost, and what is left shows it, too
     points.status[rng.uniform(size=len(XY)) < 0.6] = PointStatus.NOT_SEEDED
     assert points.ok.sum() > 50
-    assert lost()[points.ok].all()
+    assert lost_of(points)[points.ok].all()
 
 
 def test_defocus_by_height_is_no_loss_of_its_crest_though_coarse_texture_scatters_it_and_a_flake_on_it_is() -> None:
@@ -93,15 +86,6 @@ def test_defocus_by_height_is_no_loss_of_its_crest_though_coarse_texture_scatter
     for spoiled in (False, True):
         points.zncc[:, 0] = 1.0 - 0.0005
         points.zncc[:, 1:] = 1.0 - np.where(flake & spoiled, 12.0 * course, loss)[:, None]
-        lost = lost_correlation(
-            points,
-            pair=pair(),
-            shape=GRID.shape,
-            xy_px=XY,
-            rays=RAYS,
-            texture=np.full(len(XY), 900.0),
-            subset_px=33,
-            limits=CorrelationLimits(6.0, 2.0, 6.0),
-        )
+        lost = lost_of(points)
         assert lost[flake].all() == spoiled
         assert spoiled or not lost.any()
