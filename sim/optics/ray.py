@@ -1,7 +1,8 @@
 """Rays of image points, written for whole lattices of sample points and for single ones.
 
-The paper's lens, Eqs. (8), (7), (5) backwards, in closed form, and OpenCV's rational one by Newton's method; checked
-against `stereorig.core.cameras.lens` and OpenCV by the tests, and sharing nothing with them.
+The paper's lens, Eqs. (8), (7), (5) backwards, in closed form, and OpenCV's rational one by Newton's method; a thin
+prism and a tilted sensor by a fixed point around that, as a kind of lens of its own. Checked against
+`stereorig.core.cameras.lens` and OpenCV by the tests, and sharing nothing with them.
 """
 
 from __future__ import annotations
@@ -15,9 +16,13 @@ from stereorig.core.arrays import Float
 
 SEIDEL: Final = 0.0
 RATIONAL: Final = 1.0
+BENT: Final = 2.0
 _STEPS: Final = 40
 _LAST_STEP: Final = 1e-8  # Newton's error after a step of this length is its square times a curvature of order one
 _SHRINK: Final = 0.98
+_SETTLED: Final = (
+    1e-13  # a prism moves rays by some thousandths of what it moves its own point by: each round gains as much
+)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -41,15 +46,35 @@ def rays(lens: Float, x0: float, y0: float, step: float, nx: Float, ny: Float) -
             continue
         for i in range(columns):
             xd[i] = (x0 + i * step - cx - skew * yd) / fx
-        if j >= 3 and _undistort_row(lens, xd, yd, nx[j - 3 : j], ny[j - 3 : j], nx[j], ny[j]):
+        if lens[0] == RATIONAL and j >= 3 and _undistort_row(lens, xd, yd, nx[j - 3 : j], ny[j - 3 : j], nx[j], ny[j]):
             continue
         gx, gy = 0.0, 0.0
         for i in range(columns):
-            gx, gy, ok = _undistort(lens, xd[i], yd, gx, gy)
+            gx, gy, ok = _ray(lens, xd[i], yd, gx, gy)
             nx[j, i] = gx if ok else np.nan
             ny[j, i] = gy if ok else np.nan
             if not ok:
                 gx, gy = 0.0, 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _ray(lens: Float, xd: float, yd: float, nx: float, ny: float) -> tuple[float, float, bool]:
+    """Return the direction of a point on the sensor at focal length 1 from the guess (nx, ny), and if there is one."""
+    if lens[0] != BENT:
+        return _undistort(lens, xd, yd, nx, ny)
+    H = lens[19:28]
+    w = H[6] * xd + H[7] * yd + H[8]
+    if w <= 0.0:
+        return nx, ny, False
+    xd, yd = (H[0] * xd + H[1] * yd + H[2]) / w, (H[3] * xd + H[4] * yd + H[5]) / w
+    for _ in range(_STEPS):
+        r2 = nx * nx + ny * ny
+        x, y, ok = _undistort(lens, xd - r2 * (lens[15] + r2 * lens[16]), yd - r2 * (lens[17] + r2 * lens[18]), nx, ny)
+        moved = abs(x - nx) + abs(y - ny)
+        nx, ny = x, y
+        if not ok or moved < _SETTLED:
+            return nx, ny, ok
+    return nx, ny, False
 
 
 # one step for a whole row without a branch, so that it runs on the vector unit
@@ -87,7 +112,7 @@ def scattered_rays(lens: Float, xy_px: Float, out: Float) -> None:
     for k in range(xy_px.shape[0]):
         yd = (xy_px[k, 1] - lens[5]) / lens[2]
         xd = (xy_px[k, 0] - lens[4] - lens[3] * yd) / lens[1]
-        x, y, ok = _undistort(lens, xd, yd, 0.0, 0.0)
+        x, y, ok = _ray(lens, xd, yd, 0.0, 0.0)
         out[k, 0] = x if ok else np.nan
         out[k, 1] = y if ok else np.nan
 

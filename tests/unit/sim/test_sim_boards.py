@@ -12,7 +12,7 @@ from stereorig.core.cameras.camera import Camera, RigidTransform
 from stereorig.sim.boards.pattern import INK, PAPER
 from stereorig.sim.boards.poses import transform_of
 from stereorig.sim.boards.target import SimTarget
-from stereorig.sim.optics.lens import SimLens
+from stereorig.sim.optics.lens import SimLens, core_lens
 from stereorig.sim.render import RenderOptions, material_points, render
 from stereorig.sim.scene import Scene
 from stereorig.sim.truth import truth_at
@@ -20,7 +20,9 @@ from stereorig.sim.truth import truth_at
 MIDDLE = 0.5 * (INK + PAPER)
 POSE = (18.0, -22.0, 9.0, 3.0, -4.0, 5.0)
 LENS = SimLens(fx_px=2006.0, fy_px=1998.0, cx_px=611.3, cy_px=517.8, k1=-0.15, k2=0.06, p1=2e-4, p2=-3e-4, k4=0.02)
-CAMERA = Camera(LENS, RigidTransform(cv2.Rodrigues(np.array([0.02, -0.2, 0.05]))[0], np.array([1.0, -2.0, 200.0])))
+CAMERA = Camera(
+    core_lens(LENS), RigidTransform(cv2.Rodrigues(np.array([0.02, -0.2, 0.05]))[0], np.array([1.0, -2.0, 200.0]))
+)
 SIZE = (1224, 1024)
 
 
