@@ -1,0 +1,73 @@
+"""The resolution study as a document, a table and a page."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, Field
+
+from stereorig.server.base.models import Reply
+from stereorig.server.evaluations.cards import NUMBER_COLUMNS, CardNumber, MarkFound, cells_of, page
+from stereorig.server.formats.csv_cells import row
+
+
+class SettingFound(BaseModel):
+    """Noise and resolution of one setting."""
+
+    spacing_px: float = Field(description="Distance of the points.")
+    strain_window: int = Field(description="Points across the strain's window.")
+    gauge_px: float = Field(description="Width of the virtual strain gauge.")
+    l10_px: float = Field(description="Period of a strain that keeps 90 % of its height in the worse direction.")
+    l10_mm: float = Field(description="The same on the surface.")
+    numbers: dict[str, CardNumber] = Field(
+        description="Noise, its ratio to the reported one, and its product with l10^2."
+    )
+
+
+class ResolutionFound(Reply):
+    """Noise and spatial resolution of a test's pattern and rig."""
+
+    verdict: Literal["met", "not met", "not asked"] = Field(description="Whether a setting has what was asked for.")
+    accepted: bool = Field(description="False if none has it.")
+    subset_px: int = Field(description="Subset of the measurement.")
+    patch: str = Field(description="Its patch.")
+    static_steps: list[int] = Field(description="Steps from which the noise is measured.")
+    mm_per_px: float = Field(description="Size of a pixel on the surface, along its longer side.")
+    l10_px: float = Field(description="Period of a displacement that keeps 90 % of its height.")
+    l10_mm: float = Field(description="The same on the surface.")
+    displacement: dict[str, CardNumber] = Field(
+        description="Noise of u, v, w, its ratio to the reported one, and its product with l10."
+    )
+    settings: list[SettingFound] = Field(description="Strain by spacing and window.")
+    chosen: SettingFound | None = Field(
+        description="The setting with the least noise that resolves the smallest feature; null without one."
+    )
+    marks: list[MarkFound] = Field(description="What the data show.")
+
+
+def heading(one: SettingFound, subset_px: int) -> str:
+    """Return a setting in words."""
+    return (
+        f"Subset {subset_px} px, spacing {one.spacing_px:g} px, strain window {one.strain_window}: "
+        f"gauge {one.gauge_px:g} px, l10 {one.l10_mm:.4g} mm"
+    )
+
+
+def table_of(card: ResolutionFound) -> str:
+    """Return the numbers as CSV."""
+    lines: list[tuple[object, ...]] = [("subset_px", "spacing_px", "strain_window", "l10_mm", *NUMBER_COLUMNS)]
+    own = (card.subset_px, None, None, card.l10_mm)
+    lines += [(*own, *cells_of(symbol, number)) for symbol, number in card.displacement.items()]
+    for one in card.settings:
+        head = (card.subset_px, one.spacing_px, one.strain_window, one.l10_mm)
+        lines += [(*head, *cells_of(symbol, number)) for symbol, number in one.numbers.items()]
+    return "".join(map(row, lines))
+
+
+def page_of(title: str, card: ResolutionFound) -> str:
+    """Return the study as an HTML page."""
+    chosen = "" if card.chosen is None else f"; chosen: {heading(card.chosen, card.subset_px)}"
+    head = f"{card.patch} patch, {card.mm_per_px:.4g} mm a pixel, {len(card.static_steps)} static steps"
+    tables = {f"Displacement, subset {card.subset_px} px: l10 {card.l10_mm:.4g} mm": card.displacement}
+    tables |= {heading(one, card.subset_px): one.numbers for one in card.settings}
+    return page(title, f"{head}: {card.verdict}{chosen}", tables, card.marks)
