@@ -179,10 +179,12 @@ def _numbers(
         each = zip(keys, (units, "1", product), strict=True)
         return {key: number_missing(key, unit, why) for key, unit in each}
     size = l10_mm**power
-    over, sample = found.sd / found.reported, {"sample": found.u / found.reported}
+    ratio = number_missing(keys[1], "1", "nothing_reported: the results state no noise.")
+    if found.reported > 0.0:
+        ratio = number_found(keys[1], found.sd / found.reported, "1", {"sample": found.u / found.reported}, ())
     return {
         keys[0]: number_found(keys[0], found.sd, units, {"sample": found.u}, ()),
-        keys[1]: number_found(keys[1], over, "1", sample, ()),
+        keys[1]: ratio,
         keys[2]: number_found(keys[2], found.sd * size, product, {"sample": found.u * size}, ()),
     }
 
