@@ -71,7 +71,10 @@ def test_the_minimum_is_the_one_a_brute_force_solver_finds() -> None:
     H = jac.T @ jac
     s = 1.0 / np.sqrt(np.diagonal(H))
     covariance = (np.linalg.inv(H * s[:, None] * s) * s[:, None] * s)[:20, :20]
-    np.testing.assert_allclose(sigma_of, np.sqrt(np.diagonal(covariance)), rtol=0.01)
+    # the errors of the target as a whole that these independent ones may contain come on top
+    ratio = sigma_of / np.sqrt(np.diagonal(covariance))
+    assert (ratio > 0.99).all()
+    assert (ratio < 1.03).all(), ratio
 
 
 def monte_carlo(tolerance: float, runs: int, degree: int | None) -> tuple[Array, list[Array], list[Array], Array]:

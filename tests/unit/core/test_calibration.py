@@ -335,6 +335,7 @@ def _modern_rig(
     axis_rad: tuple[float, float] = (0.0, 0.0),
     bow_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
     shear: float = 0.0,
+    bend_mm: Array | None = None,
     tau_rad: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (0.0, 0.0)),
     noise_px: float = 0.02,
     roll_deg: float = 2.0,
@@ -352,7 +353,11 @@ def _modern_rig(
     at = (np.arange(11) - 5.0) * pitch_mm
     points = flat(np.stack(np.meshgrid(at, at, indexing="ij"), axis=-1))
     x, y = np.moveaxis(points[..., :2] / at.max(), -1, 0)
-    points[..., 2] = np.stack([x * x, x * y, y * y], axis=-1) @ bow_mm
+    second = np.stack([x * x, x * y, y * y], axis=-1)
+    points[..., 2] = second @ bow_mm
+    points[..., :2] += (
+        0.0 if bend_mm is None else np.concatenate([x[..., None], y[..., None], second], axis=-1) @ bend_mm
+    )
     points[..., 0] += shear * points[..., 1]
     rng = np.random.default_rng(seed)
     along = np.array([*axis_rad, np.sqrt(1.0 - np.square(axis_rad).sum())])
@@ -439,6 +444,21 @@ def test_a_bow_that_is_named_is_in_the_reported_error(lens: tuple[float, ...]) -
         np.testing.assert_allclose(total, result.covariance, rtol=1e-6, atol=1e-12 * np.abs(total).max())
     # the named amount is known to a tenth; 3 to 18 without it
     assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.mark.parametrize("lens", [(-0.05, 0.1, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0)])
+def test_a_staged_grid_that_is_stretched_sheared_and_bent_within_its_tolerance_is_in_the_reported_error(
+    lens: tuple[float, ...],
+) -> None:
+    ratios = []
+    for seed in range(6):
+        bend_mm = 0.01 / 3.0 * np.random.default_rng([35, seed]).standard_normal((5, 2))
+        views, target, nominal, cameras = _modern_rig(35.0, lens, bend_mm=bend_mm, noise_px=0.01, seed=seed)
+        result = calibrate(views, dataclasses.replace(target, node_tolerance_mm=0.01), nominal)
+        true_um = rig_shape_error_um(result.pair, cameras, result.uncertainty.points_mm)
+        ratios.append(true_um / (1e3 * result.uncertainty.shape_rms_mm))
+    # 1.1 and 3.2 where the points' errors were taken as independent of each other
+    assert 0.4 < np.sqrt(np.mean(np.square(ratios))) < 1.3, ratios
 
 
 @pytest.mark.parametrize(
