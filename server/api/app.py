@@ -37,7 +37,7 @@ from stereorig.server.api.routes.calibrations import calibrations, guide, noise,
 from stereorig.server.api.routes.calibrations import checks as calibration_checks
 from stereorig.server.api.routes.calibrations import exports as calibration_exports
 from stereorig.server.api.routes.certificates import certificates, procedure
-from stereorig.server.api.routes.rig import cameras, devices, live_check, stage
+from stereorig.server.api.routes.rig import cameras, devices, live_check, prints, stage
 from stereorig.server.api.routes.service import jobs, session, system
 from stereorig.server.api.routes.tests import channels, frame, live, metadata, models, recipes, tests, watch, workspace
 from stereorig.server.api.routes.tests.trash import router as trash_router
@@ -150,6 +150,7 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         cameras,
         devices,
         live_check,
+        prints,
         stage,
         noise,
         calibrations,

@@ -222,6 +222,11 @@ def _calibration(session: Session) -> str:
     call, client = session.call, session.client
     plan = {"positions_mm": [0.0, 5.0], "held_out_mm": [2.0]}
     call("expect_calibration", summary="Two positions", body={"positions_mm": [0.0, 5.0], "noise_px": 0.005})
+    call("print_target", summary="The rig's target on A4", body={"paper": "A4", "form": "pdf"})
+    call("print_speckle", query={"diameter_mm": 1.0, "form": "svg"})
+    beside = call("print_target", body={"form": "toml"}).text
+    rulers = {"printed_mm": [150.0, 250.0], "measured_mm": [149.91, 249.8], "u_mm": 0.05}
+    call("measure_print", summary="Both rulers", body={"target_file": beside, **rulers})
     made = call("create_calibration", summary="Two positions and one for the check", body={**plan, "frames": 4}).json()
     job = wait_for_job(client, made["job"])
     assert job["state"] == "succeeded", job["problem"]

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 from stereorig.core.errors import InputError
-from stereorig.server.formats.calibrations.target_toml import read_target
+from stereorig.server.formats.calibrations.target_toml import load_toml, read_target
 from stereorig.server.formats.files import make_folder, write_bytes
 from stereorig.server.formats.prints.drawing import DRAWING_FORMS, Drawing
 from stereorig.server.formats.prints.measured import measured_print
 from stereorig.server.formats.prints.page import PAPER_HELP
 from stereorig.server.formats.prints.speckle import speckle_mm, speckle_page
-from stereorig.server.formats.prints.targets import UNMEASURED_SCALE_SIGMA, target_drawing, target_text, title_of
+from stereorig.server.formats.prints.targets import target_drawing, title_of, unmeasured_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -60,10 +59,8 @@ def run(args: argparse.Namespace) -> int:
     target = read_target(args.file)
     drawing = target_drawing(target, marks=args.marks, **page)
     _write(args.out, drawing)
-    if target.pitch_scale_sigma is None:
-        target = replace(target, pitch_scale_sigma=UNMEASURED_SCALE_SIGMA)
     beside = args.out.with_suffix(".toml")
-    write_bytes(beside, target_text(target).encode())
+    write_bytes(beside, unmeasured_text(target).encode())
     print(f"written: {beside}; measure the print's rulers, then: stereorig print measured {beside} ...")
     return 0
 
@@ -78,7 +75,9 @@ def _write(path: Path, drawing: Drawing) -> None:
 
 
 def _measured(args: argparse.Namespace) -> int:
-    found = measured_print(args.file, args.printed_mm, args.measured_mm, args.u_mm)
+    content = load_toml(args.file, kind="target description")
+    found = measured_print(content, str(args.file), args.printed_mm, args.measured_mm, args.u_mm)
+    write_bytes(args.file, found.text.encode())
     print(f"{title_of(found.target)}\nscale {found.scale:.6f}, standard uncertainty {found.sigma:.2g}")
     if found.stretch is None:
         print("note: one direction was measured; that the other one has the same scale is not known")

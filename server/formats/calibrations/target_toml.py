@@ -68,15 +68,27 @@ def load_toml(path: Path, *, kind: str) -> dict[str, object]:
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise _malformed(path, kind, f"it has {path.stat().st_size} bytes")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return toml_of(path.read_bytes(), path, kind=kind)
     except FileNotFoundError as error:
         raise FileFormatError(
             f"The {kind} {path} does not exist.", code="file_missing", remedy="Check the path."
         ) from error
     except OSError as error:
         raise _malformed(path, kind, error.strerror or str(error)) from error
+
+
+def toml_of(data: bytes, where: Path | str, *, kind: str) -> dict[str, object]:
+    """Return the content of a TOML file; ``where`` names it in messages.
+
+    Raises
+    ------
+    FileFormatError
+        ``toml_malformed``.
+    """
+    try:
+        return tomllib.loads(data.decode())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise _malformed(path, kind, f"it is no valid TOML ({error})") from error
+        raise _malformed(where, kind, f"it is no valid TOML ({error})") from error
 
 
 def read_target(path: Path) -> GridTarget | BoardTarget:
@@ -265,7 +277,7 @@ def _number(
     return float(value)
 
 
-def _malformed(path: Path, kind: str, why: str) -> FileFormatError:
+def _malformed(path: Path | str, kind: str, why: str) -> FileFormatError:
     return FileFormatError(
         f"The {kind} {path} cannot be read: {why}.", code="toml_malformed", remedy="Correct the file named above."
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,8 +11,7 @@ import numpy as np
 from stereorig.core.boards.board import BoardTarget
 from stereorig.core.errors import FileFormatError, InputError
 from stereorig.core.target import GridTarget
-from stereorig.server.formats.calibrations.target_toml import load_toml, target_of
-from stereorig.server.formats.files import write_bytes
+from stereorig.server.formats.calibrations.target_toml import target_of
 from stereorig.server.formats.prints.targets import target_text
 
 _MOST_OFF = 0.1  # a page fitted to another paper is off by less
@@ -32,16 +30,21 @@ class MeasuredPrint:
         Measured over nominal length, and its standard uncertainty.
     stretch
         Half the difference of both directions' scales; None if one direction was measured.
+    text
+        New content of its file.
     """
 
     target: GridTarget | BoardTarget
     scale: float
     sigma: float
     stretch: float | None
+    text: str
 
 
-def measured_print(path: Path, printed_mm: Sequence[float], measured_mm: Sequence[float], u_mm: float) -> MeasuredPrint:
-    """Bring the measured scale into a printed target's file, which is written again.
+def measured_print(
+    content: Mapping[str, Any], where: str, printed_mm: Sequence[float], measured_mm: Sequence[float], u_mm: float
+) -> MeasuredPrint:
+    """Bring the measured scale into a printed target's description.
 
     Lengths of one ruler, or of the ruler across and the one down. Readings with one instrument may err alike, so that
     two of them are not taken to be better than one. Two directions of different scales leave an error of position that
@@ -49,8 +52,10 @@ def measured_print(path: Path, printed_mm: Sequence[float], measured_mm: Sequenc
 
     Parameters
     ----------
-    path
-        ``target.toml``; a scale brought in before is replaced.
+    content
+        Content of its ``target.toml``; a scale brought in before is replaced.
+    where
+        Name of the file in messages.
     printed_mm, measured_mm
         Length by the ruler's numbers, and as measured; one or two.
     u_mm
@@ -64,8 +69,7 @@ def measured_print(path: Path, printed_mm: Sequence[float], measured_mm: Sequenc
         As :func:`stereorig.server.formats.calibrations.target_toml.read_target`; ``field_invalid`` also for a file that
         describes more than a target.
     """
-    content = load_toml(path, kind="target description")
-    found, before, added = _described(content, path)
+    found, before, added = _described(content, where)
     scales, sigma = _scales(printed_mm, measured_mm, u_mm)
     scale = float(np.mean(scales))
     stretch = 0.5 * abs(scales[0] - scales[1]) if len(scales) == 2 else None
@@ -75,11 +79,10 @@ def measured_print(path: Path, printed_mm: Sequence[float], measured_mm: Sequenc
     nodes = target.all_points_mm() if isinstance(target, GridTarget) else target.points_mm()
     added = (stretch or 0.0) * float(np.abs(nodes).max())
     target = replace(target, node_tolerance_mm=tolerance + added, flatness_mm=flatness)
-    write_bytes(path, target_text(target, scale=scale, stretch_mm=added).encode())
-    return MeasuredPrint(target, scale, sigma, stretch)
+    return MeasuredPrint(target, scale, sigma, stretch, target_text(target, scale=scale, stretch_mm=added))
 
 
-def _described(content: Mapping[str, Any], path: Path) -> tuple[GridTarget | BoardTarget, float, float]:
+def _described(content: Mapping[str, Any], where: str) -> tuple[GridTarget | BoardTarget, float, float]:
     """Return the target of a file, and scale and tolerance that were brought in before."""
     table = content.get("target", content)
     own = content.get("print", {"scale": 1.0, "stretch_mm": 0.0})
@@ -90,12 +93,12 @@ def _described(content: Mapping[str, Any], path: Path) -> tuple[GridTarget | Boa
     if wrong or not (abs(before - 1.0) <= _MOST_OFF and added >= 0.0):
         field = (*wrong, "print")[0]
         raise FileFormatError(
-            f"{path}: {field} is no part of a printed target's description.",
+            f"{where}: {field} is no part of a printed target's description.",
             code="field_invalid",
             remedy="Name the target.toml that was written beside the print; copy its values to the rig file.",
             field=field,
         )
-    return target_of(table, str(path)), before, added
+    return target_of(table, where), before, added
 
 
 def _stated(table: object, key: str) -> float:

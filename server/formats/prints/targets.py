@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import cv2
 import numpy as np
@@ -170,6 +170,13 @@ def target_text(target: GridTarget | BoardTarget, *, scale: float | None = None,
         lines.append("# not measured: measure its rulers, then stereorig print measured")
     lines += [f"scale = {_toml(1.0 if scale is None else scale)}", f"stretch_mm = {_toml(stretch_mm)}"]
     return "\n".join([*lines, ""])
+
+
+def unmeasured_text(target: GridTarget | BoardTarget) -> str:
+    """Return ``target.toml`` of a print whose rulers are not measured yet: its scale is known as printers keep it."""
+    if target.pitch_scale_sigma is None:
+        target = replace(target, pitch_scale_sigma=UNMEASURED_SCALE_SIGMA)
+    return target_text(target)
 
 
 def _toml(value: object) -> str:

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import cv2
+import httpx
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -265,3 +266,42 @@ def test_a_rig_file_is_not_written_over(tmp_path: Path, capsys: pytest.CaptureFi
     assert main(["print", "measured", str(path), *lengths]) == 1
     assert "field_invalid" in capsys.readouterr().err
     assert path.read_text(encoding="utf-8") == before
+
+
+def test_the_api_gives_the_pages_that_the_command_writes(client: httpx.Client) -> None:
+    board = {"kind": "checkerboard", "size": [7, 10], "pitch_mm": 18.0}
+    answer = client.post("/api/v1/prints/target", json={"target": board, "form": "svg"})
+    assert answer.status_code == 200, answer.text
+    assert answer.headers["content-type"] == "image/svg+xml"
+    assert answer.headers["content-disposition"] == 'attachment; filename="target.svg"'
+    assert answer.content == target_drawing(TARGETS["checkerboard"]).svg()
+    rigs = client.post("/api/v1/prints/target", json={"paper": "600x400"})
+    assert rigs.content.startswith(b"%PDF")
+    beside = client.post("/api/v1/prints/target", json={"target": board, "form": "toml"}).text
+    rulers = {"printed_mm": [100.0, 200.0], "measured_mm": [99.93, 200.4], "u_mm": 0.05}
+    found = client.post("/api/v1/prints/measured", json={"target_file": beside, **rulers}).json()
+    # by hand, as above
+    assert (found["scale"], found["sigma"]) == (pytest.approx(1.00065), pytest.approx(3.75e-4))
+    assert f"pitch_mm = {18.0 * 1.00065:.9g}" in found["target_file"]
+    speckle = client.get("/api/v1/prints/speckle", params={"diameter_mm": 1.0, "form": "svg"})
+    assert speckle.content == speckle_page(1.0).svg()
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "sent", "code"),
+    [
+        ("POST", "target", {"paper": "A5"}, "print_page"),
+        ("POST", "target", {"paper": "40x40"}, "print_too_large"),
+        ("POST", "target", {"target": {"pitch_mm": 1.0}}, "invalid_request"),
+        ("GET", "speckle", {"diameter_px": 9.0}, "speckle_invalid"),
+        ("GET", "speckle", {"diameter_mm": 1.0, "share": 0.95}, "speckle_invalid"),
+        ("POST", "measured", {"target_file": "[", "printed_mm": [1], "measured_mm": [1], "u_mm": 1}, "toml_malformed"),
+    ],
+)
+def test_a_page_that_cannot_be_is_refused_with_its_code(
+    client: httpx.Client, method: str, path: str, sent: dict[str, object], code: str
+) -> None:
+    how = {"json": sent} if method == "POST" else {"params": sent}
+    answer = client.request(method, f"/api/v1/prints/{path}", **how)  # type: ignore[arg-type]
+    assert (answer.status_code, answer.json()["code"]) == (422, code)
+    assert answer.json()["remedy"]
