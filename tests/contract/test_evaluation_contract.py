@@ -27,7 +27,8 @@ from tests.support.gauge_field import SUBSET, make_field
 GRID = (14, 17)
 PAGE = "docs/how_to/evidence/evaluations.md"
 NAMES = sorted(
-    {entry.name for entry in entry_points(group=door.GROUP)} | {"conformity", "crack", "flatness", "tensile"}
+    {entry.name for entry in entry_points(group=door.GROUP)}
+    | {"conformity", "crack", "flatness", "resolution", "tensile"}
 )
 
 
