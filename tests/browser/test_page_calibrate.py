@@ -11,7 +11,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Download, Page, expect
 
 from stereorig.core.names import CameraName
 from stereorig.server.config.rig_file import parse_config
@@ -276,3 +276,37 @@ def test_on_a_tablet_nothing_hangs_over(chromium: Browser, client: httpx.Client)
         shown.wait_for_selector(".view")
         assert not shown.evaluate("document.documentElement.scrollWidth > document.documentElement.clientWidth")
         page.sound()
+
+
+def test_targets_are_printed_and_measured_on_the_page(page: Watched, client: httpx.Client, tmp_path: Path) -> None:
+    shown = page.open("#/calibrate")
+    shown.get_by_text("Print a target or speckle").click()
+    saved: dict[str, bytes] = {}
+
+    def keep(download: Download) -> None:
+        saved[download.suggested_filename] = Path(download.path()).read_bytes()
+
+    shown.on("download", keep)
+    with shown.expect_event("download", lambda one: one.suggested_filename == "target.toml"):
+        shown.get_by_role("button", name="Save the rig's target").click()
+    assert saved["target.pdf"].startswith(b"%PDF")
+    rigs = parse_config(SMALL).target.pitch_mm
+    assert f"pitch_mm = {rigs:.1f}" in saved["target.toml"].decode()
+    shown.get_by_label("Speckle, diameter").fill("1")
+    with shown.expect_download() as speckle:
+        shown.get_by_role("button", name="Save speckle").click()
+    answer = client.get(f"{API}/prints/speckle", params={"diameter_mm": 1.0})
+    assert Path(speckle.value.path()).read_bytes() == answer.content
+    kept = tmp_path / "target.toml"
+    kept.write_bytes(saved["target.toml"])
+    shown.get_by_label("target.toml of the print").set_input_files(kept)
+    numbers = {"across, by its numbers": "100", "across, measured": "99.93"}
+    numbers |= {"down, by its numbers": "200", "down, measured": "200.4"}
+    for label, number in numbers.items():
+        shown.get_by_label(f"Ruler {label}").fill(number)
+    shown.get_by_label("u of a measured length").fill("0.05")
+    with shown.expect_download() as measured:
+        shown.get_by_role("button", name="Save the measured target").click()
+    # by hand: the mean of 0.9993 and 1.002, and of 0.05/100 and 0.05/200
+    expect(shown.locator('[data-role="print-scale"]')).to_contain_text("scale 1.00065 ± 0.00038")
+    assert f"pitch_mm = {rigs * 1.00065:.9g}" in Path(measured.value.path()).read_text(encoding="utf-8")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import brentq
 
 from stereorig.core.errors import InputError
 from stereorig.server.formats.prints.drawing import Discs, Drawing
@@ -84,6 +83,8 @@ def speckle_page(
 
 def diameter_in_cells(share: float) -> float:
     """Return the diameter, in cells of the lattice, of discs that are expected to cover a share of the area."""
+    from scipy.optimize import brentq  # the web process draws pages, and is not to load it before
+
     return float(brentq(lambda diameter: _covered(diameter) - share, 0.1, 2.0, xtol=1e-6))
 
 

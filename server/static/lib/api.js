@@ -191,6 +191,14 @@ export const upload = async (path, form) => json(await send("POST", path, { body
 export const raw = async (path, query) => ok(await send("GET", path, { query }));
 
 /**
+ * A file that the service makes of a body.
+ * @template {string} const P
+ * @param {P & Address<"post", P>} path
+ * @param {Body<"post", P>} body
+ */
+export const fileOf = async (path, body) => (await ok(await send("POST", path, { body }))).blob();
+
+/**
  * Read something together with its ETag, for a change that must not overwrite another client's.
  * @template {string} const P
  * @param {P & Address<"get", P>} path

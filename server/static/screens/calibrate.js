@@ -5,6 +5,7 @@ import { distanceCheck } from "./calibrate/checks.js";
 import { correlations } from "./calibrate/correlations.js";
 import { guidePanel } from "./calibrate/guide.js";
 import { newCalibration } from "./calibrate/new.js";
+import { printer } from "./calibrate/print.js";
 import { geometryOf, statusBadge } from "./calibrate/summary.js";
 import { comparison, measures, parameters, um, viewTable } from "./calibrate/tables.js";
 import { calibrationViews } from "./calibrate/views.js";
@@ -152,6 +153,7 @@ export async function open(root, { path }) {
           await refresh();
           await show();
         }),
+        printer(),
       ),
     ),
   );
