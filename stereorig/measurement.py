@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from stereorig.core.measure import ReferencePair
 from stereorig.core.settings import AnalysisSettings
 from stereorig.core.strain import StrainOptions, surface_strain
 from stereorig.core.systematic.sensor_pull import fixed_lines
+from stereorig.parameters import MeasurementParameters
 from stereorig.result import Result
 from stereorig.server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from stereorig.server.formats.calibrations.volume import parameter_covariance, volume_of
@@ -65,7 +66,7 @@ class Measurement:
         roi: tuple[float, float, float, float] | None = None,
         mask: NDArray[np.bool_] | None = None,
         noise: LoadedNoise | None = None,
-        **parameters: Any,
+        **parameters: Unpack[MeasurementParameters],
     ) -> None:
         if isinstance(calibration, str | Path):
             calibration = load_calibration(calibration)

@@ -6,7 +6,7 @@ import base64
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +20,7 @@ from stereorig.core.gauge.rigid import RigidMotion, rigid_motion, without_rigid_
 from stereorig.core.settings import AnalysisSettings, StrainSettings
 from stereorig.core.strain import StrainField, StrainOptions, surface_strain
 from stereorig.core.strain.mean import mean_strain_variance
+from stereorig.parameters import StrainParameters
 from stereorig.server.base.errors import no_variable
 from stereorig.server.formats.results.dataset import as_dataset
 from stereorig.server.formats.results.layout import COVARIANCE_NAMES, stored_settings
@@ -115,7 +116,7 @@ class Result:
         """
         write_field(path, self.field, self._provenance, self.strain)
 
-    def with_strain(self, **settings: object) -> Result:
+    def with_strain(self, **settings: Unpack[StrainParameters]) -> Result:
         """Return the result with strain over another window, order or tensor: see :class:`stereorig.StrainSettings`.
 
         Raises

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, Unpack
 
 import httpx
 
 from stereorig.client import datasets, operations
 from stereorig.client.errors import checked, no_answer
 from stereorig.client.operations import Ask, Operation, Result, request_of
+from stereorig.client.parameters import (
+    AnalysisParameters,
+    CalibrationParameters,
+    ExtensometerGaugeParameters,
+    GaugeParameters,
+    MoveParameters,
+    StepParameters,
+)
 from stereorig.client.progress import Progress, shown
 from stereorig.client.settings import options_of
 from stereorig.server.api.models import (
@@ -93,7 +101,7 @@ class AsyncClient:
         """Do as :meth:`Client.rig`."""
         return await self._run(operations.get("/rig", RigReply))
 
-    async def move(self, request: MoveRequest | None = None, **targets: Any) -> JobReply:
+    async def move(self, request: MoveRequest | None = None, **targets: Unpack[MoveParameters]) -> JobReply:
         """Do as :meth:`Client.move`."""
         body = request_of(MoveRequest, request, targets)
         return await self._watched("Moving", lambda on: operations.move(body, on))
@@ -106,7 +114,7 @@ class AsyncClient:
     # calibrations ----------------------------------------------------------------------------------------------------
 
     async def calibrate(
-        self, request: CalibrationRequest | None = None, *, accept: bool = True, **plan: Any
+        self, request: CalibrationRequest | None = None, *, accept: bool = True, **plan: Unpack[CalibrationParameters]
     ) -> CalibrationReply:
         """Do as :meth:`Client.calibrate`."""
         body = request_of(CalibrationRequest, request, plan)
@@ -218,12 +226,14 @@ class AsyncTest:
         """Do as :meth:`Test.step`."""
         return await self._client._run(operations.get(f"/tests/{self.id}/steps/{n}", StepReply))
 
-    async def capture(self, request: StepRequest | None = None, **fields: Any) -> StepReply:
+    async def capture(self, request: StepRequest | None = None, **fields: Unpack[StepParameters]) -> StepReply:
         """Do as :meth:`Test.capture`."""
         body = request_of(StepRequest, request, {"count": 1, **fields} if request is None else {})
         return (await self._client._run(operations.capture(self.id, body, None)))[-1]
 
-    async def capture_burst(self, request: StepRequest | None = None, **fields: Any) -> list[StepReply]:
+    async def capture_burst(
+        self, request: StepRequest | None = None, **fields: Unpack[StepParameters]
+    ) -> list[StepReply]:
         """Do as :meth:`Test.capture_burst`."""
         body = request_of(StepRequest, request, fields)
         return await self._client._watched("Burst", lambda on: operations.capture(self.id, body, on))
@@ -260,7 +270,9 @@ class AsyncTest:
         """End the live measurement; return its last state, with the account of its frames."""
         return await self._client._run(operations.stop_live(self.id))
 
-    async def measure(self, request: AnalysisRequest | None = None, **settings: Any) -> AsyncAnalysis:
+    async def measure(
+        self, request: AnalysisRequest | None = None, **settings: Unpack[AnalysisParameters]
+    ) -> AsyncAnalysis:
         """Do as :meth:`Test.measure`."""
         body = request_of(AnalysisRequest, request, settings)
         analysis = await self._client._watched("Measurement", lambda on: operations.measure(self.id, body, on))
@@ -305,14 +317,14 @@ class AsyncAnalysis:
         return datasets.array_of(await self._client._run(operations.netcdf_of(self._path, name, step, frame)), name)
 
     async def gauges(
-        self, request: GaugeRequest | None = None, *, frame: str | None = None, **gauges: Any
+        self, request: GaugeRequest | None = None, *, frame: str | None = None, **gauges: Unpack[GaugeParameters]
     ) -> GaugesReply:
         """Do as :meth:`Analysis.gauges`."""
         return await self._client._run(operations.gauges(self._path, request_of(GaugeRequest, request, gauges), frame))
 
     async def extensometer(self, a_px: tuple[float, float], b_px: tuple[float, float], **more: Any) -> xarray.Dataset:
         """Do as :meth:`Analysis.extensometer`."""
-        ends = [{"a_px": list(a_px), "b_px": list(b_px)}]
+        ends: list[ExtensometerGaugeParameters] = [{"a_px": a_px, "b_px": b_px}]
         return datasets.extensometers(await self.gauges(extensometers=ends, **more))
 
     async def export(self, path: str | Path, format: str = "nc", **options: Any) -> Path:  # noqa: A002

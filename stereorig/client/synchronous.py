@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, Unpack
 
 import httpx
 
 from stereorig.client import datasets, operations
 from stereorig.client.errors import checked, no_answer
 from stereorig.client.operations import Ask, Operation, Result, request_of
+from stereorig.client.parameters import (
+    AnalysisParameters,
+    CalibrationParameters,
+    ExtensometerGaugeParameters,
+    GaugeParameters,
+    MoveParameters,
+    StepParameters,
+)
 from stereorig.client.progress import Progress, shown
 from stereorig.client.settings import options_of
 from stereorig.server.api.models import (
@@ -102,7 +110,7 @@ class Client:
         """Return the rig: cameras, stage, target, who holds it."""
         return self._run(operations.get("/rig", RigReply))
 
-    def move(self, request: MoveRequest | None = None, **targets: Any) -> JobReply:
+    def move(self, request: MoveRequest | None = None, **targets: Unpack[MoveParameters]) -> JobReply:
         """Move axes to their end: ``positions_mm={"1": 2.0}``, ``dz_mm=`` or ``by_mm=``."""
         body = request_of(MoveRequest, request, targets)
         return self._watched("Moving", lambda on: operations.move(body, on))
@@ -115,7 +123,7 @@ class Client:
     # calibrations ----------------------------------------------------------------------------------------------------
 
     def calibrate(
-        self, request: CalibrationRequest | None = None, *, accept: bool = True, **plan: Any
+        self, request: CalibrationRequest | None = None, *, accept: bool = True, **plan: Unpack[CalibrationParameters]
     ) -> CalibrationReply:
         """Calibrate the pair, wait for it, and accept it.
 
@@ -253,12 +261,12 @@ class Test:
         """Return one step."""
         return self._client._run(operations.get(f"/tests/{self.id}/steps/{n}", StepReply))
 
-    def capture(self, request: StepRequest | None = None, **fields: Any) -> StepReply:
+    def capture(self, request: StepRequest | None = None, **fields: Unpack[StepParameters]) -> StepReply:
         """Capture a step: ``label=``, ``load_n=``, ``channels={"force_kn": 1.2}``; durable when this returns."""
         body = request_of(StepRequest, request, {"count": 1, **fields} if request is None else {})
         return self._client._run(operations.capture(self.id, body, None))[-1]
 
-    def capture_burst(self, request: StepRequest | None = None, **fields: Any) -> list[StepReply]:
+    def capture_burst(self, request: StepRequest | None = None, **fields: Unpack[StepParameters]) -> list[StepReply]:
         """Capture ``count`` steps, one every ``interval_ms``, to their end."""
         body = request_of(StepRequest, request, fields)
         return self._client._watched("Burst", lambda on: operations.capture(self.id, body, on))
@@ -295,7 +303,7 @@ class Test:
         """End the live measurement; return its last state, with the account of its frames."""
         return self._client._run(operations.stop_live(self.id))
 
-    def measure(self, request: AnalysisRequest | None = None, **settings: Any) -> Analysis:
+    def measure(self, request: AnalysisRequest | None = None, **settings: Unpack[AnalysisParameters]) -> Analysis:
         """Measure the steps, and wait for it; with ``follow=True`` it continues with each new step.
 
         Parameters
@@ -357,13 +365,15 @@ class Analysis:
         """Return a variable (``w_mm``, ``exx`` ...) of one step or of all that have it, as :meth:`dataset` does."""
         return datasets.array_of(self._client._run(operations.netcdf_of(self._path, name, step, frame)), name)
 
-    def gauges(self, request: GaugeRequest | None = None, *, frame: str | None = None, **gauges: Any) -> GaugesReply:
+    def gauges(
+        self, request: GaugeRequest | None = None, *, frame: str | None = None, **gauges: Unpack[GaugeParameters]
+    ) -> GaugesReply:
         """Read points, extensometers, lines and areas in every step: ``points=[{"xy_px": [210, 180]}]`` ..."""
         return self._client._run(operations.gauges(self._path, request_of(GaugeRequest, request, gauges), frame))
 
     def extensometer(self, a_px: tuple[float, float], b_px: tuple[float, float], **more: Any) -> xarray.Dataset:
         """Read a strain gauge between two positions in every step, with load, channels and time; needs xarray."""
-        ends = [{"a_px": list(a_px), "b_px": list(b_px)}]
+        ends: list[ExtensometerGaugeParameters] = [{"a_px": a_px, "b_px": b_px}]
         return datasets.extensometers(self.gauges(extensometers=ends, **more))
 
     def export(self, path: str | Path, format: str = "nc", **options: Any) -> Path:  # noqa: A002
