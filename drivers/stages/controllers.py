@@ -301,10 +301,10 @@ class Controllers:
 
     # one axis ---------------------------------------------------------------------------------------------------------
 
-    def enable(self, axis: int) -> None:
-        """Switch the motor on."""
+    def enable(self, axis: int, *, since: int | None = None) -> None:
+        """Switch the motor on, see `Stage.enable`."""
         with self._of(axis).used(motion=True) as stage:
-            stage.enable(axis)
+            stage.enable(axis, since=since)
 
     def disable(self, axis: int) -> None:
         """Switch the motor off."""

@@ -182,8 +182,8 @@ class Stage(Protocol):
     def identify(self) -> StageIdentity:
         """Return the controller's identity, for example ``ESP301 Version 3.09``."""
 
-    def enable(self, axis: int) -> None:
-        """Switch the motor on."""
+    def enable(self, axis: int, *, since: int | None = None) -> None:
+        """Switch the motor on; ``since`` as in `move_many`."""
 
     def disable(self, axis: int) -> None:
         """Switch the motor off."""

@@ -258,10 +258,12 @@ class SerialStage(ControllerCommands):
         self._check_axis(axis)
         raise not_in_configuration(axis)
 
-    def enable(self, axis: int) -> None:
+    def enable(self, axis: int, *, since: int | None = None) -> None:
         """Switch the motor on."""
         self._check_axis(axis)
+        noted = self._note_stops((axis,), since)
         with self._motion_lock:
+            self._check_not_stopped(noted, write=False)
             self._switch_motor(axis, on=True)
 
     def disable(self, axis: int) -> None:

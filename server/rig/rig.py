@@ -41,7 +41,7 @@ from stereorig.server.rig.description import (
     kept_camera,
     utc_of,
 )
-from stereorig.server.rig.process.remote import RemoteDevices, RemoteRig
+from stereorig.server.rig.process.remote import Check, RemoteDevices, RemoteRig
 from stereorig.server.rig.reconnect import ReconnectWatch
 from stereorig.server.rig.shared import SharedReading
 from stereorig.server.rig.stage_controls import StageControls
@@ -161,7 +161,7 @@ class Rig:
         try:
             # an axis in configuration state is shown as such, and can only be helped with the rig open
             stuck = self.controls.in_configuration(there)
-            self.home(tuple(axis for axis in there if axis not in stuck))
+            self.home(tuple(axis for axis in there if axis not in stuck), lambda: None)
         except StageError as error:
             _log.warning("homing has failed, and the axes are to be homed before they move: %s", error)
 
@@ -497,17 +497,26 @@ class Rig:
         stage = self._ready().stage
         return {axis: stage.position(axis) for axis in axes or stage.axes}
 
-    def move(self, targets_mm: dict[int, float]) -> dict[int, MoveResult]:
-        """Move; call on the owner thread, with the hold."""
-        return self._ready().stage.move_many(targets_mm)
+    def move(self, targets_mm: dict[int, float], check: Check) -> dict[int, MoveResult]:
+        """Move; call on the owner thread, with the hold.
 
-    def home(self, axes: tuple[int, ...]) -> dict[int, float]:
-        """Switch on and home; call on the owner thread, with the hold."""
+        ``check`` raises if the motion's job is cancelled. A stop cancels the job before its number is known here:
+        the number is read first, so that a stop either ends the check or refuses the motion.
+        """
         stage = self._ready().stage
+        since = stage.last_stop
+        check()
+        return stage.move_many(targets_mm, since=since)
+
+    def home(self, axes: tuple[int, ...], check: Check) -> dict[int, float]:
+        """Switch on and home; call on the owner thread, with the hold; ``check`` as in `move`."""
+        stage = self._ready().stage
+        since = stage.last_stop
+        check()
         found = {}
         for axis in axes:
-            stage.enable(axis)
-            found[axis] = stage.home(axis)
+            stage.enable(axis, since=since)
+            found[axis] = stage.home(axis, since=since)
         return found
 
     def stop(self) -> None:

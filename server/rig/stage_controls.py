@@ -9,7 +9,8 @@ from collections.abc import Callable
 from dataclasses import asdict
 
 from stereorig.core.errors import DeviceError
-from stereorig.drivers.stages.protocol import AxisState, Stage
+from stereorig.drivers.stages.controllers import Controllers
+from stereorig.drivers.stages.protocol import AxisState
 from stereorig.server.rig.description import DynamicsReply, StageMessage
 from stereorig.server.store.folder import now_utc
 
@@ -26,7 +27,7 @@ class StageControls:
         Gives the connected stage, or raises ``not_connected``.
     """
 
-    def __init__(self, stage: Callable[[], Stage]) -> None:
+    def __init__(self, stage: Callable[[], Controllers]) -> None:
         self._stage = stage
         self._messages: deque[StageMessage] = deque(maxlen=_KEPT)
         self._next_message = 1
@@ -41,9 +42,10 @@ class StageControls:
     def switch(self, axes: tuple[int, ...], *, on: bool) -> None:
         """Switch motors; call on the owner thread, with the hold."""
         stage = self._stage()
+        since = stage.last_stop  # an abort between two axes leaves the second one off
         for axis in axes:
             if on:
-                stage.enable(axis)
+                stage.enable(axis, since=since)
             else:
                 stage.disable(axis)
 
@@ -70,7 +72,7 @@ class StageControls:
         stage = self._stage()
         return tuple(axis for axis in axes if stage.state(axis).state is AxisState.CONFIGURATION)
 
-    def collect(self, stage: Stage, *, ask: bool = True) -> None:
+    def collect(self, stage: Controllers, *, ask: bool = True) -> None:
         """Read the controller's messages, log and keep them."""
         with self._collecting:
             for message in stage.errors(ask=ask):

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 import httpx
 import pytest
 
+from stereorig.core.errors import StageError
+from stereorig.drivers.stages.controllers import Controllers
 from tests.support.stage_service import API, StageService, stage_service, wait_until
 
 
@@ -53,6 +55,37 @@ def test_nothing_moves_before_homing_nor_without_power(tmp_path_factory: pytest.
             assert not [text for text in stand.actions() if "PA" in text]
             stand.post("/stage:enable", axes=[1])
             assert stand.done(stand.job("/stage/moves", positions_mm={"1": 1.0}))["state"] == "succeeded"
+
+
+@pytest.mark.fault(26)
+@pytest.mark.parametrize("kind", ["move", "home"])
+def test_a_stop_between_a_job_s_last_look_and_its_motion_refuses_it(homed: StageService, kind: str) -> None:
+    rig = homed.service.rig
+    known = len(homed.actions())
+    # the stop comes after the look has found none
+    motion = {"move": lambda: rig.move({1: 1.0, 2: 1.0}, rig.stop), "home": lambda: rig.home((1, 2), rig.stop)}[kind]
+    with pytest.raises(StageError, match="A stop ended the motion") as caught:
+        motion()
+    assert caught.value.code == "stage_stopped"
+    assert {text.lstrip("12") for text in homed.actions()[known:]} <= {"ST"}
+
+
+@pytest.mark.fault(26)
+def test_an_abort_while_motors_are_switched_on_leaves_the_next_one_off(
+    homed: StageService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    controls = homed.service.rig.controls
+    controls.switch((1, 2), on=False)
+    enable = Controllers.enable
+
+    def aborted(stage: Controllers, axis: int, *, since: int | None = None) -> None:
+        enable(stage, axis, since=since)
+        controls.abort()
+
+    monkeypatch.setattr(Controllers, "enable", aborted)
+    with pytest.raises(StageError, match="A stop ended the motion"):
+        controls.switch((1, 2), on=True)
+    assert [axis["motor_on"] for axis in homed.client.get(f"{API}/stage").json()["axes"]] == [False, False]
 
 
 @pytest.mark.fault(22)

@@ -108,12 +108,11 @@ class RigLink:
             self.known_stop = max(self.known_stop, number)
             self._known.notify_all()
 
-    def move(self, name: str, *args: Any) -> Any:
-        """Call a motion of the stage, which is refused after a stop that is not known here yet; raises as `call`.
+    def move(self, name: str, *args: Any, since: int) -> Any:
+        """Call a motion of the stage, which is refused after any stop later than number ``since``; raises as `call`.
 
         The error of a motion that was stopped is raised once the stop is known here, and its job cancelled.
         """
-        since = self.known_stop
         try:
             return self.call("stage", name, *args, since=since)
         except StageError as error:
@@ -218,13 +217,22 @@ class _RemotePair(_Remote):
 class _RemoteStage(_Remote):
     """A stage whose motions are refused after a stop that is not known here yet."""
 
-    def home(self, axis: int) -> float:
-        """Search home, see `Stage.home`."""
-        return float(self._link.move("home", axis))
+    @property
+    def last_stop(self) -> int:
+        """Return the number of the last stop that is known here."""
+        return self._link.known_stop
 
-    def move_many(self, targets_mm: Mapping[int, float]) -> dict[int, MoveResult]:
+    def enable(self, axis: int, *, since: int) -> None:
+        """Switch the motor on, see `Stage.enable`."""
+        self._link.move("enable", axis, since=since)
+
+    def home(self, axis: int, *, since: int) -> float:
+        """Search home, see `Stage.home`."""
+        return float(self._link.move("home", axis, since=since))
+
+    def move_many(self, targets_mm: Mapping[int, float], *, since: int) -> dict[int, MoveResult]:
         """Move several axes, see `Stage.move_many`."""
-        moved: dict[int, MoveResult] = self._link.move("move_many", dict(targets_mm))
+        moved: dict[int, MoveResult] = self._link.move("move_many", dict(targets_mm), since=since)
         return moved
 
     def stop(self) -> None:

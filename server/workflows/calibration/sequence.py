@@ -140,7 +140,7 @@ def take_views(service: Service, job: Job, calibration_id: str, plan: Calibratio
         job.check()
         service.require_room()
         job.progress("views", index, len(stops))
-        moved = rig.move(rig.targets_for_dz(dict.fromkeys(CAMERAS, dz)))
+        moved = rig.move(rig.targets_for_dz(dict.fromkeys(CAMERAS, dz)), job.check)
         job.check()
         captured = rig.pair.capture(plan.frames, job.check)
         role = _role(plan, dz, last=index == len(stops) - 1)

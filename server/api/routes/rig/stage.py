@@ -83,8 +83,7 @@ def _start_move(service: Service, body: MoveRequest, key: str | None) -> str:
 
         def run(job: Job) -> Mapping[str, object]:
             job.progress("moving", 0, 1)
-            job.check()
-            moved = rig.move(wanted)
+            moved = rig.move(wanted, job.check)
             job.progress("moving", 1, 1)
             return {
                 "axes": {str(a): {"target_mm": r.target_mm, "position_mm": r.position_mm} for a, r in moved.items()}
@@ -129,8 +128,7 @@ def _start_home(service: Service, body: HomeRequest | None, key: str | None) -> 
             found = {}
             for index, axis in enumerate(axes):
                 job.progress("homing", index, len(axes))
-                job.check()
-                found.update(service.rig.home((axis,)))
+                found.update(service.rig.home((axis,), job.check))
             return {"axes": {str(a): {"position_mm": p} for a, p in found.items()}}
 
         return {
