@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from stereorig.core.strain import StrainOptions, surface_strain
 from stereorig.server.formats.results.writing import Provenance, write_field
@@ -92,6 +92,21 @@ def test_a_tension_along_the_images_vertical_reads_as_one_and_files_keep_the_sys
     assert [abs(v) for v in directions(at)] == pytest.approx([half] * 4, abs=0.01)
     at.reload()
     expect(at.get_by_label("Axes", exact=True)).to_have_value("system")
+    page.sound()
+
+
+def test_two_drawings_at_once_list_the_principal_strains_once(page: Watched, bench: Bench, strip: str) -> None:
+    held: list[Route] = []
+    at = opened(page, bench, strip, "w_mm")
+    at.route(re.compile("fields/e1"), lambda route: held.append(route))  # both drawings wait for these strains
+    at.get_by_label("Field", exact=True).select_option("exx")
+    at.get_by_label("Colours", exact=True).select_option("turbo")
+    assert held
+    for route in held:
+        route.continue_()
+    expect(at.locator('[data-role="principal-axis"]')).to_have_count(1)
+    at.wait_for_timeout(300)
+    expect(at.locator('[data-role="principal-axis"]')).to_have_count(1)
     page.sound()
 
 

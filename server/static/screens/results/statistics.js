@@ -25,13 +25,16 @@ export function statistics(screen) {
   }
 
   /** Principal strains with a component of strain: they do not depend on the axes. */
+  let asked = 0;
   async function principal() {
+    asked += 1;
+    const mine = asked;
     const { step, info } = state;
     if (step === null || info?.group !== "Strain" || !map.now) return;
     const { all } = await result.fields(step);
     if (!all.has("e1") || !all.has("e2")) return;
     const [e1, e2, exx, eyy, exy] = await Promise.all(["e1", "e2", "exx", "eyy", "exy"].map((name) => result.values(step, name)));
-    if (state.step !== step || state.info !== info || !map.now) return;
+    if (mine !== asked || state.step !== step || state.info !== info || !map.now) return; // another drawing adds them
     const { grid } = map.now;
     const mean = (/** @type {ArrayLike<number>} */ of) => {
       const known = measured(grid, of);
