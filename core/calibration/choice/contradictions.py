@@ -24,9 +24,11 @@ from stereorig.core.calibration.inputs import CalibrationOptions
 from stereorig.core.errors import CalibrationError
 from stereorig.core.names import CAMERAS
 
-#: probability by chance below which two measures of a millimetre contradict each other, as for a lens's terms; the
-#: verdict fails from a tenth of it on, since some calibrations of a hundred come upon this one by chance
-SCALE_LEVEL, FAILED_LEVEL = 0.01, 1e-3
+#: probability by chance below which two measures of a millimetre contradict each other, as for a lens's terms, shared
+#: by all tests of the millimetre, so that one right calibration of a hundred comes upon any of them by chance; the
+#: verdict fails from a tenth of it on
+SCALE_LEVEL = 0.01 / len(SCALE_GROUPS)
+FAILED_LEVEL = 0.1 * SCALE_LEVEL
 # the many terms of a lens, and a smooth field, absorb all of a wrong scale and some noise, while one scale absorbs a
 # hundredth of a lens's effect; one scale of each camera absorbs 0.8 of decentring, and one scale leaves 0.82 to a bow.
 # An aspect ratio and a sheared target cannot be distinguished

@@ -35,7 +35,8 @@ NOMINALS = (
     NominalValues((512, 480), 12000.0, 400.0, -30.0, 0.9617),
     NominalValues((512, 480), 12000.0, 400.0, 30.0, 0.9617),
 )
-OPTIONS = CalibrationOptions(lens="paper", axis_tilt_sigma_rad=0.0)
+# the pictures' stage, aspect ratio and axes are exact
+OPTIONS = CalibrationOptions(lens="paper", axis_tilt_sigma_rad=0.0, stage_scale_sigma=0.0, aspect_sigma=0.0)
 
 
 def clean_pictures() -> dict[tuple[str, float], Array]:
