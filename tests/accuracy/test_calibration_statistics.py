@@ -142,16 +142,11 @@ def test_parameters_from_pictures_of_line_grids_scatter_as_their_covariance_says
     assert found == pytest.approx(1.0, abs=2.5 * math.sqrt(2.0 / (20 * replicates)))
 
 
-@pytest.mark.parametrize(("lens", "seed"), [("pinhole", 2), ("pinhole", 12), ("p1 p2 of 3e-4", 2), ("p1 p2 of 3e-4", 12)])
+@pytest.mark.parametrize("lens", ["pinhole", "p1 p2 of 3e-4"])
+@pytest.mark.parametrize("seed", [2, 12])
 def test_several_tests_of_one_millimetre_do_not_make_right_rigs_doubtful(lens: str, seed: int) -> None:
     # right by how they are built; of four tests one comes upon each of them with a probability of 0.3 to 0.5 %
     assert replicate(lens, "cameras", seed).level == "good"
-
-
-def test_parameters_from_a_few_pictures_are_known_as_well_as_their_covariance_says() -> None:
-    replicates = 2
-    found = float(np.mean(normalised_squares(detections(replicates))))
-    assert found == pytest.approx(1.0, abs=2.5 * math.sqrt(2.0 / (20 * replicates)))
 
 
 def _sd(covariance: Array) -> Array:
