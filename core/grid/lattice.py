@@ -5,8 +5,9 @@ Family a: lines at constant X_sys, crossed walking along X_sys; family b: lines 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 from stereorig.core.arrays import Float
 from stereorig.core.errors import TargetError
 from stereorig.core.grid.chains import Chain, CoarseLine, link, order
-from stereorig.core.grid.directions import FAMILY_REACH_RAD, Directions, family_pieces
+from stereorig.core.grid.directions import FAMILY_REACH_RAD, Directions, Pieces, family_pieces
 from stereorig.core.grid.lines.parabolas import meet_parabolas
 from stereorig.core.grid.threshold import LinePicture
 from stereorig.core.grid.view import Orientation
@@ -90,6 +91,10 @@ def polylines(nodes_px: Float) -> list[list[float]]:
     return [[round(float(v), 1) for v in (*p, *q)] for p, q in ends]
 
 
+_Linked = Callable[[float, float], tuple[Pieces, list[CoarseLine]]]
+"""Pieces within an angle of a direction, and the lines that they form."""
+
+
 def find_lattice(picture: LinePicture, found: Directions, *, broken: bool = False) -> LineLattice:
     """Try the picture's main directions in pairs; return the lattice with the most line seen.
 
@@ -103,11 +108,17 @@ def find_lattice(picture: LinePicture, found: Directions, *, broken: bool = Fals
     best: LineLattice | None = None
     best_seen = 0.0
     max_counts = (0, 0)
+
+    @cache  # a direction is in several pairs
+    def linked(direction_rad: float, reach_rad: float) -> tuple[Pieces, list[CoarseLine]]:
+        pieces = family_pieces(picture, found, direction_rad, reach_rad)
+        return pieces, link(pieces, broken=broken) if len(pieces) >= _MIN_LINES else []
+
     for low, high in _CROSSINGS_RAD:
         for p, q in combinations(found.peaks_rad, 2):
             if not low <= _between(p, q) <= high:
                 continue
-            lattice, seen, counts = _try_pair(picture, found, p, q, broken)
+            lattice, seen, counts = _try_pair(linked, p, q, broken)
             max_counts = max(max_counts, counts, key=min)
             if lattice is not None and seen > best_seen:
                 best, best_seen = lattice, seen
@@ -135,7 +146,7 @@ def not_found(cause: str, **context: Any) -> TargetError:
 
 
 def _try_pair(
-    picture: LinePicture, found: Directions, first_rad: float, second_rad: float, broken: bool
+    linked: _Linked, first_rad: float, second_rad: float, broken: bool
 ) -> tuple[LineLattice | None, float, tuple[int, int]]:
     # X_sys runs right and down: its direction is in (0, 90) degrees of the image, and family b runs along it
     along_x, along_y = sorted((first_rad, second_rad))
@@ -147,8 +158,8 @@ def _try_pair(
         along_y = candidates[1 - int(np.argmin(off))]
     angle_rad = _between(first_rad, second_rad)
     reach = min(FAMILY_REACH_RAD, 0.5 * angle_rad) if angle_rad < _CROSSINGS_RAD[0, 0] else FAMILY_REACH_RAD
-    pieces_a = family_pieces(picture, found, along_y, reach)
-    pieces_b = family_pieces(picture, found, along_x, reach)
+    pieces_a, lines_a = linked(along_y, reach)
+    pieces_b, lines_b = linked(along_x, reach)
     if min(len(pieces_a), len(pieces_b)) < _MIN_LINES:
         return None, 0.0, (0, 0)
     centre = np.median(np.concatenate([pieces_a.centre_px, pieces_b.centre_px]), axis=0)
@@ -160,8 +171,8 @@ def _try_pair(
         x_dir = -x_dir
     if x_dir[0] * y_dir[1] - x_dir[1] * y_dir[0] < 0.0:  # right-handed, y down: clockwise from X to Y
         y_dir = -y_dir
-    chain_a = order(link(pieces_a, broken=broken), centre, x_dir, broken=broken)
-    chain_b = order(link(pieces_b, broken=broken), centre, y_dir, broken=broken)
+    chain_a = order(lines_a, centre, x_dir, broken=broken)
+    chain_b = order(lines_b, centre, y_dir, broken=broken)
     counts = (len(chain_a.lines), len(chain_b.lines))
     if min(counts) < _MIN_LINES:
         return None, 0.0, counts

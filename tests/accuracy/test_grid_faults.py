@@ -46,9 +46,15 @@ def _digitise(grey: Float, seed: int = 0) -> NDArray[np.uint8]:
 
 
 def _with_disc(grey: Float, x: float, y: float, radius: float, value: float) -> Float:
-    yy, xx = np.mgrid[0 : grey.shape[0], 0 : grey.shape[1]]
+    reach = radius + 40.0  # e^-40 of a grey level beyond
+    (top, left), (bottom, right) = (
+        [int(np.clip(c + side * reach, 0, n)) for c, n in zip((y, x), grey.shape, strict=True)] for side in (-1, 1)
+    )
+    yy, xx = np.mgrid[top:bottom, left:right]
     m = 1.0 / (1.0 + np.exp(np.clip(np.hypot(xx - x, yy - y) - radius, -50.0, 50.0)))
-    return grey * (1.0 - m) + value * m
+    spoilt = grey.copy()
+    spoilt[top:bottom, left:right] = grey[top:bottom, left:right] * (1.0 - m) + value * m
+    return spoilt
 
 
 def _refusal(grey: Float, target: GridTarget = PAPER_TARGET) -> TargetError:

@@ -12,6 +12,8 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +30,8 @@ def measure() -> None:
 
 
 def curved() -> None:
-    """The same with quadratic patches: the shape here, the motion in a process beside it."""
+    """The same with quadratic patches, and a shape's cluster-robust covariance; the motion in a process beside it."""
+    from stereorig.core.matching.cluster_robust import cluster_robust_covariance
     from stereorig.core.matching.fit import fit_shape
     from stereorig.core.matching.options import MatchOptions
     from tests.support.matching_scene import paper_pair
@@ -37,7 +40,10 @@ def curved() -> None:
     with subprocess.Popen(command, cwd=ROOT):
         picture = np.random.default_rng(1).normal(128.0, 20.0, (64, 64))
         options = MatchOptions(subset_px=21, patch="quadratic")
-        fit_shape(paper_pair(size=64), picture, picture, [[32.0, 32.0]], [[np.nan] * 3], options)
+        pair, at = paper_pair(size=64), [[32.0, 32.0]]
+        fit_shape(pair, picture, picture, at, [[np.nan] * 3], options)
+        flat = [[0.0025, *[0.0] * 5]]
+        cluster_robust_covariance(pair, [picture, picture], at, flat, None, [0.0], options)
 
 
 def dense() -> None:
@@ -63,6 +69,24 @@ def dense() -> None:
         none = np.empty((0, 0))
         shape = Shape(np.empty((0, 0), np.int8), none[..., None], none[..., None, None])
         finish_windows(found, points, Limits(0.6, 0.1, 0.1, 0.1, np.ones(images)), shape)
+
+
+def covariances() -> None:
+    """What a measurement with a calibration's covariance and strain needs, and starts from scattered matches."""
+    from stereorig.core.common.derivatives import Estimator
+    from stereorig.core.field.seeding.local_fit import robust_local_fits
+    from stereorig.core.strain.common_part import common_part
+    from stereorig.core.strain.reduced import window_sums
+    from tests.support.matching_scene import paper_pair
+
+    rng = np.random.default_rng(1)
+    points = np.column_stack([rng.normal(size=(30, 2)), np.zeros(30)])
+    Estimator.at(paper_pair(size=64), points, points + 1e-3)
+    robust_local_fits(points[:3, :2], points[:, :2], points[:, :2], tolerance=1.0)
+    one = np.array([1])
+    window_sums(rng.normal(size=(3, 3, 2)), one, one, one - 1, np.ones((1, 2, 9)), 1, from_centre=True)
+    windows: Any = SimpleNamespace(status=np.zeros((3, 3), np.int8), reduced=[(one, one, np.ones((1, 2, 9)))])
+    common_part(np.ones((3, 3, 6, 2), np.float32), np.ones((3, 3), bool), windows, np.ones((3, 3, 3, 12)), 1)
 
 
 def targets() -> None:
@@ -96,7 +120,7 @@ def scenes() -> None:
         world.expose("cam1", exposure_ms=10.0, gain_db=0.0, rng=np.random.default_rng(1))
 
 
-GROUPS: dict[str, Callable[[], None]] = {f.__name__: f for f in (measure, curved, dense, targets, scenes)}
+GROUPS: dict[str, Callable[[], None]] = {f.__name__: f for f in (measure, curved, dense, covariances, targets, scenes)}
 
 
 def main() -> int:
