@@ -10,7 +10,7 @@ from stereorig.core.certify.measured import Measured
 
 
 @dataclass(frozen=True)
-class Scatter:
+class ScatterEvidence:
     """A quantity over the points of one static step.
 
     Attributes
@@ -53,7 +53,7 @@ class StaticStep:
     n: int
     time_s: float | None
     motion: Measured
-    scatter: Mapping[str, Scatter] = field(default_factory=dict)
+    scatter: Mapping[str, ScatterEvidence] = field(default_factory=dict)
     strain: Measured | None = None
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from stereorig.core.certify.comparison import Outcome
-from stereorig.core.certify.evidence import Scatter, StaticStep
+from stereorig.core.certify.evidence import ScatterEvidence, StaticStep
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def noise_floor(steps: Sequence[StaticStep], *, ratio_limit: float, false_alarm:
     return tuple(_row(name, [s.scatter[name] for s in steps], ratio_limit, tail) for name in names)
 
 
-def _row(name: str, found: Sequence[Scatter], ratio_limit: float, tail: float) -> FloorRow:
+def _row(name: str, found: Sequence[ScatterEvidence], ratio_limit: float, tail: float) -> FloorRow:
     count = len(found)
     means = [one.mean for one in found]
     scatter = float(np.sqrt(np.mean([one.sd**2 for one in found])))

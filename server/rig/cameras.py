@@ -24,7 +24,7 @@ from stereorig.drivers.acquisition.sources import CommandedPairs, NoPairs, PairS
 from stereorig.drivers.acquisition.unit import CameraUnit, share_links
 from stereorig.drivers.cameras.protocol import CameraDescription, CameraSettings, Frame, Pixels
 from stereorig.server.config.rig_file import SKEW_PX
-from stereorig.server.rig.recorder import Ring, RingState, begun_ns
+from stereorig.server.rig.recorder import PairRing, RingState, begun_ns
 
 if TYPE_CHECKING:
     from stereorig.server.rig.image_speed import ImageMotion
@@ -209,7 +209,7 @@ class CameraPair:
         self._sources = 1  # made so far; the number of the present one
         self._lock = threading.Lock()
         self._capturing = threading.Event()
-        self._ring: Ring | None = None
+        self._ring: PairRing | None = None
         self._before_record: tuple[dict[CameraName, dict[str, int]], dict[str, int]] = {}, {}
 
     def _made(self) -> PairSource:
@@ -302,11 +302,11 @@ class CameraPair:
     # a recording --------------------------------------------------------------------------------------------------
 
     def record(self, *, room: int, before_s: float, period_s: float) -> None:
-        """Begin to hold pairs in a `stereorig.server.rig.recorder.Ring`; ``period_s`` between software triggers."""
+        """Begin to hold pairs in a `stereorig.server.rig.recorder.PairRing`; ``period_s`` between software triggers."""
         self.end_record()
         exposure_ms = self.units["cam1"].settings.exposure_ms or 0.0
         self._before_record = {cam: unit.counters() for cam, unit in self.units.items()}, self.account()
-        self._ring = Ring(room=room, before_s=before_s, exposure_s=exposure_ms / 1e3)
+        self._ring = PairRing(room=room, before_s=before_s, exposure_s=exposure_ms / 1e3)
         self._feed_ring()
         if self.fires:
             arguments = (lambda: self._fired(), period_s)
@@ -320,7 +320,7 @@ class CameraPair:
         if isinstance(self._source, StreamedPairs) and not self.fires:
             self._source.on_pair = None if self._ring is None else self._ring.add
 
-    def _recording(self) -> Ring:
+    def _recording(self) -> PairRing:
         if self._ring is None:
             raise StateError("No pairs are recorded: the rig was opened again.", code="recording_lost")
         return self._ring
@@ -332,7 +332,7 @@ class CameraPair:
         return replace(state, fault=faults[0] if faults else state.fault)
 
     def keep_recorded(self, numbers: Sequence[int], from_number: int | None = None) -> list[int]:
-        """Keep pairs, see `stereorig.server.rig.recorder.Ring.keep`."""
+        """Keep pairs, see `stereorig.server.rig.recorder.PairRing.keep`."""
         return self._recording().keep(numbers, from_number=from_number)
 
     def keep_until(self, last: int) -> None:

@@ -34,7 +34,7 @@ class RingState:
     fault: str
 
 
-class Ring:
+class PairRing:
     """Pairs by number, from 0; the oldest that is not kept goes first.
 
     Parameters

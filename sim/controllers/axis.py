@@ -45,7 +45,7 @@ class Ramp:
 
 
 @dataclass(frozen=True)
-class Profile:
+class MotionProfile:
     """Segments one after the other; at rest at ``goal_mm`` from ``end_s`` on."""
 
     segments: tuple[Ramp, ...]
@@ -62,17 +62,17 @@ class Profile:
         return self.segments[0].at(now_s)
 
 
-def trapezoid(start_mm: float, goal_mm: float, now_s: float, velocity_mm_s: float, ramp_mm_s2: float) -> Profile:
+def trapezoid(start_mm: float, goal_mm: float, now_s: float, velocity_mm_s: float, ramp_mm_s2: float) -> MotionProfile:
     """Plan a move from rest to rest: ramp up, cruise, ramp down."""
     distance = abs(goal_mm - start_mm)
     sign = math.copysign(1.0, goal_mm - start_mm)
     peak = min(velocity_mm_s, math.sqrt(distance * ramp_mm_s2))
     if distance == 0 or peak == 0:
-        return Profile((), goal_mm, now_s)
+        return MotionProfile((), goal_mm, now_s)
     ramp_s = peak / ramp_mm_s2
     cruise_s = max(0.0, distance / peak - ramp_s)
     lead = sign * peak * ramp_s / 2
-    return Profile(
+    return MotionProfile(
         (
             Ramp(now_s, ramp_s, start_mm, 0.0, sign * ramp_mm_s2),
             Ramp(now_s + ramp_s, cruise_s, start_mm + lead, sign * peak, 0.0),
@@ -83,12 +83,12 @@ def trapezoid(start_mm: float, goal_mm: float, now_s: float, velocity_mm_s: floa
     )
 
 
-def brake(position_mm: float, velocity_now_mm_s: float, now_s: float, ramp_mm_s2: float) -> Profile:
+def brake(position_mm: float, velocity_now_mm_s: float, now_s: float, ramp_mm_s2: float) -> MotionProfile:
     """Plan to come to rest as soon as the ramp allows."""
     duration = abs(velocity_now_mm_s) / ramp_mm_s2
     goal = position_mm + velocity_now_mm_s * duration / 2
     ramp = -math.copysign(ramp_mm_s2, velocity_now_mm_s)
-    return Profile((Ramp(now_s, duration, position_mm, velocity_now_mm_s, ramp),), goal, now_s + duration)
+    return MotionProfile((Ramp(now_s, duration, position_mm, velocity_now_mm_s, ramp),), goal, now_s + duration)
 
 
 @dataclass
@@ -156,7 +156,7 @@ class SimAxis:
         self._offset_mm = start_mm  # motor position at which the encoder reads 0
         self._motor_mm = start_mm
         self._load_mm = start_mm
-        self._profile = Profile((), start_mm, -math.inf)
+        self._profile = MotionProfile((), start_mm, -math.inf)
         self._trouble: Trouble | None = None
 
     def move_to(self, encoder_mm: float) -> None:
@@ -196,7 +196,7 @@ class SimAxis:
         """Stop at once, as with the motor switched off."""
         with self._lock:
             self._advance()
-            self._profile = Profile((), self._motor_mm, -math.inf)
+            self._profile = MotionProfile((), self._motor_mm, -math.inf)
 
     @property
     def moving(self) -> bool:
@@ -249,12 +249,12 @@ class SimAxis:
             motor = min(max(motor, self.faults.jam_mm[0]), self.faults.jam_mm[1])
             if motor != wanted and self.faults.jam_kind == "following_error":
                 self._trouble = "following_error"
-                self._profile = Profile((), motor, -math.inf)
+                self._profile = MotionProfile((), motor, -math.inf)
         switches = self.faults.limit_switches_mm
         if switches is not None and not switches[0] <= motor <= switches[1] and motor != self._motor_mm:
             self._trouble = "positive_limit" if motor > switches[1] else "negative_limit"
             motor = min(max(motor, switches[0]), switches[1])
-            self._profile = Profile((), motor, -math.inf)
+            self._profile = MotionProfile((), motor, -math.inf)
         self._motor_mm = motor
         # A load with play: the motor pushes it upwards at once, downwards only after the lost motion. Motion between
         # two calls has one direction, so this is exact for any interval between calls.

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stereorig.server.formats.prints.drawing import Drawing
+from stereorig.server.formats.prints.drawing import PrintedPage
 
 
-def pdf_image(drawing: Drawing, per_mm: float) -> NDArray[np.uint8]:
+def pdf_image(drawing: PrintedPage, per_mm: float) -> NDArray[np.uint8]:
     """Draw the page's PDF; without rounding of its size to pixels, which would change its scale."""
     pdfium: Any = pytest.importorskip("pypdfium2", reason="pypdfium2 not found: pip install pypdfium2 to draw PDF")
     raw = pdfium.raw
@@ -27,7 +27,7 @@ def pdf_image(drawing: Drawing, per_mm: float) -> NDArray[np.uint8]:
     return np.array(bitmap.to_numpy(), dtype=np.uint8).reshape(height, width)
 
 
-def svg_image(drawing: Drawing, per_mm: float) -> NDArray[np.uint8]:
+def svg_image(drawing: PrintedPage, per_mm: float) -> NDArray[np.uint8]:
     """Draw the page's SVG; the page's size must be a whole number of pixels."""
     from tests.support.page_bench import browser
 

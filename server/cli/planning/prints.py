@@ -8,7 +8,7 @@ from pathlib import Path
 from stereorig.core.errors import InputError
 from stereorig.server.formats.calibrations.target_toml import load_toml, read_target
 from stereorig.server.formats.files import make_folder, write_bytes
-from stereorig.server.formats.prints.drawing import DRAWING_FORMS, Drawing
+from stereorig.server.formats.prints.drawing import DRAWING_FORMS, PrintedPage
 from stereorig.server.formats.prints.measured import measured_print
 from stereorig.server.formats.prints.page import PAPER_HELP
 from stereorig.server.formats.prints.speckle import speckle_mm, speckle_page
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _write(path: Path, drawing: Drawing) -> None:
+def _write(path: Path, drawing: PrintedPage) -> None:
     form = path.suffix.removeprefix(".")
     if form not in DRAWING_FORMS:
         raise InputError(f"--out {path} is neither .pdf nor .svg.", remedy="Name the page NAME.pdf or NAME.svg.")

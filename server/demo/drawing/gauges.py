@@ -13,7 +13,7 @@ from stereorig.core.arrays import Float
 from stereorig.core.field.points.result import Field
 from stereorig.core.strain import StrainField
 from stereorig.server.demo.drawing.fields import HEIGHT, STYLE, colour_limit, draw_difference, draw_map, save
-from stereorig.server.demo.experiments.panel_gauges import ENDS_PX, Opening, Slice
+from stereorig.server.demo.experiments.panel_gauges import ENDS_PX, CrackOpening, Slice
 from stereorig.server.demo.experiments.panel_strain import PanelStrain
 from stereorig.server.demo.experiments.steel_motion import Moved
 from stereorig.server.demo.strain import MICRO
@@ -21,7 +21,7 @@ from stereorig.server.demo.strain import MICRO
 _DOTS: Any = {"fmt": ".", "markersize": 5, "elinewidth": 0.8}
 
 
-def opening(out: Path, found: Opening, loads_kn: Sequence[float], half_crack_mm: float) -> dict[str, str]:
+def opening(out: Path, found: CrackOpening, loads_kn: Sequence[float], half_crack_mm: float) -> dict[str, str]:
     """Draw the opening along the crack and over the load, and by how much the lips part out of the plane."""
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(1, 3, figsize=(13.0, 4.2), layout="constrained")

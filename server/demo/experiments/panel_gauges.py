@@ -26,7 +26,7 @@ _CREST_MM = 12.0  # a parabola holds that far from a crest
 
 
 @dataclass(frozen=True, eq=False)
-class Opening:
+class CrackOpening:
     """Virtual extensometers across the crack in every step with a displacement.
 
     Attributes
@@ -82,7 +82,7 @@ class Crest:
 
 def read_opening(
     session: DemoRun, analysis: AnalysisHandle, crack_px: Float, panel: CrackedPanel, loads_kn: Sequence[float]
-) -> Opening:
+) -> CrackOpening:
     """Put extensometers across the crack and read them over HTTP."""
     position = np.array([BEYOND[0], *ACROSS, BEYOND[1]])
     middle, half = 0.5 * (crack_px[0] + crack_px[-1]), 0.5 * (crack_px[-1] - crack_px[0])
@@ -102,7 +102,7 @@ def read_opening(
     s_mm = truths[0].st_mm[..., 0].mean(axis=1)
     lens = np.sqrt(np.clip(panel.half_crack_mm**2 - s_mm**2, 0.0, None))
     lips = [4.0 * panel.stress_mpa(load) * lens / panel.youngs_modulus_mpa for load in loads_kn]
-    return Opening(
+    return CrackOpening(
         position=position,
         found=found,
         sigma=sigma,
@@ -156,7 +156,7 @@ def plane_patch_error_mm(rig: SimRig, camera1: Camera, xy_px: Float, load_kn: fl
 
 
 def add_checks(
-    outcome: Outcome, opening: Opening, up: Slice, loads_kn: Sequence[float], rig: SimRig, subset_px: int
+    outcome: Outcome, opening: CrackOpening, up: Slice, loads_kn: Sequence[float], rig: SimRig, subset_px: int
 ) -> None:
     """Add the opening's and the buckle's tables, figures and limits to the experiment's outcome."""
     open_rows, crest_rows = [], []

@@ -47,7 +47,7 @@ class Text:
 
 
 @dataclass(eq=False)
-class Drawing:
+class PrintedPage:
     """A page.
 
     Attributes

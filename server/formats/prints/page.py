@@ -8,7 +8,7 @@ import numpy as np
 
 from stereorig.core.arrays import Float
 from stereorig.core.errors import InputError
-from stereorig.server.formats.prints.drawing import Drawing, Text
+from stereorig.server.formats.prints.drawing import PrintedPage, Text
 
 PAPERS = {"A4": (210.0, 297.0), "A3": (297.0, 420.0), "letter": (215.9, 279.4)}
 PAPER_HELP = "A4, A3, letter, or WIDTHxHEIGHT in mm"
@@ -20,7 +20,7 @@ _TICK_MM, _TICK_WIDTH_MM, _TYPE_MM = 4.0, 0.1, 2.5
 
 def laid_out(
     extent_mm: tuple[float, float], paper: str, margin_mm: float, clear_mm: float, title: str
-) -> tuple[Drawing, Float]:
+) -> tuple[PrintedPage, Float]:
     """Return a page with its rulers, and the middle of the place for a pattern.
 
     Parameters
@@ -61,7 +61,7 @@ def laid_out(
             code="print_too_large",
             remedy="Choose a larger paper, a smaller pitch or fewer points.",
         )
-    drawing = Drawing(width, height, title)
+    drawing = PrintedPage(width, height, title)
     _add_rulers(drawing, margin_mm)
     return drawing, 0.5 * (room[:2] + room[2:])
 
@@ -102,7 +102,7 @@ def _fits(extent: tuple[float, float], room: Float) -> bool:
     return bool((np.asarray(extent) <= room[2:] - room[:2] + 1e-9).all())
 
 
-def _add_rulers(drawing: Drawing, margin: float) -> None:
+def _add_rulers(drawing: PrintedPage, margin: float) -> None:
     """Draw a ruler along the lower and along the left rim: marks of every millimetre, and the caption."""
     left, foot = margin + _STRIP_MM, drawing.height_mm - margin - 0.5 * _STRIP_MM
     across, down = (int((side - left - margin - 5.0) // 10) * 10 for side in (drawing.width_mm, drawing.height_mm))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from stereorig.core.errors import InputError
-from stereorig.server.formats.prints.drawing import Discs, Drawing
+from stereorig.server.formats.prints.drawing import Discs, PrintedPage
 from stereorig.server.formats.prints.page import laid_out, room_mm
 
 _CLEAR_MM = 2.0
@@ -40,7 +40,7 @@ def speckle_mm(stated_mm: float | None, speckle_px: float, mm_per_px: float | No
 
 def speckle_page(
     diameter_mm: float, *, share: float = 0.5, seed: int = 1, paper: str = "A4", margin_mm: float = 10.0
-) -> Drawing:
+) -> PrintedPage:
     """Draw speckle over all that the rulers leave of a page; the same seed is the same pattern.
 
     Parameters

@@ -10,7 +10,7 @@ import numpy as np
 from stereorig.core.arrays import Bool, Float
 from stereorig.core.boards.board import BoardTarget, dictionary_id
 from stereorig.core.target import LINE_GRID, GridTarget, invalid
-from stereorig.server.formats.prints.drawing import Discs, Drawing
+from stereorig.server.formats.prints.drawing import Discs, PrintedPage
 from stereorig.server.formats.prints.page import laid_out
 
 #: standard uncertainty of a print's scale until its rulers are measured: printers and paper change it by thousandths
@@ -20,7 +20,7 @@ _DOT_SHARE = 0.5  # of the pitch, for a dot whose diameter is not stated
 
 def target_drawing(
     target: GridTarget | BoardTarget, *, paper: str = "A4", margin_mm: float = 10.0, marks: bool = False
-) -> Drawing:
+) -> PrintedPage:
     """Draw a target.
 
     Parameters

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stereorig.core.arrays import Float
-from stereorig.core.certify.evidence import CheckedLength, Scatter
+from stereorig.core.certify.evidence import CheckedLength, ScatterEvidence
 from stereorig.core.certify.measured import Measured, mean_strain_of, measured_of, motion_of
 from stereorig.core.certify.noise_floor import independent_values
 from stereorig.core.errors import InputError
@@ -75,7 +75,7 @@ class Readings:
         return mean_strain_of(strain.strain[strain.valid].mean(axis=0), variance)
 
     @property
-    def scatter(self) -> dict[str, Scatter]:
+    def scatter(self) -> dict[str, ScatterEvidence]:
         """Scatter of every quantity over the points, displacements about the rigid motion."""
         field, strain, found = self.field, self.strain, {}
         valid = field.valid
@@ -103,10 +103,10 @@ class Readings:
         arm = field.xyz_mm - motion.centre_mm
         return np.asarray(arm + field.uvw_mm - motion.translation_mm - arm @ motion.rotation.T)
 
-    def _scatter(self, mean: float, values: Float, variance: Float, width_px: float) -> Scatter:
+    def _scatter(self, mean: float, values: Float, variance: Float, width_px: float) -> ScatterEvidence:
         count = int(values.size)
         spacing = float(self.field.x_px[0, 1] - self.field.x_px[0, 0]) if self.field.shape[1] > 1 else width_px
-        return Scatter(
+        return ScatterEvidence(
             mean=mean,
             sd=float(values.std(ddof=1)),
             reported=float(np.sqrt(np.mean(variance))),

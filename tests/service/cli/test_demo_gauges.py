@@ -20,7 +20,7 @@ from stereorig.server.demo.drawing import gauges as gauge_pictures
 from stereorig.server.demo.drawing import strain as strain_pictures
 from stereorig.server.demo.experiments import plate_strain, steel_motion
 from stereorig.server.demo.experiments.panel_gauges import (
-    Opening,
+    CrackOpening,
     Slice,
     crests,
     plane_patch_error_mm,
@@ -267,7 +267,7 @@ def test_pictures_of_gauges_are_drawn_with_readings_missing(tmp_path: Path) -> N
     positions = np.array([-1.35, -0.5, 0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 1.35])
     some = np.full((2, 9), 0.1)
     some[0, 3] = np.nan
-    drawn |= gauge_pictures.opening(tmp_path, Opening(positions, *[some] * 7), [1.0, 2.0], 50.8)
+    drawn |= gauge_pictures.opening(tmp_path, CrackOpening(positions, *[some] * 7), [1.0, 2.0], 50.8)
     line = Slice(np.zeros((9, 2)), 40.0 * positions, some, some, some)
     drawn |= gauge_pictures.buckle(tmp_path, line, line, [1.0, 2.0])
     motion = steel_motion.Moved("shifted", *[np.zeros(6)] * 4, 1.0, *[np.zeros(1)] * 2, *[np.zeros(3)] * 5, 1.0, {})

@@ -14,7 +14,7 @@ from stereorig.server.api.protocol.problems import errors
 from stereorig.server.base.models import Reply, Request
 from stereorig.server.config.rig_file import TargetSection
 from stereorig.server.formats.calibrations.target_toml import target_of, toml_of
-from stereorig.server.formats.prints.drawing import Drawing
+from stereorig.server.formats.prints.drawing import PrintedPage
 from stereorig.server.formats.prints.measured import measured_print
 from stereorig.server.formats.prints.page import PAPER_HELP
 from stereorig.server.formats.prints.speckle import speckle_mm, speckle_page
@@ -112,7 +112,7 @@ def _target(section: TargetSection) -> GridTarget | BoardTarget:
     return target_of(section.plain(), "target")
 
 
-def _page(drawing: Drawing, name: str, form: PageForm) -> Response:
+def _page(drawing: PrintedPage, name: str, form: PageForm) -> Response:
     return _file(drawing.data(form), name, form)
 
 

@@ -10,7 +10,14 @@ import pytest
 from stereorig.core.arrays import Float
 from stereorig.core.certify.certify import certify
 from stereorig.core.certify.comparison import CertificateLimits
-from stereorig.core.certify.evidence import CameraOffset, CheckedLength, Evidence, MovedStep, Scatter, StaticStep
+from stereorig.core.certify.evidence import (
+    CameraOffset,
+    CheckedLength,
+    Evidence,
+    MovedStep,
+    ScatterEvidence,
+    StaticStep,
+)
 from stereorig.core.certify.measured import Measured
 from stereorig.core.certify.scales import scales_of
 
@@ -62,10 +69,10 @@ def evidence(seed: int, fault: Fault | None = None, *, static: int = 4, distance
         value = SIGMA_STRAIN * rng.standard_normal(3) + strain_reference
         return Measured(value, own, own, np.zeros((3, 1)))
 
-    def scatter(name: str) -> Scatter:
+    def scatter(name: str) -> ScatterEvidence:
         size, stated = 400, 1e-3 if name.endswith("_mm") else 5e-5
         values = fault.noise * stated * rng.standard_normal(size)
-        return Scatter(float(values.mean()), float(values.std(ddof=1)), stated, size, float(size))
+        return ScatterEvidence(float(values.mean()), float(values.std(ddof=1)), stated, size, float(size))
 
     names = ("u_mm", "v_mm", "w_mm", "exx", "eyy", "exy")
     at_rest = tuple(
