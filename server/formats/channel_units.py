@@ -81,12 +81,31 @@ def stated_unit(written: str) -> str:
 
 def unit_of(name: str) -> str:
     """Return the unit that a channel's name ends in, as NetCDF writes it; ``1`` if it ends in none."""
-    parts = name.lower().split("_")
+    return _parted(name)[1]
+
+
+def channel_title(name: str, unit: str | None = None) -> str:
+    """Return a channel's name and unit as a figure shows them: ``pressure_kpa`` is ``pressure, kPa``.
+
+    Parameters
+    ----------
+    unit
+        Unit that the channel's record states; None: the one that its name ends in.
+    """
+    stem, ending = _parted(name)
+    unit = unit or ending
+    title = (stem if unit == ending else name).replace("_", " ")
+    return title if unit == "1" else f"{title}, {unit}"
+
+
+def _parted(name: str) -> tuple[str, str]:
+    """Return a channel's name without the unit that it ends in, and that unit, ``1`` for none."""
+    parts = name.split("_")
     for count in (2, 1):
-        ending = "_".join(parts[-count:])
+        ending = "_".join(parts[-count:]).lower()
         if len(parts) > count and ending in _UNITS:
-            return _UNITS[ending]
-    return "1"
+            return "_".join(parts[:-count]), _UNITS[ending]
+    return name, "1"
 
 
 def channel_name(title: str, unit: str = "") -> str:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 from stereorig.core.field.points.result import Field
 from stereorig.core.field.region.lay_points import corners_px
 from stereorig.core.names import ALL_PARTS, BUDGET, CAMERAS
+from stereorig.core.progress import Progress, no_progress
 from stereorig.core.settings import CoverageFields, Outline
 from stereorig.server.formats.results.camera_motion import MOVED_REMEDY
 from stereorig.server.formats.results.uncertainty import NOT_INCLUDED, Statement
@@ -19,17 +22,21 @@ from stereorig.server.formats.version import software_version
 from stereorig.server.report import pictures
 from stereorig.server.report.calibration import CalibrationPart, calibration_gaps
 from stereorig.server.report.evidence.models import compared_models
-from stereorig.server.report.floor import STRAINS, UM
+from stereorig.server.report.floor import STRAINS
 from stereorig.server.report.geometry import geometry
 from stereorig.server.report.hardware import hardware, image_sizes
 from stereorig.server.report.histories import courses, gauges
-from stereorig.server.report.items import Item, Missing, Value, plain
-from stereorig.server.report.page import PNG, PagePicture, render
+from stereorig.server.report.items import METADATA_FORM, UM, Item, Missing, Value, plain
+from stereorig.server.report.options import ReportOptions, chosen_sections
+from stereorig.server.report.page import PNG, PagePicture, kept_logo, read_logo, render
 from stereorig.server.report.settings import analysis
 from stereorig.server.report.source import Source
 from stereorig.server.report.steps import DrawnStep, MeasuredSteps, read_steps
 from stereorig.server.report.uncertainty import field_budgets, sentence
 
+T = TypeVar("T")
+#: sections that take the time, in the order in which they are made
+_SLOW = ("seen", "histories", "fields", "models")
 _COMPONENTS = (("U", 0), ("V", 1), ("W", 2))
 _LEVELS = {"ok": "good", "good": "good", "warning": "warning", "failed": "failed"}
 
@@ -72,7 +79,12 @@ class Origin:
     inputs: list[tuple[str, list[tuple[str, str]]]]
 
 
-def make_report(source: Source, coverage: CoverageFields | None = None) -> Report:
+def make_report(
+    source: Source,
+    coverage: CoverageFields | None = None,
+    options: ReportOptions | None = None,
+    progress: Progress = no_progress,
+) -> Report:
     """Return the report.
 
     Parameters
@@ -81,13 +93,23 @@ def make_report(source: Source, coverage: CoverageFields | None = None) -> Repor
         Result files, records, calibration and metadata.
     coverage
         Coverage of the stated uncertainties; None: the metadata's gauges', or one standard uncertainty.
+    options
+        Sections, logo, links; None: every section, the logo of the data folder, no links.
+    progress
+        Receives each step that is read and each section that is drawn.
 
     Raises
     ------
     FileFormatError
-        A result file that cannot be read.
+        A result file or a logo that cannot be read.
+    InputError
+        A section that there is not.
     """
-    measured = read_steps(source, coverage)
+    options = options or ReportOptions()
+    sections = chosen_sections(options.sections)
+    logo = options.logo or kept_logo(source.test)
+    picture = None if logo is None else read_logo(logo)
+    measured = read_steps(source, coverage, progress)
     found = None
     if source.calibration is not None:
         found = geometry(source.calibration.pair, measured.reference_sys, image_sizes(source))
@@ -96,7 +118,8 @@ def make_report(source: Source, coverage: CoverageFields | None = None) -> Repor
         hardware(source, measured, found),
         analysis(source, measured, found),
     )
-    seen, unseen = _reference(source, measured)
+    drawn = _Drawn(sections, progress)
+    seen, unseen = drawn.of("seen", lambda: _reference(source, measured)) or ([], [])
     missing = [gap for item in (*test, *rig, *settings) for gap in item.missing]
     missing += [*_floor_gaps(source, measured), *calibration_gaps(source, measured), *unseen]
     if not measured.loaded:
@@ -107,10 +130,16 @@ def make_report(source: Source, coverage: CoverageFields | None = None) -> Repor
         )
         missing.append(Missing("Gauges", remedy))
     budget = field_budgets(measured)
+    # the uncertainties have a budget of each gauge
+    found_gauges = drawn.of("histories" if "histories" in sections else "uncertainty", lambda: gauges(source, measured))
     made = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
     page, policy = render(
         f"{source.title}  \u00b7  stereorig {software_version()}  \u00b7  {made}",
         source=source,
+        sections=sections,
+        logo=picture,
+        form_url=_form_url(source, options),
+        metadata_form=METADATA_FORM,
         measured=measured,
         under=_under(source, measured, made),
         boxes=_boxes(source, measured),
@@ -123,10 +152,10 @@ def make_report(source: Source, coverage: CoverageFields | None = None) -> Repor
         max_extrapolated=max(s.summary.status.get("extrapolated", 0) for s in measured.steps),
         seen=seen,
         unseen=unseen,
-        fields=_fields(measured),
-        courses=courses(measured),
-        gauges=gauges(source, measured),
-        models=compared_models(source),
+        fields=drawn.of("fields", lambda: _fields(measured)),
+        courses=drawn.of("histories", lambda: courses(measured)),
+        gauges=found_gauges,
+        models=drawn.of("models", lambda: compared_models(source)),
         uncertainty=sentence(measured),
         budget=budget,
         budget_names=list(BUDGET if all(row.parts[-1] is None for row in budget[1]) else ALL_PARTS),
@@ -134,6 +163,30 @@ def make_report(source: Source, coverage: CoverageFields | None = None) -> Repor
         origin=_origin(source),
     )
     return Report(page, policy, missing)
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """Makes the parts of the chosen sections alone, and reports each."""
+
+    sections: Sequence[str]
+    progress: Progress
+
+    def of(self, section: str, make: Callable[[], T]) -> T | None:
+        """Return a part of a section; None if the section was not chosen."""
+        if section not in self.sections:
+            return None
+        slow = [name for name in _SLOW if name in self.sections]
+        if section in slow:
+            self.progress("drawing", slow.index(section), len(slow))
+        return make()
+
+
+def _form_url(source: Source, options: ReportOptions) -> str:
+    """Return the address of the test's screen, which has the form of the metadata; empty if there is none."""
+    if not (options.service_url and source.test_record.id):
+        return ""
+    return f"{options.service_url.rstrip('/')}/#/test/{source.test_record.id}"
 
 
 def _under(source: Source, measured: MeasuredSteps, made_utc: str) -> list[str]:
@@ -186,12 +239,7 @@ def the_test(source: Source, measured: MeasuredSteps) -> list[Item]:
 
     def stated(name: str, label: str, value: str | None) -> Item:
         known = Value(value, None, "as stated") if value else None
-        return Item(
-            f"test.{name}",
-            label,
-            (known,),
-            f"{name}, in the form Metadata of the test's screen (PUT /tests/{{id}}/metadata, or metadata.toml)",
-        )
+        return Item(f"test.{name}", label, (known,), f"{name}, in {METADATA_FORM}")
 
     taken = None
     if times:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from stereorig.core.arrays import Float
 from stereorig.core.field.points.result import Field
 from stereorig.core.strain import StrainField
+from stereorig.server.report.items import UM, UM_PER_M
 
-UM = "\u00b5m"
 LENGTHS = ("U", "V", "W", "X", "Y", "Z")
 STRAINS = ("exx", "eyy", "exy")
 _STATIC = re.compile(r"\s*static\b", re.IGNORECASE)
@@ -87,7 +87,7 @@ class Quantity:
     @property
     def unit(self) -> str:
         """Unit in which it reads well."""
-        return "microstrain" if self.name in STRAINS else UM
+        return UM_PER_M if self.name in STRAINS else UM
 
 
 class FloorKeeper:

@@ -17,6 +17,7 @@ from stereorig.server.report.geometry import Geometry, View
 from stereorig.server.report.items import (
     CALIBRATION,
     MEASURED,
+    METADATA_FORM,
     RECORD,
     STATED,
     Item,
@@ -29,8 +30,7 @@ from stereorig.server.report.items import (
 from stereorig.server.report.source import Source
 from stereorig.server.report.steps import MeasuredSteps
 
-_METADATA_SOURCE = "the form Metadata of the test's screen (PUT /tests/{id}/metadata, or metadata.toml)"
-_RIG_FILE = f"the rig file or {_METADATA_SOURCE}"
+_RIG_FILE = f"the rig file or {METADATA_FORM}"
 _IN_FILE = "as stated (test or rig file)"
 _BY_SERVICE = "is recorded when the service captures"
 _NEEDS_CALIBRATION = "needs the calibration that the results were measured with (--calibration)"
@@ -80,7 +80,7 @@ def _camera_items(source: Source, cameras: dict[CameraName, CameraMetadata]) -> 
             "camera.model",
             "Camera, model",
             lambda cam: device(cam, "model") or recorded_text("model", cam),
-            f"camN.model of {_METADATA_SOURCE}",
+            f"camN.model of {METADATA_FORM}",
         ),
         each("camera.serial", "Camera, serial number", lambda cam: device(cam, "serial"), _BY_SERVICE),
         each("camera.resolution", "Image size", size, "needs the images or the calibration"),
@@ -194,7 +194,7 @@ def _recording_items(source: Source, measured: MeasuredSteps) -> list[Item]:
     set_to = {cam: rig.cameras.get(cam, CameraRecord()) for cam in CAMERAS}
     lighting = of_text(metadata.lighting, STATED) or of_text(rig.lighting, "as stated (rig file)")
     return [
-        one("rate", "Image acquisition rate", _rate(source, measured), f"frame_rate_hz of {_METADATA_SOURCE}"),
+        one("rate", "Image acquisition rate", _rate(source, measured), f"frame_rate_hz of {METADATA_FORM}"),
         each(
             "exposure",
             "Exposure",
@@ -202,7 +202,7 @@ def _recording_items(source: Source, measured: MeasuredSteps) -> list[Item]:
                 of_number(set_to[cam].exposure_ms, "g", "ms", read_back)
                 or of_number(metadata.exposure_ms, "g", "ms", STATED)
             ),
-            f"exposure_ms of {_METADATA_SOURCE}",
+            f"exposure_ms of {METADATA_FORM}",
         ),
         each("gain", "Gain", lambda cam: of_number(set_to[cam].gain_db, "g", "dB", read_back), _BY_SERVICE),
         one(
@@ -217,7 +217,7 @@ def _recording_items(source: Source, measured: MeasuredSteps) -> list[Item]:
             "pattern.technique",
             "Patterning technique",
             of_text(metadata.pattern_technique, STATED),
-            f"pattern_technique of {_METADATA_SOURCE}",
+            f"pattern_technique of {METADATA_FORM}",
         ),
     ]
 

@@ -9,11 +9,12 @@ import numpy as np
 
 from stereorig.core.errors import StereorigError
 from stereorig.core.names import CAMERAS
-from stereorig.server.formats.channel_units import unit_of
+from stereorig.server.formats.channel_units import channel_title
 from stereorig.server.formats.gauges.readings import LineReading, Number, StepReadings
 from stereorig.server.formats.results.uncertainty import Statement
-from stereorig.server.report.floor import STRAINS, UM
-from stereorig.server.report.items import Value
+from stereorig.server.formats.results.variables import VARIABLES
+from stereorig.server.report.floor import STRAINS
+from stereorig.server.report.items import Value, rounded, shown_unit
 from stereorig.server.report.page import SVG, PagePicture
 from stereorig.server.report.pictures import Lines, course
 from stereorig.server.report.source import Source
@@ -24,6 +25,8 @@ from stereorig.server.results.gauges.readings import read_gauges
 #: a gauge's values in every step, or the reason why there are none
 _Readings = Sequence[tuple[Mapping[str, Number], str]]
 _EXTENSOMETER = ("elongation_mm", "strain")
+#: shown in um/m or %
+_STRAINS = {"strain", "true_strain"} | {name for name, one in VARIABLES.items() if one.kind == "strain"}
 _FOLLOWS = 0.9  # correlation of the mean motion with the load or channel that drives it
 
 
@@ -104,8 +107,8 @@ def _driving(steps: Sequence[StepRow]) -> _Axis | None:
     name, positions = next(((name, known) for follows, name, known in found if follows >= _FOLLOWS), ("", None))
     if positions is None:
         return None
-    label = "load, N" if name == "load" else _with_unit(name, steps)
-    return _Axis(positions.tolist(), label, name, as_given=True)
+    label = "load, N" if name == "load" else _title(name, steps)
+    return _Axis(positions.tolist(), label, label.partition(",")[0], as_given=True)
 
 
 def courses(measured: MeasuredSteps) -> list[PagePicture] | None:
@@ -120,32 +123,33 @@ def courses(measured: MeasuredSteps) -> list[PagePicture] | None:
         drawn.append(time.draw(lines, "load, N", "Load", text="load", caption="Load as recorded with the steps"))
     for name in measured.channels:
         lines = {name: ([s.channels.get(name) for s in steps], None)}
-        label = _with_unit(name, steps)
-        drawn.append(time.draw(lines, label, name, text=name, caption=f"{name} as recorded with the steps"))
+        label = _title(name, steps)
+        title = label.partition(",")[0]
+        drawn.append(time.draw(lines, label, title, text=title, caption=f"{title} as recorded with the steps"))
 
     # displacement and strain are relative to the reference, and zero there
     moving = [s for s in steps if s.summary.displacement_mm or s.n == measured.reference_step]
     if measured.moved:
-        lines = {}
+        means: dict[str, list[float | None]] = {}
         for component in ("u", "v", "w"):
             spans = [(s.summary.displacement_mm or {}).get(component) for s in moving]
-            zeros = [0.0 if s.n == measured.reference_step else None for s in moving]
-            lines[component.upper()] = (
-                [zero if t is None else 1e3 * t.mean for t, zero in zip(spans, zeros, strict=True)],
-                None,
-            )
+            means[component.upper()] = [
+                (0.0 if s.n == measured.reference_step else None) if span is None else span.mean
+                for s, span in zip(moving, spans, strict=True)
+            ]
         title, caption = "Displacement, mean over the points", "Mean of U, V, W over all valid points"
-        label = f"mean displacement, {UM}"
-        drawn.append(axis.only(moving, steps).draw(lines, label, title, text="mean displacement", caption=caption))
+        lines, unit = _scaled(means, "mm")
+        along = axis.only(moving, steps)
+        drawn.append(along.draw(lines, f"mean displacement, {unit}", title, text="mean displacement", caption=caption))
     strained = {s.n: s.strain for s in steps if s.strain is not None and s.strain.points}
     if strained:
         chosen = [s for s in steps if s.n in strained or s.n == measured.reference_step]
-        means = [None if s.n not in strained else strained[s.n].mean_microstrain for s in chosen]
-        lines = {e: ([0.0 if mean is None else mean[e] for mean in means], None) for e in STRAINS}
+        of_steps = [None if s.n not in strained else strained[s.n].mean_microstrain for s in chosen]
+        means = {e: [0.0 if mean is None else _times(mean[e], 1e-6) for mean in of_steps] for e in STRAINS}
         title, caption = "Strain, mean over the points", "Mean of the strains over all points that have it"
-        drawn.append(
-            axis.only(chosen, steps).draw(lines, "mean strain, microstrain", title, text="mean strain", caption=caption)
-        )
+        lines, unit = _scaled(means, "1", strain=True)
+        along = axis.only(chosen, steps)
+        drawn.append(along.draw(lines, f"mean strain, {unit}", title, text="mean strain", caption=caption))
     return drawn + _against_temperature(steps)
 
 
@@ -188,9 +192,7 @@ def gauges(source: Source, measured: MeasuredSteps) -> Gauges | None:
         title = f"Extensometer {extensometer.name}"
         tables.append(_table(extensometer.name, title, _EXTENSOMETER, steps, read))
         curves += _curves(title, _EXTENSOMETER[-1:], [values for values, _ in read], axis, at_rest, measured.statement)
-        curves += _against_loads(
-            title, [figures[s.n] for s in steps], [values for values, _ in read], measured.statement
-        )
+        curves += _against_loads(title, read_, [values for values, _ in read], measured.statement, axis.label)
     others: list[tuple[str | None, str, _Readings]] = []
     for k, point in enumerate(steps[0].points):
         others.append((point.name, "Point", [(s.points[k].values, s.points[k].missing) for s in steps]))
@@ -203,41 +205,66 @@ def gauges(source: Source, measured: MeasuredSteps) -> Gauges | None:
         moved = [n for n in last if n in ("u_mm", "v_mm", "w_mm")]
         curves += _curves(f"{kind} {name}", moved, [values for values, _ in read], axis, at_rest, measured.statement)
     for line in steps[-1].lines:
-        curves += _line(line, steps[-1].n)
+        curves += _line(line, steps[-1].n, asked.variables)
     return Gauges(curves, problems, tables, gauge_budgets(steps[-1], measured.statement), steps[-1].n)
 
 
-def _with_unit(channel: str, steps: Sequence[StepRow]) -> str:
+def _title(channel: str, steps: Sequence[StepRow]) -> str:
     stated = [getattr(s, "units", {}).get(channel) for s in steps]
-    unit = next((unit for unit in stated if unit), unit_of(channel))
-    return channel if unit == "1" else f"{channel}, {unit}"
+    return channel_title(channel, next((unit for unit in stated if unit), None))
+
+
+def _times(value: float | None, factor: float) -> float | None:
+    return None if value is None else factor * value
+
+
+def _scaled(
+    values: Mapping[str, Sequence[float | None]],
+    units: str,
+    sigma: Mapping[str, Sequence[float | None]] | None = None,
+    *,
+    strain: bool = False,
+) -> tuple[Lines, str]:
+    """Return the lines of a plot in the unit that the page shows them in, and that unit."""
+    known = [abs(v) for line in values.values() for v in line if v is not None and np.isfinite(v)]
+    factor, unit = shown_unit(units, max(known, default=0.0), strain=strain)
+    return {
+        name: ([_times(v, factor) for v in line], None if sigma is None else [_times(u, factor) for u in sigma[name]])
+        for name, line in values.items()
+    }, unit
 
 
 def _against_loads(
-    title: str, steps: Sequence[StepRow], read: Sequence[Mapping[str, Number]], statement: Statement
+    title: str, steps: Sequence[StepRow], read: Sequence[Mapping[str, Number]], statement: Statement, drawn_over: str
 ) -> list[PagePicture]:
-    """Draw the strain of an extensometer against the load and each channel; steps without a value are left out."""
+    """Draw the strain of an extensometer against the load and each channel; steps without a value are left out.
+
+    Parameters
+    ----------
+    drawn_over
+        Label of the abscissa that the strain is drawn over already.
+    """
     names = sorted({name for s in steps for name in s.channels})[:4]
-    loads = {_with_unit(name, steps): [s.channels.get(name) for s in steps] for name in names}
+    loads = {_title(name, steps): [s.channels.get(name) for s in steps] for name in names}
     loads = {"load, N": [s.load_n for s in steps], **loads}
     drawn = []
     for label, values in loads.items():
         points = [
-            (x, 0.0 if v is None or v.value is None else 1e6 * v.value, None if v is None else v.sigma)
+            (x, 0.0 if v is None or v.value is None else v.value, None if v is None else v.sigma)
             for s, x, v in zip(steps, values, (numbers.get("strain") for numbers in read), strict=True)
             # strain is relative to the reference, and zero there
             if x is not None and ((v is not None and v.value is not None) or not s.summary.displacement_mm)
         ]
-        if len({x for x, _, _ in points}) < 2:
+        if label == drawn_over or len({x for x, _, _ in points}) < 2:
             continue
-        strain = [y for _, y, _ in points]
-        sigma = [None if s is None else statement.k * 1e6 * s for _, _, s in points]
+        sigma = [_times(s, statement.k) for _, _, s in points]
+        lines, unit = _scaled({"strain": [y for _, y, _ in points]}, "1", {"strain": sigma}, strain=True)
         name = label.partition(",")[0]
         data = course(
             [x for x, _, _ in points],
-            {"strain": (strain, sigma)},
+            lines,
             x_label=label,
-            y_label="microstrain",
+            y_label=f"strain, {unit}",
             title=f"{title} against {name}",
             as_given=True,
         )
@@ -250,21 +277,23 @@ def _table(
     name: str | None, title: str, wanted: Sequence[str], steps: Sequence[StepReadings], read: _Readings
 ) -> GaugeTable:
     wanted = [n for n in wanted if n in read[-1][0]]
-    units = {n: next((values[n].units for values, _ in read if n in values), "") for n in wanted}
-    columns = [f"{n.removesuffix('_mm')}{'' if units[n] in ('', '1') else ', ' + units[n]}" for n in wanted]
-    rows = [
-        (step.n, [_value(values.get(n), missing) for n in wanted])
-        for step, (values, missing) in zip(steps, read, strict=True)
-    ]
-    return GaugeTable(str(name), title, ["step", *columns], rows)
+    columns, of_steps = ["step"], [list[Value]() for _ in steps]
+    for n in wanted:
+        numbers = [values.get(n) for values, _ in read]
+        known = [abs(v.value) for v in numbers if v is not None and v.value is not None]
+        units = next((v.units for v in numbers if v is not None), "")
+        factor, unit = shown_unit(units, max(known, default=0.0), strain=n in _STRAINS)
+        columns.append(f"{n.removesuffix('_mm').replace('_', ' ')}{f', {unit}' if unit else ''}")
+        for row, number, (_, missing) in zip(of_steps, numbers, read, strict=True):
+            row.append(_value(number, missing, factor))
+    return GaugeTable(str(name), title, columns, [(step.n, row) for step, row in zip(steps, of_steps, strict=True)])
 
 
-def _value(number: Number | None, missing: str) -> Value:
+def _value(number: Number | None, missing: str, factor: float) -> Value:
     if number is None or number.value is None:
         return Value(missing or "no value")
     u = number.sigma if number.expanded is None else number.expanded
-    sd = "" if u is None else f" \u00b1 {u:.2g}"
-    return Value(f"{number.value:.6g}{sd}", number.value)
+    return Value(rounded(factor * number.value, _times(u, factor)), number.value)
 
 
 def _curves(
@@ -277,29 +306,36 @@ def _curves(
 ) -> list[PagePicture]:
     if not wanted:
         return []
-    factor, unit = (1e3, UM) if wanted[0].endswith("_mm") else (1e6, "microstrain")
-    lines: Lines = {}
+    lengths = wanted[0].endswith("_mm")
+    values: dict[str, list[float | None]] = {}
+    sigma: dict[str, list[float | None]] = {}
     for n in wanted:
-        numbers = [values.get(n) for values in read]
-        value = [
-            (0.0 if rest else None) if v is None or v.value is None else factor * v.value
+        numbers = [found.get(n) for found in read]
+        name = n.removesuffix("_mm")
+        values[name] = [
+            (0.0 if rest else None) if v is None or v.value is None else v.value
             for v, rest in zip(numbers, at_rest, strict=True)
         ]
-        sigma = [None if v is None or v.sigma is None else statement.k * factor * v.sigma for v in numbers]
-        lines[n.removesuffix("_mm")] = (value, sigma)
+        sigma[name] = [None if v is None else _times(v.sigma, statement.k) for v in numbers]
+    lines, unit = _scaled(values, "mm" if lengths else "1", sigma, strain=not lengths)
     caption = f"{title}; bars are \u00b1 {statement.text}"
-    return [axis.draw(lines, unit, title, text=title, caption=caption)]
+    label = f"{'displacement' if lengths else 'strain'}, {unit}"
+    return [axis.draw(lines, label, title, text=title, caption=caption)]
 
 
-def _line(line: LineReading, n: int) -> list[PagePicture]:
-    drawn = []
-    for name, read in list(line.values.items())[:6]:
-        data = course(
-            line.distance_px,
-            {name: (read.value, None)},
-            x_label="distance along the line, px",
-            y_label=f"{name}, {read.units}",
-            title=f"Line {line.name}, step {n}",
-        )
-        drawn.append(PagePicture(data, SVG, f"{name} along line {line.name}", f"Line {line.name}: {name} in step {n}"))
-    return drawn
+def _line(line: LineReading, n: int, asked: Sequence[str] | None) -> list[PagePicture]:
+    """Draw one plot of a line: the variable that was asked for first, else the out-of-plane displacement or Z."""
+    names = [name for name in (*(asked or ()), "w_mm", "z_mm", *line.values) if name in line.values]
+    if not names:
+        return []
+    name, read = names[0], line.values[names[0]]
+    lines, unit = _scaled({name: read.value}, read.units, {name: read.sigma}, strain=name in _STRAINS)
+    data = course(
+        line.distance_px,
+        lines,
+        x_label="distance along the line, px",
+        y_label=f"{name.removesuffix('_mm')}{f', {unit}' if unit else ''}",
+        title=f"Line {line.name}, step {n}",
+    )
+    caption = f"Line {line.name}: {name.removesuffix('_mm')} in step {n}; bars are one standard uncertainty"
+    return [PagePicture(data, SVG, f"{name} along line {line.name}", caption)]

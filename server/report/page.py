@@ -6,13 +6,19 @@ import base64
 import hashlib
 import re
 from dataclasses import dataclass
+from pathlib import Path
 
 import jinja2
 from markupsafe import Markup
 
+from stereorig.core.errors import FileFormatError
 from stereorig.server.report.items import plain
 
 PNG, SVG = "image/png", "image/svg+xml"
+LOGO_NAME = "report_logo"
+_MAX_LOGO_BYTES = 1 << 20
+#: by the beginning of a file
+_LOGOS = ((b"\x89PNG\r\n\x1a\n", PNG), (b"\xff\xd8\xff", "image/jpeg"))
 
 
 @dataclass(frozen=True)
@@ -92,3 +98,36 @@ def render(head: str, *, template: str = "report.html.j2", **content: object) ->
     policy = f"default-src 'none'; style-src 'sha256-{digest}'; img-src data:; base-uri 'none'; form-action 'none'"
     page = templates.get_template(template).render(style=Markup(style), policy=policy, **content)
     return page.encode(), policy
+
+
+def read_logo(path: Path) -> PagePicture:
+    """Read a logo: PNG, JPEG or SVG, at most 1 MiB.
+
+    Raises
+    ------
+    FileFormatError
+        ``file_missing``, ``file_unreadable``.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(_MAX_LOGO_BYTES + 1)
+    except FileNotFoundError as error:
+        raise FileFormatError(f"{path} does not exist.", code="file_missing", remedy="Check the path.") from error
+    except OSError as error:
+        raise FileFormatError(f"{path} cannot be read: {error}.") from error
+    found = next((media for begin, media in _LOGOS if data.startswith(begin)), None)
+    # a picture of a page runs no script of an SVG file and loads nothing for it
+    media = found or (SVG if b"<svg" in data[:2000] else None)
+    if media is None or len(data) > _MAX_LOGO_BYTES:
+        raise FileFormatError(
+            f"{path} is not a PNG, JPEG or SVG picture of at most 1 MiB.", remedy="Save the logo in one of these forms."
+        )
+    return PagePicture(data, media, "logo", "")
+
+
+def kept_logo(test: Path | None) -> Path | None:
+    """Return the logo that is kept in the data folder of a test; None if there is none."""
+    if test is None:
+        return None
+    candidates = (test.parent.parent / f"{LOGO_NAME}.{ending}" for ending in ("png", "jpg", "svg"))
+    return next((path for path in candidates if path.is_file()), None)

@@ -21,6 +21,7 @@ from stereorig.core.strain import StrainField
 from stereorig.server.formats.figures.axes import directions_of, scale_of_image
 from stereorig.server.formats.figures.figure import FigureData, draw
 from stereorig.server.formats.figures.options import FigureStyle
+from stereorig.server.report.items import shown_unit
 
 #: by name, values and their standard deviations
 Lines = dict[str, tuple[Sequence[float | None], Sequence[float | None] | None]]
@@ -40,7 +41,7 @@ def _cropped(data: bytes) -> bytes:
     left, top, right, bottom = box
     out = io.BytesIO()
     kept = plain.crop((max(left - 8, 0), max(top - 8, 0), right + 8, bottom + 8))
-    kept.save(out, format="png", optimize=True)
+    kept.save(out, format="png")
     return out.getvalue()
 
 
@@ -48,9 +49,7 @@ def unit_for(values: Float, *, strain: bool = False) -> tuple[float, str]:
     """Factor and unit in which a length (mm) or a strain reads well."""
     finite = np.abs(values[np.isfinite(values)])
     max_value = float(np.percentile(finite, 99)) if finite.size else 0.0
-    if strain:
-        return (1e6, "microstrain") if max_value < 0.02 else (100.0, "%")
-    return (1e3, "\u00b5m") if max_value < 0.5 else (1.0, "mm")
+    return shown_unit("mm", max_value, strain=strain)
 
 
 def field_map(

@@ -11,12 +11,14 @@ import numpy as np
 from stereorig.core.field.checks.epipolar_offset import EpipolarCheck
 from stereorig.core.field.points.result import Field
 from stereorig.core.names import CameraName
+from stereorig.core.progress import Progress, no_progress
 from stereorig.core.settings import Coverage, CoverageFields
 from stereorig.core.strain import StrainField
 from stereorig.server.compute.strain import StrainSummary, summarise_strain
 from stereorig.server.documents.steps import StepQuality, StepRecord
 from stereorig.server.documents.tests import CameraMotion
 from stereorig.server.formats.calibrations.volume import rbe_of
+from stereorig.server.formats.channel_units import channel_title
 from stereorig.server.formats.results.reading import read_field
 from stereorig.server.formats.results.strain import read_strain
 from stereorig.server.formats.results.summary import ROWS_APART, StepSummary, summarise
@@ -159,6 +161,12 @@ class MeasuredSteps:
         return sorted({name for s in self.steps for name in s.channels})[:4]
 
     @property
+    def channel_titles(self) -> list[str]:
+        """Their names with their units."""
+        units = {name: unit for s in self.steps for name, unit in s.units.items()}
+        return [channel_title(name, units.get(name)) for name in self.channels]
+
+    @property
     def moved(self) -> list[StepRow]:
         """Steps with displacements."""
         return [s for s in self.steps if s.summary.displacement_mm]
@@ -182,7 +190,9 @@ class MeasuredSteps:
         return max(checks, key=lambda c: c.offset_px, default=None)
 
 
-def read_steps(source: Source, coverage: CoverageFields | None = None) -> MeasuredSteps:
+def read_steps(
+    source: Source, coverage: CoverageFields | None = None, progress: Progress = no_progress
+) -> MeasuredSteps:
     """Read every result file once; at most three fields are held at a time, and the static steps' values.
 
     Parameters
@@ -191,6 +201,8 @@ def read_steps(source: Source, coverage: CoverageFields | None = None) -> Measur
         Result files, records, calibration and metadata.
     coverage
         Coverage of the stated uncertainties; None or without a factor: the metadata's gauges'.
+    progress
+        Receives each step that is read.
     """
     labels = {n: _label(source, n) for n in source.files}
     static, static_source = static_steps(source.metadata.static_steps, labels, source.reference)
@@ -206,7 +218,8 @@ def read_steps(source: Source, coverage: CoverageFields | None = None) -> Measur
     reported: dict[str, float | None] = {}
     loads = {n: _load(source, n) for n in source.files}
     by_load = all(load is not None for load in loads.values()) and len(set(loads.values())) > 1
-    for n, path in source.files.items():
+    for k, (n, path) in enumerate(source.files.items()):
+        progress("reading", k, len(source.files))
         field, strain = read_field(path), read_strain(path)
         if n in static:
             keeper.add(n, field, strain)

@@ -7,17 +7,23 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from stereorig.core.settings import Coverage
+from stereorig.server.report.options import ReportOptions
+from stereorig.server.worker.process import current_task
 
 NAME = "report.html"
 
 
-def report_task(results: str, out: str, coverage: Coverage, framed: Sequence[str] = ()) -> tuple[str, int]:
+def report_task(
+    results: str, out: str, coverage: Coverage, framed: Sequence[str] = (), options: ReportOptions | None = None
+) -> tuple[str, int]:
     """Make an analysis' report; return its Content-Security-Policy and the number of items that are not stated.
 
     Parameters
     ----------
     framed
         Its result files in the frame of the report; those stored if left out.
+    options
+        Sections, logo, links.
     """
     # matplotlib is loaded here alone
     from stereorig.server.formats.results.folder import number_of
@@ -27,7 +33,13 @@ def report_task(results: str, out: str, coverage: Coverage, framed: Sequence[str
     source = find_source(Path(results))
     if framed:
         source = source.in_frame({number_of(path): path for path in map(Path, framed)})
-    made = make_report(source, coverage)
+    task = current_task()
+
+    def progress(phase: str, done: int, total: int) -> None:
+        task.check()
+        task.progress(phase, done, total)
+
+    made = make_report(source, coverage, options, progress)
     (Path(out) / NAME).write_bytes(made.page)
     return made.policy, len(made.missing)
 

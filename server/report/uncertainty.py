@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from stereorig.core.names import ALL_PARTS
 from stereorig.server.formats.gauges.readings import Number, StepReadings
 from stereorig.server.formats.results.uncertainty import DISTRIBUTION, NOT_INCLUDED, SYSTEMATIC, Statement, percent
-from stereorig.server.report.floor import STRAINS, UM
+from stereorig.server.report.floor import STRAINS
+from stereorig.server.report.items import UM, UM_PER_M
 from stereorig.server.report.steps import MeasuredSteps, StepRow
 
 #: of gauges' numbers, the factor to a unit that reads well
-_UNITS = {"mm": (1e3, UM), "1": (1e6, "microstrain"), "rad": (1e6, "microrad")}
+_UNITS = {"mm": (1e3, UM), "1": (1e6, UM_PER_M), "rad": (1e6, "microrad")}
 _ROUNDING = 1e-6  # of the whole: a smaller part is zero but for rounding
 _LENGTHS = (("x_mm", "X"), ("y_mm", "Y"), ("z_mm", "Z"), ("u_mm", "U"), ("v_mm", "V"), ("w_mm", "W"))
 
@@ -87,7 +88,7 @@ def _of_step(step: StepRow, statement: Statement) -> list[BudgetRow]:
             parts = step.strain.budget_median_microstrain.get(name)
             if parts:
                 total = step.strain.noise_floor_microstrain[name]
-                rows.append(_row(f"budget.{name}", name, "microstrain", 1.0, parts, total, statement))
+                rows.append(_row(f"budget.{name}", name, UM_PER_M, 1.0, parts, total, statement))
     return rows
 
 

@@ -8,7 +8,9 @@ from pathlib import Path
 
 from stereorig.core.errors import InputError
 from stereorig.server.cli.measurement.coverage import add_coverage, coverage_from
+from stereorig.server.cli.terminal import ProgressLine
 from stereorig.server.formats.files import make_folder, write_bytes
+from stereorig.server.report.options import SECTIONS, ReportOptions, chosen_sections
 from stereorig.server.results.gauges import FRAME_HELP
 from stereorig.server.results.gauges.framed import asked_at, in_frame
 from stereorig.server.results.metadata import load_metadata
@@ -35,6 +37,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--frame", metavar="FRAME", help=FRAME_HELP)
     add("--out", metavar="FILE", type=Path, default=Path("report.html"), help="the report (report.html)")
+    add("--logo", metavar="FILE", type=Path, help="PNG, JPEG or SVG (report_logo.png of the data folder)")
+    add(
+        "--sections",
+        metavar="NAME,NAME",
+        type=lambda text: [name.strip() for name in text.split(",")],
+        default=list(SECTIONS),
+        help=f"some of {', '.join(SECTIONS)}",
+    )
     add_coverage(parser)
 
 
@@ -60,7 +70,12 @@ def run(args: argparse.Namespace) -> int:
         if asked is not None:
             framed = in_frame(list(source.files.values()), asked, Path(folder) / "frame")
             source = source.in_frame(dict(zip(source.files, framed, strict=True)))
-        made = make_report(source, coverage_from(args))
+        options = ReportOptions(chosen_sections(args.sections), args.logo)
+        line = ProgressLine()
+        try:
+            made = make_report(source, coverage_from(args), options, lambda *at: _show(line, *at))
+        finally:
+            line.close()
     make_folder(args.out.absolute().parent)
     write_bytes(args.out, made.page)
     for doubt in (*(f"{reason} since this was measured" for reason in source.stale), *source.doubts):
@@ -69,3 +84,8 @@ def run(args: argparse.Namespace) -> int:
     for item in made.missing:
         print(f"  {item.name}: {item.remedy}")
     return 0
+
+
+def _show(line: ProgressLine, phase: str, done: int, total: int) -> None:
+    """Show the progress; drawing takes as long as reading many steps."""
+    line.show(f"report: {phase} {done + 1} of {total}", 0.5 * (done / total + (phase == "drawing")))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stereorig.core.errors import StereorigError
+from stereorig.server.report.items import UM, UM_PER_M
 from stereorig.server.report.page import PNG, PagePicture
 from stereorig.server.report.pictures import field_map
 from stereorig.server.report.source import Source
@@ -101,7 +102,7 @@ def _extent(values: np.ndarray) -> float:
 def _rows(found: ModelComparisonReply) -> list[QuantityRow]:
     out = [_row("displacement", found.displacement, 1e3, "\u00b5m")]
     if found.strain is not None:
-        out.append(_row("strain", found.strain, 1e6, "microstrain"))
+        out.append(_row("strain", found.strain, 1e6, UM_PER_M))
     return out
 
 
@@ -123,7 +124,7 @@ def _refuted(region: RegionReply) -> tuple[str, str, str]:
             continue
         z = abs(number.value) / number.sigma
         if z > worst:
-            scale, unit = (1e3, "\u00b5m") if number.units == "mm" else (1e6, "microstrain")
+            scale, unit = (1e3, UM) if number.units == "mm" else (1e6, UM_PER_M)
             worst = z
             text = f"{label} off by {scale * number.value:.3g} \u00b1 {scale * number.sigma:.2g} {unit}"
     return f"{x0:g}, {y0:g} to {x1:g}, {y1:g} px", " and ".join(region.refuted), text

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Annotated
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse, Response
 from starlette.concurrency import run_in_threadpool
 
@@ -13,11 +14,22 @@ from stereorig.server.api.protocol.dependencies import AnalysisId, CoverageDep, 
 from stereorig.server.api.protocol.problems import errors
 from stereorig.server.api.routes.analyses.exports import finished
 from stereorig.server.base.errors import NotFoundError
+from stereorig.server.report.options import SECTIONS, ReportOptions, chosen_sections
 from stereorig.server.report.task import NAME, report_task
 from stereorig.server.workflows.analysis import start as analysis_start
 from stereorig.server.workflows.analysis.framed import asked_of, results_in_frame
 from stereorig.server.workflows.service import Service
 
+_NAMES = "|".join(SECTIONS)
+SectionsText = Annotated[
+    str | None,
+    Query(
+        max_length=200,
+        pattern=rf"^({_NAMES})(,({_NAMES}))*$",
+        description=f"Sections of the report: {', '.join(SECTIONS)}; all if left out.",
+        examples=["fields,histories"],
+    ),
+]
 router = APIRouter(prefix="/tests/{test_id}/analyses/{analysis_id}", tags=["results"])
 
 
@@ -40,17 +52,21 @@ async def get_report(
     analysis_id: AnalysisId,
     coverage: CoverageDep,
     frame: FrameText = None,
+    sections: SectionsText = None,
 ) -> Response:
     """Answer with the report of the finished steps: rig, settings, noise floor, calibration, pictures, tables, courses.
 
-    Facts that no device reports come from `PUT /tests/{test_id}/metadata`; missing ones are listed as not stated.
+    Facts that no device reports come from `PUT /tests/{test_id}/metadata`; missing ones are listed as not stated. The
+    logo is the data folder's report_logo.png, .jpg or .svg.
     """
+    asked = tuple(SECTIONS) if sections is None else sections.split(",")
+    options = ReportOptions(chosen_sections(asked), service_url=str(request.base_url))
     results, stale = await run_in_threadpool(_prepared, service, test_id, analysis_id)
     service.require_room()
     folder = await run_in_threadpool(service.exports.new_folder)
     try:
         framed = await run_in_threadpool(_framed, service, test_id, analysis_id, frame, folder / "frame")
-        task = service.exports.run(report_task, results, str(folder), coverage, framed)
+        task = service.exports.run(report_task, results, str(folder), coverage, framed, options)
         policy, missing = await finished(request, task)
         page = await run_in_threadpool((folder / NAME).read_bytes)
     finally:
