@@ -153,7 +153,7 @@ def make_report(
         seen=seen,
         unseen=unseen,
         fields=drawn.of("fields", lambda: _fields(measured)),
-        courses=drawn.of("histories", lambda: courses(measured)),
+        courses=courses(measured) if "histories" in sections else None,
         gauges=found_gauges,
         models=drawn.of("models", lambda: compared_models(source)),
         uncertainty=sentence(measured),

@@ -324,8 +324,10 @@ def _curves(
 
 
 def _line(line: LineReading, n: int, asked: Sequence[str] | None) -> list[PagePicture]:
-    """Draw one plot of a line: the variable that was asked for first, else the out-of-plane displacement or Z."""
-    names = [name for name in (*(asked or ()), "w_mm", "z_mm", *line.values) if name in line.values]
+    """Draw one plot of a line: the only strain or displacement that was asked for, else W, else Z."""
+    moving = [name for name in asked or () if name in _STRAINS or name in ("u_mm", "v_mm", "w_mm")]
+    names = [*(moving if len(moving) == 1 else ()), "w_mm", *moving, "z_mm", *line.values]
+    names = [name for name in names if name in line.values]
     if not names:
         return []
     name, read = names[0], line.values[names[0]]

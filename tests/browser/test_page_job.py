@@ -371,7 +371,7 @@ def check_report(shown: Page) -> None:
         "Strain formulation Green-Lagrange",
         "Calibration good",
         "simulated rig",
-        "Laboratory not stated",
+        "Laboratory laboratory, in Metadata",
     )
     assert [text for text in wanted if text not in words] == [], words
     assert report.locator("img").count() + report.locator("svg").count() > 2

@@ -25,6 +25,8 @@ from scipy.optimize import fsolve
 
 from stereorig.server.cli import main
 from stereorig.server.config.rig_file import parse_config
+from stereorig.server.report.build import make_report
+from stereorig.server.report.options import ReportOptions
 from stereorig.server.report.source import find_source
 from stereorig.server.report.steps import read_steps
 from stereorig.server.workflows.service import Service
@@ -426,6 +428,64 @@ def test_steps_and_histories(page: Page) -> None:
     assert centre[1] == pytest.approx((centre[0] or 0.0) * 689.0 / 400.0, rel=0.02)
 
 
+def test_gauges_are_rounded_as_on_the_page(page: Page) -> None:
+    """Two digits of the uncertainty, the value to the same place, a column in one unit of a readable size."""
+    for n in (4, 5):
+        row = page.rows[f"gauge.ax<i>al.{n}"]
+        for cell in row.cells[1:]:
+            value, _, u = cell.replace("\u2212", "-").replace("\u202f", "").partition(" \u00b1 ")
+            assert len(u.replace(".", "").strip("0")) <= 2, cell
+            assert len(u.replace(".", "").lstrip("0")) >= 2, cell
+            assert len(value.partition(".")[2]) == len(u.partition(".")[2]), cell
+        strain = float(row.cells[2].replace("\u2212", "-").partition(" ")[0])
+        assert strain == pytest.approx(1e6 * (row.numbers[2] or 0.0), abs=5.0)
+    heads = page.texts["histories"]
+    assert "elongation, \u00b5m" in heads
+    assert "strain, \u00b5m/m" in heads
+
+
+def test_a_line_is_one_plot(page: Page) -> None:
+    assert sum("along line across" in str(p["alt"]) for p in page.pictures()) == 1
+
+
+def test_sections_logo_and_links_are_as_chosen(plate: Measurement, tmp_path: Path) -> None:
+    logo = io.BytesIO()
+    Image.new("RGB", (60, 20), "navy").save(logo, format="png")
+    kept = plate.data / "report_logo.png"
+    kept.write_bytes(logo.getvalue())
+    try:
+        answer = plate.client.get(plate.url, params={"sections": "not-stated,histories"})
+        assert answer.status_code == 200, answer.text
+        page = Page(answer.text)
+        sections = [attributes["id"] for tag, attributes in page.tags if tag == "section"]
+        assert sections == ["histories", "not-stated"]
+        assert page.pictures()[0]["src"] == f"data:image/png;base64,{base64.b64encode(logo.getvalue()).decode()}"
+        assert not any("map of" in str(picture["alt"]) for picture in page.pictures())
+        # what is not stated does not depend on what is shown
+        assert answer.headers["X-Not-Stated"] == str(len(page.missing()))
+        refused = plate.client.get(plate.url, params={"sections": "fields,nonsense"})
+        assert (refused.status_code, refused.json()["code"]) == (422, "invalid_request")
+    finally:
+        kept.unlink()
+    drawing = tmp_path / "logo.svg"
+    drawing.write_text('<svg xmlns="http://www.w3.org/2000/svg" width="9" height="9"/>')
+    out = tmp_path / "r.html"
+    chosen = ["--sections", "annex", "--logo", str(drawing), "--out", str(out)]
+    assert main(["report", str(plate.data), *chosen]) == 0
+    page = Page(out.read_text())
+    assert [a["id"] for tag, a in page.tags if tag == "section"] == ["annex"]
+    (only,) = page.pictures()
+    assert str(only["src"]).startswith("data:image/svg+xml;base64,")
+    assert json.loads(page.texts["settings"])["subset_px"] == 25
+
+
+def test_the_report_tells_its_progress(plate: Measurement) -> None:
+    seen: list[tuple[str, int, int]] = []
+    options = ReportOptions(sections=("seen", "histories"))
+    make_report(find_source(plate.data), options=options, progress=lambda *at: seen.append(at))
+    assert seen == [*(("reading", n, 6) for n in range(6)), ("drawing", 0, 2), ("drawing", 1, 2)]
+
+
 def test_pictures_are_pictures_with_a_bar_and_a_unit(page: Page) -> None:
     for attributes in page.pictures():
         kind, _, data = str(attributes["src"]).partition(";base64,")
@@ -439,7 +499,7 @@ def test_pictures_are_pictures_with_a_bar_and_a_unit(page: Page) -> None:
             assert b"<svg" in base64.b64decode(data)
 
 
-def test_the_page_loads_nothing_from_elsewhere(answered: Answered) -> None:
+def test_the_page_loads_nothing_from_elsewhere(answered: Answered, plate: Measurement) -> None:
     answer, page = answered.response, Page(answered.response.text)
     for tag, attributes in page.tags:
         assert tag not in {"script", "link", "iframe", "object", "embed", "base", "form"}, tag
@@ -447,6 +507,9 @@ def test_the_page_loads_nothing_from_elsewhere(answered: Answered) -> None:
         assert "style" not in attributes
         for name in ("src", "href", "srcset", "action", "data", "poster", "background"):
             value = attributes.get(name)
+            if tag == "a" and value is not None:  # loads nothing by itself
+                assert value.endswith(f"/#/test/{plate.test_id}")
+                continue
             assert value is None or value.startswith(("data:image/", "#")), (tag, name, str(value)[:80])
     assert "url(" not in page.style
     assert "@import" not in page.style
@@ -511,8 +574,10 @@ def test_command_line_on_a_data_folder_and_what_is_missing_is_listed(
         assert f"  {name}: " in printed
     assert "Camera, maker, cam1" not in missing
     assert "Operator" not in missing
-    for key in ("lens.maker", "lighting", "floor.W"):
-        assert any("not stated" in cell for cell in page.rows[key].cells), page.rows[key]
+    # an item without a statement is in the list alone
+    assert not page.rows.keys() & {"lens.maker", "lighting", "test.material"}
+    assert any("not stated" in cell for cell in page.rows["floor.W"].cells)
+    assert not any(tag == "a" for tag, _ in page.tags)  # no service is known whose form could be linked
     # the points' own values are reported beside it all the same
     assert page.rows["floor.W"].numbers[5] is not None
     # each item that is not stated in the tables is in the list
@@ -615,6 +680,7 @@ def test_results_of_files_without_a_rig(plate: Measurement, tmp_path: Path) -> N
     [
         (["nowhere"], "results_missing"),
         (["."], "results_missing"),
+        ([".", "--sections", "fields,none"], "results_missing"),
         ([".", "--out", "r.pdf"], "output_unusable"),
         ([".", "--facts", "none.toml"], "file_missing"),
         ([".", "--test", "t000001-000000"], "option_conflict"),

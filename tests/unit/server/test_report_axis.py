@@ -31,7 +31,7 @@ TIMES: list[float | None] = [0.0, 10.0, 25.0, 31.0]
 
 def test_curves_are_drawn_against_the_pressure_that_drives_them_up_and_down() -> None:
     axis = _Axis.of(steps([0.0, 0.1, 0.2, 0.1], TIMES, pressure_kpa=[0.0, 100.0, 200.0, 100.0]))
-    assert (axis.positions, axis.label) == ([0.0, 100.0, 200.0, 100.0], "pressure_kpa, kPa")
+    assert (axis.positions, axis.label) == ([0.0, 100.0, 200.0, 100.0], "pressure, kPa")
     assert axis.as_given
 
 
