@@ -10,7 +10,7 @@ from stereorig.core.arrays import Float
 from stereorig.core.calibration.checks.agreement import share_of_own_poses
 from stereorig.core.calibration.checks.measures import CheckMeasures, Measures, mean_of_cameras, measure_points, pooled
 from stereorig.core.calibration.checks.positions import PositionCheck
-from stereorig.core.calibration.choice.declared import AXES, POSITIONS, SCALE, SCALE_GROUPS
+from stereorig.core.calibration.choice.declared import ASPECTS, AXES, POSITIONS, SCALE, SCALE_GROUPS
 from stereorig.core.calibration.choice.held_out import HeldOutView, held_out_view
 from stereorig.core.calibration.choice.lens import Chosen
 from stereorig.core.calibration.choice.screening import points_mm
@@ -139,6 +139,8 @@ def build_result(
             aspect_estimated=aspect_estimated,
             aspect_carried=bool(adjustment.priors.carried.any()),
             stage_over_pitch=chosen.stage_over_pitch,
+            shape_mm=uncertainty.shape_rms_mm,
+            unseen=_unseen(chosen, pair, nominals, uncertainty.points_mm),
         ),
         verdict=verdict,
         nominals=nominals,
@@ -192,6 +194,33 @@ def _unseen_scale(chosen: Chosen, pair: StereoPair, points_mm: Float) -> tuple[f
         named_derivatives(layout, priors, adjustment.state.x) @ _by_scale(adjustment)
     )
     return size, size * float(np.sqrt(np.mean(shape_of(points_mm, moved[:, None]) ** 2)))
+
+
+def _unseen(
+    chosen: Chosen, pair: StereoPair, nominals: Sequence[NominalValues], points_mm: Float
+) -> dict[str, tuple[float, float]]:
+    """Return errors that the views do not show and no prior covers, with the shape's rms error by each, mm.
+
+    Of the aspect ratios, unless their uncertainty is stated or in the covariance, and of a stretch and shear of a
+    target that was declared exact, by the names of their groups.
+    """
+    adjustment = chosen.screened.adjustment
+    layout, priors = adjustment.layout, adjustment.priors
+    names = parameter_names(layout, priors)
+    stated = chosen.screened.problem.options.aspect_sigma is not None or bool(priors.carried.any())
+    out: dict[str, tuple[float, float]] = {}
+    for found in chosen.unseen:
+        if found.name == ASPECTS and stated:
+            continue
+        pulled = named_derivatives(layout, priors, adjustment.state.x) @ found.pulled
+        images = -image_derivatives(pair, points_mm, names) @ pulled
+        for c, camera in enumerate((pair.cam1, pair.cam2) if found.name == ASPECTS else ()):
+            rows = camera.project(points_mm).xy[:, 1] - camera.lens.kernel_parameters()[5]
+            images[:, 2 * c + 1, c] += rows / nominals[c].aspect
+        moved = shape_of(points_mm, triangulated(pair, points_mm, images).reshape(-1, pulled.shape[1]))
+        squares = float(np.einsum("ip,pq,iq->", moved, found.covariance, moved, optimize=True)) / len(moved)
+        out[found.name] = float(np.sqrt(np.mean(np.diagonal(found.covariance)))), float(np.sqrt(squares))
+    return out
 
 
 def _moved_mm(

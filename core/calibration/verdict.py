@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -10,9 +10,9 @@ from stereorig.core.arrays import Float
 from stereorig.core.calibration.checks.agreement import DISAGREE_SHARE, lens_faults
 from stereorig.core.calibration.checks.measures import CheckMeasures, focal_lengths_px
 from stereorig.core.calibration.choice.contradictions import FAILED_LEVEL
-from stereorig.core.calibration.choice.declared import DECLARED, SCALE, SCALE_GROUPS
+from stereorig.core.calibration.choice.declared import ASPECTS, DECLARED, SCALE, SCALE_GROUPS
 from stereorig.core.calibration.choice.screening import DroppedView
-from stereorig.core.calibration.choice.structure import Structure
+from stereorig.core.calibration.choice.structure import UNEQUAL_PITCH, Structure
 from stereorig.core.calibration.fit.layout import ASPECT_SIGMA
 from stereorig.core.calibration.inputs import CalibrationOptions, Moves
 from stereorig.core.calibration.result import CheckDone, Level, Verdict, ViewResult
@@ -220,9 +220,27 @@ def checks_made(
     aspect_estimated: bool,
     aspect_carried: bool,
     stage_over_pitch: tuple[float, float] | None,
+    shape_mm: float,
+    unseen: Mapping[str, tuple[float, float]],
 ) -> tuple[CheckDone, ...]:
-    """Return the checks made and not made: a wrong scale or a tilted axis does not always show in residuals."""
+    """Return the checks made and not made: a wrong scale or a tilted axis does not always show in residuals.
+
+    ``unseen`` are errors of aspect ratios and of the target that are not in the reported error of the shape,
+    ``shape_mm``, with the shifts by them.
+    """
     staged = moves != "free"
+
+    def hidden(name: str, what: str, remedy: str) -> tuple[bool, str]:
+        """Return True if the reported error has room for an error that may be there, and it in words."""
+        amount, shift_mm = unseen[name]
+        room = bool(np.hypot(shift_mm, shape_mm) <= UNSEEN_FACTOR * shape_mm)
+        reported = "within twice the" if room else "which is not in the"
+        text = (
+            f"{what} by {100.0 * amount:.2g} % would hardly show in these views and move the shape by "
+            f"{1e3 * shift_mm:.2g} um, {reported} reported {1e3 * shape_mm:.2g} um"
+        )
+        return room, f"{text}." if room else f"{text}: {remedy}."
+
     checks = [_held_out_done(held_out, staged=staged, in_turn=not options.held_out_mm)]
     if staged:
         checks += [
@@ -267,7 +285,15 @@ def checks_made(
         text = "The aspect ratio was taken as given"
         if aspect_carried:
             text += f"; {ASPECT_SIGMA:g} of it are in the covariance"
-        checks.append(CheckDone("aspect", False, f"{text}."))
+        text += "."
+        if ASPECTS in unseen:
+            text += f" {hidden(ASPECTS, 'Ratios that are off', 'measure them, or state aspect_sigma')[1]}"
+        checks.append(CheckDone("aspect", False, text))
+    if UNEQUAL_PITCH in unseen:
+        remedy = "measure its sides and diagonals, or add free poses of the tilted target"
+        checks.append(
+            CheckDone("target_shape", *hidden(UNEQUAL_PITCH, "A target that is stretched or sheared", remedy))
+        )
     return tuple(checks)
 
 

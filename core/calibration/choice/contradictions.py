@@ -9,6 +9,7 @@ import numpy as np
 
 from stereorig.core.arrays import Float
 from stereorig.core.calibration.choice.declared import (
+    ASPECTS,
     AXES,
     DECLARED,
     POSITIONS,
@@ -18,7 +19,15 @@ from stereorig.core.calibration.choice.declared import (
     position_name,
 )
 from stereorig.core.calibration.choice.screening import Screened, fit_screened
-from stereorig.core.calibration.choice.structure import SIGNIFICANT, Group, Score, Structure, joint_terms
+from stereorig.core.calibration.choice.structure import (
+    SIGNIFICANT,
+    UNEQUAL_PITCH,
+    Group,
+    Score,
+    Structure,
+    Unseen,
+    joint_terms,
+)
 from stereorig.core.calibration.fit.adjust import Adjustment
 from stereorig.core.calibration.inputs import CalibrationOptions
 from stereorig.core.errors import CalibrationError
@@ -32,9 +41,11 @@ FAILED_LEVEL = 0.1 * SCALE_LEVEL
 # the many terms of a lens, and a smooth field, absorb all of a wrong scale and some noise, while one scale absorbs a
 # hundredth of a lens's effect; one scale of each camera absorbs 0.8 of decentring, and one scale leaves 0.82 to a bow.
 # An aspect ratio and a sheared target cannot be distinguished
-_SHARE, _SHARE_OF_ONE, _ALIKE = 0.9, 0.7, ("aspect", "unequal pitch")
+_SHARE, _SHARE_OF_ONE, _ALIKE = 0.9, 0.7, ("aspect", UNEQUAL_PITCH)
 _NEARLY = 0.85  # share of a probability's power of ten: the simplest of the scales that is nearly as certain is named
 _LEAST = 1e-200  # probabilities below it are rounding
+#: relative error that may be in an aspect ratio, and in a stretch or shear of a target, of which nothing is stated
+UNSTATED = 1e-4
 _OPEN_SCALE, _OPEN_ASPECT = 0.5, 0.1  # priors that say next to nothing
 _ITERATIONS = 300  # iterations of fits that start far off
 
@@ -113,6 +124,11 @@ def scale_seen(groups: Sequence[Group], score: Score) -> tuple[float, float] | N
             value, sigma = score.test(group, []).terms["pitch"]
             return -value, sigma
     return None
+
+
+def unseen(groups: Sequence[Group], score: Score) -> tuple[Unseen, ...]:
+    """Return the errors that aspect ratios and a target taken as exact may have, as far as these views hide them."""
+    return tuple(score.hidden(g, UNSTATED) for g in groups if g.name in (ASPECTS, UNEQUAL_PITCH))
 
 
 def in_words(screened: Screened, found: Sequence[tuple[Structure, Group]], score: Score) -> list[Structure]:

@@ -15,6 +15,7 @@ from stereorig.core.calibration.choice.contradictions import (
     contradicted,
     in_words,
     scale_seen,
+    unseen,
     with_open_scales,
     with_open_steps,
 )
@@ -24,9 +25,11 @@ from stereorig.core.calibration.choice.pairs import apart_pairs
 from stereorig.core.calibration.choice.screening import Screened, fit_screened, not_of_one_pose, points_mm
 from stereorig.core.calibration.choice.structure import (
     LENS_TERMS,
+    UNEQUAL_PITCH,
     Group,
     Score,
     Structure,
+    Unseen,
     find_structure,
     lens_share_px,
     lens_significance,
@@ -90,8 +93,9 @@ class Chosen:
         Structure of the residuals beyond noise.
     reasons
         Why this lens, as sentences.
-    stage_over_pitch
-        See :func:`stereorig.core.calibration.choice.contradictions.scale_seen`.
+    stage_over_pitch, unseen
+        See :func:`stereorig.core.calibration.choice.contradictions.scale_seen` and
+        :func:`stereorig.core.calibration.choice.contradictions.unseen`.
     """
 
     screened: Screened
@@ -99,6 +103,7 @@ class Chosen:
     structure: tuple[Structure, ...]
     reasons: tuple[str, ...]
     stage_over_pitch: tuple[float, float] | None
+    unseen: tuple[Unseen, ...]
 
     @property
     def model(self) -> LensName:
@@ -306,16 +311,15 @@ def _tilted_throughout(result: Chosen, held: Sequence[CalibrationView], fit: Cal
 
 
 def _or_tilted(result: Chosen, fit: Callable[..., Screened]) -> Chosen:
-    """Add to a contradiction of the scales that sensors which are tilted would leave the same residuals, if so."""
+    """Add to contradicting scales or a sheared target that tilted sensors would leave the same residuals, if so."""
     found, model = result.screened, TILTED.get(result.model)
-    if model is None or not has_own_stages(found) or not {s.name for s in result.structure} & {*SCALE_GROUPS}:
+    like = {*SCALE_GROUPS, UNEQUAL_PITCH}
+    if model is None or not has_own_stages(found) or not {s.name for s in result.structure} & like:
         return result
     with suppress(CalibrationError):
         tilted = fit(model, with_open_axes(found.problem, found))
         if text := as_tilts(tilted, with_open_scales(fit(UNTILTED[model]))):
-            named = [
-                replace(s, sentence=f"{s.sentence} {text}") if s.name in SCALE_GROUPS else s for s in result.structure
-            ]
+            named = [replace(s, sentence=f"{s.text} {text}") if s.name in like else s for s in result.structure]
             return replace(result, structure=tuple(named))
     return result
 
@@ -412,4 +416,4 @@ def _result(best: _Candidate, reasons: tuple[str, ...], known: Sequence[Structur
         found += find_structure(groups, score, [group for _, group in best.contradicted])
     names = {f.name for f in known}
     structure = (*(replace(f, freed=None) for f in known), *(f for f in found if f.name not in names))
-    return Chosen(best.screened, tuple(best.held), structure, reasons, scale_seen(groups, score))
+    return Chosen(best.screened, tuple(best.held), structure, reasons, scale_seen(groups, score), unseen(groups, score))

@@ -28,6 +28,8 @@ from stereorig.core.names import CAMERAS
 from stereorig.core.robust import f_tail
 
 SIGNIFICANT = 1e-4
+#: stretch and shear of the target
+UNEQUAL_PITCH = "unequal pitch"
 _DEGREE = 5
 _LEAST_LEFT = 1e-3
 _VARIANCES = 1000
@@ -100,6 +102,25 @@ class Structure:
         values = ", ".join(f"{n} = {v:.2g} +- {s:.1g}" for n, (v, s) in self.terms.items())
         what = f"{self.name}: {values}" if values else "a smooth field over the image of no known lens term"
         return f"The residuals of {who} hold structure ({what}), {self.rms_px:.3f} px rms."
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """Errors of quantities that the fit took as exact, as far as the views leave room for them.
+
+    Attributes
+    ----------
+    name
+        The group of terms.
+    covariance
+        (q, q) of the terms after the views.
+    pulled
+        (m, q) bias of the fit's unknowns by a unit of each term, because the fit lacks it.
+    """
+
+    name: str
+    covariance: Float
+    pulled: Float
 
 
 @dataclass(frozen=True)
@@ -251,7 +272,7 @@ def no_target(groups: Sequence[Group], score: Score, found: Structure, *, staged
         return score.test(group, []).rms_px ** 2 * score.points([0, 1] if group.camera is None else [group.camera])
 
     by_lenses = sum(squares(g) for g in groups if g.name == found.name) / (_MORE if staged else 1.0)
-    rivals = [g for g in groups if g.name in ("bow", "unequal pitch", *DECLARED)]
+    rivals = [g for g in groups if g.name in ("bow", UNEQUAL_PITCH, *DECLARED)]
     return not any(score.test(g, []).probability <= found.probability and squares(g) > by_lenses for g in rivals)
 
 
@@ -317,7 +338,7 @@ def _extras(
     board_at = at
     if board:
         groups.append(Group("bow", None, ("XX_mm", "XY_mm", "YY_mm"), np.arange(at, at + 3)))
-        groups.append(Group("unequal pitch", None, ("stretch", "shear"), np.arange(at + 3, at + 5)))
+        groups.append(Group(UNEQUAL_PITCH, None, ("stretch", "shear"), np.arange(at + 3, at + 5)))
         at += 5
     half = np.abs(nominal_nodes_mm[:, :2]).max()
     X, Y = (nominal_nodes_mm[:, :2] / half).T
@@ -415,6 +436,12 @@ class Score:
         if group.name == "smooth":
             gain -= q * left / freedom  # its many terms take up as much of mere noise
         return Structure(group.name, name, terms, probability, noise * float(np.sqrt(max(gain, 0.0) / max(count, 1.0))))
+
+    def hidden(self, group: Group, sigma: float) -> Unseen:
+        """Return how far terms with a prior standard deviation may be off without these views showing it."""
+        own = group.columns - self._first
+        left = inverse(self._matrix[np.ix_(own, own)] + np.eye(len(own)) / sigma**2)
+        return Unseen(group.name, left, self._pulls[:, own])
 
     def spread(self, group: Group, given: Sequence[Group]) -> float:
         """Return the most likely standard deviation of a group's terms, if all are drawn from one distribution.

@@ -335,6 +335,8 @@ def _modern_rig(
     axis_rad: tuple[float, float] = (0.0, 0.0),
     bow_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
     shear: float = 0.0,
+    stretch: float = 0.0,
+    aspects: tuple[float, float] = (1.0, 1.0),
     bend_mm: Array | None = None,
     tau_rad: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (0.0, 0.0)),
     noise_px: float = 0.02,
@@ -349,6 +351,10 @@ def _modern_rig(
         one, two = (
             dataclasses.replace(c, lens=(*lens, *np.zeros(7), *tau)) for c, tau in zip((one, two), tau_rad, strict=True)
         )
+    one, two = (
+        dataclasses.replace(c, K=c.K * [[1.0], [a], [1.0]] + [[0.0] * 3, [0.0, 0.0, (1.0 - a) * c.K[1, 2]], [0.0] * 3])
+        for c, a in zip((one, two), aspects, strict=True)
+    )
     cameras = one, two
     at = (np.arange(11) - 5.0) * pitch_mm
     points = flat(np.stack(np.meshgrid(at, at, indexing="ij"), axis=-1))
@@ -358,7 +364,7 @@ def _modern_rig(
     points[..., :2] += (
         0.0 if bend_mm is None else np.concatenate([x[..., None], y[..., None], second], axis=-1) @ bend_mm
     )
-    points[..., 0] += shear * points[..., 1]
+    points[..., 0] += shear * points[..., 1] + stretch * points[..., 0]
     rng = np.random.default_rng(seed)
     along = np.array([*axis_rad, np.sqrt(1.0 - np.square(axis_rad).sum())])
     views = []
@@ -399,6 +405,39 @@ def test_a_scale_that_a_wide_lens_hides_is_named_with_its_amount_unless_it_is_st
     hidden = re.search(r"wrong by up to ([0-9.]+) % would not show", check.text)
     assert hidden is not None
     assert float(hidden[1]) > 0.2
+
+
+@pytest.mark.fault(32)
+@pytest.mark.parametrize("lens", [(0.0, 0.0, 0.0, 0.0, 0.0), (-0.05, 0.1, 0.0, 0.0, 0.0)])
+@pytest.mark.parametrize(
+    ("check", "wrong"),
+    [
+        ("aspect", ({"aspects": (1.0001, 1.0)}, {"aspects": (1.0, 1.0001)})),
+        ("target_shape", ({"stretch": 1e-4}, {"shear": 1e-4})),
+    ],
+)
+def test_what_an_unstated_aspect_ratio_or_a_sheared_target_would_do_is_named_with_its_amount(
+    check: str, wrong: tuple[dict[str, Any], ...], lens: tuple[float, ...]
+) -> None:
+    views, target, nominal, _ = _modern_rig(35.0, lens)
+    options = CalibrationOptions(lens="paper" if not any(lens) else "opencv5")
+    right = calibrate(views, target, nominal, options)
+    found = {c.name: c for c in right.checks}[check]
+    assert not found.made
+    said = re.search(r"by ([0-9.]+) % would hardly show in these views and move the shape by ([0-9.]+) um", found.text)
+    assert said is not None, found.text
+    # the same noise before such errors: their squares add up, and most of a ten-thousandth is left by these views
+    points = right.uncertainty.points_mm
+    squares = 0.0
+    for errors in wrong:
+        off_views, _, _, cameras = _modern_rig(35.0, lens, **errors)
+        off = calibrate(off_views, target, nominal, options)
+        assert off.verdict.level == "good", "no residual shows it"
+        seen = [camera.project(points) for camera in cameras]
+        before = right.pair.triangulate(*(c.project(points) for c in _modern_rig(35.0, lens)[3])).xyz_mm
+        squares += aligned_rms_um(off.pair.triangulate(*seen).xyz_mm, before) ** 2
+    assert float(said[1]) == pytest.approx(0.01, rel=0.4)
+    assert float(said[2]) == pytest.approx(np.sqrt(squares) * float(said[1]) / 0.01, rel=0.15)
 
 
 @pytest.mark.parametrize("lens", [(-0.05, 0.1, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0)])
@@ -586,6 +625,7 @@ def test_a_pitch_wrong_as_much_as_the_stage_shows_in_a_known_distance_and_nowher
         "known_distance": False,
         "stage_axis": True,  # of the 1 mrad that is assumed
         "aspect": False,
+        "target_shape": True,  # a ten-thousandth does less than that of the aspect ratio, which is reported
     }
     marks = np.array([[project(c, -3.0, 1.0, 0.0), project(c, 3.0, 1.0, 0.0)] for c in PAPER])
     check = check_known_distance(
