@@ -20,8 +20,9 @@ from stereorig.core.field.region.cuts import Cuts
 from stereorig.core.field.region.region import PointGrid
 from stereorig.core.measure import MeasureOptions, ReferencePair
 from stereorig.core.progress import no_progress
+from stereorig.server.evaluations.centre_crack import width_factor
 from stereorig.server.evaluations.crack.assessment import ROOT_M, Assessed, Problem, assessed, parts_of
-from stereorig.server.evaluations.crack.document import CrackCardFound, CrackStepFound
+from stereorig.server.evaluations.crack.document import CrackCardFound, CrackStepFound, page_of
 from stereorig.server.evaluations.crack.drawn import drawn_crack
 from stereorig.server.evaluations.crack.evaluation import CrackCard
 from stereorig.server.evaluations.crack.settings import CrackSettings
@@ -311,3 +312,32 @@ def test_k_of_the_rendered_panel_is_its_formulas() -> None:
         assert abs(found.numbers[key].value - value) < 4.0 * u, (key, found.numbers[key].value, value, u)
         assert u < share * value or share == 0.0, (key, u)
     assert not found.doubts
+
+
+def test_the_width_correction_is_that_of_isidas_series() -> None:
+    """Isida (1971), from 36 terms of a series: crack over width, and K over that of a wide sheet."""
+    known = {0.1: 1.0060, 0.2: 1.0246, 0.3: 1.0577, 0.4: 1.1094, 0.5: 1.1867, 0.6: 1.3033, 0.7: 1.4882, 0.8: 1.8160}
+    for share, factor in known.items():
+        assert width_factor(0.5 * share * 300.0, 300.0) == pytest.approx(factor, rel=1.5e-3), share
+
+
+def test_k_of_a_stated_panel_stands_beside_the_formula_and_a_load_that_is_not_known_is_named(
+    tmp_path: Path, mixed: Field
+) -> None:
+    width, thickness = 240.0, 1000.0 / (240.0 * SHEET.tension)
+    card = card_of(tmp_path, [exact(mixed)], panel=[width, thickness, 0.01])
+    numbers, k = card.steps[0].numbers, truth(SHEET)["k1"]
+    # the first step has 1 kN; the sheet is wide, and so the measured K is that of a wide one
+    assert numbers["K_I, wide sheet"].value == pytest.approx(k, rel=2e-3)
+    factor = 1.0 / np.sqrt(np.cos(np.pi * SHEET.half_mm / width))
+    assert numbers["K_I, panel"].value == pytest.approx(factor * k, rel=2e-3)
+    assert numbers["K_I / panel's"].value == pytest.approx(1.0 / factor, rel=4e-3)
+    panel = numbers["K_I, panel"]
+    assert panel.value is not None
+    assert panel.parts["stress"] == pytest.approx(0.01 * panel.value)
+    # K goes with the root of the crack's length, whose other end is drawn to a pixel
+    assert panel.parts["other_end"] == pytest.approx(panel.value * 0.25 * MM_PER_PX / SHEET.half_mm, rel=0.1)
+    assert "1000 N: K_I, panel" in page_of("Crack", card)
+    with pytest.raises(StereorigError) as error:
+        card_of(tmp_path, [mixed], panel=[25.0, 1.0, 0.01])
+    assert (error.value.code, bool(error.value.remedy)) == ("panel_invalid", True)

@@ -19,12 +19,20 @@ from tests.support.service_rig import data_of, new_test, served, true_cameras, w
 API = "/api/v1"
 RIG = ROOT / "config" / "sim_panel.toml"
 LOADS_KN = (0.0, 20.0, 30.0)
-SETTINGS = {"youngs_modulus": 73.1, "modulus_unit": "GPa", "modulus_u": 0.01, "poisson": 0.33, "poisson_u": 0.01}
+SHEET = CrackedPanel()
+SETTINGS = {
+    "youngs_modulus": 73.1,
+    "modulus_unit": "GPa",
+    "modulus_u": 0.01,
+    "poisson": 0.33,
+    "poisson_u": 0.01,
+    "panel": [SHEET.width_mm, SHEET.thickness_mm, 0.01],
+}
 pytestmark = pytest.mark.timeout(600)
 
 
 def test_k_of_the_panel_rises_with_the_load_as_the_formula(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    panel, data = CrackedPanel(), data_of(tmp_path)
+    panel, data = SHEET, data_of(tmp_path)
     along = np.linspace(-panel.half_crack_mm, panel.half_crack_mm, 21) * np.sqrt(0.5)  # it hangs upright
     xyz = np.stack([along, -along, np.full_like(along, -panel.bow_mm)], axis=-1)
     crack = SimRig.from_toml(RIG).cam1.camera.project(xyz).xy
@@ -55,6 +63,10 @@ def test_k_of_the_panel_rises_with_the_load_as_the_formula(tmp_path: Path, capsy
         # one draw: beyond four standard uncertainties is one in 16,000
         assert abs(k["value"] - true) < 4.0 * k["u"], (k, true)
         assert k["u"] < 0.04 * true
+        # the formula's own: half of the crack and the tip's place are known to a share of a millimetre
+        assert one["numbers"]["K_I, wide sheet"]["value"] == pytest.approx(true, rel=0.01)
+        factor = np.sqrt(1.0 / np.cos(np.pi * panel.half_crack_mm / panel.width_mm))
+        assert one["numbers"]["K_I, panel"]["value"] == pytest.approx(factor * true, rel=0.01)
         assert abs(one["numbers"]["K_II"]["value"]) < 4.0 * one["numbers"]["K_II"]["u"]
         assert abs(one["numbers"]["J"]["value"] - 1e3 * true**2 / panel.youngs_modulus_mpa) < (
             4.0 * one["numbers"]["J"]["u"]
@@ -66,4 +78,6 @@ def test_k_of_the_panel_rises_with_the_load_as_the_formula(tmp_path: Path, capsy
     assert json.loads(capsys.readouterr().out) == card
     table = (tmp_path / "card" / "crack.csv").read_text().splitlines()
     assert table[1].split(",")[3] == "K_I"
-    assert "<td>K_I</td>" in (tmp_path / "card" / "crack.html").read_text()
+    shown = (tmp_path / "card" / "crack.html").read_text()
+    assert "<td>K_I</td>" in shown
+    assert "<td>30000 N: K_I, panel</td>" in shown

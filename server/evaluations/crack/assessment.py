@@ -99,12 +99,12 @@ def assessed(step: Field, of: Problem, start_mm: Float) -> Assessed | Lack:
     if isinstance(found, Lack):
         return found
     points, fit = found
-    edges = rings(*of.crack.ring, points.spacing_mm, _PARTS)
+    edges = rings(of.crack.inner_mm, of.crack.outer_mm, points.spacing_mm, _PARTS)
     whole = [(a, b, ring_integral(points, fit, of.elastic, a, b)) for a, b in edges]
     total = whole[-1][2] if whole and all(one is not None for _, _, one in whole) else None
     numbers = _numbers(points, fit, of.elastic, total)
-    spots = np.linspace(edges[0][0], of.crack.ring.outer_mm, _OPENINGS) if edges else np.zeros(0)
-    at_tip = of.asked.ctod_mm if of.asked.ctod_mm is not None else float(spots.min(initial=of.crack.ring.outer_mm))
+    spots = np.linspace(edges[0][0], of.crack.outer_mm, _OPENINGS) if edges else np.zeros(0)
+    at_tip = of.asked.ctod_mm if of.asked.ctod_mm is not None else float(spots.min(initial=of.crack.outer_mm))
     parting = opening(points, fit, of.elastic, np.unique([at_tip, *spots]))
     for place in np.flatnonzero(parting.behind_mm == at_tip):
         numbers["ctod"] = Number(float(parting.value[place, 1]), parting.gains[place, 1])
@@ -137,7 +137,7 @@ def parts_of(found: Assessed, key: str) -> dict[str, float]:
 def _fit_about(step: Field, of: Problem, start_mm: Float) -> tuple[Points, SeriesFit] | Lack:
     """Fit the series to the points about the tip, the ring's middle being the tip."""
     centre = np.asarray(start_mm, dtype=np.float64)
-    inner = of.crack.ring.inner_mm
+    inner = of.crack.inner_mm
     for _ in range(_RECENTRED):
         points = points_about(step, of.shared, of.crack, centre)
         lack = _few(points, centre)
@@ -149,7 +149,7 @@ def _fit_about(step: Field, of: Problem, start_mm: Float) -> tuple[Points, Serie
             return Lack("crack_closed", text + "the faces do not open.")
         fit = chosen_fit(points.few, of.elastic, centre, inner, of.asked.max_order, of.asked.criterion)
         off = float(np.linalg.norm(fit.tip_mm - centre))
-        if not fit.settled or off > of.crack.ring.outer_mm:
+        if not fit.settled or off > of.crack.outer_mm:
             break
         if off <= _OFF_CENTRE * inner:
             return points, fit
@@ -197,7 +197,7 @@ def _add_stated(
     if of.direction_u > 0.0:
         changes["direction"] = points.turned(of.direction_u), of.elastic
     for cause, (seen, elastic) in changes.items():
-        again = fitted(seen.few, elastic, fit.order, fit.tip_mm, of.crack.ring.inner_mm)
+        again = fitted(seen.few, elastic, fit.order, fit.tip_mm, of.crack.inner_mm)
         total = None if edges is None else ring_integral(seen, again, elastic, *edges)
         for key, one in _numbers(seen, again, elastic, total).items():
             if key in numbers:
@@ -218,9 +218,8 @@ def _doubts(found: Assessed, of: Problem, total: RingIntegral | None) -> list[Ma
         text = f"The points are {fit.excess:.2g} times as far from the series as their noise explains; the intervals "
         text += "are that much wider. Is the crack straight, the sheet elastic?"
         out.append(Mark("misfit", text, spoils=every if fit.excess**2 > _MISFIT else ()))
-    if np.linalg.norm(fit.tip_mm) > of.crack.ring.inner_mm:
-        text = f"The tip is {np.linalg.norm(fit.tip_mm):.3g} mm from the drawn one."
-        out.append(Mark("tip_moved", text))
+    if np.linalg.norm(fit.tip_mm) > of.crack.inner_mm:
+        out.append(Mark("tip_moved", f"The tip is {np.linalg.norm(fit.tip_mm):.3g} mm from the drawn one."))
     if total is None:
         return [*out, Mark("ring_not_measured", "Points are missing where J is integrated.", spoils=("j",))]
     away = numbers["j"].value - numbers["j_of_k"].value

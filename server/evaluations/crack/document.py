@@ -8,6 +8,7 @@ from pydantic import BaseModel, Field
 
 from stereorig.server.base.models import Reply
 from stereorig.server.evaluations.cards import NUMBER_COLUMNS, CardNumber, MarkFound, cells_of, page
+from stereorig.server.evaluations.centre_crack import by_load
 from stereorig.server.formats.csv_cells import row
 
 
@@ -107,7 +108,8 @@ def page_of(title: str, card: CrackCardFound) -> str:
     """Return the card as an HTML page."""
     head = f"{card.state.replace('_', ' ')}, E = {card.youngs_modulus_mpa:.5g} MPa, nu = {card.poisson:g}; points from "
     head += f"{card.inner_mm:.4g} to {card.outer_mm:.4g} mm: {card.verdict}"
-    tables = {}
+    against = by_load({one.load_n: one.numbers for one in card.steps if one.load_n is not None})
+    tables = {"K_I by load, measured and of the closed formula": against} if against else {}
     for one in card.steps:
         load = "" if one.load_n is None else f", {one.load_n:g} N"
         cycles = "" if one.cycles is None else f", {one.cycles:g} cycles"

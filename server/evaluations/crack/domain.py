@@ -45,9 +45,8 @@ def local_fits(points: Points, tip_mm: Float, at_mm: Float, sides: Float) -> Loc
     point, place = points.xy_mm - tip_mm, at_mm - tip_mm
     # a line from a place to a point of the other side meets y = 0 at this x
     height = place[:, 1, None] - point[None, :, 1]
-    meets = place[:, 0, None] - place[:, 1, None] * (place[:, 0, None] - point[None, :, 0]) / np.where(
-        height == 0.0, np.inf, height
-    )
+    fall = np.where(height == 0.0, np.inf, height)
+    meets = place[:, 0, None] - place[:, 1, None] * (place[:, 0, None] - point[None, :, 0]) / fall
     other = np.sign(point[None, :, 1]) != sides[:, None]
     distance = np.where(other & (meets < 0.0), np.inf, distance)
     near = np.argpartition(distance, _NEAREST, axis=1)[:, :_NEAREST]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,13 +21,6 @@ _DRAWN_PX = 2.0  # as well as a line is drawn
 _FEWEST = 12  # points by which the surface is known
 
 
-class Ring(NamedTuple):
-    """Distances from the tip between which points are used, mm."""
-
-    inner_mm: float
-    outer_mm: float
-
-
 @dataclass(frozen=True, eq=False)
 class DrawnCrack:
     """A crack as it was drawn, in camera 1's reference image, and the frame of its tip.
@@ -41,8 +33,8 @@ class DrawnCrack:
         (3, 3) the frame's axes as rows, and (3,) the tip on the reference's surface, both in the system frame.
     mm_per_px
         (2, 2) change of x and y with the image's column and row.
-    length_mm, ring
-        Length of the line, and the ring about the tip.
+    length_mm, inner_mm, outer_mm
+        Length of the line, and distances from the tip between which points are used.
     """
 
     line_px: Float
@@ -50,7 +42,8 @@ class DrawnCrack:
     origin_mm: Float
     mm_per_px: Float
     length_mm: float
-    ring: Ring
+    inner_mm: float
+    outer_mm: float
 
     @property
     def scale(self) -> float:
@@ -87,14 +80,14 @@ def drawn_crack(field: Field, shared: SharedPixels, asked: CrackSettings) -> Dra
     slope = 0.5 * (surface(tip + np.eye(2)) - surface(tip - np.eye(2)))
     scale = float(np.sqrt(np.linalg.norm(np.cross(slope[0], slope[1]))))
     reach_px = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line[::-1], axis=0), axis=1))])
-    ring = Ring(*asked.ring_mm(shared.subset_px * scale, scale * min(0.5 * float(reach_px[-1]), border)))
-    outer_px = ring.outer_mm / scale
+    inner, outer = asked.ring_mm(shared.subset_px * scale, scale * min(0.5 * float(reach_px[-1]), border))
+    outer_px = outer / scale
     back = np.array([np.interp(outer_px, reach_px, line[::-1, k]) for k in (0, 1)])
     away, chord = line[::-1][reach_px < outer_px] - tip, (back - tip) / np.linalg.norm(back - tip)
     off = float(np.abs(away[:, 0] * chord[1] - away[:, 1] * chord[0]).max())
     if off > max(_DRAWN_PX, _STRAIGHT * outer_px):
         raise InputError(
-            f"Within {ring.outer_mm:.4g} mm of its tip the crack leaves a straight line by {off:.3g} px: it is kinked.",
+            f"Within {outer:.4g} mm of its tip the crack leaves a straight line by {off:.3g} px: it is kinked.",
             code="crack_kinked",
             remedy="State an outer_mm within which it is straight; about a kink the series does not hold.",
         )
@@ -102,14 +95,14 @@ def drawn_crack(field: Field, shared: SharedPixels, asked: CrackSettings) -> Dra
     find_near(0, 1, tip[None], 0, outer_px, Cuts(others).pieces_px, np.zeros((1, 1), np.int64), near)
     if near[0]:
         raise InputError(
-            f"Another crack or a hole lies within {ring.outer_mm:.4g} mm of the tip.",
+            f"Another crack or a hole lies within {outer:.4g} mm of the tip.",
             code="crack_not_alone",
             remedy="State a smaller outer_mm.",
         )
     about = np.hypot(field.x_px - tip[0], field.y_px - tip[1]) <= outer_px
     axes = align_plane(field, shared=shared, chosen=about, x_direction=surface(tip) - surface(back)).rotation
     length = float(np.linalg.norm(np.diff(surface(line), axis=0), axis=1).sum())
-    return DrawnCrack(line, axes, surface(tip), (slope @ axes[:2].T).T, length, ring)
+    return DrawnCrack(line, axes, surface(tip), (slope @ axes[:2].T).T, length, inner, outer)
 
 
 def _lines(cuts: Cuts | None, asked: CrackSettings) -> tuple[Float, list[Float]]:

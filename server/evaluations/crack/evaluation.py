@@ -10,6 +10,7 @@ import numpy as np
 from stereorig.core.errors import InputError, MeasurementError
 from stereorig.core.progress import Progress
 from stereorig.server.evaluations.cards import Lack, Mark, MarkFound, number_found, number_missing
+from stereorig.server.evaluations.centre_crack import K_I, Panel, beside
 from stereorig.server.evaluations.crack.assessment import NUMBERS, Assessed, Problem, assessed, parts_of
 from stereorig.server.evaluations.crack.document import (
     CrackCardFound,
@@ -45,7 +46,7 @@ class CrackCard:
         ------
         InputError
             ``modulus_missing``, ``modulus_unit_missing``, ``no_displacement``, ``crack_smoothed``,
-            ``cycles_missing``, and those of the drawn crack.
+            ``cycles_missing``, ``panel_invalid``, and those of the drawn crack.
         MeasurementError
             ``too_few_points`` if no step has enough in the ring.
         """
@@ -63,7 +64,7 @@ class CrackCard:
         shared = shared_pixels(results.file(moved[0]), first)
         crack = drawn_crack(first, shared, asked)
         degrees = asked.direction_u_deg
-        direction_u = crack.scale / crack.ring.outer_mm if degrees is None else math.radians(degrees)
+        direction_u = crack.scale / crack.outer_mm if degrees is None else math.radians(degrees)
         problem = Problem(shared, crack, elastic, asked, direction_u)
         steps: list[tuple[CrackStepFound, Sequence[Lack | Mark]]] = []
         growth = Growth(first, shared)
@@ -115,6 +116,11 @@ def _step(step: int, found: Assessed | Lack, recorded: Recorded, of: Problem) ->
         else:
             one.numbers[symbol] = number_missing(key, units, "ring_not_measured: points near the faces are missing.")
     one.state = "doubtful" if any(number.state == "doubtful" for number in one.numbers.values()) else "good"
+    if of.asked.panel is not None:
+        # the other end is as drawn, to a pixel
+        half_u = {"tip": 0.5 * (one.numbers["tip x"].u or 0.0), "other_end": 0.5 * of.crack.scale}
+        half = 0.5 * (of.crack.length_mm + float(found.fit.tip_mm[0]))
+        one.numbers |= beside(one.numbers[K_I], Panel(*of.asked.panel), one.load_n, half, half_u)
     one.tip_px = of.crack.pixel(found.fit.tip_mm).tolist()
     one.order, one.points = found.fit.order, len(found.points.few.at)
     one.chi_square, one.degrees = found.fit.chi_square, found.fit.degrees
@@ -160,8 +166,8 @@ def _card(
             "youngs_modulus_mpa": of.elastic.youngs_modulus,
             "poisson": of.elastic.poisson,
             "drawn_length_mm": of.crack.length_mm,
-            "inner_mm": of.crack.ring.inner_mm,
-            "outer_mm": of.crack.ring.outer_mm,
+            "inner_mm": of.crack.inner_mm,
+            "outer_mm": of.crack.outer_mm,
             "steps": [one for one, _ in steps],
             "growth": growth,
             "marks": list(marks.values()),

@@ -204,7 +204,7 @@ def _chosen(field: Field, shared: SharedPixels, crack: DrawnCrack, tip_mm: Float
     """Return (r, c) True at the points of the ring that are used."""
     away = (field.xyz_mm - crack.origin_mm) @ crack.axes[:2].T - tip_mm
     distance = np.hypot(away[..., 0], away[..., 1])
-    used = field.valid & (distance >= crack.ring.inner_mm) & (distance <= crack.ring.outer_mm)
+    used = field.valid & (distance >= crack.inner_mm) & (distance <= crack.outer_mm)
     line = np.concatenate([crack.line_px, crack.pixel(tip_mm)[None]])
     pieces = np.ascontiguousarray(np.concatenate([line[:-1], line[1:]], axis=1))
     xy = np.stack([field.x_px[used], field.y_px[used]], axis=-1)

@@ -86,6 +86,11 @@ class CrackSettings(Request):
         None, description="Distance behind the tip at which the tip's opening is read; null: that of inner_mm."
     )
     cycles_channel: _Channel | None = Field(None, description="Channel with the count of load cycles; null: none.")
+    panel: tuple[_Positive, _Positive, _Small] | None = Field(
+        None,
+        description="Panel with a centre crack, to show K_I beside the closed formula: its width and thickness in mm, "
+        "and the relative standard uncertainty of its stress; null: none.",
+    )
 
     def elastic(self) -> Elastic:
         """Return the material.
@@ -101,9 +106,8 @@ class CrackSettings(Request):
                 code="modulus_unit_missing",
                 remedy="State modulus_unit, MPa or GPa.",
             )
-        stated = (self.youngs_modulus, self.modulus_u, self.poisson, self.poisson_u)
-        names = ("youngs_modulus", "modulus_u", "poisson", "poisson_u")
-        missing = [name for name, value in zip(names, stated, strict=True) if value is None]
+        needed = ("youngs_modulus", "modulus_u", "poisson", "poisson_u")
+        missing = [name for name in needed if getattr(self, name) is None]
         if self.youngs_modulus is None or self.poisson is None or self.modulus_unit is None or missing:
             raise InputError(
                 f"Displacements give stresses with a modulus alone; {', '.join(missing)} missing.",
