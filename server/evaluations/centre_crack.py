@@ -49,7 +49,7 @@ def width_factor(half_mm: float, width_mm: float) -> float:
         raise InputError(
             f"A crack of {2.0 * half_mm:.4g} mm is {share:.0%} of a panel's width of {width_mm:.4g} mm.",
             code="panel_invalid",
-            remedy=f"State the panel's whole width; up to {_LONGEST:.0%} of it the formula holds.",
+            remedy="State the panel's whole width; the formula holds up to nine tenths of it.",
         )
     return float((1.0 - 0.025 * share**2 + 0.06 * share**4) / np.sqrt(np.cos(0.5 * np.pi * share)))
 

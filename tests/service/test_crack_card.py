@@ -63,10 +63,13 @@ def test_k_of_the_panel_rises_with_the_load_as_the_formula(tmp_path: Path, capsy
         # one draw: beyond four standard uncertainties is one in 16,000
         assert abs(k["value"] - true) < 4.0 * k["u"], (k, true)
         assert k["u"] < 0.04 * true
-        # the formula's own: half of the crack and the tip's place are known to a share of a millimetre
-        assert one["numbers"]["K_I, wide sheet"]["value"] == pytest.approx(true, rel=0.01)
+        # the formula takes the crack up to the tip that is found; the secant alone is 0.2 % above Tada's
         factor = np.sqrt(1.0 / np.cos(np.pi * panel.half_crack_mm / panel.width_mm))
-        assert one["numbers"]["K_I, panel"]["value"] == pytest.approx(factor * true, rel=0.01)
+        for symbol, formula in (("K_I, wide sheet", true), ("K_I, panel", factor * true)):
+            stands = one["numbers"][symbol]
+            of_length = np.hypot(stands["parts"]["tip"], stands["parts"]["other_end"])
+            assert abs(stands["value"] - formula) < 4.0 * of_length + 0.0025 * formula, (stands, formula)
+            assert of_length < 0.02 * formula
         assert abs(one["numbers"]["K_II"]["value"]) < 4.0 * one["numbers"]["K_II"]["u"]
         assert abs(one["numbers"]["J"]["value"] - 1e3 * true**2 / panel.youngs_modulus_mpa) < (
             4.0 * one["numbers"]["J"]["u"]

@@ -80,14 +80,14 @@ def drawn_crack(field: Field, shared: SharedPixels, asked: CrackSettings) -> Dra
     slope = 0.5 * (surface(tip + np.eye(2)) - surface(tip - np.eye(2)))
     scale = float(np.sqrt(np.linalg.norm(np.cross(slope[0], slope[1]))))
     reach_px = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line[::-1], axis=0), axis=1))])
-    inner, outer = asked.ring_mm(shared.subset_px * scale, scale * min(0.5 * float(reach_px[-1]), border))
-    outer_px = outer / scale
+    inner_mm, outer_mm = asked.ring_mm(shared.subset_px * scale, scale * min(0.5 * float(reach_px[-1]), border))
+    outer_px = outer_mm / scale
     back = np.array([np.interp(outer_px, reach_px, line[::-1, k]) for k in (0, 1)])
     away, chord = line[::-1][reach_px < outer_px] - tip, (back - tip) / np.linalg.norm(back - tip)
     off = float(np.abs(away[:, 0] * chord[1] - away[:, 1] * chord[0]).max())
     if off > max(_DRAWN_PX, _STRAIGHT * outer_px):
         raise InputError(
-            f"Within {outer:.4g} mm of its tip the crack leaves a straight line by {off:.3g} px: it is kinked.",
+            f"Within {outer_mm:.4g} mm of its tip the crack leaves a straight line by {off:.3g} px: it is kinked.",
             code="crack_kinked",
             remedy="State an outer_mm within which it is straight; about a kink the series does not hold.",
         )
@@ -95,14 +95,14 @@ def drawn_crack(field: Field, shared: SharedPixels, asked: CrackSettings) -> Dra
     find_near(0, 1, tip[None], 0, outer_px, Cuts(others).pieces_px, np.zeros((1, 1), np.int64), near)
     if near[0]:
         raise InputError(
-            f"Another crack or a hole lies within {outer:.4g} mm of the tip.",
+            f"Another crack or a hole lies within {outer_mm:.4g} mm of the tip.",
             code="crack_not_alone",
             remedy="State a smaller outer_mm.",
         )
     about = np.hypot(field.x_px - tip[0], field.y_px - tip[1]) <= outer_px
     axes = align_plane(field, shared=shared, chosen=about, x_direction=surface(tip) - surface(back)).rotation
     length = float(np.linalg.norm(np.diff(surface(line), axis=0), axis=1).sum())
-    return DrawnCrack(line, axes, surface(tip), (slope @ axes[:2].T).T, length, inner, outer)
+    return DrawnCrack(line, axes, surface(tip), (slope @ axes[:2].T).T, length, inner_mm, outer_mm)
 
 
 def _lines(cuts: Cuts | None, asked: CrackSettings) -> tuple[Float, list[Float]]:
