@@ -186,7 +186,7 @@ def test_without_the_images_the_measured_subset_alone_is_studied_and_this_is_sai
 
 def test_what_a_gauge_loses_at_the_steepest_place_is_that_of_a_wave(tmp_path: Path) -> None:
     """A wave of strain along x, as plane patches see it: its crests are too low by what the window and they lose."""
-    static = still(3, 2, rows=60, cols=60)
+    static = [replace(one, uvw_mm=0.01 * one.uvw_mm) for one in still(3, 2, rows=60, cols=60) if one.uvw_mm is not None]
     period_px, height, window = 260.0, 0.01, 5
     turn = 2.0 * np.pi / period_px
     x = static[0].x_px - 250.0

@@ -27,7 +27,7 @@ from stereorig.server.evaluations.resolution.document import (
 )
 from stereorig.server.evaluations.resolution.noise import Scatter, scatter, thinned
 from stereorig.server.evaluations.resolution.settings import ResolutionSettings
-from stereorig.server.evaluations.resolution.steepest import bias_of, moment_px2, steepest
+from stereorig.server.evaluations.resolution.steepest import bias_of, moment_px2, steepest, whole_windows
 from stereorig.server.evaluations.resolution.transfer import Filter, l10_px, patch_filter, slope_filter
 
 _STATIC = re.compile(r"\s*static\b", re.IGNORECASE)
@@ -239,8 +239,8 @@ def _displacement(of: _Subset) -> SubsetFound:
     )
 
 
-def _strain(whole: _Subset, every: int, window: int) -> SettingFound:
-    of = whole.thinned(every)
+def _strain(measured: _Subset, every: int, window: int) -> SettingFound:
+    of = measured.thinned(every)
     point = _of_displacement(of.static[0], of.px)
     # a strain may vary along its own direction or across it, where the window takes a mean
     slope, mean = (
@@ -251,7 +251,7 @@ def _strain(whole: _Subset, every: int, window: int) -> SettingFound:
     fields = of.static if of.loaded is None else [*of.static, of.loaded]
     fits = all(min(field.shape) >= window for field in fields)
     strains = [surface_strain(one, StrainOptions(window=window), subset_px=of.px) for one in fields] if fits else []
-    still = strains[: len(of.static)]
+    still, whole = strains[: len(of.static)], [whole_windows(one.valid, window) for one in fields if fits]
     moments = moment_px2(slope), moment_px2(mean)
     along, down = moments if _columns_are_x(of.static[0]) else moments[::-1]
     numbers: dict[str, CardNumber] = {}
@@ -263,7 +263,10 @@ def _strain(whole: _Subset, every: int, window: int) -> SettingFound:
         values = every_value[: len(still)]
         found = scatter(values, [one.sigma[..., k] for one in still], gauge, of.spacing_px, about_zero=True)
         numbers |= _numbers(name, found, "1", resolved * of.mm_per_px, "mm^2", 2)
-        each = [bias_of(one, of.spacing_px, window, *ways[k]) for one in every_value]
+        each = [
+            bias_of(np.where(inside, one, np.nan), of.spacing_px, window, *ways[k])
+            for one, inside in zip(every_value, whole, strict=True)
+        ]
         bent = each[-1] if of.loaded is not None and each else None
         key = f"bias_{name}"
         numbers[key], place = _bias(key, "1", bent, each[: len(still)], gauge, of)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereorig.core.arrays import Float
+from stereorig.core.arrays import Bool, Float
 from stereorig.server.evaluations.resolution.transfer import Filter
 
 _LONG = 1e3  # widths of the filter, at which its transfer is a parabola
@@ -55,6 +55,16 @@ def bias_of(values: Float, spacing_px: float, window: int, along_px2: float, dow
     windows = np.lib.stride_tricks.sliding_window_view(values, (window, window))
     half = window // 2
     out[half : values.shape[0] - half, half : values.shape[1] - half] = np.einsum("rcij,ij->rc", windows, kernel)
+    return out
+
+
+def whole_windows(valid: Bool, window: int) -> Bool:
+    """Return (r, c) True at points whose window of points is whole; at others a strain is that of a place beside it."""
+    out = np.zeros(valid.shape, bool)
+    if min(valid.shape) >= window:
+        half = window // 2
+        every = np.lib.stride_tricks.sliding_window_view(valid, (window, window)).all(axis=(2, 3))
+        out[half : valid.shape[0] - half, half : valid.shape[1] - half] = every
     return out
 
 
