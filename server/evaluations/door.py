@@ -29,7 +29,7 @@ from stereorig.core.progress import Progress, no_progress
 from stereorig.core.strain import StrainField
 from stereorig.server.base.errors import NotFoundError
 from stereorig.server.base.json_values import without_nan
-from stereorig.server.evaluations.histories import Ends, History, Mean, history
+from stereorig.server.evaluations.histories import Deflection, Ends, History, Mean, history
 from stereorig.server.formats.results.folder import file_of_step, home_of, number_of
 from stereorig.server.formats.results.reading import ResultHead, read_field, read_head
 from stereorig.server.formats.results.strain import read_strain
@@ -158,8 +158,8 @@ class Results:
         found = recorded_with(home_of(self.file(step)), head.step, head.reference_step)
         return found if found.load_n is not None else replace(found, load_n=head.load_n)
 
-    def history(self, gauge: Ends | Mean) -> History:
-        """Return an engineering strain over :attr:`steps`, with what its errors have in common; see :func:`history`."""
+    def history(self, gauge: Ends | Mean | Deflection) -> History:
+        """Return a strain or a deflection over :attr:`steps`, with the errors that they share; see :func:`history`."""
         return history([*self._files.values()], gauge)
 
 

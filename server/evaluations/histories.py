@@ -19,6 +19,7 @@ from stereorig.core.gauge.align import Alignment, aligned
 from stereorig.core.gauge.area import points_within
 from stereorig.core.gauge.extensometer import extensometer
 from stereorig.core.gauge.reading import MISSING, Reading, reading_of
+from stereorig.core.gauge.sampling import Samples, sample
 from stereorig.core.names import ALL_CAUSES
 from stereorig.server.formats.results.reading import read_field, read_head
 from stereorig.server.formats.results.strain import read_strain
@@ -47,6 +48,18 @@ class Mean(NamedTuple):
     x_line_px: tuple[tuple[float, float], tuple[float, float]] | None = None
 
 
+class Deflection(NamedTuple):
+    """The deflection in mm of a beam's position against the straight line between two others, of its supports.
+
+    Along the surface's normal, or in the surface across that line.
+    """
+
+    middle_px: tuple[float, float]
+    a_px: tuple[float, float]
+    b_px: tuple[float, float]
+    normal: bool
+
+
 #: engineering strain of a component of each tensor, and its derivative
 _ENGINEERING: dict[str, Callable[[float], tuple[float, float]]] = {
     "green_lagrange": lambda e: (float(np.sqrt(1.0 + 2.0 * e)) - 1.0, 1.0 / float(np.sqrt(1.0 + 2.0 * e))),
@@ -62,7 +75,7 @@ class History:
     Attributes
     ----------
     value
-        (n,) strain; NaN where there is none.
+        (n,) strain, or deflection in mm; NaN where there is none.
     own
         (n,) standard deviation of the errors that are new at each step.
     shared
@@ -78,7 +91,7 @@ class History:
     known: bool
 
 
-def history(files: Sequence[Path], gauge: Ends | Mean) -> History:
+def history(files: Sequence[Path], gauge: Ends | Mean | Deflection) -> History:
     """Read a gauge in every step.
 
     Parameters
@@ -135,7 +148,7 @@ def shared_pixels(path: Path, field: Field) -> SharedPixels:
     return SharedPixels.of(field, float(subset))
 
 
-def _reading(path: Path, gauge: Ends | Mean, frame: Alignment | None) -> Reading | None:
+def _reading(path: Path, gauge: Ends | Mean | Deflection, frame: Alignment | None) -> Reading | None:
     """Return an engineering strain of a step; None for a shape."""
     field = read_field(path)
     if field.uvw_mm is None:
@@ -143,7 +156,36 @@ def _reading(path: Path, gauge: Ends | Mean, frame: Alignment | None) -> Reading
     if isinstance(gauge, Mean):
         assert frame is not None
         return _mean(path, aligned(field, frame), gauge)
+    if isinstance(gauge, Deflection):
+        return _deflection(field, gauge, shared_pixels(path, field))
     return extensometer(field, gauge.a_px, gauge.b_px, shared=shared_pixels(path, field)).strain
+
+
+def _deflection(field: Field, gauge: Deflection, shared: SharedPixels) -> Reading:
+    samples = sample(field, np.array([gauge.middle_px, gauge.a_px, gauge.b_px]))
+    assert field.uvw_mm is not None
+    if any(samples.missing):
+        return MISSING
+    at, normal = samples.of(field.xyz_mm), samples.of(field.normal_sys).mean(axis=0)
+    span = at[2] - at[1]
+    share = float((at[0] - at[1]) @ span / (span @ span))
+    along = normal if gauge.normal else np.cross(normal, span)
+    slope = np.zeros((3, 6))
+    slope[:, 3:] = np.outer([1.0, share - 1.0, -share], along / np.linalg.norm(along))
+    pairs = np.indices((3, 3)).reshape(2, -1)
+
+    def variance(of: Samples) -> float:
+        each = of.covariance(shared, *pairs).reshape(3, 3, 6, 6)
+        return float(np.einsum("ia,ijab,jb->", slope, each, slope))
+
+    reference, common = samples.reference_alone(), samples.common()
+    return reading_of(
+        float(np.sum(slope[:, 3:] * samples.of(field.uvw_mm))),
+        variance(samples),
+        None if reference is None else variance(reference),
+        None if common is None else np.einsum("ia,iak->k", slope, common),
+        field.causes,
+    )
 
 
 def _mean(path: Path, field: Field, gauge: Mean) -> Reading:

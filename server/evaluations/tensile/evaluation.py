@@ -12,10 +12,11 @@ from stereorig.core.progress import Progress
 from stereorig.server.evaluations.cards import CardNumber, MarkFound, number_found, number_missing
 from stereorig.server.evaluations.door import Evaluated, Results
 from stereorig.server.evaluations.histories import Ends, History, Mean
+from stereorig.server.evaluations.specimens import over_specimens, table_over
 from stereorig.server.evaluations.tensile.assessment import Assessed, Found, assessed
-from stereorig.server.evaluations.tensile.batch import over_specimens, table_over
 from stereorig.server.evaluations.tensile.curve import AXIAL, LATERAL, STRESS, Curve, with_load_errors
 from stereorig.server.evaluations.tensile.document import CurveFound, MaterialCardFound, page_of, table_of
+from stereorig.server.evaluations.tensile.flexure import strain_of_deflection, with_beam_errors
 from stereorig.server.evaluations.tensile.planning import Asked
 from stereorig.server.evaluations.tensile.profiles import PROFILES, UNITS, Profile
 from stereorig.server.evaluations.tensile.settings import TensileSettings
@@ -98,7 +99,7 @@ def curve_of(results: Results, asked: TensileSettings, progress: Progress) -> tu
     )
     missing = [] if axial.known and (lateral is None or lateral.known) else ["calibration of the cameras"]
     return with_load_errors(
-        curve,
+        with_beam_errors(curve, asked),
         scale_u=asked.load_scale_u or 0.0,
         offset_u_mpa=asked.load_zero_u_n * asked.load_scale / section,
         section_u=section_u,
@@ -108,6 +109,8 @@ def curve_of(results: Results, asked: TensileSettings, progress: Progress) -> tu
 
 
 def _strains(results: Results, asked: TensileSettings) -> tuple[History, History | None]:
+    if asked.deflection_px is not None:
+        return strain_of_deflection(results, asked), None
     corners = None
     if asked.rectangle_px is not None:
         x0, y0, x1, y1 = asked.rectangle_px
@@ -116,7 +119,7 @@ def _strains(results: Results, asked: TensileSettings) -> tuple[History, History
     along, across = ("exx", "eyy") if of_line else ("eyy", "exx")
     ends = None if asked.extensometer_px is None else Ends(*asked.extensometer_px)
     axial = results.history(ends or Mean(along, corners, asked.pull_px))
-    if not asked.lateral:
+    if not asked.lateral or asked.span_mm is not None:
         return axial, None
     ends = None if asked.lateral_px is None else Ends(*asked.lateral_px)
     return axial, results.history(ends or Mean(across, corners, asked.pull_px))

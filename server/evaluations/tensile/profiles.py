@@ -51,6 +51,13 @@ _PLASTICS = {
     "strain_at_strength": "eps_m",
     "strain_at_break": "eps_b",
 }
+_FLEXURE = {
+    "modulus": "E_B",
+    "upper_yield": "sigma_fy",
+    "strength": "sigma_fM",
+    "strain_at_strength": "eps_fM",
+    "strain_at_break": "eps_fB",
+}
 # ISO 6892-1 regresses the modulus between a lower and an upper share of the proof stress; ISO 527 states its strains
 PROFILES: dict[str, Profile] = {
     "iso_6892_1": Profile("ISO 6892-1", "share", 0.10, 0.40, _METALS),
@@ -63,6 +70,8 @@ PROFILES: dict[str, Profile] = {
     ),
     "iso_527_2": Profile("ISO 527-2", "strain", 0.0005, 0.0025, _PLASTICS),
     "astm_d638": Profile("ASTM D638", "strain", 0.0005, 0.0025, {**_PLASTICS, "modulus": "E", "proof": "YS0.2"}),
+    # the chord modulus; stress and strain are those of the outer face at midspan
+    "astm_d790": Profile("ASTM D790", "strain", 0.0005, 0.0025, _FLEXURE),
 }
 UNITS = {
     **dict.fromkeys(("modulus", "proof", "upper_yield", "lower_yield", "strength", "k"), "MPa"),

@@ -12,7 +12,7 @@ from stereorig.core.errors import InputError
 from stereorig.core.settings import Pixel
 from stereorig.server.base.models import Number, Request, Switch
 
-Standard = Literal["iso_6892_1", "iso_527_2", "astm_d638", "astm_e8"]
+Standard = Literal["iso_6892_1", "iso_527_2", "astm_d638", "astm_e8", "astm_d790"]
 Positive = Annotated[float, Field(gt=0.0, le=1e9, allow_inf_nan=False)]
 _Small = Annotated[float, Field(ge=0.0, le=0.5, allow_inf_nan=False)]
 _NotNegative = Annotated[float, Field(ge=0.0, le=1e9, allow_inf_nan=False)]
@@ -38,6 +38,19 @@ class TensileSettings(Request):
     diameter_mm: Positive | None = Field(None, description="Diameter of a round section.")
     section_mm2: Positive | None = Field(None, description="Area of another section.")
     section_u: _Small | None = Field(None, description="Relative standard uncertainty of the section: 0.003 is 0.3 %.")
+    span_mm: Positive | None = Field(
+        None, description="Distance of the supports of a bar in three-point bending; thickness_mm is its depth."
+    )
+    span_u: _Small = Field(0.0, description="Relative standard uncertainty of the span.")
+    depth_u: _Small = Field(0.0, description="Relative standard uncertainty of the depth; section_u is the width's.")
+    deflection_px: tuple[tuple[Pixel, Pixel], tuple[Pixel, Pixel], tuple[Pixel, Pixel]] | None = Field(
+        None,
+        description="Midspan and both supports in camera 1's image, whose deflection gives the strain; null: it is the "
+        "measured strain along the bar's outer face.",
+    )
+    deflection_normal: Switch = Field(
+        False, description="The deflection is along the surface's normal, the bar seen from above or below."
+    )
     load_channel: Annotated[str, Field(min_length=1, max_length=100)] | None = Field(
         None, description="Channel that is the load; null: the load of the steps."
     )
@@ -88,10 +101,14 @@ class TensileSettings(Request):
             window = getattr(self, name)
             if window is not None and window[0] >= window[1]:
                 raise ValueError(f"{name} needs its lower end first, has {window[0]:g} and {window[1]:g}")
+        if (self.standard == "astm_d790") != (self.span_mm is not None):
+            raise ValueError("astm_d790 and span_mm need each other")
+        if self.span_mm is not None and not (self.span_u and self.depth_u):
+            raise ValueError("a span needs span_u and depth_u, its and the depth's relative standard uncertainty")
         return self
 
     def section(self) -> tuple[float, float]:
-        """Return the section in mm2, and its relative standard uncertainty.
+        """Return the section in mm2, and its relative standard uncertainty; of a bent bar, load over bending stress.
 
         Raises
         ------
@@ -102,6 +119,8 @@ class TensileSettings(Request):
         areas.append(None if self.diameter_mm is None else math.pi * self.diameter_mm**2 / 4.0)
         areas.append(None if self.width_mm is None or self.thickness_mm is None else self.width_mm * self.thickness_mm)
         given = [area for area in areas if area is not None]
+        if self.span_mm is not None:
+            given = [area * 2.0 * self.thickness_mm / (3.0 * self.span_mm) for area in given if self.thickness_mm]
         if len(given) != 1 or self.section_u is None:
             raise InputError(
                 f"{len(given)} sections are stated, with {'no' if self.section_u is None else 'an'} uncertainty.",

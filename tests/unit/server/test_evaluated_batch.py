@@ -10,7 +10,7 @@ import pytest
 
 from stereorig.core.strain import StrainOptions, surface_strain
 from stereorig.server.cli.main import main
-from stereorig.server.evaluations.tensile.batch import factor, over_specimens
+from stereorig.server.evaluations.specimens import factor, over_specimens
 from stereorig.server.evaluations.tensile.document import CardNumber, CurveFound, MaterialCardFound
 from stereorig.server.formats.results.writing import Provenance, write_field
 from tests.support.gauge_field import SUBSET, make_field

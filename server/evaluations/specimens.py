@@ -3,18 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Protocol
 
 import numpy as np
 from pydantic import BaseModel, Field
 from scipy.stats import nct, norm
 
 from stereorig.server.base.models import Reply
-from stereorig.server.evaluations.tensile.document import MaterialCardFound
+from stereorig.server.evaluations.cards import CardNumber
 from stereorig.server.formats.csv_cells import row
 
 _SHARE, _CONFIDENCE = 0.90, 0.95
 #: causes that are new at each specimen
 _NEW = ("strain", "load", "reference", "section", "sampling")
+
+
+class Card(Protocol):
+    """A card of a specimen."""
+
+    @property
+    def verdict(self) -> str:
+        """Its verdict."""
+        ...
+
+    @property
+    def numbers(self) -> Mapping[str, CardNumber]:
+        """Its numbers by their symbols."""
+        ...
 
 
 class OverSpecimens(BaseModel):
@@ -42,7 +57,7 @@ class MaterialFound(Reply):
     numbers: dict[str, OverSpecimens] = Field(description="The numbers by their symbols.")
 
 
-def over_specimens(cards: Mapping[str, MaterialCardFound]) -> MaterialFound:
+def over_specimens(cards: Mapping[str, Card]) -> MaterialFound:
     """Return the numbers over specimens by their cards."""
     symbols = dict.fromkeys(symbol for card in cards.values() for symbol in card.numbers)
     return MaterialFound(
@@ -52,7 +67,7 @@ def over_specimens(cards: Mapping[str, MaterialCardFound]) -> MaterialFound:
     )
 
 
-def _over(symbol: str, cards: list[MaterialCardFound]) -> OverSpecimens:
+def _over(symbol: str, cards: list[Card]) -> OverSpecimens:
     each = [card.numbers[symbol] for card in cards if symbol in card.numbers]
     good = [one for one in each if one.state == "good" and one.value is not None]
     values = np.array([one.value for one in good], dtype=np.float64)
