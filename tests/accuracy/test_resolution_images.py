@@ -87,7 +87,10 @@ def test_l10_of_a_star_rendered_in_stereo_is_the_transfers(patch: Any, order: in
         ]
         for plane in (Plane(), star)
     ]
-    grid, options = PointGrid.rectangle(30, 30, SIZE - 31, SIZE - 31, spacing_px=9), MeasureOptions(SUBSET, patch=patch)
+    grid, options = (
+        PointGrid.rectangle(30, 30, SIZE - 31, SIZE - 31, spacing_px=9),
+        MeasureOptions(subset_px=SUBSET, patch=patch),
+    )
     reference = ReferencePair(pair, *images[0])
     field = reference.motion(*images[1], grid, options, shape=reference.shape(grid, options))
     assert field.uvw_mm is not None
@@ -151,7 +154,7 @@ def test_the_setting_chosen_of_several_subsets_is_near_the_best_by_brute_force(
     assert not card["marks"]
     loudest: dict[tuple[int, int], float] = {}
     for subset in (15, 21, 31):
-        grid, options = PointGrid.rectangle(*ROI, spacing_px=7), MeasureOptions(subset, patch="affine")
+        grid, options = PointGrid.rectangle(*ROI, spacing_px=7), MeasureOptions(subset_px=subset, patch="affine")
         reference = ReferencePair(pair, *images[0])
         shape = reference.shape(grid, options)
         fields = [reference.motion(*one, grid, options, shape=shape) for one in images[1:]]
