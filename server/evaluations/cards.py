@@ -92,19 +92,29 @@ def cells_of(symbol: str, one: CardNumber) -> tuple[object, ...]:
     return symbol, one.value, one.units, one.u, one.lower, one.upper, one.state, one.why
 
 
-def page(title: str, head: str, tables: Mapping[str, Mapping[str, CardNumber]], marks: Iterable[MarkFound]) -> str:
-    """Return a card as an HTML page that needs nothing else: a table of numbers for each heading, and the marks."""
+def page(
+    title: str,
+    head: str,
+    tables: Mapping[str, Mapping[str, CardNumber]],
+    marks: Iterable[MarkFound],
+    items: Mapping[str, str] | None = None,
+) -> str:
+    """Return a card as an HTML page that needs nothing else.
+
+    It has a table of numbers for each heading, the marks, and a table of further items by name.
+    """
     body = []
     for heading, numbers in tables.items():
         rows = [_row("td", _shown(symbol, one)) for symbol, one in numbers.items()]
         above = f"<h2>{html.escape(heading)}</h2>" if heading else ""
         titles = ("", "value", "u (k = 1)", "95 % interval", "unit", "state")
         body.append(f"{above}<table>{_row('th', titles)}{''.join(rows)}</table>")
+    each = "".join(_row("td", item) for item in (items or {}).items())
     listed = "".join(f"<li>{html.escape(mark.code)}: {html.escape(mark.text)}</li>" for mark in marks)
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
         f"<style>{_STYLE}</style><h1>{html.escape(title)}</h1><p>{html.escape(head)}</p>"
-        f"{''.join(body)}<ul>{listed}</ul></html>\n"
+        f"{''.join(body)}<ul>{listed}</ul>{f'<table>{each}</table>' if each else ''}</html>\n"
     )
 
 

@@ -152,6 +152,12 @@ def test_the_setting_chosen_of_several_subsets_is_near_the_best_by_brute_force(
     assert [one["subset_px"] for one in card["subsets"]] == [21, 15, 31]
     assert len(card["settings"]) == 9
     assert not card["marks"]
+    rows = {one["item"]: one["value"] for one in card["reporting"]}
+    assert rows["Stereo-angle"] == "20 degrees"
+    assert rows["Subset size"] == f"{card['chosen']['subset_px']} px"
+    assert rows["Lens"] is None
+    # blobs of 1.5 px (sd) under a tanh: an autocorrelation of 2 sqrt(ln 2) 2 sd = 5 px at half of its height
+    assert float(rows["Pattern feature size"].split()[0]) == pytest.approx(4.0 * np.sqrt(np.log(2.0)) * 1.5, rel=0.15)
     loudest: dict[tuple[int, int], float] = {}
     for subset in (15, 21, 31):
         grid, options = PointGrid.rectangle(*ROI, spacing_px=7), MeasureOptions(subset_px=subset, patch="affine")

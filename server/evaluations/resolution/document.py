@@ -41,6 +41,13 @@ class SettingFound(BaseModel):
     steepest_px: dict[str, tuple[float, float]] = Field(description="Those places in camera 1's reference image.")
 
 
+class Reported(BaseModel):
+    """An item of the tables."""
+
+    item: str = Field(description="Its name in the guide.")
+    value: str | None = Field(description="Its value; null: nobody stated it, and no record has it.")
+
+
 class ResolutionFound(Reply):
     """Noise and spatial resolution of a test's pattern and rig."""
 
@@ -60,6 +67,10 @@ class ResolutionFound(Reply):
         description="The setting with the least noise that resolves the smallest feature; null without one."
     )
     marks: list[MarkFound] = Field(description="What the data show.")
+    reporting: list[Reported] = Field(
+        description="The iDICs guide's reporting tables, of the chosen setting or the first; empty if the results state "
+        "no settings."
+    )
 
 
 def heading(one: SettingFound) -> str:
@@ -88,4 +99,5 @@ def page_of(title: str, card: ResolutionFound) -> str:
     head = f"{card.patch} patch, {card.mm_per_px:.4g} mm a pixel, {len(card.static_steps)} static steps"
     tables = {f"Displacement, subset {one.subset_px} px: l10 {one.l10_mm:.4g} mm": one.numbers for one in card.subsets}
     tables |= {heading(one): one.numbers for one in card.settings}
-    return page(title, f"{head}: {card.verdict}{chosen}", tables, card.marks)
+    items = {one.item: one.value or "not stated" for one in card.reporting}
+    return page(title, f"{head}: {card.verdict}{chosen}", tables, card.marks, items)

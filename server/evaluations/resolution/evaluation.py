@@ -19,6 +19,7 @@ from stereorig.server.evaluations.cards import CardNumber, MarkFound, number_fou
 from stereorig.server.evaluations.door import Evaluated, Results
 from stereorig.server.evaluations.histories import shared_pixels
 from stereorig.server.evaluations.resolution.document import (
+    Reported,
     ResolutionFound,
     SettingFound,
     SubsetFound,
@@ -26,6 +27,8 @@ from stereorig.server.evaluations.resolution.document import (
     table_of,
 )
 from stereorig.server.evaluations.resolution.noise import Scatter, scatter, thinned
+from stereorig.server.evaluations.resolution.origin import Origin
+from stereorig.server.evaluations.resolution.reporting import reporting
 from stereorig.server.evaluations.resolution.settings import ResolutionSettings
 from stereorig.server.evaluations.resolution.steepest import bias_of, moment_px2, steepest, whole_windows
 from stereorig.server.evaluations.resolution.transfer import Filter, l10_px, patch_filter, slope_filter
@@ -106,6 +109,7 @@ class ResolutionStudy:
             settings=studied,
             chosen=chosen,
             marks=[*_marks(subsets[0].numbers, steps), *marks],
+            reporting=_reported(Origin(results, steps[0]), fields[0], subsets, studied, chosen, scale),
         )
         return Evaluated(card, steps[-1], files={".csv": table_of(card), ".html": page_of(self.title, card)})
 
@@ -143,6 +147,20 @@ def _loaded(results: Results, asked: ResolutionSettings) -> int | None:
     return max((step for step in moved if step not in static), default=None)
 
 
+def _reported(
+    origin: Origin,
+    points: Field,
+    subsets: list[SubsetFound],
+    studied: list[SettingFound],
+    chosen: SettingFound | None,
+    scale: float,
+) -> list[Reported]:
+    """Return the reporting tables of the chosen setting; without one, of the measured subset's first."""
+    setting = chosen if chosen is not None else next(iter(studied), None)
+    px = subsets[0].subset_px if setting is None else setting.subset_px
+    return reporting(origin, points, next(one for one in subsets if one.subset_px == px), setting, scale)
+
+
 def _anew(
     results: Results, steps: list[int], loaded: int | None, like: _Subset, others: list[int], marks: list[MarkFound]
 ) -> Iterator[_Subset]:
@@ -152,7 +170,7 @@ def _anew(
         for subset in others:
             if subset == others[0]:
                 # the matching is slow to load, and not every study needs it
-                from stereorig.server.evaluations.resolution.anew import MeasuredAnew, Origin
+                from stereorig.server.evaluations.resolution.anew import MeasuredAnew
 
                 anew = MeasuredAnew(Origin(results, steps[0]), like.static[0], like.spacing_px)
             fields = anew.fields(wanted, subset)
