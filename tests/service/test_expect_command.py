@@ -121,3 +121,35 @@ def test_what_the_cameras_see_follows_from_what_is_stated(capsys: pytest.Capture
     assert "mm nearer to" in shown
     assert main(["expect", *NOT_THERE]) == 0
     assert "not stated: f_number, exposure_ms, speed_mm_s" in capsys.readouterr().out
+
+
+def test_the_modulus_of_a_planned_test_scatters_as_its_parts_say(capsys: pytest.CaptureFixture[str]) -> None:
+    """Tests drawn with the predicted errors of strain, load and section, and a line through each."""
+    planned = ["--area-mm", "12", "--modulus-strains", "0.0005,0.0025", "--modulus-steps", "15"]
+    found = document(capsys, *NOT_THERE, *planned, "--load-class", "0.5", "--section-u", "0.003")["modulus"]
+    assert found["gauge_mm"] == pytest.approx(12.0, rel=0.1)
+    assert found["missing"] == []
+    strain = np.linspace(0.0005, 0.0025, 15)
+    spread, rng, moduli = 0.002 * np.sqrt(15 * 16 / (12 * 14)), np.random.default_rng(1), []
+    for _ in range(4000):
+        load = strain * (1.0 + 0.005 * rng.uniform(-1.0, 1.0)) / (1.0 + 0.003 * rng.normal())
+        # noise by the predicted slope's part, the reference's noise in all steps alike, the cameras' growing
+        read = strain * (1.0 + found["parts"]["cameras"] * rng.normal()) + 1e-4 * rng.normal()
+        read = read + found["parts"]["noise"] * spread * rng.normal(size=15)
+        moduli.append(1.0 / np.polyfit(load, read, 1)[0])
+    # a standard deviation of 4,000 is known to 1.1 %
+    assert np.std(moduli) / np.mean(moduli) == pytest.approx(found["relative_u"], rel=0.05)
+    # what is not stated is named, and no whole is made of the rest
+    assert main(["expect", *NOT_THERE, *planned]) == 0
+    assert "modulus: not stated: load_class, section_u; noise" in capsys.readouterr().out
+    assert main(["expect", *NOT_THERE, "--modulus-strains", "0.003,0.001"]) == 1
+    assert "lower end first" in capsys.readouterr().err
+
+
+def test_a_wider_gauge_and_more_steps_know_the_modulus_better(capsys: pytest.CaptureFixture[str]) -> None:
+    def noise(*options: str) -> float:
+        return float(document(capsys, *NOT_THERE, *options)["modulus"]["parts"]["noise"])
+
+    assert noise("--area-mm", "20") < 0.6 * noise("--area-mm", "12")
+    few, many = (noise("--modulus-steps", str(n)) for n in (20, 80))
+    assert many == pytest.approx(few * np.sqrt(20 * 21 / 19) / np.sqrt(80 * 81 / 79), rel=1e-9)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -12,10 +14,15 @@ from pydantic import BaseModel, ValidationError
 
 from stereorig.core.errors import InputError
 from stereorig.core.names import BUDGET
+from stereorig.core.plan.modulus import PlannedTensileTest, modulus_parts
 from stereorig.core.plan.settings import PlannedMeasurement, PlannedRig
+from stereorig.core.settings import STRAIN_WINDOW
 
 #: options that other commands have by these names
 _NAMES = {"subset_px": "--subset", "spacing_px": "--step", "strain_window": "--strain"}
+#: causes that a strain has from a motion of the whole body
+_OF_CAMERAS = ("calibration", "stage", "target")
+_UNSEEN = "a camera does not see the whole gauge"
 _M = TypeVar("_M", bound=BaseModel)
 _NEEDED = ("image_size_px", "standoff_mm", "angle_deg", "pitch_mm", "lines")
 
@@ -37,7 +44,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--roll-deg", type=float, default=0.0, metavar="DEG", help="turn of the target in the images")
     parser.add_argument("--json", action="store_true", help="print the whole document in place of a table")
-    for title, model in (("the rig, if it differs from the file", PlannedRig), ("measurement", PlannedMeasurement)):
+    for title, model in (
+        ("the rig, if it differs from the file", PlannedRig),
+        ("measurement", PlannedMeasurement),
+        ("a tensile test, whose gauge is area_mm wide", PlannedTensileTest),
+    ):
         group = parser.add_argument_group(title)
         for name, field in model.model_fields.items():
             default = "" if field.default is None else f" (default: {_shown(field.default)})"
@@ -66,7 +77,9 @@ def run(args: argparse.Namespace) -> int:
     plan = PlannedCalibration(
         positions_mm=positions, localiser=localiser, noise_px=args.noise_px, roll_deg=args.roll_deg
     )
-    document = expectation_document(rig_as_planned(rig, planned), plan, measured)
+    predicted = partial(expectation_document, rig_as_planned(rig, planned), plan)
+    document = predicted(measured)
+    document["modulus"] = _modulus(predicted, document["views"], measured, _model(PlannedTensileTest, args))
     print(to_json(document).decode().rstrip() if args.json else table(document))
     return 1 if document["refused"] else 0
 
@@ -96,8 +109,45 @@ def table(document: Mapping[str, Any]) -> str:
     ]
     lines += ["", document["assumed"]["text"], document["measurement"]["text"]]
     lines += [f"{name}: {_seen(view)}" for name, view in document["views"].items()]
+    lines += [_modulus_line(document["modulus"])]
     lines += [f"would be refused: {reason}" for reason in document["reasons"]]
     return "\n".join(line.rstrip() for line in lines)
+
+
+def _modulus(
+    predicted: Callable[[PlannedMeasurement], Mapping[str, Any]],
+    views: Any,
+    measured: PlannedMeasurement,
+    test: PlannedTensileTest,
+) -> dict[str, Any]:
+    """Return the relative standard uncertainty of a modulus whose gauge is as wide as the planned area."""
+    across = 1e3 * measured.area_mm / views["cam1"]["um_per_px"]
+    window = 2 * round(0.5 * (across - measured.subset_px) / measured.spacing_px) + 1
+    window = min(max(window, STRAIN_WINDOW.low), STRAIN_WINDOW.high)
+    wide = measured.model_copy(update={"strain_window": window})
+    strains = [q for q in predicted(wide)["quantities"] if q["name"] == "exx"]
+    known = [q for q in strains if q["sigma"] is not None]
+    missing = [name for name in ("load_class", "section_u") if getattr(test, name) is None]
+    found: dict[str, Any] = {**test.model_dump(), "gauge_mm": None, "relative_u": None, "parts": {}, "missing": missing}
+    if known:
+        moved = max(math.hypot(*(q["budget"][c] for c in _OF_CAMERAS)) for q in known)
+        parts = modulus_parts(test, max(q["budget"]["matching"] for q in known), moved)
+        whole = None if missing else math.hypot(*parts.values())
+        found |= {"gauge_mm": known[0]["size_mm"], "relative_u": whole, "parts": dict(parts)}
+    return found
+
+
+def _modulus_line(found: Mapping[str, Any]) -> str:
+    """Write the modulus' uncertainty and its parts in one line."""
+    if found["gauge_mm"] is None:
+        return f"modulus: no uncertainty, {_UNSEEN}"
+    low, high = found["modulus_strains"]
+    parts = ", ".join(f"{cause} {100.0 * u:.2g} %" for cause, u in found["parts"].items())
+    whole = f"not stated: {', '.join(found['missing'])}"
+    if found["relative_u"] is not None:
+        whole = f"u (k = 1) {100.0 * found['relative_u']:.2g} %"
+    gauge = f"{found['gauge_mm']:.3g} mm gauge, {found['modulus_steps']} steps between strains of {low:g} and {high:g}"
+    return f"modulus: {whole}; {parts}; {gauge}, the body moving by the largest translation"
 
 
 def _seen(view: Mapping[str, Any]) -> str:

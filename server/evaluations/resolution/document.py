@@ -68,8 +68,8 @@ class ResolutionFound(Reply):
     )
     marks: list[MarkFound] = Field(description="What the data show.")
     reporting: list[Reported] = Field(
-        description="The iDICs guide's reporting tables, of the chosen setting or the first; empty if the results state "
-        "no settings."
+        description="The iDICs guide's reporting tables, of the chosen setting or the first; empty without stated "
+        "settings."
     )
 
 
