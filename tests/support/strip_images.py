@@ -1,4 +1,4 @@
-"""Tensile tests of a linear strip through rendered stereo images: every error of camera noise, load and section is drawn."""
+"""Tensile tests of a linear strip through rendered stereo images, with drawn errors of pixels, load and section."""
 
 from __future__ import annotations
 
