@@ -27,11 +27,13 @@ from stereorig.server.results.channels import has_more, rising
 from stereorig.server.results.provenance import provenance
 from stereorig.server.results.steps import (
     ExportSource,
+    StepResult,
     chosen,
     columns_of,
     each,
     read_step,
     require_known,
+    step_name,
     variables_of,
     with_coverage,
 )
@@ -63,14 +65,14 @@ def export(source: ExportSource, request: ExportRequest, out: Path) -> Iterator[
         yield from _as_stored(source, files, request, out)
     elif request.format == "csv":
         for step in each(source, request.steps, request.variables):
-            path = _path(out, source, step.n, "csv")
-            write_table(path, step, source, matrices=request.variables is not None)
+            path = _path(out, source, step, "csv")
+            write_table(path, step, source, asked=request.variables is not None)
             yield path
     elif request.format == "vtu":
         yield from _as_vtu(source, files, request, out)
     elif request.format == "mat":
         path = out / f"{source.name}.mat"
-        write_mat(path, each(source, request.steps, request.variables), source)
+        write_mat(path, source, request.steps, request.variables)
         yield path
     elif request.format == "h5":
         path = out / f"{source.name}.h5"
@@ -109,8 +111,8 @@ def _watched(made: Iterator[Path], source: ExportSource, request: ExportRequest)
         yield path
 
 
-def _path(out: Path, source: ExportSource, n: int, suffix: str) -> Path:
-    return out / f"{source.name}_step_{n:04d}.{suffix}"
+def _path(out: Path, source: ExportSource, step: StepResult, suffix: str) -> Path:
+    return out / f"{step_name(source, step)}.{suffix}"
 
 
 def _as_stored(source: ExportSource, files: Sequence[Path], request: ExportRequest, out: Path) -> Iterator[Path]:
@@ -127,11 +129,12 @@ def _as_stored(source: ExportSource, files: Sequence[Path], request: ExportReque
             remedy="Leave k and coverage out, or choose h5.",
         )
     for path in files:
-        copy = _path(out, source, number_of(path), "nc")
+        step = read_step(path, [], home=source.home)
+        copy = _path(out, source, step, "nc")
         with written_temporary(copy) as temporary:
             temporary.write_bytes(checked_bytes(path))
             if has_more(path, source.home or home_of(path)):
-                add_scalars(temporary, scalars_of(read_step(path, [], home=source.home).recorded))
+                add_scalars(temporary, scalars_of(step.recorded))
         yield copy
 
 
@@ -149,7 +152,7 @@ def _as_vtu(source: ExportSource, files: Sequence[Path], request: ExportRequest,
         if names is not None:
             names = [name for name in (*names, *NEEDS) if name in there[path]]
         step = with_coverage(read_step(path, names, home=source.home), source)
-        target = _path(out, source, step.n, "vtu")
+        target = _path(out, source, step, "vtu")
         write_vtu(target, step, source, mask=mask, at_rest=moves and "u_mm" not in there[path], time=time)
         written.append((time, target.name))
         yield target
@@ -179,7 +182,7 @@ def _drawn(source: ExportSource, files: Sequence[Path], request: ExportRequest, 
             continue
         for step in each(source, request.steps, [name]):
             if name in columns_of(step) or step.n == number_of(files[-1]):
-                path = out / f"{source.name}_step_{step.n:04d}_{name}.{request.format}"
+                path = out / f"{step_name(source, step)}_{name}.{request.format}"
                 form: Literal["png", "svg"] = "svg" if request.format == "svg" else "png"
                 write_figure(path, picture_of(step, name, source, image), request.style, form)
                 yield path

@@ -8,6 +8,7 @@ from stereorig.core.errors import InputError
 from stereorig.server.formats.calibrations.in_test import calibration_id_in
 from stereorig.server.formats.results.folder import first_results, home_of, results_in
 from stereorig.server.formats.results.reading import read_head
+from stereorig.server.results.naming import analysis_name
 from stereorig.server.results.staleness import stale_results
 from stereorig.server.results.steps import ExportSource, failed_steps
 from stereorig.server.store.durable import known_json
@@ -61,11 +62,10 @@ def source_of(folder: Path, files: list[Path]) -> ExportSource:
             "calibration_id": calibration_id_in(document, heads[0].inputs_sha256.get("calibration")),
             "specimen": document.get("specimen", ""),
         }
-        name, title = test.name, str(document.get("name") or test.name)
+        title = str(document.get("name") or test.name)
         if folder.parent.name == "analyses":
             about["analysis_id"] = folder.name
-            name = f"{test.name}_{folder.name}"
-        return ExportSource(files, name + dense, title, image, about, mask, stale, home=folder)
+        return ExportSource(files, analysis_name(folder) + dense, title, image, about, mask, stale, home=folder)
     image_file = heads[0].image_file("cam1")
     calibration = known_json(folder / "summary.json").get("calibration")
     if isinstance(calibration, dict) and calibration.get("file"):

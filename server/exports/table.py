@@ -1,9 +1,9 @@
-"""A step as a CSV table: one line a point, its provenance in comment lines above the header."""
+"""A step as a CSV table: a header, then one line a point; the last column of the first one has the provenance."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from stereorig.server.formats import csv_cells
 from stereorig.server.formats.files import written_temporary
 from stereorig.server.results.provenance import provenance
-from stereorig.server.results.steps import ExportSource, StepResult, columns_of
+from stereorig.server.results.reader import FileVariable
+from stereorig.server.results.steps import ExportSource, StepResult, columns_of, without_internals
 
 _LINES_AT_ONCE = 2000
 
 
-def write_table(path: Path, step: StepResult, source: ExportSource, *, matrices: bool = False) -> None:
+def write_table(path: Path, step: StepResult, source: ExportSource, *, asked: bool = False) -> None:
     """Write one step as CSV.
 
     Parameters
@@ -27,27 +28,24 @@ def write_table(path: Path, step: StepResult, source: ExportSource, *, matrices:
         The file.
     step, source
         Its numbers, and their provenance.
-    matrices
-        Write covariances (upper triangle) and common factors among its variables too, an entry a column.
+    asked
+        True: its variables were asked for by name, so that internals among them are written too, and covariances
+        (upper triangle) and common factors an entry a column.
 
     Notes
     -----
-    Lines that begin with ``#`` state the provenance name by name, and each column's unit and meaning. The header
-    follows, then one line a grid point: ``row, col``, then the variables. A number that is not there is empty; a
-    variable of states is written as its number, with the name in the next column.
+    The header comes first, so that programs read the table without an option, then one line a grid point: ``row,
+    col``, then the variables. A number that is not there is empty; a variable of states is written as its number, with
+    the name in the next column. The column ``about`` has JSON in the first line alone: the provenance, and each
+    column's unit and meaning. Its number signs are escaped: no reader takes them for comments.
     """
-    columns = columns_of(step, matrices=matrices)
+    columns = columns_of(step if asked else without_internals(step), matrices=asked)
     with written_temporary(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as out:
-        for name, value in provenance(step, source).items():
-            out.write(csv_cells.comment(f"{name}: {_text(value)}"))
-        out.write("# column row, unit 1: row of the grid of points\n# column col, unit 1: column of the grid\n")
         header = ["row", "col"]
         for name, variable in columns.items():
-            out.write(csv_cells.comment(f"column {name}, unit {variable.units}: {variable.long_name}"))
-            header.append(name)
-            if variable.flags is not None:
-                header.append(f"{name}_name")
-        out.write(csv_cells.row(header))
+            header += [name] if variable.flags is None else [name, f"{name}_name"]
+        out.write(csv_cells.row([*header, "about"]))
+        about = csv_cells.row([_about(step, source, columns)])
         rows, cols = step.shape
         texts: list[tuple[Callable[[Any], str], NDArray[Any]]] = [
             (str, np.repeat(np.arange(rows), cols)),
@@ -60,7 +58,9 @@ def write_table(path: Path, step: StepResult, source: ExportSource, *, matrices:
                 texts.append((_name_of(variable.flags), flat))
         for first in range(0, rows * cols, _LINES_AT_ONCE):
             block = [[text(v) for v in flat[first : first + _LINES_AT_ONCE].tolist()] for text, flat in texts]
-            out.writelines(",".join(line) + "\n" for line in zip(*block, strict=True))
+            for line in zip(*block, strict=True):
+                out.write(f"{','.join(line)},{about}")
+                about = "\n"
 
 
 def _text_of(values: NDArray[Any]) -> Callable[[Any], str]:
@@ -76,5 +76,14 @@ def _name_of(flags: dict[int, str]) -> Callable[[Any], str]:
     return lambda v: names.get(v, "")
 
 
-def _text(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, sort_keys=True)
+def _about(step: StepResult, source: ExportSource, columns: Mapping[str, FileVariable]) -> str:
+    document = {
+        **provenance(step, source),
+        "units": {"row": "1", "col": "1", **{name: v.units for name, v in columns.items()}},
+        "meaning": {
+            "row": "row of the grid of points",
+            "col": "column of the grid of points",
+            **{name: v.long_name for name, v in columns.items()},
+        },
+    }
+    return json.dumps(document, ensure_ascii=False).replace("#", "\\u0023")

@@ -172,9 +172,14 @@ def plain_names(names: Iterable[str], plain: Callable[[str], str] | None = None)
     return found
 
 
+def ascii_of(text: str) -> str:
+    """Return a text without accents and without letters of other scripts."""
+    return unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
+
+
 def folded(text: str) -> str:
     """Return a text in small letters without accents."""
-    return unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().lower()
+    return ascii_of(text).lower()
 
 
 def _word(text: str) -> str:

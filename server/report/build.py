@@ -27,11 +27,11 @@ from stereorig.server.report.geometry import geometry
 from stereorig.server.report.hardware import hardware, image_sizes
 from stereorig.server.report.histories import courses, gauges
 from stereorig.server.report.items import METADATA_FORM, UM, Item, Missing, Value, plain
-from stereorig.server.report.options import ReportOptions, chosen_sections
 from stereorig.server.report.page import PNG, PagePicture, kept_logo, read_logo, render
 from stereorig.server.report.settings import analysis
 from stereorig.server.report.source import Source
 from stereorig.server.report.steps import DrawnStep, MeasuredSteps, read_steps
+from stereorig.server.report.task import ReportOptions, chosen_sections
 from stereorig.server.report.uncertainty import field_budgets, sentence
 
 T = TypeVar("T")

@@ -22,7 +22,9 @@ from stereorig.server.formats.results.folder import home_of, number_of
 from stereorig.server.formats.results.netcdf import opened
 from stereorig.server.formats.results.reading import causes_of
 from stereorig.server.formats.results.uncertainty import Included, Statement
+from stereorig.server.formats.results.variables import described
 from stereorig.server.results.channels import Recorded, recorded_with
+from stereorig.server.results.naming import numbered
 from stereorig.server.results.reader import FileVariable, derived_variable
 from stereorig.server.results.uncertainty import COMMON_FACTOR, as_matrix, in_file, matrix_columns, with_intervals
 from stereorig.server.store.durable import known_json
@@ -122,6 +124,11 @@ class ExportSource:
     stale_reasons: Sequence[str] = ()
     coverage: CoverageFields = field(default_factory=lambda: Coverage.model_validate({}))
     home: Path | None = None
+
+
+def step_name(source: ExportSource, step: StepResult) -> str:
+    """Return the name of a step's file without its ending: the source's, the number, the label."""
+    return numbered(source.name, step.n, step.label)
 
 
 def failed_steps(folder: Path) -> dict[str, dict[str, Any]]:
@@ -292,6 +299,12 @@ def require_same_grid(step: StepResult, first: StepResult) -> None:
             code="steps_mixed",
             remedy="Export the steps of one analysis, or choose another format.",
         )
+
+
+def without_internals(step: StepResult) -> StepResult:
+    """Return a step without the variables that no reader of a table needs: angles of patches, iterations, causes."""
+    kept = {name: v for name, v in step.variables.items() if name in ALWAYS or described(name).group != "Internals"}
+    return replace(step, variables=kept)
 
 
 def columns_of(step: StepResult, *, matrices: bool = False) -> dict[str, FileVariable]:

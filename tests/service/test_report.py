@@ -26,9 +26,9 @@ from scipy.optimize import fsolve
 from stereorig.server.cli import main
 from stereorig.server.config.rig_file import parse_config
 from stereorig.server.report.build import make_report
-from stereorig.server.report.options import ReportOptions
 from stereorig.server.report.source import find_source
 from stereorig.server.report.steps import read_steps
+from stereorig.server.report.task import ReportOptions
 from stereorig.server.workflows.service import Service
 from stereorig.sim.texture import speckle
 from tests.support.independent_rig import PlainCamera

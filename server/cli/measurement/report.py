@@ -10,7 +10,7 @@ from stereorig.core.errors import InputError
 from stereorig.server.cli.measurement.coverage import add_coverage, coverage_from
 from stereorig.server.cli.terminal import ProgressLine
 from stereorig.server.formats.files import make_folder, write_bytes
-from stereorig.server.report.options import SECTIONS, ReportOptions, chosen_sections
+from stereorig.server.report.task import SECTIONS, ReportOptions, chosen_sections
 from stereorig.server.results.gauges import FRAME_HELP
 from stereorig.server.results.gauges.framed import asked_at, in_frame
 from stereorig.server.results.metadata import load_metadata

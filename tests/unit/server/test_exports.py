@@ -72,41 +72,49 @@ def test_a_table_holds_every_number_to_its_last_bit(
     source: ExportSource, stored: list[xr.Dataset], tmp_path: Path
 ) -> None:
     paths = _made(source, tmp_path, "csv")
-    assert [p.name for p in paths] == [f"panel_step_{n:04d}.csv" for n in range(3)]
+    assert [p.name for p in paths] == [f"panel_step_{n:04d}_Stufe-{n}.csv" for n in range(3)]
     for path, held in zip(paths, stored, strict=True):
-        table = pd.read_csv(path, comment="#")
+        table = pd.read_csv(path)
         assert len(table) == ROWS * COLS
+        assert table.dtypes["w_mm" if "w_mm" in table else "z_mm"] == np.float64
+        assert not {"iterations", "theta_rad", "normal_x", "exx_patch"} & set(table)  # internals
         for name, variable in held.variables.items():
-            if variable.dims == ("row", "col"):
+            if variable.dims == ("row", "col") and name in table:
                 read = table[name].to_numpy().astype(variable.dtype).reshape(ROWS, COLS)
                 np.testing.assert_array_equal(read, variable.values, err_msg=str(name))
         named = table.set_index(["row", "col"]).loc[FAILED[0]]
         assert named["status_name"] == "low_correlation"
         assert np.isnan(named["x_mm"])
         assert named["x_px"] == 40 + 7 * FAILED[0][1]
-    parts = pd.read_csv(paths[1], comment="#")["zncc_cam1_ref__cam2_cur"].to_numpy().reshape(ROWS, COLS)
+    parts = pd.read_csv(paths[1])["zncc_cam1_ref__cam2_cur"].to_numpy().reshape(ROWS, COLS)
     np.testing.assert_array_equal(parts.astype("f4"), stored[1].zncc.values[..., 2])
 
 
-def test_a_tables_comments_tell_unit_and_meaning_of_each_column(source: ExportSource, tmp_path: Path) -> None:
-    text = _made(source, tmp_path, "csv", steps=[1])[0].read_text(encoding="utf-8")
-    comments = [line for line in text.splitlines() if line.startswith("#")]
-    header = text.splitlines()[len(comments)].split(",")
-    described = dict(re.fullmatch(r"# column (\w+), unit (\S+): .+", c).groups() for c in comments if "column" in c)  # type: ignore[union-attr]
-    assert set(header) - {"status_name", "strain_status_name"} == set(described)
-    assert (described["u_mm"], described["exx"], described["rotation_x_rad"], described["x_px"]) == (
-        "mm",
-        "1",
-        "rad",
-        "pixel",
-    )
+def test_the_first_line_of_a_table_tells_unit_and_meaning_of_each_column(source: ExportSource, tmp_path: Path) -> None:
+    (path,) = _made(source, tmp_path, "csv", steps=[1])
+    table = pd.read_csv(path)
+    assert list(table.columns)[-1] == "about"
+    assert table.about.notna().sum() == 1
+    about = json.loads(table.about[0])
+    assert set(table) - {"status_name", "strain_status_name", "about"} == set(about["units"]) == set(about["meaning"])
+    assert (about["units"]["u_mm"], about["units"]["exx"], about["units"]["x_px"]) == ("mm", "1", "pixel")
+    # scripts that skip comments read the same
+    pd.testing.assert_frame_equal(pd.read_csv(path, comment="#"), table)
+
+
+def test_internals_are_in_a_table_that_asks_for_them(
+    source: ExportSource, stored: list[xr.Dataset], tmp_path: Path
+) -> None:
+    (path,) = _made(source, tmp_path, "csv", steps=[1], variables=["normal_z", "iterations"])
+    read = pd.read_csv(path)["normal_z"].to_numpy().astype("f4").reshape(ROWS, COLS)
+    np.testing.assert_array_equal(read, stored[1].normal_z.values)
 
 
 def test_chosen_variables_and_steps(source: ExportSource, tmp_path: Path) -> None:
     paths = _made(source, tmp_path, "csv", steps=[2], variables=["exx"])
-    assert [p.name for p in paths] == ["panel_step_0002.csv"]
-    columns = list(pd.read_csv(paths[0], comment="#").columns)
-    assert columns == ["row", "col", "x_px", "y_px", "x_mm", "y_mm", "z_mm", "status", "status_name", "exx"]
+    assert [p.name for p in paths] == ["panel_step_0002_Stufe-2.csv"]
+    columns = list(pd.read_csv(paths[0]).columns)
+    assert columns == ["row", "col", "x_px", "y_px", "x_mm", "y_mm", "z_mm", "status", "status_name", "exx", "about"]
 
 
 # surfaces ---------------------------------------------------------------------------------------------------------
@@ -218,24 +226,28 @@ def test_a_mask_parts_the_surface(results: Path, source: ExportSource, tmp_path:
 def test_scipy_opens_the_matlab_file(source: ExportSource, stored: list[xr.Dataset], tmp_path: Path) -> None:
     (path,) = _made(source, tmp_path, "mat")
     read = scipy.io.loadmat(path, simplify_cells=True)
-    assert [k for k in read if k.startswith("step")] == ["step_0000", "step_0001", "step_0002"]
+    np.testing.assert_array_equal(read["step"], [0, 1, 2])
+    assert read["w_mm"].shape == (ROWS, COLS, 3)
+    assert np.isnan(read["w_mm"][..., 0]).all()  # a shape has no displacement; it is not zero
+    about = read["about"]
     for n, held in enumerate(stored):
-        step, about = read[f"step_{n:04d}"], read[f"about_{n:04d}"]
         for name, variable in held.variables.items():
             if variable.dims[:2] == ("row", "col"):
-                assert step[name].dtype == np.float64
-                values = step[name]
+                values = read[name]
+                assert values.dtype == np.float64
+                if name not in ("x_px", "y_px"):
+                    values = values[:, :, n, ...][(..., *(slice(0, k) for k in variable.shape[2:]))]
                 if name == "covariance" and n:  # a matrix here, its upper triangle row by row there
                     i, j = np.triu_indices(6)
                     np.testing.assert_array_equal(values, np.swapaxes(values, -1, -2))
                     values = values[..., i, j]
                 np.testing.assert_array_equal(values, np.squeeze(variable.values.astype(float)), err_msg=str(name))
                 assert about["units"][name] == variable.attrs["units"]
-        assert step["n"] == n
-        assert step["label"] == f"Stufe {n} µ"
-        assert step["load_n"] == 125.5 * n if n else np.isnan(step["load_n"])
-    for name in ("about_0001", "step_0001"):
-        assert all(re.fullmatch(r"[A-Za-z]\w{0,62}", field) for field in read[name])
+        assert read["label"][n] == f"Stufe {n} µ"
+        assert read["load_n"][n] == 125.5 * n if n else np.isnan(read["load_n"][n])
+        assert json.loads(read["provenance"][n])["step"] == n
+    for names in (about, (name for name in read if not name.startswith("__"))):
+        assert all(re.fullmatch(r"[A-Za-z]\w{0,62}", field) for field in names)
 
 
 def test_names_that_matlab_does_not_take_are_changed() -> None:
@@ -384,9 +396,7 @@ def test_films_have_a_frame_a_step_on_one_scale(source: ExportSource, tmp_path: 
 
 def _provenance(path: Path) -> dict[str, Any]:
     if path.suffix == ".csv":
-        lines = path.read_text(encoding="utf-8").splitlines()
-        pairs = [line[2:].split(": ", 1) for line in lines if line.startswith("# ") and not line.startswith("# column")]
-        return {k: json.loads(v) if v[:1] in "{[" else v for k, v in pairs}
+        return dict(json.loads(pd.read_csv(path).about[0]))
     if path.suffix == ".vtu":
         bytes_ = pv.read(path).field_data["provenance_json_utf8"]
         found: dict[str, Any] = json.loads(bytes(bytes_).decode())
@@ -396,7 +406,7 @@ def _provenance(path: Path) -> dict[str, Any]:
         assert found["units"]["displacement"] == "mm"
         return found
     if path.suffix == ".mat":
-        about = scipy.io.loadmat(path, simplify_cells=True)["about_0001"]
+        about = scipy.io.loadmat(path, simplify_cells=True)["about"]
         return {**about, "settings": json.loads(about["settings"])}
     if path.suffix == ".h5":
         with h5py.File(path) as file:
@@ -446,7 +456,7 @@ def test_several_files_are_packed_and_one_is_not(source: ExportSource, tmp_path:
 
     packed = export_packed(source, ExportRequest("csv"), tmp_path)
     with zipfile.ZipFile(packed) as archive:
-        assert archive.namelist() == [f"panel_step_{n:04d}.csv" for n in range(3)]
+        assert archive.namelist() == [f"panel_step_{n:04d}_Stufe-{n}.csv" for n in range(3)]
         assert archive.testzip() is None
     assert [p.name for p in tmp_path.iterdir()] == ["panel_csv.zip"]
     assert export_packed(source, ExportRequest("mat"), tmp_path).name == "panel.mat"
@@ -457,7 +467,7 @@ def test_the_command_line(results: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert (
         main(["export", str(results), "--format", "csv", "--out", str(out), "--step", "0-1", "--variable", "z_mm"]) == 0
     )
-    assert sorted(p.name for p in out.iterdir()) == ["panel_step_0000.csv", "panel_step_0001.csv"]
+    assert sorted(p.name for p in out.iterdir()) == ["panel_step_0000_Stufe-0.csv", "panel_step_0001_Stufe-1.csv"]
     assert "written: 2 files" in capsys.readouterr().out
     for arguments, code in (
         (["--step", "x"], "step_invalid"),

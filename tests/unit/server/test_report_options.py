@@ -9,8 +9,8 @@ import pytest
 from stereorig.core.errors import FileFormatError, InputError
 from stereorig.server.formats.channel_units import channel_title
 from stereorig.server.report.items import rounded, shown_unit
-from stereorig.server.report.options import SECTIONS, chosen_sections
 from stereorig.server.report.page import kept_logo, read_logo
+from stereorig.server.report.task import SECTIONS, chosen_sections
 
 
 @pytest.mark.parametrize(

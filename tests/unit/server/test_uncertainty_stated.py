@@ -83,12 +83,13 @@ def made(source: ExportSource, out: Path, form: Any, **more: Any) -> list[Path]:
 def texts(path: Path) -> list[str]:
     """What other programs read beside a file's numbers."""
     if path.suffix == ".csv":
-        lines = path.read_text().splitlines()
-        return [line for line in lines if line.startswith(("# uncertainty", "# column sigma_"))]
+        about = json.loads(pd.read_csv(path).about[0])
+        meanings = [text for name, text in about["meaning"].items() if name.startswith("sigma_")]
+        return [json.dumps(about["uncertainty"]), *meanings]
     if path.suffix == ".vtu":
         return [bytes(meshio.read(path).field_data["uncertainty_utf8"].astype(np.uint8)).decode()]
     if path.suffix == ".mat":
-        about = scipy.io.loadmat(path, simplify_cells=True)["about_0001"]
+        about = scipy.io.loadmat(path, simplify_cells=True)["about"]
         return [about["uncertainty"], *(text for name, text in about["meaning"].items() if name.startswith("sigma_"))]
     if path.suffix in (".h5", ".nc"):
         with h5py.File(path) as file:
@@ -122,7 +123,7 @@ def test_expanded_uncertainties_stand_beside_the_standard_ones_on_request_alone(
     for name in ("w_mm", "x_mm", "exx"):
         np.testing.assert_allclose(two[f"expanded_{name}"], K95 * one[f"sigma_{name}"], rtol=1e-6)  # single precision
         np.testing.assert_array_equal(two[f"sigma_{name}"], one[f"sigma_{name}"])
-    stated = json.loads(wide.read_text().split("# uncertainty: ")[1].splitlines()[0])
+    stated = json.loads(two.about[0])["uncertainty"]
     assert stated["k"] == pytest.approx(K95)
     assert stated["coverage"] == 0.95
     assert "normal" in stated["distribution"]
@@ -156,11 +157,11 @@ def test_forms_that_hold_matrices_hold_the_total_covariance_and_the_factor_by_ca
     # MATLAB: as they are, with the causes of the columns
     (path,) = made(source, tmp_path, "mat", steps=[2])
     held = scipy.io.loadmat(path, simplify_cells=True)
-    np.testing.assert_array_equal(held["step_0002"]["common_factor"], stored[2].common_factor.values)
+    np.testing.assert_array_equal(held["common_factor"], stored[2].common_factor.values)
     rows, cols = np.triu_indices(6)
     triangle = stored[2].covariance.values.reshape(-1, 21)
-    np.testing.assert_array_equal(held["step_0002"]["covariance"][..., rows, cols].reshape(-1, 21), triangle)
-    assert held["about_0002"]["parts"]["common_factor"].split() == list(COLUMNS[2])
+    np.testing.assert_array_equal(held["covariance"][..., rows, cols].reshape(-1, 21), triangle)
+    assert held["about"]["parts"]["common_factor"].split() == list(COLUMNS[2])
     # VTU: the upper triangle and the factor as components
     path = made(source, tmp_path, "vtu", steps=[2])[0]
     mesh = meshio.read(path)

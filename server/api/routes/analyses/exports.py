@@ -30,6 +30,7 @@ from stereorig.server.exports.request import (
 from stereorig.server.formats.figures.options import COLOURS, MAX_LEVELS, WIDTHS_PX, FigureStyle
 from stereorig.server.formats.results.folder import dense_result, home_of
 from stereorig.server.results.channels import has_more
+from stereorig.server.results.naming import stored_name
 from stereorig.server.worker.executor import TaskFuture
 from stereorig.server.workflows.analysis import start as analysis_start
 from stereorig.server.workflows.analysis.framed import results_in_frame
@@ -165,7 +166,7 @@ async def export(
     home = home_of(files[0])
     as_stored &= wanted.format == "nc" and len(files) == 1
     if as_stored and not await run_in_threadpool(has_more, files[0], home):
-        name = "_".join([test_id, analysis_id, *files[0].relative_to(home).parts])
+        name = await run_in_threadpool(stored_name, files[0], home)
         return FileResponse(files[0], media_type=MEDIA_TYPES["nc"], headers=headers, filename=name)
     folder = await run_in_threadpool(service.exports.new_folder)
     try:

@@ -14,8 +14,7 @@ from stereorig.server.api.protocol.dependencies import AnalysisId, CoverageDep, 
 from stereorig.server.api.protocol.problems import errors
 from stereorig.server.api.routes.analyses.exports import finished
 from stereorig.server.base.errors import NotFoundError
-from stereorig.server.report.options import SECTIONS, ReportOptions, chosen_sections
-from stereorig.server.report.task import NAME, report_task
+from stereorig.server.report.task import NAME, SECTIONS, ReportOptions, chosen_sections, report_task
 from stereorig.server.workflows.analysis import start as analysis_start
 from stereorig.server.workflows.analysis.framed import asked_of, results_in_frame
 from stereorig.server.workflows.service import Service
