@@ -106,7 +106,7 @@ def test_internals_are_in_a_table_that_asks_for_them(
     source: ExportSource, stored: list[xr.Dataset], tmp_path: Path
 ) -> None:
     (path,) = _made(source, tmp_path, "csv", steps=[1], variables=["normal_z", "iterations"])
-    read = pd.read_csv(path)["normal_z"].to_numpy().astype("f4").reshape(ROWS, COLS)
+    read = pd.read_csv(path)["normal_z"].to_numpy().reshape(ROWS, COLS)
     np.testing.assert_array_equal(read, stored[1].normal_z.values)
 
 
@@ -241,7 +241,8 @@ def test_scipy_opens_the_matlab_file(source: ExportSource, stored: list[xr.Datas
                     i, j = np.triu_indices(6)
                     np.testing.assert_array_equal(values, np.swapaxes(values, -1, -2))
                     values = values[..., i, j]
-                np.testing.assert_array_equal(values, np.squeeze(variable.values.astype(float)), err_msg=str(name))
+                wanted = np.squeeze(variable.values.astype(float))
+                np.testing.assert_array_equal(np.squeeze(values), wanted, err_msg=str(name))
                 assert about["units"][name] == variable.attrs["units"]
         assert read["label"][n] == f"Stufe {n} µ"
         assert read["load_n"][n] == 125.5 * n if n else np.isnan(read["load_n"][n])
@@ -497,6 +498,10 @@ def test_a_tests_folder_and_its_analyses(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         find_source(test)
     assert caught.value.code == "analysis_ambiguous"
-    assert find_source(test, "a000002-000002").name == f"{test.name}_a000002-000002"
+    assert find_source(test, "a000002-000002").name == "Panel-7_a000002-000002"
+    (test / "analyses" / "a000002-000002" / "analysis.json").write_text('{"label": "fine, 33 px"}')
+    assert find_source(test, "a000002-000002").name == "Panel-7_fine-33-px"
+    (test / "test.json").write_text('{"name": "\u8bd5\u6837"}')  # a name in another script: the id
+    assert find_source(test, "a000002-000002").name == f"{test.name}_fine-33-px"
     with pytest.raises(InputError):
         find_source(test, "a000003-000003")
