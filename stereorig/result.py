@@ -6,14 +6,16 @@ import base64
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from stereorig.core.arrays import Bool, Float
+from stereorig.core.errors import StateError
 from stereorig.core.field.points.result import Field
 from stereorig.core.field.points.shared_pixels import SharedPixels
+from stereorig.core.field.region.triangles import triangles_of
 from stereorig.core.gauge.area import AreaStatistics, area_statistics, points_within
 from stereorig.core.gauge.extensometer import Extensometer, extensometer
 from stereorig.core.gauge.rigid import RigidMotion, rigid_motion, without_rigid_motion
@@ -27,12 +29,16 @@ from stereorig.server.formats.results.layout import COVARIANCE_NAMES, stored_set
 from stereorig.server.formats.results.reading import read_field, read_head
 from stereorig.server.formats.results.strain import read_strain
 from stereorig.server.formats.results.uncertainty import Included
-from stereorig.server.formats.results.variables import STRAIN_NAMES, VARIABLES, values_of
+from stereorig.server.formats.results.variables import STRAIN_NAMES, VARIABLES, described, values_of
 from stereorig.server.formats.results.writing import Provenance, write_field
 from stereorig.server.formats.version import software_version
 
 if TYPE_CHECKING:
+    import pyvista
     import xarray
+    from matplotlib.figure import Figure
+
+    from stereorig.server.formats.figures.figure import FigureData
 
 _POSITION = ("x_mm", "y_mm", "z_mm")
 _THUMBNAIL_PX = 420
@@ -75,12 +81,11 @@ class Result:
         return f"<Result of step {self.step}: {kind}{strain}, {count} valid, frame: {self.frame}>"
 
     def _repr_html_(self) -> str:
-        from stereorig.server.formats.figures.figure import FigureData, draw  # slow to load
+        from stereorig.server.formats.figures.figure import draw  # slow to load
         from stereorig.server.formats.figures.options import FigureStyle
 
-        name = "w_mm" if self.field.has_motion else "z_mm"
-        figure = FigureData(self[name], self.field.x_px, self.field.y_px, name.removesuffix("_mm").upper(), "mm", "")
-        picture = base64.b64encode(draw(figure, FigureStyle(width_px=_THUMBNAIL_PX), "png")).decode("ascii")
+        name = self._shown
+        picture = base64.b64encode(draw(self._figure(name), FigureStyle(width_px=_THUMBNAIL_PX), "png")).decode("ascii")
         sigma_um = 1e3 * float(np.median(self[f"sigma_{name}"][self.valid])) if self.valid.any() else np.nan
         text = f"{str(self)[1:-1]}; median standard uncertainty of {name} {sigma_um:.2g} um"
         return f'<p>{text}</p><img alt="Map of {name}" src="data:image/png;base64,{picture}">'
@@ -95,11 +100,68 @@ class Result:
         """
         values = values_of(self.field, self.strain, name)
         if values is None:
-            names = [one for row in VARIABLES for one in (row, f"sigma_{row}")]
-            raise no_variable(
-                "The result", name, [one for one in names if values_of(self.field, self.strain, one) is not None]
-            )
+            raise no_variable("The result", name, self._names)
         return values
+
+    @property
+    def _names(self) -> list[str]:
+        names = [one for row in VARIABLES for one in (row, f"sigma_{row}")]
+        return [one for one in names if values_of(self.field, self.strain, one) is not None]
+
+    def plot(self, name: str | None = None, *, width_px: int = 900) -> Figure:
+        """Draw a variable over camera 1's reference image's axes, as the exports do; a notebook shows it.
+
+        Parameters
+        ----------
+        name
+            Variable; None: ``w_mm`` or, for a shape, ``z_mm``.
+        width_px
+            Width of the picture.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            With one axes for the map and one for its scale.
+
+        Raises
+        ------
+        InputError
+            ``field_missing``.
+        """
+        from stereorig.server.formats.figures.figure import Drawing  # slow to load
+        from stereorig.server.formats.figures.options import FigureStyle
+
+        return Drawing(self._figure(name or self._shown), FigureStyle(width_px=width_px)).figure
+
+    def pyvista(self) -> pyvista.PolyData:
+        """Return the surface for PyVista: triangles between valid points, none over a crack, with every variable.
+
+        ``result.pyvista().warp_by_vector("displacement", factor=100)`` is the deformed surface. Points are at their
+        reference position, mm.
+
+        Raises
+        ------
+        StateError
+            ``pyvista_missing`` if PyVista is not installed.
+        """
+        try:
+            import pyvista
+        except ImportError as error:
+            raise StateError(
+                "A surface for PyVista is asked for, and PyVista is not installed.",
+                code="pyvista_missing",
+                remedy="pip install pyvista.",
+            ) from error
+        field, valid = self.field, self.valid
+        triangles = triangles_of(field.x_px, field.y_px, valid, field.cuts)
+        place: Any = np.cumsum(valid.ravel()) - 1  # of each valid point among them
+        surface: pyvista.PolyData = pyvista.PolyData.from_regular_faces(field.xyz_mm[valid], place[triangles])
+        for name in self._names:
+            surface.point_data[name] = self[name][valid]
+        if field.uvw_mm is not None:
+            surface.point_data["displacement"] = field.uvw_mm[valid]
+        surface.set_active_scalars(self._shown)
+        return surface
 
     @cached_property
     def dataset(self) -> xarray.Dataset:
@@ -191,6 +253,20 @@ class Result:
     @cached_property
     def _shared(self) -> SharedPixels:
         return SharedPixels.of(self.field, float(self.settings.subset_px))
+
+    @property
+    def _shown(self) -> str:
+        return "w_mm" if self.field.has_motion else "z_mm"
+
+    def _figure(self, name: str) -> FigureData:
+        from stereorig.server.formats.figures.figure import FigureData  # slow to load
+
+        about, field = described(name), self.field
+        title = f"{about.shown}, step {self.step}"
+        strain = about.kind == "strain"
+        return FigureData(
+            self[name], field.x_px, field.y_px, about.shown, about.units, title, cuts=field.cuts, strain=strain
+        )
 
     @property
     def _provenance(self) -> Provenance:

@@ -12,7 +12,7 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from stereorig.server.exports.mesh import triangles_of, turned_as
+from stereorig.core.field.region.triangles import triangles_of, turned_as
 from stereorig.server.formats.files import write_bytes, written_temporary
 from stereorig.server.results.provenance import provenance
 from stereorig.server.results.reader import FileVariable

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Self, Unpack
 
 import httpx
 
-from stereorig.client import datasets, operations
+from stereorig.client import cards, datasets, operations
 from stereorig.client.errors import checked, no_answer
 from stereorig.client.operations import Ask, Operation, Result, request_of
 from stereorig.client.parameters import (
@@ -21,6 +21,7 @@ from stereorig.client.parameters import (
 )
 from stereorig.client.progress import Progress, shown
 from stereorig.client.settings import options_of
+from stereorig.core.errors import StereorigError
 from stereorig.server.api.models import (
     AnalysisReply,
     AnalysisRequest,
@@ -40,6 +41,7 @@ from stereorig.server.api.models import (
 from stereorig.server.api.models.calibrations import CalibrationEntry
 from stereorig.server.api.models.channels import ChannelsImported, ChannelsPreview
 from stereorig.server.api.models.tests import StepEntry, TestEntry
+from stereorig.server.formats.card import card
 from stereorig.server.results.gauges.request import GaugeRequest
 
 if TYPE_CHECKING:
@@ -216,6 +218,13 @@ class Client:
         except StopIteration as end:
             return end.value  # type: ignore[no-any-return]
 
+    def _card(self, made: Operation[str], of: object) -> str:
+        """Return the HTML of an object; its one line where the service does not answer."""
+        try:
+            return self._run(made)
+        except StereorigError as error:
+            return card(f"{of!r}: {error}", [])
+
     def _answer(self, wanted: Ask) -> httpx.Response:
         if wanted.into is None:
             return self.ask(wanted.method, wanted.path, **wanted.options)
@@ -248,6 +257,9 @@ class Test:
 
     def __repr__(self) -> str:
         return f"<Test {self.id} of {self._client.url}>"
+
+    def _repr_html_(self) -> str:
+        return self._client._card(cards.test_card(self.id, self._client.url), self)
 
     def document(self) -> TestReply:
         """Return name, steps and analyses."""
@@ -344,6 +356,9 @@ class Analysis:
 
     def __repr__(self) -> str:
         return f"<Analysis {self.id} of {self.test_id}, {self._client.url}>"
+
+    def _repr_html_(self) -> str:
+        return self._client._card(cards.analysis_card(self._path), self)
 
     def document(self) -> AnalysisReply:
         """Return settings, state and summary."""

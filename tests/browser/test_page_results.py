@@ -16,7 +16,7 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 from stereorig.core.cameras.camera import Camera
-from stereorig.server.exports.mesh import triangles_of
+from stereorig.core.field.region.triangles import triangles_of
 from stereorig.server.formats.calibrations.recognise import load_calibration
 from stereorig.server.formats.results.netcdf import library
 from stereorig.server.formats.results.reading import read_field, read_head

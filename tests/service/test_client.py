@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import inspect
 import json
 import re
@@ -11,6 +12,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import httpx
 import numpy as np
 import pytest
@@ -24,6 +26,7 @@ from stereorig.server.api.models import AnalysisRequest, JobReply
 from stereorig.server.config.rig_file import parse_config
 from stereorig.server.workflows.service import Service
 from tests.support.document_scripts import WRITTEN, one_block, run
+from tests.support.export_results import write_results
 from tests.support.service_rig import SMALL, served, true_cameras, wait_for_rig
 
 PAGE = "docs/tutorial/client.md"
@@ -245,6 +248,29 @@ def test_both_clients_have_the_same_methods_and_parameters() -> None:
             other = getattr(two, name)
             assert list(inspect.signature(method).parameters) == list(inspect.signature(other).parameters), name
             assert inspect.iscoroutinefunction(other) or name in ("test", "analysis"), name
+
+
+def test_a_test_and_its_analysis_show_themselves_in_a_notebook(tiny: Client, service: Service, tmp_path: Path) -> None:
+    test = tiny.new_test("Plate & <rod>", calibration_id=None)
+    image = np.random.default_rng(1).integers(0, 255, (240, 256), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "view.png"), image)
+    test.import_step(tmp_path / "view.png", tmp_path / "view.png", label="at rest")
+    shown = test._repr_html_()
+    assert "Plate &amp; &lt;rod&gt;" in shown
+    assert "0 at rest" in shown
+    found = re.search(r"base64,([^\"]+)", shown)
+    assert found is not None
+    decoded = cv2.imdecode(np.frombuffer(base64.b64decode(found[1]), np.uint8), cv2.IMREAD_GRAYSCALE)
+    np.testing.assert_allclose(decoded.mean(), image.mean(), atol=3.0)
+    document = {"kind": "displacement", "steps": [0, 1, 2], "settings": {}, "inputs": {"steps": {"0": {}}}}
+    made = service.tests.analyses.create(test.id, document)
+    write_results(service.tests.analyses.path(test.id, made.id))
+    shown = test.analysis(made.id)._repr_html_()
+    assert "3 of 3, 0 failed" in shown
+    assert "map of step 2" in shown
+    # without the service there is the line
+    gone = stereorig.Client("http://127.0.0.1:9", progress=False)
+    assert "&lt;Test t1 of http://127.0.0.1:9&gt;: " in gone.test("t1")._repr_html_()
 
 
 @pytest.mark.deep

@@ -17,6 +17,7 @@ from stereorig.server.api.models.jobs import Accepted, JobProblem
 from stereorig.server.base.models import Label, Listing, Number, Reply, Request, StepNumber
 from stereorig.server.documents.made import MadeState, Review
 from stereorig.server.documents.results import ViewResiduals
+from stereorig.server.formats.card import card
 
 
 class CalibrationRequest(Request):
@@ -270,6 +271,11 @@ class CalibrationReply(Reply):
     kept_checks: dict[str, KeptCheck] | None = Field(
         None, description="Checks made since, by name, `known_distance` among them; null: none."
     )
+
+    def _repr_html_(self) -> str:
+        verdict = self.verdict
+        level, reasons = (None, "") if verdict is None else (verdict.level, "; ".join(verdict.reasons))
+        return card(f"Calibration {self.id}", [("state", self.state), ("verdict", level), ("reasons", reasons)])
 
 
 class CalibrationFile(Reply):

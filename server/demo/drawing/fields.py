@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from stereorig.core.arrays import Float
 from stereorig.core.field.points.result import Field
+from stereorig.core.field.region.triangles import triangles_of
 from stereorig.server.demo.calibration import ViewIntersections
 from stereorig.server.demo.compare import MotionComparison
-from stereorig.server.exports.mesh import triangles_of
 from stereorig.sim.plate import CircularPlate
 
 mpl.use("Agg")

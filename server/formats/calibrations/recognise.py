@@ -38,6 +38,7 @@ from stereorig.server.formats.calibrations.programs.named_numbers import is_pyva
 from stereorig.server.formats.calibrations.programs.opencv_yaml import is_half, is_opencv, joined, parse_opencv
 from stereorig.server.formats.calibrations.programs.vic3d_xml import is_vic3d, parse_vic3d
 from stereorig.server.formats.calibrations.record import CalibrationRecord
+from stereorig.server.formats.card import card
 from stereorig.server.formats.manifest import checked_bytes
 
 #: text for the option of a command
@@ -91,6 +92,29 @@ class LoadedCalibration:
     def record(self) -> CalibrationRecord:
         """Settings of the calibration; empty where the file does not state them."""
         return CalibrationRecord.model_validate(self.details)
+
+    def __repr__(self) -> str:
+        return (
+            f"<Calibration from {self.source}: baseline {self.pair.baseline_mm:.2f} mm, "
+            f"stereo angle {np.degrees(self.pair.stereo_angle_rad):.2f} degrees>"
+        )
+
+    def _repr_html_(self) -> str:
+        from stereorig.core.calibration.checks.measures import focal_lengths_px  # its package is slow to load
+
+        sizes = (self.image_size1_px, self.image_size2_px)
+        shape_mm = self.record.uncertainty.shape_rms_mm
+        facts: list[tuple[str, object]] = [
+            ("verdict", self.record.verdict.level),
+            ("stereo angle", f"{np.degrees(self.pair.stereo_angle_rad):.3f} degrees"),
+            ("baseline", f"{self.pair.baseline_mm:.3f} mm"),
+            ("uncertainty left in shape", None if shape_mm is None else f"{1e3 * shape_mm:.3g} um rms"),
+        ]
+        for name, camera, size in zip(CAMERAS, (self.pair.cam1, self.pair.cam2), sizes, strict=True):
+            f_u, f_v = focal_lengths_px(camera.lens)
+            at = "" if size is None else f", images of {size[0]} x {size[1]} px"
+            facts.append((name, f"f = {f_u:.2f}, {f_v:.2f} px, lens {type(camera.lens).__name__}{at}"))
+        return card(f"Calibration from {self.source}", [*facts, ("notes", "; ".join(self.notes))])
 
 
 IMPORTED = "imported"

@@ -20,6 +20,7 @@ import pytest
 
 from stereorig.core.errors import MeasurementError, StateError
 from stereorig.core.field.region.cuts import Cuts
+from stereorig.core.field.region.triangles import triangles_of
 from stereorig.server.cli import main
 from stereorig.server.cli.operation import demo
 from stereorig.server.demo.calibration import ViewIntersections
@@ -29,7 +30,6 @@ from stereorig.server.demo.drawing import fields as pictures
 from stereorig.server.demo.experiments.plate import centre_deflection_um, fit_plate
 from stereorig.server.demo.process import free_port, running_service
 from stereorig.server.demo.session import DemoCheck, Outcome, table
-from stereorig.server.exports.mesh import triangles_of
 from stereorig.server.formats.images import read_image
 from stereorig.sim.plate import CircularPlate
 from stereorig.sim.rig import SimRig
