@@ -254,7 +254,8 @@ def test_a_test_and_its_analysis_show_themselves_in_a_notebook(tiny: Client, ser
     test = tiny.new_test("Plate & <rod>", calibration_id=None)
     image = np.random.default_rng(1).integers(0, 255, (240, 256), dtype=np.uint8)
     cv2.imwrite(str(tmp_path / "view.png"), image)
-    test.import_step(tmp_path / "view.png", tmp_path / "view.png", label="at rest")
+    cv2.imwrite(str(tmp_path / "other.png"), image[:, ::-1])
+    test.import_step(tmp_path / "view.png", tmp_path / "other.png", label="at rest")
     shown = test._repr_html_()
     assert "Plate &amp; &lt;rod&gt;" in shown
     assert "0 at rest" in shown
@@ -262,7 +263,8 @@ def test_a_test_and_its_analysis_show_themselves_in_a_notebook(tiny: Client, ser
     assert found is not None
     decoded = cv2.imdecode(np.frombuffer(base64.b64decode(found[1]), np.uint8), cv2.IMREAD_GRAYSCALE)
     np.testing.assert_allclose(decoded.mean(), image.mean(), atol=3.0)
-    document = {"kind": "displacement", "steps": [0, 1, 2], "settings": {}, "inputs": {"steps": {"0": {}}}}
+    settings = stereorig.AnalysisSettings.model_validate({"region": {"rectangle": [40, 60, 250, 221]}})
+    document = {"kind": "displacement", "steps": [0, 1, 2], "settings": settings.model_dump(mode="json"), "inputs": {}}
     made = service.tests.analyses.create(test.id, document)
     write_results(service.tests.analyses.path(test.id, made.id))
     shown = test.analysis(made.id)._repr_html_()
