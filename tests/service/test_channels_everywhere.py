@@ -59,14 +59,13 @@ def exported(folder: Path, form: str, out: Path) -> list[Path]:
     return list(export(find_source(folder), ExportRequest(form), out))  # type: ignore[arg-type]
 
 
-def test_csv_says_channels_units_and_time_above_the_table(test_folder: Path, tmp_path: Path) -> None:
-    text = exported(test_folder, "csv", tmp_path)[1].read_text(encoding="utf-8")
-    about = dict(re.findall(r"^# (\w+): (.*)$", text, re.MULTILINE))
-    assert json.loads(about["channels"]) == {"force_kn": 1.5}
-    assert json.loads(about["channel_units"]) == {"force_kn": "kN"}
-    assert json.loads(about["channel_u"]) == {"force_kn": 0.25}
-    assert float(about["time_s"]) == 10.0
-    assert float(about["load_n"]) == 100.0
+def test_csv_says_channels_units_and_time_in_its_last_column(test_folder: Path, tmp_path: Path) -> None:
+    about = json.loads(pd.read_csv(exported(test_folder, "csv", tmp_path)[1]).about[0])
+    assert about["channels"] == {"force_kn": 1.5}
+    assert about["channel_units"] == {"force_kn": "kN"}
+    assert about["channel_u"] == {"force_kn": 0.25}
+    assert about["time_s"] == 10.0
+    assert about["load_n"] == 100.0
 
 
 def test_netcdf_hdf5_and_mat_have_them_as_numbers(test_folder: Path, tmp_path: Path) -> None:
@@ -83,9 +82,11 @@ def test_netcdf_hdf5_and_mat_have_them_as_numbers(test_folder: Path, tmp_path: P
         np.testing.assert_array_equal(data["time_s"][...], [0.0, 10.0, 40.0])
         assert data["time_s"].attrs["units"] in (b"s", "s")
     (mat,) = exported(test_folder, "mat", tmp_path / "mat")
-    held = scipy.io.loadmat(mat, simplify_cells=True)["step_0001"]
-    assert (held["channels"]["force_kn"], held["time_s"], held["load_n"]) == (1.5, 10.0, 100.0)
-    assert held["channel_u"]["force_kn"] == 0.25
+    held = scipy.io.loadmat(mat, simplify_cells=True)
+    np.testing.assert_array_equal(held["channel_force_kn"], [0.0, 1.5, 3.0])
+    np.testing.assert_array_equal(held["time_s"], [0.0, 10.0, 40.0])
+    assert (held["load_n"][1], held["channel_force_kn_u"][1]) == (100.0, 0.25)
+    assert held["about"]["units"]["channel_force_kn"] == "kN"
 
 
 def test_the_time_series_for_paraview_goes_by_seconds(test_folder: Path, tmp_path: Path) -> None:
@@ -141,10 +142,10 @@ def test_an_export_in_the_specimens_axes_and_one_of_dense_fields_have_them_too(
         found = str(folder / "dense" if dense else folder)
         assert main(["export", found, "--format", form, "--out", str(out), *asked]) == 0
     (table,) = (tmp_path / "csv").glob("*step_0001*")
-    text = table.read_text(encoding="utf-8")
-    assert '# channels: {"force_kn": 1.5}' in text
+    about = json.loads(pd.read_csv(table).about[0])
+    assert about["channels"] == {"force_kn": 1.5}
     # a dense field says that it is one, by its name too
-    assert (f"# method: {METHOD}" in text, "a000001-000001_dense_step" in table.name) == (dense, dense)
+    assert (about.get("method") == METHOD, "a000001-000001_dense_step" in table.name) == (dense, dense)
     with h5py.File(next((tmp_path / "h5").glob("*.h5"))) as data:
         np.testing.assert_array_equal(data["channel_force_kn"][...], [0.0, 1.5, 3.0])
         np.testing.assert_array_equal(data["time_s"][...], [0.0, 10.0, 40.0])
@@ -156,7 +157,7 @@ def test_an_export_in_the_specimens_axes_and_one_of_dense_fields_have_them_too(
 def test_results_of_no_test_have_none(test_folder: Path, tmp_path: Path) -> None:
     alone = tmp_path / "alone" / "results"
     shutil.copytree(test_folder / "analyses" / "a000001-000001", alone)
-    assert "# channels" not in exported(alone, "csv", tmp_path / "csv")[1].read_text(encoding="utf-8")
+    assert "channels" not in json.loads(pd.read_csv(exported(alone, "csv", tmp_path / "csv")[1]).about[0])
     stored, copy = alone / "step_0001.nc", exported(alone, "nc", tmp_path / "nc")[1]
     assert copy.read_bytes() == stored.read_bytes()
 

@@ -105,7 +105,8 @@ def test_dense_fields_are_exported_on_request(client: httpx.Client, service: Ser
     for n in (0, 1):
         shutil.copy(folder / f"step_000{n}.nc", folder / "dense" / f"step_000{n}.nc")
     every = client.get(url, params={"format": "csv", "dense": "true"})
-    assert sorted(name[-13:] for name in _content(every.content)) == ["step_0000.csv", "step_0001.csv"]
+    names = sorted(_content(every.content))
+    assert names == [f"Dense_{analysis.id}_step_000{n}_Stufe-{n}.csv" for n in (0, 1)]
     one = client.get(url, params={"format": "nc", "step": 1, "dense": "true"})
     assert one.content == (folder / "dense" / "step_0001.nc").read_bytes()
     assert client.get(url, params={"step": 2, "dense": "true"}).json()["code"] == "dense_missing"
