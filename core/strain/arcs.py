@@ -9,7 +9,6 @@ are subtracted. On a surface that keeps its shape they are the same before and a
 from __future__ import annotations
 
 import numpy as np
-from scipy import ndimage
 
 from stereorig.core.arrays import Bool, Float
 from stereorig.core.field.region.window import fit_terms, window_offsets
@@ -51,19 +50,6 @@ def _thirds(s: Float, t: Float) -> Float:
     return np.asarray(out)
 
 
-def whole_second_derivatives(values: Float, half: int) -> Float:
-    """Return second derivatives (r, c, 3, 3) of X Y Z over column twice, column and row, row twice; whole windows."""
-    side = np.arange(-half, half + 1, dtype=np.float64)
-    bent = side**2 - (side**2).mean()
-    twice, line, ones = 2.0 * bent / (bent**2).sum(), side / (side**2).sum(), np.full(len(side), 1.0 / len(side))
-
-    def over(along: Float, across: Float) -> Float:
-        part = ndimage.correlate1d(values, along, axis=1, mode="constant", cval=np.nan)
-        return np.asarray(ndimage.correlate1d(part, across, axis=0, mode="constant", cval=np.nan))
-
-    return np.stack([over(twice, ones), over(line, line), over(ones, twice)], axis=-1)
-
-
 def second_weights(seen: Bool, half: int) -> Float:
     """Return weights (m, 3, n) of the windows' connected points in these derivatives; zero where undetermined."""
     A = fit_terms(window_offsets(half)[0], half, 2)
@@ -73,32 +59,3 @@ def second_weights(seen: Bool, half: int) -> Float:
     inverse = np.linalg.inv(np.where(firm[:, None, None], normal, np.eye(terms)))[:, 3:]
     weights = inverse.reshape(-1, terms) @ A.T * np.tile([2.0, 1.0, 2.0], len(seen))[:, None] / half**2
     return np.where(seen[:, None, :] & firm[:, None, None], weights.reshape(-1, 3, n), 0.0)
-
-
-def missed_slope(slope: Float, second: Float, moments: Float) -> Float:
-    """Return (n, 3, 2), the bias of the fitted slopes.
-
-    Parameters
-    ----------
-    slope
-        (n, 3, 2) tangents x_s, x_t in their columns, a step each.
-    second
-        (n, 3, 3) x_ss, x_st, x_tt in their columns.
-    moments
-        (n, 2, 4) of :func:`third_moments`.
-    """
-    (x, y, z), (p, q, r) = np.moveaxis(slope, (2, 1), (0, 1))  # (n,) each: one array operation a number
-    u, v, w = y * r - z * q, z * p - x * r, x * q - y * p
-    aa, ab, bb = x * x + y * y + z * z, x * p + y * q + z * r, p * p + q * q + r * r
-    per = 1.0 / (u * u + v * v + w * w)  # the metric's determinant, and the normal's square
-    ss, st, tt = (np.sqrt(per) * (u * c[0] + v * c[1] + w * c[2]) for c in np.moveaxis(second, (2, 1), (0, 1)))
-    # the third derivatives along x_s and x_t
-    third = ((ss * ss, ss * st), (ss * st, st * st), (st * st, tt * st), (tt * st, tt * tt))
-    raised = [((ab * two - bb * one) * per, (ab * one - aa * two) * per) for one, two in third]
-    out = np.empty(slope.shape)
-    for k in range(2):
-        m = [moments[:, k, i] for i in range(4)]
-        along, across = (sum(m[i] * raised[i][j] for i in range(4)) for j in range(2))
-        for i in range(3):
-            out[:, i, k] = along * slope[:, i, 0] + across * slope[:, i, 1]
-    return out

@@ -9,51 +9,18 @@ kept, their remaining bias counts in the reported uncertainty.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from stereorig.core.arrays import Bool, Float
 from stereorig.core.field.region.window import distinct_windows
 from stereorig.core.settings import StrainTensor
+from stereorig.core.strain.on_surface import OnSurface
 from stereorig.core.strain.reduced import window_sums
 from stereorig.core.strain.result import StrainStatus
-from stereorig.core.strain.tensors import as_tensor, strain_covariance
+from stereorig.core.strain.tensors import as_tensor
 from stereorig.core.strain.window import Slopes
-
-
-@dataclass(frozen=True, eq=False)
-class OnSurface:
-    """Windows' slopes on the surface, at the n points that have a strain.
-
-    Attributes
-    ----------
-    frame
-        (n, 3, 2) unit tangents.
-    per_mm
-        (n, 2, 2) steps of column and row (first index) per mm along them.
-    gradient
-        (n, 3, 2) the displacement's derivatives along them.
-    around
-        (n, 6, 6) the points' covariance, mean over each window.
-    strain
-        (n, 3) exx, eyy, exy.
-    pulls
-        (n, 2, 6) of :func:`stereorig.core.strain.tensors.pulls_of`.
-    """
-
-    frame: Float
-    per_mm: Float
-    gradient: Float
-    around: Float
-    strain: Float
-    pulls: Float
-
-    def covariance(self, spread: Float, tensor: StrainTensor, at: np.ndarray | slice = slice(None)) -> Float:
-        """Covariance (m, 3, 3) of the strain of some points, from the spread (m, 2, 2) of the slopes in grid steps."""
-        per_mm = self.per_mm[at]
-        spread = np.swapaxes(per_mm, -1, -2) @ spread @ per_mm
-        return strain_covariance(self.pulls[at], tensor, self.around[at], spread, self.strain[at])
 
 
 def raise_order(slopes: Slopes, surface: OnSurface, tensor: StrainTensor) -> tuple[Slopes, Float, Bool]:

@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 from stereorig.core.arrays import Bool, Float
 from stereorig.core.field.points.result import Field
 from stereorig.core.matching.geometry import tangent_frames
+from stereorig.core.strain.on_surface import strain_covariance
 from stereorig.core.strain.result import StrainField
-from stereorig.core.strain.tensors import pulls_of, strain_covariance
+from stereorig.core.strain.tensors import pulls_of
 
 
 def reference_share(field: Field, strain: StrainField, points: Bool | None = None) -> Float | None:
@@ -43,12 +44,17 @@ def reference_share(field: Field, strain: StrainField, points: Bool | None = Non
     frame = tangent_frames(field.normal_sys[good])[..., :2]
     gradient = _moved(field, good, frame) - frame
     per_mm = np.linalg.inv(np.swapaxes(frame, -1, -2) @ _grid_tangents(field)[good])
-    even = np.swapaxes(per_mm, -1, -2) @ per_mm  # a whole window's slopes are equally sure along columns and rows
-    both = np.stack([field.covariance[good]] * 2)  # covariance of all noise, and of the reference's
-    both[1, :, 3:, 3:] = field.frozen[good]
-    tensor = strain.options.tensor
-    made = strain_covariance(pulls_of(frame, gradient, tensor), tensor, both, even, strain.strain[good])
-    variance, of_reference = np.diagonal(made, axis1=2, axis2=3)
+    # a whole window's slopes are equally sure along columns and rows
+    spread = per_mm, np.broadcast_to(np.eye(2), per_mm.shape)
+    pulls, own = pulls_of(frame, gradient, strain.options.tensor), field.covariance[good]
+    reference = own.copy()
+    reference[:, 3:, 3:] = field.frozen[good]
+    variance, of_reference = (
+        np.diagonal(
+            strain_covariance(pulls, strain.options.tensor, noise, spread, strain.strain[good]), axis1=1, axis2=2
+        )
+        for noise in (own, reference)
+    )
     out = np.full((*field.shape, 3), np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
         out[good] = np.clip(of_reference / variance, 0.0, 1.0)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import fields, replace
 
 import numpy as np
-from scipy import ndimage
 
 from stereorig.core.arrays import Bool, Float, Float32
 from stereorig.core.common.factor import FINE, round_in_place, sample_of
@@ -13,12 +12,13 @@ from stereorig.core.errors import InputError
 from stereorig.core.field.points.result import Field
 from stereorig.core.field.points.shared_pixels import SharedPixels
 from stereorig.core.matching.geometry import tangent_frames
-from stereorig.core.strain.arcs import missed_slope
 from stereorig.core.strain.common_part import common_part
-from stereorig.core.strain.one_sided import OnSurface, raise_order
+from stereorig.core.strain.on_surface import OnSurface
+from stereorig.core.strain.one_sided import raise_order
 from stereorig.core.strain.options import StrainOptions
+from stereorig.core.strain.reduced import whole_sums
 from stereorig.core.strain.result import StrainField, StrainStatus
-from stereorig.core.strain.tensors import pulls_of, strain_of, strain_of_stretch, strain_slopes
+from stereorig.core.strain.tensors import strain_of_stretch, strain_slopes
 from stereorig.core.strain.window import Slopes, window_slopes
 
 _POINTS_AT_ONCE = 1024  # points whose arrays stay in the processor's cache
@@ -166,15 +166,8 @@ def _replaced(surface: OnSurface, slopes: Slopes, field: Field, options: StrainO
 
 def _at(good: Bool, around: Float, slopes: Slopes, field: Field, options: StrainOptions) -> OnSurface:
     """Windows' slopes on the surface at the n points ``good``; ``around`` is (n, 6, 6) the mean covariance there."""
-    slope, second, moments = slopes.slope[good], slopes.second[good], slopes.moments[good]
-    before = missed_slope(slope[:, :3], second[:, :3], moments)
-    now = missed_slope(slope[:, :3] + slope[:, 3:], second[:, 3:], moments)
-    slope = slope - np.concatenate([before, now - before], axis=1)
-    frame = surface_frames(slope[:, :3], field.normal_sys[good])
-    per_mm = np.linalg.inv(np.swapaxes(frame, -1, -2) @ slope[:, :3])
-    gradient = slope[:, 3:] @ per_mm
-    strain, pulls = strain_of(frame, gradient, options.tensor), pulls_of(frame, gradient, options.tensor)
-    return OnSurface(frame, per_mm, gradient, around, strain, pulls)
+    of = slopes.slope[good], slopes.second[good], slopes.moments[good]
+    return OnSurface.of(*of, field.normal_sys[good], around, options.tensor)
 
 
 def surface_frames(tangents: Float, towards: Float) -> Float:
@@ -186,16 +179,11 @@ def surface_frames(tangents: Float, towards: Float) -> Float:
 
 def _mean_around(covariance: Float, valid: Bool, window: int, good: Bool) -> Float:
     """Mean (n, 6, 6) of the valid points' covariance over each window about the points ``good``."""
-    # it is symmetric: half of it is filtered
-    i, j = np.triu_indices(6)
-    total = np.take(covariance.reshape(-1, 36), 6 * i + j, axis=1).reshape(*valid.shape, len(i))
-    total[~valid] = 0.0
-    ndimage.uniform_filter(total, size=(window, window, 1), mode="constant", output=total)
-    share = ndimage.uniform_filter(valid.astype(np.float64), size=window, mode="constant")
-    half = total[good] / np.maximum(share[good], 0.5 / window**2)[:, None]
-    place = np.zeros((6, 6), np.int64)
-    place[i, j] = place[j, i] = np.arange(len(i))
-    return np.take(half, place.ravel(), axis=1).reshape(-1, 6, 6)
+    ones = np.ones((1, window))
+    held = np.where(valid[..., None, None], covariance, 0.0).reshape(*valid.shape, 36)
+    total = whole_sums(held, ones, ones, (0,))[good]
+    count = whole_sums(valid[..., None].astype(np.float64), ones, ones, (0,))[good]
+    return np.asarray((total / count).reshape(-1, 6, 6))
 
 
 def _patch_strain(field: Field, options: StrainOptions) -> Float | None:

@@ -68,45 +68,7 @@ def as_tensor(small: Float, strain: Float, tensor: StrainTensor) -> Float:
 
     Infinitesimal strain changes by as much itself.
     """
-    return np.einsum("nij,nj->ni", _hencky_slope(strain), small) if tensor == "hencky" else small
-
-
-def strain_covariance(pulls: Float, tensor: StrainTensor, points: Float, spread: Float, strain: Float) -> Float:
-    """Covariance (..., n, 3, 3) of exx, eyy, exy.
-
-    Parameters
-    ----------
-    pulls
-        (n, 2, 6) of :func:`pulls_of`.
-    tensor
-        Which strain.
-    points
-        (..., n, 6, 6) covariance of X Y Z U V W of the window's points.
-    spread
-        (n, 2, 2) sum over pairs of points of c_k rho_kl c_l^T in 1/mm^2, c the points' weights in the gradient and rho
-        the correlation of their errors.
-    strain
-        (n, 3) the strain itself.
-
-    Notes
-    -----
-    An error of the positions changes the tangents by d_j = sum c_kj (dX, dU)_k, six numbers for each of j = 1, 2. The
-    strain follows as de_ij = 1/2 (A_i . d_j + A_j . d_i), and cov(d_i, d_j) = spread_ij points.
-    """
-    Q = pulls @ points @ _transposed(pulls)
-    q11, q22, q12 = Q[..., 0, 0], Q[..., 1, 1], Q[..., 0, 1]
-    k11, k22, k12 = spread[..., 0, 0], spread[..., 1, 1], spread[..., 0, 1]
-    out = np.empty((*q11.shape, 3, 3))
-    out[..., 0, 0] = k11 * q11
-    out[..., 1, 1] = k22 * q22
-    out[..., 2, 2] = 0.25 * (k22 * q11 + k11 * q22 + 2.0 * k12 * q12)
-    out[..., 0, 1] = out[..., 1, 0] = k12 * q12
-    out[..., 0, 2] = out[..., 2, 0] = 0.5 * (k12 * q11 + k11 * q12)
-    out[..., 1, 2] = out[..., 2, 1] = 0.5 * (k22 * q12 + k12 * q22)
-    if tensor == "hencky":
-        J = _hencky_slope(strain)
-        out = J @ out @ _transposed(J)
-    return out
+    return np.einsum("nij,nj->ni", hencky_slope(strain), small) if tensor == "hencky" else small
 
 
 def strain_slopes(pulls: Float, tensor: StrainTensor, per_mm: Float, strain: Float) -> Float:
@@ -115,7 +77,7 @@ def strain_slopes(pulls: Float, tensor: StrainTensor, per_mm: Float, strain: Flo
     Parameters
     ----------
     pulls, tensor
-        As in :func:`strain_covariance`.
+        As in :func:`stereorig.core.strain.on_surface.strain_covariance`.
     per_mm
         (n, 2, 2) steps of column and row (first index) per mm along the frame's axes (second).
     strain
@@ -123,11 +85,28 @@ def strain_slopes(pulls: Float, tensor: StrainTensor, per_mm: Float, strain: Flo
     """
     along = pulls[:, :, None, None, :] * np.swapaxes(per_mm, -1, -2)[:, None, :, :, None]  # (n, i, j, a, 6)
     out = np.stack([along[:, 0, 0], along[:, 1, 1], 0.5 * (along[:, 0, 1] + along[:, 1, 0])], axis=1)
-    return np.einsum("nij,njab->niab", _hencky_slope(strain), out) if tensor == "hencky" else out
+    return np.einsum("nij,njab->niab", hencky_slope(strain), out) if tensor == "hencky" else out
+
+
+def hencky_slope(hencky: Float) -> Float:
+    """Return (..., 3, 3), the derivative of Hencky strain over Green-Lagrange strain, components exx, eyy, exy."""
+    h = principal_of(hencky)
+    inverse = np.exp(-2.0 * h)  # 1 / C
+    difference = h[..., 0] - h[..., 1]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shear = np.where(
+            difference > 1e-9, 2.0 * difference / (1.0 / inverse[..., 0] - 1.0 / inverse[..., 1]), inverse[..., 0]
+        )
+    angle = 0.5 * np.arctan2(2.0 * hencky[..., 2], hencky[..., 0] - hencky[..., 1])
+    diagonal = np.stack([inverse[..., 0], inverse[..., 1], shear], axis=-1)
+    return np.asarray(_turn(-angle) @ (diagonal[..., None] * _turn(angle)))
 
 
 def pulls_of(frame: Float, gradient: Float, tensor: StrainTensor) -> Float:
-    """Return A (n, 2, 6): a strain follows as de_ij = 1/2 (A_i . d_j + A_j . d_i), see :func:`strain_covariance`."""
+    """Return A (n, 2, 6): a strain follows as de_ij = 1/2 (A_i . d_j + A_j . d_i).
+
+    :func:`stereorig.core.strain.on_surface.strain_covariance` states the d_i.
+    """
     moved = frame + gradient
     if tensor == "infinitesimal":
         of_motion = frame
@@ -140,20 +119,6 @@ def pulls_of(frame: Float, gradient: Float, tensor: StrainTensor) -> Float:
         of_motion = moved
         of_position = moved - frame @ (_transposed(moved) @ moved)
     return _transposed(np.concatenate([of_position, of_motion], axis=-2))
-
-
-def _hencky_slope(hencky: Float) -> Float:
-    """(..., 3, 3) derivative of Hencky strain over Green-Lagrange strain, components exx, eyy, exy."""
-    h = principal_of(hencky)
-    inverse = np.exp(-2.0 * h)  # 1 / C
-    difference = h[..., 0] - h[..., 1]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        shear = np.where(
-            difference > 1e-9, 2.0 * difference / (1.0 / inverse[..., 0] - 1.0 / inverse[..., 1]), inverse[..., 0]
-        )
-    angle = 0.5 * np.arctan2(2.0 * hencky[..., 2], hencky[..., 0] - hencky[..., 1])
-    diagonal = np.stack([inverse[..., 0], inverse[..., 1], shear], axis=-1)
-    return np.asarray(_turn(-angle) @ (diagonal[..., None] * _turn(angle)))
 
 
 def _turn(angle: Float) -> Float:

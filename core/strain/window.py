@@ -23,15 +23,9 @@ from stereorig.core.field.region.window import (
     ways_cut,
     window_offsets,
 )
-from stereorig.core.strain.arcs import (
-    reduced_moments,
-    second_moments,
-    second_weights,
-    third_moments,
-    whole_second_derivatives,
-)
+from stereorig.core.strain.arcs import reduced_moments, second_moments, second_weights, third_moments
 from stereorig.core.strain.options import StrainOptions
-from stereorig.core.strain.reduced import window_sums
+from stereorig.core.strain.reduced import whole_sums, window_sums
 from stereorig.core.strain.result import StrainStatus
 
 _AT_ONCE = 1024
@@ -207,15 +201,13 @@ def window_slopes(
     crossed = ways_cut(valid, xy_px, cuts, half)
     whole &= ~crossed.any(axis=-1) if crossed is not None else True
     status = np.where(valid, StrainStatus.OK, StrainStatus.NO_POINT).astype(np.int8)
-    slope = _whole_slopes(values, half)
+    slope, second = _whole_windows(values, half)
     spread = np.zeros((*valid.shape, 2, 2))
     c = plane_weights(half)
     down, along = (np.subtract.outer(o, o).astype(np.float64) for o in offsets.T)
     rho = shared.correlation(along * step[0], down * step[1])
     del down, along
     spread[...] = c @ rho @ c.T
-    positions = np.concatenate([values[..., :3], values[..., :3] + values[..., 3:]], axis=-1)
-    second = whole_second_derivatives(positions, half)
     moments = np.empty((*valid.shape, 2, 4))
     moments[...] = third_moments(c, half)
     second_spread = None
@@ -253,15 +245,20 @@ def plane_weights(half: int) -> Float:
     return np.asarray(offsets[:, ::-1].T / float((offsets[:, 0] ** 2).sum()))
 
 
-def _whole_slopes(values: Float, half: int) -> Float:
-    """Slopes (r, c, 6, 2) of whole windows, quadratic or not: a line's weights one way, equal ones the other."""
+def _whole_windows(values: Float, half: int) -> tuple[Float, Float]:
+    """Slopes (r, c, 6, 2) of whole windows by planes or quadratics, and the second derivatives as :class:`Slopes` has.
+
+    A line's weights one way and equal ones the other give a slope.
+    """
     side = np.arange(-half, half + 1, dtype=np.float64)
-    line, ones = side / (side**2).sum(), np.full(2 * half + 1, 1.0 / (2 * half + 1))
-    out = []
-    for along, across in ((1, 0), (0, 1)):
-        part = ndimage.correlate1d(values, line, axis=along, mode="constant", cval=np.nan)
-        out.append(ndimage.correlate1d(part, ones, axis=across, mode="constant", cval=np.nan))
-    return np.stack(out, axis=-1)
+    bent = side**2 - (side**2).mean()
+    line, ones, twice = side / (side**2).sum(), np.full(len(side), 1.0 / len(side)), 2.0 * bent / (bent**2).sum()
+    down = np.stack([ones, line, twice])
+    sums = whole_sums(values, down, np.stack([line, ones, twice, line, ones]), (0, 1, 0, 1, 2))
+    sums = np.moveaxis(sums, 2, 3)
+    slope, second = sums[..., :2], sums[..., 2:]
+    second[..., 3:, :] += second[..., :3, :]  # of the displacement, then of the deformed position
+    return slope, second
 
 
 def _weights(seen: Bool, half: int, order: int, options: StrainOptions) -> tuple[np.ndarray, Float]:

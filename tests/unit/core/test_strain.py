@@ -15,10 +15,11 @@ from stereorig.core.field.region.cuts import Cuts
 from stereorig.core.field.region.window import distinct_windows, window_offsets
 from stereorig.core.status import PointStatus
 from stereorig.core.strain import StrainField, StrainOptions, StrainStatus, surface_strain
-from stereorig.core.strain.arcs import missed_slope
 from stereorig.core.strain.common_part import common_part
+from stereorig.core.strain.on_surface import OnSurface
+from stereorig.core.strain.reduced import whole_sums
 from stereorig.core.strain.surface import surface_slopes
-from stereorig.core.strain.tensors import strain_slopes
+from stereorig.core.strain.tensors import pulls_of, strain_of, strain_slopes
 from stereorig.core.strain.window import plane_weights
 from tests.support.strain_fields import cylinder, make_field, plane, sphere, turned
 
@@ -448,17 +449,62 @@ def test_only_windows_cut_off_alike_share_their_weights():
 def test_what_third_derivatives_add_to_a_slope_is_that_of_the_general_solution():
     """The plain twin solves the metric's equations by LAPACK; rounding alone is between them."""
     rng = np.random.default_rng(6)
-    slope, second = rng.normal(size=(40, 3, 2)), rng.normal(size=(40, 3, 3))
-    moments = rng.normal(size=(40, 2, 4))
+    slope, second = rng.normal(size=(40, 6, 2)), rng.normal(size=(40, 6, 3))
+    moments, towards = 0.1 * rng.normal(size=(40, 2, 4)), rng.normal(size=(40, 3))
+    found = OnSurface.of(slope, second, moments, towards, np.empty((40, 6, 6)), "green_lagrange")
     for k in range(40):
-        x_s, x_t = slope[k].T
-        normal = np.cross(x_s, x_t) / np.linalg.norm(np.cross(x_s, x_t))
-        ss, st, tt = normal @ second[k]
-        along = -np.array([[ss * ss, ss * st], [ss * st, st * st], [st * st, tt * st], [tt * st, tt * tt]])
-        third = np.linalg.solve(slope[k].T @ slope[k], along.T).T @ slope[k].T
-        wanted = (moments[k] @ third).T
-        found = missed_slope(slope[k : k + 1], second[k : k + 1], moments[k : k + 1])[0]
-        assert found == pytest.approx(wanted, rel=1e-9, abs=1e-12 * np.abs(wanted).max())
+        before = slope[k, :3] - _bias_by_lapack(slope[k, :3], second[k, :3], moments[k])
+        now = slope[k, :3] + slope[k, 3:]
+        now = now - _bias_by_lapack(now, second[k, 3:], moments[k])
+        assert found.frame[k] @ np.linalg.inv(found.per_mm[k]) == pytest.approx(before, rel=1e-9, abs=1e-9)
+        assert found.gradient[k] @ np.linalg.inv(found.per_mm[k]) == pytest.approx(now - before, rel=1e-9, abs=1e-9)
+        normal = np.cross(*found.frame[k].T)
+        assert normal @ before == pytest.approx([0.0, 0.0], abs=1e-9)
+        assert normal @ towards[k] > 0.0
+
+
+def _bias_by_lapack(slope, second, moments):
+    x_s, x_t = slope.T
+    normal = np.cross(x_s, x_t) / np.linalg.norm(np.cross(x_s, x_t))
+    ss, st, tt = normal @ second
+    along = -np.array([[ss * ss, ss * st], [ss * st, st * st], [st * st, tt * st], [tt * st, tt * tt]])
+    third = np.linalg.solve(slope.T @ slope, along.T).T @ slope.T
+    return (moments @ third).T
+
+
+@pytest.mark.parametrize("tensor", ["green_lagrange", "infinitesimal", "hencky"])
+def test_the_compiled_strain_is_that_of_matrices(tensor):
+    """Strain, its derivatives and its covariance of single points, by the matrices of the definitions."""
+    rng = np.random.default_rng(7)
+    n = 30
+    slope = np.concatenate([rng.normal(size=(n, 3, 2)), 0.05 * rng.normal(size=(n, 3, 2))], axis=1)
+    root = rng.normal(size=(n, 6, 6))
+    around = root @ np.swapaxes(root, 1, 2)
+    spread = np.array([[2.0, 0.3], [0.3, 1.0]]) * np.ones((n, 1, 1))
+    flat = np.zeros((n, 6, 3)), np.zeros((n, 2, 4))
+    found = OnSurface.of(slope, *flat, rng.normal(size=(n, 3)), around, tensor)
+    covariance = found.covariance(spread, tensor)
+    assert found.strain == pytest.approx(strain_of(found.frame, found.gradient, tensor), rel=1e-9, abs=1e-14)
+    assert found.pulls == pytest.approx(pulls_of(found.frame, found.gradient, tensor), rel=1e-9, abs=1e-14)
+    by_slope = strain_slopes(found.pulls, tensor, found.per_mm, found.strain)
+    for k in range(n):
+        # slopes' errors over column and row: spread times the points' covariance
+        wanted = np.einsum("iap,ab,pq,jbq->ij", by_slope[k], spread[k], around[k], by_slope[k])
+        assert covariance[k] == pytest.approx(wanted, rel=1e-9, abs=1e-9 * wanted.max())
+
+
+def test_sums_over_whole_windows_are_those_of_each_window():
+    """Filters down and along make one sum with the products of their weights; nothing lies beside the grid."""
+    rng = np.random.default_rng(8)
+    values, half = rng.normal(size=(7, 9, 4)), 2
+    down, along = rng.normal(size=(2, 5)), rng.normal(size=(3, 5))
+    found = whole_sums(values, down, along, (1, 0, 1))
+    there = np.pad(values, ((half, half), (half, half), (0, 0)))
+    for r in range(7):
+        for c in range(9):
+            part = there[r : r + 5, c : c + 5]
+            wanted = np.stack([np.einsum("i,j,ijq->q", down[d], along[a], part) for a, d in enumerate((1, 0, 1))])
+            assert found[r, c] == pytest.approx(wanted, rel=1e-12, abs=1e-13)
 
 
 def test_islands_have_no_strain():
