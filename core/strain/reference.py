@@ -45,7 +45,7 @@ def reference_share(field: Field, strain: StrainField, points: Bool | None = Non
     gradient = _moved(field, good, frame) - frame
     per_mm = np.linalg.inv(np.swapaxes(frame, -1, -2) @ _grid_tangents(field)[good])
     # a whole window's slopes are equally sure along columns and rows
-    spread = per_mm, np.broadcast_to(np.eye(2), per_mm.shape)
+    spread = np.asarray(per_mm), np.tile(np.eye(2), (len(per_mm), 1, 1))
     pulls, own = pulls_of(frame, gradient, strain.options.tensor), field.covariance[good]
     reference = own.copy()
     reference[:, 3:, 3:] = field.frozen[good]
