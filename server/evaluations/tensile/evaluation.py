@@ -97,7 +97,8 @@ def curve_of(results: Results, asked: TensileSettings, progress: Progress) -> tu
     curve = Curve(
         values[:, there], own[:, there], shared, np.array(results.steps)[there], times if rising else None, others
     )
-    missing = [] if axial.known and (lateral is None or lateral.known) else ["calibration of the cameras"]
+    missing = ["change of the stated section along the gauge"]
+    missing += [] if axial.known and (lateral is None or lateral.known) else ["calibration of the cameras"]
     return with_load_errors(
         with_beam_errors(curve, asked),
         scale_u=asked.load_scale_u or 0.0,

@@ -48,9 +48,7 @@ class TensileSettings(Request):
         description="Midspan and both supports in camera 1's image, whose deflection gives the strain; null: it is the "
         "measured strain along the bar's outer face.",
     )
-    deflection_normal: Switch = Field(
-        False, description="The deflection is along the surface's normal, the bar seen from above or below."
-    )
+    deflection_normal: Switch = Field(False, description="The deflection is along the surface's normal.")
     load_channel: Annotated[str, Field(min_length=1, max_length=100)] | None = Field(
         None, description="Channel that is the load; null: the load of the steps."
     )

@@ -62,6 +62,8 @@ function bars(edges, counts) {
 function shown(value) {
   if (typeof value === "number") return Number.isInteger(value) ? count(value) : num(value, 5);
   if (value === null || value === undefined) return "–";
+  if (Array.isArray(value) && value.some((one) => typeof one === "object" && one !== null))
+    return definitions(value.map((one, k) => [String(k + 1), shown(one)]));
   if (Array.isArray(value))
     return value.length > 12 ? `${value.length} values` : value.map((one) => (typeof one === "number" ? num(one, 5) : String(one))).join(", ");
   if (typeof value !== "object") return String(value);
