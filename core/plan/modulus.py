@@ -1,4 +1,4 @@
-"""The uncertainty of a modulus that a planned tensile test would give."""
+"""What is stated of a planned tensile test or cracked panel, and the uncertainty of the modulus that it would give."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
+from stereorig.core.plan.settings import Positive
 from stereorig.core.settings import Real, Settings, Whole, disagreement
 
 _Strain = Annotated[Real, Field(ge=0.0, le=0.5)]
@@ -34,6 +35,23 @@ class PlannedTensileTest(Settings):
         if self.modulus_strains[0] >= self.modulus_strains[1]:
             raise disagreement("modulus_strains needs its lower end first")
         return self
+
+
+class PlannedCrack(Settings):
+    """The centre-cracked panel whose stress intensity is predicted; its crack runs along X to a tip in the middle."""
+
+    crack_half_mm: Positive | None = Field(None, description="Half of the crack's length.")
+    panel_width_mm: Positive | None = Field(None, description="Width of the panel.")
+    panel_thickness_mm: Positive | None = Field(None, description="Its thickness.")
+    panel_load_n: Positive | None = Field(None, description="Load that pulls it across the crack.")
+    youngs_modulus_mpa: Positive | None = Field(None, description="Young's modulus.")
+    poisson: Annotated[Real, Field(ge=0.0, lt=0.5)] = Field(0.33, description="Poisson's ratio.")
+    modulus_u: Annotated[Real, Field(ge=0.0, le=0.5)] | None = Field(
+        None, description="Relative standard uncertainty of the modulus."
+    )
+    ring_mm: tuple[Positive, Positive] | None = Field(
+        None, description="Distances from the tip of the points; null: a subset and a half, and half the crack."
+    )
 
 
 def modulus_parts(test: PlannedTensileTest, noise: float, moved: float) -> Mapping[str, float]:

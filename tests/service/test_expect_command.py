@@ -153,3 +153,32 @@ def test_a_wider_gauge_and_more_steps_know_the_modulus_better(capsys: pytest.Cap
     assert noise("--area-mm", "20") < 0.6 * noise("--area-mm", "12")
     few, many = (noise("--modulus-steps", str(n)) for n in (20, 80))
     assert many == pytest.approx(few * np.sqrt(20 * 21 / 19) / np.sqrt(80 * 81 / 79), rel=1e-9)
+
+
+CRACKED = [
+    *("--crack-half-mm", "20", "--panel-width-mm", "200", "--panel-thickness-mm", "2", "--panel-load-n", "40000"),
+    *("--youngs-modulus-mpa", "73100", "--modulus-u", "0.01", "--ring-mm", "4,16"),
+]
+
+
+def test_k_of_a_planned_panel_is_the_formulas_and_its_noise_that_of_a_line_fit(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    found = document(capsys, *NOT_THERE, *CRACKED)["k1"]
+    # 40 kN over 200 x 2 mm2, a crack of a fifth of the width: the secant, which is within 0.2 % of Tada's
+    k = 100.0 * np.sqrt(np.pi * 0.020 / np.cos(np.pi * 20.0 / 200.0))
+    assert found["k1"] == pytest.approx(k, rel=2e-3)
+    assert found["parts"]["modulus"] == pytest.approx(0.01 * found["k1"])
+    assert found["u"] == pytest.approx(np.linalg.norm(list(found["parts"].values())))
+    # twice the noise is twice the part, four times the points are half of it; a part in a million moved is none
+    twice, dense = (
+        document(capsys, *NOT_THERE, *CRACKED, *more)["k1"]["parts"]
+        for more in (["--image-noise-grey", "4"], ["--subset", "17"])
+    )
+    assert twice["matching"] == pytest.approx(2.0 * found["parts"]["matching"], rel=0.02)
+    assert dense["matching"] > found["parts"]["matching"]
+    assert found["parts"]["calibration"] < found["parts"]["modulus"]
+    assert main(["expect", *NOT_THERE, "--crack-half-mm", "20"]) == 0
+    assert "K_I: not stated: panel_width_mm" in capsys.readouterr().out
+    assert main(["expect", *NOT_THERE, *CRACKED, "--panel-width-mm", "41"]) == 1
+    assert "panel" in capsys.readouterr().err

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ValidationError
 
 from stereorig.core.errors import InputError
 from stereorig.core.names import BUDGET
-from stereorig.core.plan.modulus import PlannedTensileTest, modulus_parts
+from stereorig.core.plan.modulus import PlannedCrack, PlannedTensileTest, modulus_parts
 from stereorig.core.plan.settings import PlannedMeasurement, PlannedRig
 from stereorig.core.settings import STRAIN_WINDOW
 
@@ -48,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ("the rig, if it differs from the file", PlannedRig),
         ("measurement", PlannedMeasurement),
         ("a tensile test, whose gauge is area_mm wide", PlannedTensileTest),
+        ("a centre-cracked panel", PlannedCrack),
     ):
         group = parser.add_argument_group(title)
         for name, field in model.model_fields.items():
@@ -63,6 +64,7 @@ def run(args: argparse.Namespace) -> int:
         expectation_document,
         rig_as_planned,
     )
+    from stereorig.server.evaluations.planned_crack import planned_k
     from stereorig.server.formats.results.summary import to_json
     from stereorig.server.workflows.calibration.sequence import CalibrationPlan, check_plan
 
@@ -78,7 +80,8 @@ def run(args: argparse.Namespace) -> int:
         positions_mm=positions, localiser=localiser, noise_px=args.noise_px, roll_deg=args.roll_deg
     )
     predicted = partial(expectation_document, rig_as_planned(rig, planned), plan)
-    document = predicted(measured)
+    crack = _model(PlannedCrack, args)
+    document = predicted(measured, more=lambda *of: {"k1": planned_k(of[0], of[1], of[2], of[3], crack)})
     document["modulus"] = _modulus(predicted, document["views"], measured, _model(PlannedTensileTest, args))
     print(to_json(document).decode().rstrip() if args.json else table(document))
     return 1 if document["refused"] else 0
@@ -109,7 +112,7 @@ def table(document: Mapping[str, Any]) -> str:
     ]
     lines += ["", document["assumed"]["text"], document["measurement"]["text"]]
     lines += [f"{name}: {_seen(view)}" for name, view in document["views"].items()]
-    lines += [_modulus_line(document["modulus"])]
+    lines += [_modulus_line(document["modulus"]), *_k_line(document["k1"])]
     lines += [f"would be refused: {reason}" for reason in document["reasons"]]
     return "\n".join(line.rstrip() for line in lines)
 
@@ -148,6 +151,16 @@ def _modulus_line(found: Mapping[str, Any]) -> str:
         whole = f"u (k = 1) {100.0 * found['relative_u']:.2g} %"
     gauge = f"{found['gauge_mm']:.3g} mm gauge, {found['modulus_steps']} steps between strains of {low:g} and {high:g}"
     return f"modulus: {whole}; {parts}; {gauge}, the body moving by the largest translation"
+
+
+def _k_line(found: Mapping[str, Any]) -> list[str]:
+    """Write K_I and its uncertainty in one line; nothing if no crack is planned."""
+    if "crack_half_mm" in found["missing"]:
+        return []
+    if found["missing"]:
+        return [f"K_I: not stated: {', '.join(found['missing'])}"]
+    parts = ", ".join(f"{cause} {u:.2g}" for cause, u in found["parts"].items())
+    return [f"K_I: {found['k1']:.4g} MPa m^0.5, u (k = 1) {found['u']:.2g}; {parts}"]
 
 
 def _seen(view: Mapping[str, Any]) -> str:

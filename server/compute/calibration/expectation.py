@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -12,12 +12,13 @@ from stereorig.core.boards import BoardTarget
 from stereorig.core.calibration.expect import Expectation, LineModel, expect
 from stereorig.core.calibration.inputs import AnyTarget
 from stereorig.core.calibration.prepare import EXPECTED_NOISE_PX
+from stereorig.core.cameras.stereo import StereoPair
 from stereorig.core.common.factor import ParameterCovariance
 from stereorig.core.errors import CalibrationError, CalibrationInputError
 from stereorig.core.names import CAMERAS
 from stereorig.core.plan.quantities import planned_quantities
 from stereorig.core.plan.settings import PlannedMeasurement, PlannedRig
-from stereorig.core.plan.synthetic import correlation_px, match_variance_px2
+from stereorig.core.plan.synthetic import Sizes, correlation_px, match_variance_px2
 from stereorig.core.plan.view import planned_view
 from stereorig.server.compute.calibration.inputs import nominals_of, options_of, target_of
 
@@ -64,7 +65,10 @@ def _stated(values: dict[str, object]) -> dict[str, object]:
 
 
 def expectation_document(
-    rig: dict[str, Any], plan: PlannedCalibration, measured: PlannedMeasurement
+    rig: dict[str, Any],
+    plan: PlannedCalibration,
+    measured: PlannedMeasurement,
+    more: Callable[[StereoPair, Sizes, ParameterCovariance, PlannedMeasurement], dict[str, object]] | None = None,
 ) -> dict[str, object]:
     """Return the uncertainties to expect from a plan.
 
@@ -74,6 +78,8 @@ def expectation_document(
         Entries of the rig file that a calibration needs, see :func:`rig_as_planned`.
     plan, measured
         The calibration and the measurement.
+    more
+        Function of cameras, image sizes, parameters and measurement that returns further entries.
 
     Raises
     ------
@@ -100,6 +106,7 @@ def expectation_document(
             )
             source = ParameterCovariance(found.pair, tuple(found.parameters), found.covariance, found.by_cause)
             quantities = planned_quantities(found.pair, sizes, source, measured)
+            further = {} if more is None else more(found.pair, sizes, source, measured)
     except (ArithmeticError, np.linalg.LinAlgError) as error:
         raise CalibrationError(
             f"The planned rig's numbers cannot be calculated with ({error}).",
@@ -122,6 +129,7 @@ def expectation_document(
             "text": _measured_text(measured),
         },
         "views": {name: _view(rig[name], measured) for name in CAMERAS},
+        **further,
         "quantities": [asdict(q) | {"budget": dict(q.budget)} for q in quantities],
     }
 

@@ -87,9 +87,7 @@ class CrackSettings(Request):
     )
     cycles_channel: _Channel | None = Field(None, description="Channel with the count of load cycles; null: none.")
     panel: tuple[_Positive, _Positive, _Small] | None = Field(
-        None,
-        description="Panel with a centre crack, to show K_I beside the closed formula: its width and thickness in mm, "
-        "and the relative standard uncertainty of its stress; null: none.",
+        None, description="Centre-cracked panel for K_I's formula: width, thickness in mm, relative u of its stress."
     )
 
     def elastic(self) -> Elastic:
