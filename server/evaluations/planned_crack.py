@@ -35,8 +35,8 @@ def planned_k(
     pair, sizes, source
         The cameras, their images' sizes, and the covariance of the cameras' parameters by cause.
     measured, crack
-        The measurement and the panel; the tip is in the middle of the target's plane, the crack runs along -X from it. The
-        cameras' errors are those after the largest of the measurement's translations, of the worst direction.
+        The measurement and the panel; the tip is in the middle of the target's plane, the crack runs along -X from it.
+        The cameras' errors are those after the largest of the measurement's translations, of the worst direction.
 
     Raises
     ------
@@ -70,17 +70,18 @@ def planned_k(
     for cause, noise in (("reference", planned.reference), ("matching", planned.matching)):
         each = points(replace(planned, field=planned.of_noise(noise)))
         parts[cause] = float(np.sqrt(each.spread(gain).own[0, 0]))
-    moved = []
+    moved: list[dict[str, float]] = []
     for motion in max(measured.translations_mm) * np.eye(3):
         after = planned_field(pair, sizes, measured, _grid(pair, measured, crack), motion.tolist())
-        of_cause = {}
+        of_cause: dict[str, float] = {}
         for name, field in after.of_causes(source).items():
             # the noise tells which points are used, and is no part of this
             with_noise = replace(planned.field, common=field.common)
             factor = points(replace(planned, field=with_noise)).spread(gain).common
             of_cause[str(name)] = 0.0 if factor is None else float(np.linalg.norm(factor))
         moved.append(of_cause)
-    parts |= max(moved, key=lambda one: float(np.linalg.norm(list(one.values()))))
+    sizes_of = [float(np.linalg.norm(list(one.values()))) for one in moved]
+    parts |= moved[int(np.argmax(sizes_of))]
     return {"k1": k, "u": float(np.linalg.norm(list(parts.values()))), "parts": parts, "missing": []}
 
 

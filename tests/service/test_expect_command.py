@@ -170,7 +170,7 @@ def test_k_of_a_planned_panel_is_the_formulas_and_its_noise_that_of_a_line_fit(
     assert found["k1"] == pytest.approx(k, rel=2e-3)
     assert found["parts"]["modulus"] == pytest.approx(0.01 * found["k1"])
     assert found["u"] == pytest.approx(np.linalg.norm(list(found["parts"].values())))
-    # twice the noise is twice the part, four times the points are half of it; a part in a million moved is none
+    # twice the noise is twice the part; a narrower subset has more of it
     twice, dense = (
         document(capsys, *NOT_THERE, *CRACKED, *more)["k1"]["parts"]
         for more in (["--image-noise-grey", "4"], ["--subset", "17"])
