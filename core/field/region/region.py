@@ -87,8 +87,10 @@ class PointGrid:
                 code="region_too_large",
                 remedy="Give a larger step or a smaller region.",
             )
-        x, y = np.meshgrid(x0_px + spacing_px * np.arange(n_x), y0_px + spacing_px * np.arange(n_y))
-        return PointGrid(x, y, np.ones(x.shape, bool), float(spacing_px), (x0_px, y0_px, x1_px, y1_px))
+        # kernels are compiled for doubles: whole numbers would compile them again
+        step = float(spacing_px)
+        x, y = np.meshgrid(x0_px + step * np.arange(n_x), y0_px + step * np.arange(n_y))
+        return PointGrid(x, y, np.ones(x.shape, bool), step, (x0_px, y0_px, x1_px, y1_px))
 
     @staticmethod
     def polygon(vertices_px: ArrayLike, *, spacing_px: float) -> PointGrid:

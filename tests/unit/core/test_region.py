@@ -18,6 +18,12 @@ def test_a_rectangle_ends_at_its_last_whole_step_and_includes_its_corner() -> No
     assert grid.allowed.all()
 
 
+def test_positions_are_doubles_whatever_the_numbers_given_since_kernels_are_compiled_for_them() -> None:
+    grid = PointGrid.rectangle(30, 40, 60, 80, spacing_px=10)
+    assert grid.xy_px.dtype == np.float64
+    assert grid.xy_px[1, 2].tolist() == [50.0, 50.0]
+
+
 def test_a_fractional_step_does_not_lose_the_last_point_to_rounding() -> None:
     grid = PointGrid.rectangle(0.1, 0.0, 0.1 + 7 * 3.3, 33.0, spacing_px=3.3)
     assert grid.shape == (11, 8)
