@@ -110,11 +110,18 @@ def render_board(
     )
     if drawn.dark_ground:
         fine = 1.0 - fine
+    return _pixels(fine, samples, blur_px)
+
+
+def _pixels(fine: NDArray[np.float32], samples: int, blur_px: float) -> Float:
+    """Blur and mean over each pixel at once; beyond the picture its rim goes on."""
+    weight = np.full(samples, 1.0 / samples)
     if blur_px > 0.0:
-        sigma = blur_px * samples
-        fine = np.asarray(cv2.GaussianBlur(fine, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE), dtype=np.float32)
-    rows, columns = size_px[1], size_px[0]
-    return np.asarray(fine.reshape(rows, samples, columns, samples).mean(axis=(1, 3), dtype=np.float64))
+        reach = int(np.ceil(4.5 * blur_px * samples))
+        gauss = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (blur_px * samples)) ** 2)
+        weight = np.convolve(gauss / gauss.sum(), weight)
+    rim = (len(weight) - samples) // 2
+    return np.asarray(_weigh(np.pad(fine, rim, mode="edge"), weight.astype(np.float32), samples))
 
 
 def board_image(
@@ -153,6 +160,27 @@ def _marker_picture(target: BoardTarget) -> NDArray[np.uint8]:
     return np.asarray(board.generateImage((squares[0] * side, squares[1] * side)), dtype=np.uint8)
 
 
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _weigh(fine: NDArray[np.float32], weight: NDArray[np.float32], samples: int) -> Float:
+    """Weigh the samples of each pixel and its surroundings, along the rows and then down the columns."""
+    n = len(weight)
+    rows, columns = (fine.shape[0] - n) // samples + 1, (fine.shape[1] - n) // samples + 1
+    out = np.zeros((rows, columns))
+    summed = np.empty(columns)
+    for j in range(fine.shape[0]):
+        line = fine[j]
+        for c in range(columns):
+            total = np.float32(0.0)
+            for k in range(n):
+                total += weight[k] * line[c * samples + k]
+            summed[c] = total
+        for r in range(max(0, (j - n + samples) // samples), min(rows, j // samples + 1)):
+            w = weight[j - r * samples]
+            for c in range(columns):
+                out[r, c] += w * summed[c]
+    return out
+
+
 @njit(cache=True, nogil=True)
 def _ramp(distance: float, width: float) -> float:
     return min(max(distance / width + 0.5, 0.0), 1.0)
@@ -175,7 +203,7 @@ def _cover(
         inside = _ramp(X + 1.0, w) * _ramp(columns - X, w) * _ramp(Y + 1.0, w) * _ramp(rows - Y, w)
         if inside <= 0.0:
             return 0.0
-        i, j = round(X), round(Y)
+        i, j = int(np.floor(X + 0.5)), int(np.floor(Y + 0.5))
         sx = 2.0 * _ramp(X - i, w) - 1.0
         sy = 2.0 * _ramp(Y - j, w) - 1.0
         parity = 1.0 if (i + j) % 2 == 0 else -1.0
@@ -190,19 +218,19 @@ def _cover(
             if min(u, v, 1.0 - u, 1.0 - v) > 0.05:  # inside a square: the marker, if it has one
                 return inside if picture[py, px] < 128 else 0.0
         return inside * (0.5 + 0.5 * sx * sy * parity)
-    j = round(Y)
+    j = int(np.floor(Y + 0.5))
     if j < 0 or j >= rows:
         return 0.0
     shift = float(j % 2) if kind == 3 else 0.0
     step = 2.0 if kind == 3 else 1.0
-    i = round((X - shift) / step)
+    i = int(np.floor((X - shift) / step + 0.5))
     if i < 0 or i >= columns:
         return 0.0
     mark = marks[i, j]
     if mark == 3:
         return 0.0
     r = radius * (1.35 if mark == 2 else 1.0)
-    distance = np.hypot(X - shift - step * i, Y - j)
+    distance = np.sqrt((X - shift - step * i) ** 2 + (Y - j) ** 2)
     cover = _ramp(r - distance, w)
     if mark == 1:
         cover -= _ramp(HOLLOW * r - distance, w)
@@ -232,9 +260,10 @@ def _render(
     root = np.sqrt(abs(np.linalg.det(to_plane)))
     for row in range(height * samples):
         yd = ((row + 0.5) / samples - 0.5 - centre[1]) / focal
+        from_x, from_y = 0.0, 0.0  # what the lens moved the sample before by
         for column in range(width * samples):
             xd = ((column + 0.5) / samples - 0.5 - centre[0]) / focal
-            x, y = xd, yd
+            x, y = xd + from_x, yd + from_y
             if k1 != 0.0 or k2 != 0.0 or p1 != 0.0 or p2 != 0.0:
                 for _ in range(30):
                     r2 = x * x + y * y
@@ -245,12 +274,13 @@ def _render(
                     x, y = nx, ny
                     if moved < 1e-10:
                         break
+                from_x, from_y = x - xd, y - yd
             q0 = to_plane[0, 0] * x + to_plane[0, 1] * y + to_plane[0, 2]
             q1 = to_plane[1, 0] * x + to_plane[1, 1] * y + to_plane[1, 2]
             q2 = to_plane[2, 0] * x + to_plane[2, 1] * y + to_plane[2, 2]
             X = (q0 / q2 - origin[0]) / pitch
             Y = (q1 / q2 - origin[1]) / pitch
             # the sample's width in pitches, by its area on the board
-            w = root / (abs(q2) ** 1.5 * samples * focal * pitch)
+            w = root / (abs(q2) * np.sqrt(abs(q2)) * samples * focal * pitch)
             out[row, column] = _cover(X, Y, w, kind, columns, rows, radius, marks, picture)
     return out

@@ -177,7 +177,8 @@ def _under_family(
     return min(max((half - abs(across - centre)) / rim + 0.5, 0.0), 1.0)
 
 
-@njit(cache=True, nogil=True)
+# sums may be taken in any order
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _render(
     width: int,
     height: int,
