@@ -13,7 +13,7 @@ from stereorig.server.cell.cell import Cell, require
 from stereorig.server.cell.sandbox import ReadingLimits, end_at_opening
 from stereorig.server.formats.hdf5_parts import require_own_parts
 from stereorig.server.formats.models.mesh_file import MeshFile
-from stereorig.server.formats.models.read import ModelFile, read_model
+from stereorig.server.formats.models.read import ModelFile, ReadAs, read_model
 from stereorig.server.formats.results.netcdf import dataset_bytes, opened
 
 _MOST_BYTES, _LEAST_BYTES = 3 << 30, 1 << 30
@@ -39,7 +39,7 @@ def described(cell: Cell, files: Mapping[str, Path], main: str, how: Mapping[str
     FileFormatError, TooLargeError, QueueFullError
         As `Cell.read`.
     """
-    found: dict[str, Any] = _through(cell, _describe, files, main, how)
+    found: dict[str, object] = _through(cell, _describe, files, main, how)
     require(type(found.get("nodes")) is int and isinstance(found.get("unit"), str), "the model")
     return found
 
@@ -77,12 +77,12 @@ def warm_up() -> None:
         pass
 
 
-def _describe(files: list[BinaryIO], names: list[str], main: str, how: dict[str, Any]) -> dict[str, object]:
+def _describe(files: list[BinaryIO], names: list[str], main: str, how: ReadAs) -> dict[str, object]:
     read = _model(files, names, main, how)
     return {"unit": read.unit, "displacement": read.displacement_name, "nodes": len(read.nodes_mm)}
 
 
-def _read(files: list[BinaryIO], names: list[str], main: str, how: dict[str, Any]) -> dict[str, object]:
+def _read(files: list[BinaryIO], names: list[str], main: str, how: ReadAs) -> dict[str, object]:
     read = _model(files, names, main, how)
     return {
         "nodes_mm": read.nodes_mm,
@@ -97,7 +97,7 @@ def _read(files: list[BinaryIO], names: list[str], main: str, how: dict[str, Any
     }
 
 
-def _model(files: list[BinaryIO], names: list[str], main: str, how: dict[str, Any]) -> ModelFile:
+def _model(files: list[BinaryIO], names: list[str], main: str, how: ReadAs) -> ModelFile:
     with contextlib.ExitStack() as held:
         contents: dict[str, Any] = {}
         for name, file in zip(names, files, strict=True):

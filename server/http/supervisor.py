@@ -25,7 +25,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from stereorig.server.front.front import ConnectionLimits, Front, HaltFailed, HaltMade
 from stereorig.server.front.messages import Halt
@@ -78,6 +78,34 @@ class ServePlan:
     rig_module: str = "stereorig.server.rig.process.host"
 
 
+class Ready(TypedDict):
+    """What the web process says when it serves: hosts that it answers for, if keys are required, names to announce."""
+
+    hosts: list[str]
+    required: bool
+    max_open: int
+    name: str
+    data: str
+
+
+class Message(TypedDict, total=False):
+    """A request to a process of the service (``do``, ``id``), its answer (``of``), or news of the process' own."""
+
+    do: str
+    id: int
+    ending: bool
+    refused: dict[str, int]
+    of: int
+    alive: bool
+    number: int
+    elapsed_ms: float
+    code: str
+    cause: str
+    remedy: str
+    lines: list[str]
+    ready: Ready
+
+
 class _Child:
     """A process of the service, with a control socket to it."""
 
@@ -95,7 +123,7 @@ class _Child:
         self.ended = os.pidfd_open(self.process.pid)
         self.since = time.monotonic()
 
-    def say(self, message: dict[str, Any]) -> bool:
+    def say(self, message: Message) -> bool:
         """Send a message; return False if the process does not take it."""
         try:
             self.control.send(json.dumps(message).encode())
@@ -103,7 +131,7 @@ class _Child:
             return False
         return True
 
-    def heard(self) -> tuple[dict[str, Any], list[int]] | None:
+    def heard(self) -> tuple[Message, list[int]] | None:
         """Return the next message with its descriptors; None if there is none.
 
         Raises
@@ -164,7 +192,7 @@ class Supervisor:
         self._front: Front | None = None
         self._lines: list[tuple[int, bytes]] = []
         self._numbers = itertools.count(1)
-        self._asked: dict[int, asyncio.Future[dict[str, Any]]] = {}
+        self._asked: dict[int, asyncio.Future[Message]] = {}
         self._refused: collections.Counter[str] = collections.Counter()
         self._web_ready = False
         self._failed_starts = 0
@@ -275,7 +303,7 @@ class Supervisor:
         except EOFError:
             asyncio.get_running_loop().remove_reader(child.control)
 
-    def _take(self, message: dict[str, Any], descriptors: list[int]) -> None:
+    def _take(self, message: Message, descriptors: list[int]) -> None:
         if "lines" in message:
             self._keep_lines(list(zip(descriptors, (stop.encode("ascii") for stop in message["lines"]), strict=False)))
             return
@@ -286,7 +314,7 @@ class Supervisor:
         for descriptor in descriptors:
             os.close(descriptor)
 
-    async def _ask(self, child: _Child | None, what: str, patience_s: float) -> dict[str, Any] | None:
+    async def _ask(self, child: _Child | None, what: str, patience_s: float) -> Message | None:
         """Return a process' answer; None if there is none in time."""
         number = next(self._numbers)
         answer = self._asked[number] = asyncio.get_running_loop().create_future()
@@ -299,7 +327,7 @@ class Supervisor:
         finally:
             self._asked.pop(number, None)
 
-    def _ready(self, about: dict[str, Any]) -> None:
+    def _ready(self, about: Ready) -> None:
         self._web_ready = True
         if self._front is not None:  # the web process was started again
             return
@@ -314,7 +342,7 @@ class Supervisor:
         )
         asyncio.get_running_loop().create_task(self._serve(self._front, about)).add_done_callback(_raised)
 
-    async def _serve(self, front: Front, about: dict[str, Any]) -> None:
+    async def _serve(self, front: Front, about: Ready) -> None:
         await front.start(self._listener)
         self._announce(about["name"], about["data"])
         self._notifier.ready(f"serves the {about['name']}")

@@ -19,7 +19,7 @@ from stereorig.core.grid import GridOptions, GridView
 from stereorig.core.names import CAMERAS
 from stereorig.server.compute.calibration.inputs import nominals_of, options_of, target_of
 from stereorig.server.compute.grid_kernels import await_grid_kernels
-from stereorig.server.compute.tasks import FitTask
+from stereorig.server.compute.tasks import FitTask, Plain
 from stereorig.server.formats.calibrations.native import calibration_content, view_record
 from stereorig.server.formats.images import GrayImage, read_image
 from stereorig.server.formats.results.netcdf import written_dataset
@@ -36,7 +36,7 @@ DRIFT_WARNING_PX = 0.05
 MAX_DRIFT_PX = 0.1
 
 
-def fit_calibration(task: FitTask) -> dict[str, Any]:
+def fit_calibration(task: FitTask) -> Plain:
     """Find the target in every view and fit both cameras.
 
     Returns
@@ -117,7 +117,7 @@ def fit_calibration(task: FitTask) -> dict[str, Any]:
 
 
 def _drift(
-    folder: Path, views: list[dict[str, Any]], known: dict[str, TargetView], detect: Callable[[GrayImage], TargetView]
+    folder: Path, views: list[Plain], known: dict[str, TargetView], detect: Callable[[GrayImage], TargetView]
 ) -> dict[str, float]:
     """Return the mean shift of the points between the first and the last view at zero, per camera; empty without."""
     drift: dict[str, float] = {}

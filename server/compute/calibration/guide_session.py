@@ -8,7 +8,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -27,7 +27,7 @@ from stereorig.server.base.json_values import without_nan
 from stereorig.server.base.problem import problem_of
 from stereorig.server.compute.calibration.inputs import nominals_of, options_of, target_of
 from stereorig.server.compute.grid_kernels import await_grid_kernels
-from stereorig.server.compute.tasks import GuideTask, LookTask
+from stereorig.server.compute.tasks import GuideTask, LookTask, Plain
 from stereorig.server.formats.images import GrayImage, read_image
 
 
@@ -43,7 +43,7 @@ class _Session:
     localiser: Localiser
     rest_px: float
     seen: dict[int, list[CalibrationView]] = field(default_factory=dict)
-    failed: dict[int, dict[str, Any]] = field(default_factory=dict)
+    failed: dict[int, Plain] = field(default_factory=dict)
     guidance: Guidance | None = None
     last: tuple[int, list[Float]] | None = None
 
@@ -79,7 +79,7 @@ def find_in_pair(task: LookTask) -> dict[str, int]:
     return found
 
 
-def look_at_pair(task: GuideTask, pixels: dict[str, GrayImage], serial: int) -> dict[str, Any]:
+def look_at_pair(task: GuideTask, pixels: dict[str, GrayImage], serial: int) -> Plain:
     """Find the target coarsely in a live pair.
 
     Returns
@@ -90,7 +90,7 @@ def look_at_pair(task: GuideTask, pixels: dict[str, GrayImage], serial: int) -> 
     """
     session = _session(task)
     points: list[Float] = []
-    cameras: dict[str, dict[str, Any]] = {}
+    cameras: dict[str, Plain] = {}
     shape = nodes_of(session.target).shape
     for cam, found in zip(CAMERAS, _pool.map(lambda c: _coarse(pixels[c], session.target), CAMERAS), strict=True):
         if isinstance(found, StereorigError):
@@ -126,7 +126,7 @@ def look_at_pair(task: GuideTask, pixels: dict[str, GrayImage], serial: int) -> 
     }
 
 
-def guide_views(task: GuideTask, views: list[dict[str, Any]]) -> dict[str, Any]:
+def guide_views(task: GuideTask, views: list[Plain]) -> Plain:
     """Locate the target's points in new views, and return the cover by all of them and the next view to take."""
     session = _session(task)
     numbers = sorted({int(v["index"]) for v in views})
@@ -165,10 +165,10 @@ def _coarse(image: GrayImage, target: GridTarget | BoardTarget) -> Float | Stere
         return error
 
 
-def _add(session: _Session, number: int, views: list[dict[str, Any]]) -> None:
+def _add(session: _Session, number: int, views: list[Plain]) -> None:
     """Locate the points of one pose; if one image does not show the target, the pose does not count."""
 
-    def located(view: dict[str, Any]) -> CalibrationView:
+    def located(view: Plain) -> CalibrationView:
         given = GridOptions(saturation=float(view["full_scale"]))
         options = grid_options_for(session.target, session.options, session.localiser, given)
         pixels = read_image(Path(session.folder) / view["file"])
@@ -187,7 +187,7 @@ def _add(session: _Session, number: int, views: list[dict[str, Any]]) -> None:
         session.seen[number] = found
 
 
-def _plain(session: _Session, found: Guidance, numbers: list[int]) -> dict[str, Any]:
+def _plain(session: _Session, found: Guidance, numbers: list[int]) -> Plain:
     estimate, cover = found.estimate, found.coverage
     dropped = [{"view": d.frame, "camera": d.camera, "reason": d.reason} for d in estimate.dropped]
     dropped += [{"view": k, "camera": p["camera"], "reason": p["detail"]} for k, p in session.failed.items()]
@@ -217,7 +217,7 @@ def _plain(session: _Session, found: Guidance, numbers: list[int]) -> dict[str, 
     )
 
 
-def _proposal(proposal: Proposal) -> dict[str, Any]:
+def _proposal(proposal: Proposal) -> Plain:
     pose, predicted = proposal.sys_from_target, proposal.predicted
     rotation = cv2.Rodrigues(np.asarray(pose.rotation))[0].ravel()
     return {

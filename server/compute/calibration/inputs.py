@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from stereorig.core.boards import BoardTarget
 from stereorig.core.calibration import CalibrationOptions, NominalValues
 from stereorig.core.calibration.inputs import Moves
 from stereorig.core.names import CAMERAS
 from stereorig.core.target import GridTarget
+from stereorig.server.compute.tasks import Plain
 
 _DEFAULTS = CalibrationOptions()
 
 
-def target_of(table: dict[str, Any]) -> GridTarget | BoardTarget:
+def target_of(table: Plain) -> GridTarget | BoardTarget:
     """Return the target of a rig file's table, see :meth:`stereorig.server.config.rig_file.TargetSection.plain`."""
-    fields: dict[str, Any] = {
+    fields: Plain = {
         k: tuple(value) if k in ("lines", "size", "missing_lines") else value for k, value in table.items()
     }
     return BoardTarget(**fields) if fields.get("kind", "line_grid") != "line_grid" else _grid(fields)
 
 
-def _grid(fields: dict[str, Any]) -> GridTarget:
+def _grid(fields: Plain) -> GridTarget:
     return GridTarget(**{name: value for name, value in fields.items() if name != "kind"})
 
 
-def nominals_of(rig: dict[str, Any]) -> tuple[NominalValues, NominalValues]:
+def nominals_of(rig: Plain) -> tuple[NominalValues, NominalValues]:
     """Return the nominal cameras of a plan's rig."""
     one, two = (
         NominalValues(
@@ -40,9 +39,7 @@ def nominals_of(rig: dict[str, Any]) -> tuple[NominalValues, NominalValues]:
     return one, two
 
 
-def options_of(
-    rig: dict[str, Any], *, held_out_mm: tuple[float, ...] = (), moves: Moves | None = None
-) -> CalibrationOptions:
+def options_of(rig: Plain, *, held_out_mm: tuple[float, ...] = (), moves: Moves | None = None) -> CalibrationOptions:
     """Return the settings of a calibration by a plan's rig; ``moves`` in place of the rig's."""
     return CalibrationOptions(
         moves=moves or rig.get("moves", _DEFAULTS.moves),

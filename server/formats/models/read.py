@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypedDict, get_args
 
 import numpy as np
 
@@ -80,6 +80,14 @@ class ModelFile:
         triangles, solid = triangles_of(self.mesh)
         surface = ModelSurface(self.nodes_mm, self.displacement_mm, triangles, closed=solid, plane=self.plane)
         return surface.facing(towards)
+
+
+class ReadAs(TypedDict, total=False):
+    """Choices of :func:`read_model`, as it describes them."""
+
+    unit: Unit | None
+    displacement: str | None
+    time: float | None
 
 
 def read_model(

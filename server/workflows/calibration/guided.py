@@ -12,14 +12,14 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 from stereorig.core.errors import StateError, StereorigError
 from stereorig.core.names import CAMERAS
 from stereorig.server.base.errors import NotFoundError
 from stereorig.server.base.models import Ids
 from stereorig.server.compute.functions import guide_views, look_at_pair
-from stereorig.server.compute.tasks import GuideTask
+from stereorig.server.compute.tasks import GuideTask, Plain
 from stereorig.server.formats.manifest import is_there
 from stereorig.server.jobs.idempotency import RequestMark
 from stereorig.server.jobs.job import Job, Phase
@@ -74,7 +74,7 @@ class _Live:
     job_id: str
     take: threading.Event = field(default_factory=threading.Event)
     finish: threading.Event = field(default_factory=threading.Event)
-    look: dict[str, Any] | None = None
+    look: Plain | None = None
     looks: int = 0
     rate_hz: float | None = None
     asked: float = field(default_factory=time.monotonic)
@@ -120,7 +120,7 @@ class Guides:
             request=request,
         )
 
-    def state(self, calibration_id: str) -> dict[str, Any]:
+    def state(self, calibration_id: str) -> Plain:
         """Return the findings of the newest live pair, and the guidance from the views taken.
 
         Raises
@@ -211,7 +211,7 @@ class Guides:
         service, live = self._service, self._live[calibration_id]
         made = service.calibrations.read(calibration_id)
         task = GuideTask(str(service.calibrations.path(calibration_id)), made.plan.plain())
-        views: list[dict[str, Any]] = []
+        views: list[Plain] = []
         with _process() as process:
             guidance = self._guided(job, process, task, views)
             failures, before = 0, None
@@ -252,15 +252,15 @@ class Guides:
         live.finish.set()
         return {"calibration_id": calibration_id, "views": len(views) // 2, "reached": guidance["reached"]}
 
-    def _guided(self, job: Job, process: ComputeWorker, task: GuideTask, views: list[dict[str, Any]]) -> dict[str, Any]:
-        guidance: dict[str, Any] = run_task(process, job, guide_views, task, views)
+    def _guided(self, job: Job, process: ComputeWorker, task: GuideTask, views: list[Plain]) -> Plain:
+        guidance: Plain = run_task(process, job, guide_views, task, views)
         calibration_id = str(task.plan["id"])
         self._service.calibrations.put_guidance(calibration_id, guidance)
         shown = {name: guidance[name] for name in ("taken", "used", "uncertainty", "reached", "text")}
         self._service.hub.publish("guide", {"calibration_id": calibration_id, **shown})
         return guidance
 
-    def _kept(self, calibration_id: str, number: int, captured: CapturedPair) -> list[dict[str, Any]]:
+    def _kept(self, calibration_id: str, number: int, captured: CapturedPair) -> list[Plain]:
         store, devices = self._service.calibrations, self._service.rig.identities()
         views = []
         for cam in CAMERAS:
