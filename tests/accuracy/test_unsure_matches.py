@@ -111,10 +111,9 @@ def test_a_field_too_unsure_is_refused_by_its_own_status_with_figure_cause_and_r
 
 
 @pytest.mark.fault(66)
-@pytest.mark.parametrize("which", [(2,), (2, 3)])
-def test_a_motion_whose_usual_point_in_the_plane_is_half_a_pixel_in_four_sigma_is_refused(flat, which):
-    """With camera 2 alone six points were left by chance, and the cause with them."""
-    images = [gaussian_filter(image, 2.0) if k in which else image for k, image in enumerate(flat.clean)]
+def test_a_motion_of_whose_usual_point_half_a_pixel_is_less_than_four_sigma_is_refused(flat):
+    """A few points were left by chance, and the cause with them."""
+    images = [gaussian_filter(image, 2.0) if k in (2, 3) else image for k, image in enumerate(flat.clean)]
     field = flat.measured(images)
     assert not field.valid.any()
     assert (field.status == PointStatus.SIGMA_TOO_LARGE).mean() > 0.9
@@ -124,10 +123,11 @@ def test_a_motion_whose_usual_point_in_the_plane_is_half_a_pixel_in_four_sigma_i
 
 
 @pytest.mark.fault(66)
+@pytest.mark.parametrize("camera", [1, 2])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_camera_2_blurred_by_two_pixels_at_t_keeps_the_field(flat, seed):
-    """Depth alone is unsure, by 0.105 to 0.11 px: the limit of the plane, 0.1 px, emptied the field."""
-    images = [*flat.clean[:3], gaussian_filter(flat.clean[3], 2.0)]
+def test_one_camera_blurred_by_two_pixels_at_t_keeps_the_field(flat, camera, seed):
+    """Depth alone (camera 2), or the plane, is unsure by 0.103 to 0.11 px: a limit of 0.1 px emptied the field."""
+    images = [gaussian_filter(image, 2.0) if k == 1 + camera else image for k, image in enumerate(flat.clean)]
     found = flat.beside(flat.measured(images, seed=seed))
     assert found.valid > 0.99
     assert found.ratio == pytest.approx(1.0, abs=0.1)
