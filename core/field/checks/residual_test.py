@@ -50,8 +50,8 @@ OF_USUAL = 2.5  # times the standard deviation of the field's usual point: up to
 _WIDER = 3
 _ONE_KIND = 0.6  # least share: patterns over parts of the subsets leave a tenth at 0.1 to 0.3, noise and blur at 0.9
 _ALL_ALIKE = 0.75  # share of the usual standard deviation: a tenth of one kind's own estimates is below
-# share of a motion's usual sd, along the depth or where points are of one kind, that counts: half a pixel is four of it
-_OF_FIELD = 0.8
+_IN_DEPTH = 0.8  # of a motion's usual point, share of its sd along the depth: half a pixel is four of it
+_OF_A_KIND = 0.9  # the same in the plane, where points are of one kind: at 0.12 px 2 in 1,000 were half a pixel off
 _SCATTERS = (1 / 1.4, 1.4)  # a scatter's variance is known to a fifth from 40 neighbouring subsets
 _AT_ONCE = 4096
 
@@ -343,8 +343,8 @@ class _Limits:
 
     A shape may state any standard deviation up to the limit that was asked for: wrong matches have larger ones. A
     motion's usual point must be as sure as a single one, so that half a pixel, which would be taken for one, is five of
-    it. Along the depth it is four, since blur of one camera is worst there and wrong matches are off in the plane, too;
-    and in the plane where all points are of one kind, as blur makes them and other patterns do not.
+    it. Along the depth it is four, since blur of one camera is worst there and wrong matches are off in the plane, too.
+    In the plane it is four and a half where all are of one kind, as blur makes them and other patterns do not.
     """
 
     def __init__(
@@ -413,8 +413,8 @@ class _Limits:
                 of_kind = np.minimum(usual, least / _ONE_KIND)
                 if not within[ok].all():
                     counted = sigma.copy()
-                    counted[ok] = self._sigma_px(np.flatnonzero(ok), estimated=estimated, in_depth=_OF_FIELD)
-                    counted = np.where(usual <= of_kind, _OF_FIELD * sigma, counted)
+                    counted[ok] = self._sigma_px(np.flatnonzero(ok), estimated=estimated, in_depth=_IN_DEPTH)
+                    counted = np.where(usual <= of_kind, np.minimum(_OF_A_KIND * sigma, counted), counted)
                     within = block_medians(counted, ok, self._shape, reach) <= ceiling
             raised = np.clip(OF_USUAL * of_kind, self._single, self._most)
             self._px = np.where(within, raised, self._single)
@@ -437,7 +437,7 @@ class _Limits:
     def _sigma_px(
         self, index: NDArray[np.intp], sd: Float | None = None, *, estimated: bool = True, in_depth: float = 1.0
     ) -> Float:
-        plane, depth = _sigma_px(self._fitter, self._points, index, self._xy_px, sd, estimated)
+        plane, depth = sigma_px(self._fitter, self._points, index, self._xy_px, sd, estimated=estimated)
         return np.maximum(plane, in_depth * depth)
 
 
@@ -461,8 +461,14 @@ def _scale(points: PointFits, index: NDArray[np.intp], variance_factor: Float, s
     points.covariance[index] = before * (root[:, :, None] * root[:, None, :])
 
 
-def _sigma_px(
-    fitter: Fitter, points: PointFits, index: NDArray[np.intp], xy_px: Float, sd: Float | None, estimated: bool
+def sigma_px(
+    fitter: Fitter,
+    points: PointFits,
+    index: NDArray[np.intp],
+    xy_px: Float,
+    sd: Float | None = None,
+    *,
+    estimated: bool = True,
 ) -> tuple[Float, Float]:
     """(m,) standard deviations, px: of the position in camera 1's current image, and along the depth.
 

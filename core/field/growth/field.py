@@ -8,7 +8,7 @@ from stereorig.core.errors import SeedError
 from stereorig.core.field.checks.unreached import mark_outside
 from stereorig.core.field.growth.check import check, check_edges, check_residuals, fill, grow_field
 from stereorig.core.field.growth.coarse_first import grow_coarse_first, is_large
-from stereorig.core.field.growth.narrower import measure_narrower
+from stereorig.core.field.growth.other_widths import measure_narrower, measure_wider
 from stereorig.core.field.growth.patch import choose_patch, refit_curved, take_off_bias
 from stereorig.core.field.growth.reach import hidden, reach_further
 from stereorig.core.field.growth.seed import Seeds, match_seeds, seed_motion, seed_shape
@@ -79,7 +79,7 @@ def fill_field(inputs: FieldInputs, state: GrowthState, *, shape: Field | None =
         reach_further(inputs, state)
     check_edges(inputs, state)
     state = replace(state, unsure=check_residuals(inputs, state))
-    state = take_off_bias(inputs, measure_narrower(inputs, state))
+    state = take_off_bias(inputs, measure_wider(inputs, measure_narrower(inputs, state)))
     inputs.progress("done", int(state.points.ok.sum()), int(inputs.usable.sum()))
     return state
 

@@ -79,6 +79,11 @@ def take_off_bias(inputs: FieldInputs, state: GrowthState) -> GrowthState:
         if inputs.visibility is not None:  # across a cut slopes differ without a bend
             known &= inputs.visibility.whole
         mean = mean_bias(bias, known, **place)
+        if state.patch.width_px is not None and state.widths_px is not None:  # it goes by the square of the width
+            more = (state.widths_px[:, None] / inputs.options.subset_px) ** 2
+            share, noise = more[:, 0] * bias.share, more[:, 0] * bias.noise
+            bias = bias._replace(change=more * bias.change, off=more * bias.off, share=share, noise=noise)
+            mean = None if mean is None else more * mean
         if mean is not None:
             bias, off = without(points, bias, mean), take_off(points, mean)
             reason = f"{state.patch.reason}; {format_length(off)} (rms) of bias taken off plane ones"

@@ -36,6 +36,8 @@ class PatchChoice:
         True if plane patches were asked for and quadratic ones would have the smaller total error.
     taken_off_mm
         Bias that was subtracted from the displacements of plane patches, rms; None if none was.
+    width_px
+        Root mean square of the subsets' widths if some are wider than asked for; else None.
     kept
         True if the choice was made in an earlier step of the sequence and kept.
     """
@@ -49,6 +51,7 @@ class PatchChoice:
     quadratic_noise_mm: float | None = None
     quadratic_advised: bool = False
     taken_off_mm: float | None = None
+    width_px: float | None = None
     kept: bool = False
 
     def document(self) -> dict[str, Any]:

@@ -52,7 +52,10 @@ class SharedPixels:
     @staticmethod
     def of(field: Field, subset_px: float) -> SharedPixels:
         """Return the correlation that fits a field's patches; plane where the field has no record of them."""
-        return SharedPixels(subset_px, field.patch is not None and field.patch.patch == "quadratic", field.smoothing)
+        patch = field.patch
+        if patch is None:
+            return SharedPixels(subset_px, smoothing=field.smoothing)
+        return SharedPixels(patch.width_px or subset_px, patch.patch == "quadratic", field.smoothing)
 
     @property
     def positions(self) -> SharedPixels:

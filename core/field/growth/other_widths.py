@@ -1,9 +1,10 @@
-"""Points that were lost where strain is localised, measured again with narrower subsets.
+"""Points that were lost, measured again with subsets of another width, as far as these help.
 
 In a neck, at the border of a plastic band or beside a notch the motion bends within a subset by more than a curved
 patch can: its residuals are no noise, and checks reject the point. The part that no curved patch has falls with the
 fourth power of the width, noise rises with its second: a narrower subset measures the point, and the same checks test
-it. Elsewhere nothing is tried again: what was lost there is no matter of the width.
+it. Where noise or blur makes points unsure it is a wider subset, since it has more of the texture. Elsewhere nothing is
+tried again: what was lost there is no matter of the width.
 """
 
 from __future__ import annotations
@@ -11,21 +12,25 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 
 from stereorig.core.arrays import Bool, Float
-from stereorig.core.field.checks.residual_test import residual_test
+from stereorig.core.field.checks.residual_test import residual_test, sigma_px
 from stereorig.core.field.growth.check import check, grow_field
 from stereorig.core.field.growth.local_bias import local_bias, worth_curving
 from stereorig.core.field.growth.state import FieldInputs, GrowthState, fresh_attempts, place_of
 from stereorig.core.field.parts.straddling import reject_straddling
 from stereorig.core.field.points.fitter import NOT_KEPT, Fitter, PointFits
+from stereorig.core.field.region.find_visible import with_visibility
 from stereorig.core.matching.arguments import VisiblePixels
-from stereorig.core.settings import single_sigma_px
+from stereorig.core.settings import SUBSET_PX, single_sigma_px
 from stereorig.core.status import PointStatus
 
 _NARROWER = 0.6
 _LEAST_PX = 11  # narrower ones are mostly noise
+_WIDER = 1.5  # halves what blur scatters, which goes by the width's power of 1.5 to 2
+_UNSURE = 0.4  # share of a single point's limit: beside points that are surer, noise and blur have lost none
 _BY_THE_MATCH = (
     PointStatus.NOT_CONVERGED,
     PointStatus.LOW_CORRELATION,
@@ -81,6 +86,71 @@ def _tried(inputs: FieldInputs, state: GrowthState) -> Bool:
         return np.zeros_like(lost)
     bias = local_bias(points, rays=inputs.rays, **place_of(inputs))
     return lost if bias is None else lost & worth_curving(points, bias, **place_of(inputs))
+
+
+def measure_wider(inputs: FieldInputs, state: GrowthState) -> GrowthState:
+    """Measure lost points of a motion again, with wider subsets, where noise or blur makes all points unsure.
+
+    The patch has the mean width, and its reason the number of points.
+    """
+    options, points = inputs.options, state.points
+    width = min(2 * int(0.5 * _WIDER * options.subset_px) + 1, int(SUBSET_PX.high))
+    lost = _lost_to_noise(inputs, state, width)
+    if width <= options.subset_px or not lost.any():
+        return state
+    grid, before = with_visibility(inputs.grid, width), points.ok
+    matching = replace(state.fitter.options, subset_px=width, patch="affine")
+    fitter = replace(state.fitter, options=matching, visibility=grid.visibility)
+    wide = replace(
+        inputs,
+        grid=grid,
+        options=replace(options, subset_px=width),
+        texture=_texture(inputs, fitter, width),
+        usable=before | lost,
+        hoped_for=before | lost,
+    )
+    found = points.take(np.arange(len(before)))
+    w, G = (np.ascontiguousarray(one[..., : fitter.terms]) for one in (found.w, found.G))
+    found = replace(found, w=w, G=G, **NOT_KEPT)
+    found.status[lost] = PointStatus.NOT_SEEDED
+    grow_field(wide, replace(state, fitter=fitter, points=found, attempts=fresh_attempts(wide)))
+    found.status[before] = PointStatus.MASKED  # tested before
+    _test(wide, fitter, found)
+    index = np.flatnonzero(found.ok)
+    if len(index) == 0:
+        return state
+    measured = points.take(index)
+    measured.put_plane(np.arange(len(index)), found.take(index))
+    points.put(index, replace(measured, **NOT_KEPT))
+    check(inputs, points)
+    widths = np.full(len(before), options.subset_px) if state.widths_px is None else state.widths_px
+    widths[index] = width
+    kept = int(points.ok[index].sum())
+    patch = replace(
+        state.patch,
+        reason=f"{state.patch.reason}; subsets of {width} px at {kept} points, which noise or blur makes unsure",
+        width_px=float(np.sqrt(np.mean(widths[points.ok] ** 2))) if points.ok.any() else None,
+    )
+    return replace(state, patch=patch, widths_px=widths)
+
+
+def _lost_to_noise(inputs: FieldInputs, state: GrowthState, width: int) -> Bool:
+    """(n,) True at points lost by the match beside points that are unsure, if the image holds the wider subset."""
+    points, options = state.points, inputs.options
+    lost = inputs.usable & inputs.hoped_for & np.isin(points.status, (*_BY_THE_MATCH, PointStatus.LOW_TEXTURE))
+    ok = np.flatnonzero(points.ok)
+    plane = state.fitter.comparisons == 3 and options.patch in ("auto", "affine") and state.patch.patch == "affine"
+    if not plane or options.blur is not None or not lost.any() or len(ok) == 0:
+        return np.zeros_like(lost)
+    rows, cols = inputs.ref1.shape
+    inside = np.abs(inputs.xy_px - 0.5 * np.array([cols - 1, rows - 1])) < 0.5 * np.array([cols, rows]) - width // 2 - 1
+    lost &= inside.all(axis=1)
+    sigma = np.maximum(*sigma_px(state.fitter, points, ok, inputs.xy_px))
+    place = cv2.connectedComponents(lost.reshape(inputs.grid.shape).astype(np.uint8), connectivity=8)[1]
+    about = cv2.dilate(place.astype(np.float32), np.ones((3, 3), np.uint8)).ravel()[ok].astype(int)
+    count, total = np.bincount(about, minlength=place.max() + 1), np.bincount(about, sigma, minlength=place.max() + 1)
+    unsure = total > _UNSURE * single_sigma_px(options.validity.max_sigma_px) * count
+    return np.asarray(lost & unsure[place.ravel()])
 
 
 def _with_width(fitter: Fitter, width: int) -> Fitter:
