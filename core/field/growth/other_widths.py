@@ -14,8 +14,10 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from stereorig.core.arrays import Bool, Float
+from stereorig.core.field.checks.block_median import block_medians, reach_of
 from stereorig.core.field.checks.residual_test import residual_test, sigma_px
 from stereorig.core.field.growth.check import check, grow_field
 from stereorig.core.field.growth.local_bias import local_bias, worth_curving
@@ -31,6 +33,7 @@ _NARROWER = 0.6
 _LEAST_PX = 11  # narrower ones are mostly noise
 _WIDER = 1.5  # halves what blur scatters, which goes by the width's power of 1.5 to 2
 _UNSURE = 0.4  # share of a single point's limit: beside points that are surer, noise and blur have lost none
+_FAR = 2  # times a point's reach: beside a place that is lost
 _BY_THE_MATCH = (
     PointStatus.NOT_CONVERGED,
     PointStatus.LOW_CORRELATION,
@@ -119,6 +122,7 @@ def measure_wider(inputs: FieldInputs, state: GrowthState) -> GrowthState:
     index = np.flatnonzero(found.ok)
     if len(index) == 0:
         return state
+    _no_surer(found, index, points, inputs, options.subset_px / width)
     measured = points.take(index)
     measured.put_plane(np.arange(len(index)), found.take(index))
     points.put(index, replace(measured, **NOT_KEPT))
@@ -132,6 +136,20 @@ def measure_wider(inputs: FieldInputs, state: GrowthState) -> GrowthState:
         width_px=float(np.sqrt(np.mean(widths[points.ok] ** 2))) if points.ok.any() else None,
     )
     return replace(state, patch=patch, widths_px=widths)
+
+
+def _no_surer(found: PointFits, index: NDArray[np.intp], points: PointFits, inputs: FieldInputs, share: float) -> None:
+    """Raise covariances of points ``index`` (m,), in place, to ``share`` of the usual standard deviations about them.
+
+    What blur scatters shows in the field only: so few points' own residuals miss up to half of it.
+    """
+    reach = _FAR * reach_of(inputs.options.subset_px, inputs.grid.spacing_px)
+    raised = np.ones((len(index), 5))
+    for k in range(4):
+        own, usual = (np.sqrt(np.where(one.ok, one.covariance[:, k, k], 0.0)) for one in (found, points))
+        usual = block_medians(usual, points.ok, inputs.grid.shape, reach)[index]
+        raised[:, k] = np.maximum(share * usual / own[index], 1.0)
+    found.covariance[index] *= raised[:, :, None] * raised[:, None, :]
 
 
 def _lost_to_noise(inputs: FieldInputs, state: GrowthState, width: int) -> Bool:
