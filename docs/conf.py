@@ -30,6 +30,8 @@ html_theme = "furo"
 html_title = f"stereorig {release}"
 html_static_path = ["site"]
 html_css_files = ["stereorig.css"]
+#: decisions and operations of the API come last in the search
+html_search_scorer = str(Path(__file__).parent / "site" / "scorer.js")
 html_copy_source = html_show_sourcelink = html_show_sphinx = False
 #: figures by nothing but the page's own files: no font, script or style comes from elsewhere
 html_theme_options = {"navigation_with_keys": True}

@@ -1,0 +1,68 @@
+"""Queries that users of other programs type into the site's search, and the page that answers each."""
+
+from __future__ import annotations
+
+_OTHER, _PAGE, _GAUGES, _LOAD = "how_to/other_programs", "how_to/page", "reference/gauges", "how_to/load_frame"
+_SUBSET, _CALIBRATE, _EXPORTS, _GLOSSARY = (
+    "how_to/lens_subset_spacing",
+    "how_to/calibrate",
+    "reference/exports",
+    "reference/glossary",
+)
+#: query -> pages of which one answers it
+QUERIES: dict[str, tuple[str, ...]] = {
+    "AOI": (_OTHER, _PAGE),
+    "area of interest": (_OTHER, _PAGE),
+    "facet": (_OTHER, _GLOSSARY, _SUBSET),
+    "facet size": (_OTHER, _GLOSSARY, _SUBSET),
+    "step size": (_OTHER, _GLOSSARY, _SUBSET),
+    "seed point": (_OTHER, _GLOSSARY),
+    "sigma": (_OTHER, "explanation/uncertainty"),
+    "confidence margin": (_OTHER,),
+    "projection error": (_OTHER,),
+    "intersection deviation": (_OTHER,),
+    "calibration score": (_OTHER, _CALIBRATE),
+    "hybrid calibration": (_OTHER, _CALIBRATE),
+    "incremental correlation": (_OTHER, "how_to/long_tests", _GLOSSARY),
+    "strain filter": (_OTHER, _SUBSET),
+    "filter size": (_OTHER, _SUBSET),
+    "VSG": (_OTHER, _GLOSSARY, _SUBSET),
+    "contour": (_PAGE, _OTHER),
+    "jet": (_OTHER, _PAGE),
+    "colormap": (_OTHER, _PAGE),
+    "inspector": (_OTHER, _GAUGES),
+    "probe": (_PAGE, _OTHER),
+    "extensometer": (_GAUGES, _PAGE),
+    "remove rigid body motion": (_GAUGES, _OTHER),
+    "rigid motion": (_GAUGES, _OTHER),
+    "tilt correction": (_OTHER, _GAUGES),
+    "coordinate transformation": (_OTHER, _PAGE),
+    "3-2-1 alignment": (_GAUGES, _PAGE, _OTHER),
+    "best-fit plane": (_OTHER, _PAGE, _GAUGES),
+    "analog data": (_LOAD, _OTHER),
+    "DAQ": (_LOAD, _OTHER),
+    "load cell": (_LOAD, _OTHER),
+    "trigger": ("how_to/triggers",),
+    "real time": ("how_to/live/measure_live", _OTHER),
+    "stress": ("how_to/evidence/material_card", _OTHER),
+    "Young's modulus": ("how_to/evidence/material_card", _OTHER),
+    "hysteresis": (_LOAD, _OTHER),
+    "fatigue": ("how_to/long_tests", _OTHER),
+    "high-speed": ("how_to/cameras", _OTHER),
+    "FLIR": ("how_to/cameras", "explanation/tested", "reference/camera_drivers"),
+    "cylindrical": (_OTHER, "how_to/curved_parts"),
+    "FFT": (_OTHER,),
+    "vibration": (_OTHER, "how_to/noise"),
+    "Windows": (_OTHER,),
+    "velocity": (_OTHER, _EXPORTS),
+    "strain rate": (_OTHER, "how_to/evidence/material_card"),
+    "undo": (_PAGE,),
+    "mask": (_PAGE, _OTHER),
+    "speckle size": (_SUBSET, "how_to/prepare/print", _GLOSSARY),
+    "movie": (_EXPORTS, _OTHER),
+    "MATLAB": (_EXPORTS, "how_to/import_export"),
+    "project file": (_OTHER, "reference/recipe_file"),
+    "report template": ("how_to/report", _OTHER),
+}
+#: results that come after every other: decisions, benchmarks, the API's operations
+LAST = ("explanation/decisions/", "explanation/performance", "explanation/years", "reference/api", "reference/errors")
