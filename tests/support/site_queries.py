@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-_OTHER, _PAGE, _GAUGES, _LOAD = "how_to/other_programs", "how_to/page", "reference/gauges", "how_to/load_frame"
+_OTHER, _PAGE, _GAUGES, _LOAD = "tutorial/other_programs", "how_to/page", "reference/gauges", "how_to/load_frame"
 _SUBSET, _CALIBRATE, _EXPORTS, _GLOSSARY = (
     "how_to/lens_subset_spacing",
     "how_to/calibrate",
