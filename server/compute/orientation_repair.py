@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,7 @@ from stereorig.core.names import CAMERAS
 from stereorig.core.orientation import RepairedPair, RepairLimits, repair_orientation
 from stereorig.core.progress import CancelToken, Progress
 from stereorig.core.settings import SPACING_PX, Region
-from stereorig.server.compute.tasks import RepairTask, StepImages
+from stereorig.server.compute.tasks import Plain, RepairTask, StepImages
 from stereorig.server.formats.calibrations.recognise import load_calibration, parse_calibration
 from stereorig.server.formats.calibrations.repaired import native_content, repaired_content
 from stereorig.server.formats.files import mismatch, sha256_of
@@ -34,7 +33,7 @@ _ENOUGH_POINTS = 10_000
 class RepairedCalibration:
     """The content of the new calibration.json, and the repair that it comes from."""
 
-    content: dict[str, Any]
+    content: Plain
     repair: RepairedPair
 
 
@@ -93,7 +92,7 @@ def repair_from_files(
         progress=progress,
         cancel=cancel,
     )
-    used: list[dict[str, Any]] = [
+    used: list[Plain] = [
         {
             cam: {"file": str(Path(*path.parts[-2:])), "sha256": sha256}
             for cam, path, sha256 in zip(CAMERAS, step.files, step.sha256, strict=True)
@@ -123,7 +122,7 @@ def _grid(
     return grid
 
 
-def repair_calibration(task: RepairTask) -> dict[str, Any]:
+def repair_calibration(task: RepairTask) -> Plain:
     """Repair a calibration in the worker; ``calibration.json`` is in the task's folder when this returns.
 
     Raises

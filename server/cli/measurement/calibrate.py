@@ -12,7 +12,7 @@ from stereorig.core.names import CAMERAS
 from stereorig.server.cli.measurement.image_lists import expand, pair_up
 from stereorig.server.cli.terminal import ProgressLine
 from stereorig.server.formats.calibrations.from_folder import calibrate_folder
-from stereorig.server.formats.views import ViewFile, views_of_pairs
+from stereorig.server.formats.calibrations.views import ViewFile, views_of_pairs
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

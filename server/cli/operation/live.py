@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _gauge(text: str, count: int, names: tuple[str, ...]) -> dict[str, Any]:
+def _gauge(text: str, count: int, names: tuple[str, ...]) -> dict[str, str | list[float]]:
     name, _, rest = text.partition("=")
     try:
         numbers = [float(part) for part in rest.split(",")]
@@ -76,7 +76,7 @@ def _gauge(text: str, count: int, names: tuple[str, ...]) -> dict[str, Any]:
             f"{text!r} is no gauge: give NAME= and {count} numbers with commas between.", code="gauge_unusable"
         )
     each = count // len(names)
-    return {"name": name} | {key: numbers[k * each : (k + 1) * each] for k, key in enumerate(names)}
+    return {"name": name, **{key: numbers[k * each : (k + 1) * each] for k, key in enumerate(names)}}
 
 
 def _state(live: Mapping[str, Any]) -> str:

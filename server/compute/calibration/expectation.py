@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from stereorig.core.plan.settings import PlannedMeasurement, PlannedRig
 from stereorig.core.plan.synthetic import Sizes, correlation_px, match_variance_px2
 from stereorig.core.plan.view import planned_view
 from stereorig.server.compute.calibration.inputs import nominals_of, options_of, target_of
+from stereorig.server.compute.tasks import Plain
 
 Localiser = Literal["profile", "paper"]
 _CORNERS = tuple(f"{z} {y} {x}" for z in ("back", "front") for y in ("-Y", "+Y") for x in ("-X", "+X"))
@@ -36,7 +37,7 @@ class PlannedCalibration:
     roll_deg: float = 0.0
 
 
-def rig_as_planned(rig: dict[str, Any], planned: PlannedRig) -> dict[str, Any]:
+def rig_as_planned(rig: Plain, planned: PlannedRig) -> Plain:
     """Return a rig's entries with a plan's differences.
 
     Parameters
@@ -65,7 +66,7 @@ def _stated(values: dict[str, object]) -> dict[str, object]:
 
 
 def expectation_document(
-    rig: dict[str, Any],
+    rig: Plain,
     plan: PlannedCalibration,
     measured: PlannedMeasurement,
     more: Callable[[StereoPair, Sizes, ParameterCovariance, PlannedMeasurement], dict[str, object]] | None = None,
@@ -134,7 +135,7 @@ def expectation_document(
     }
 
 
-def _view(camera: dict[str, Any], measured: PlannedMeasurement) -> dict[str, object]:
+def _view(camera: Plain, measured: PlannedMeasurement) -> dict[str, object]:
     """Return what a camera sees, as far as the rig file and the plan state it."""
     lens = camera.get("lens") or {}
     found = planned_view(

@@ -15,10 +15,10 @@ from stereorig.core.progress import Progress, no_progress
 from stereorig.core.target import GridTarget
 from stereorig.server.formats.calibrations.native import calibration_content, write_calibration
 from stereorig.server.formats.calibrations.target_toml import read_rig, read_target
+from stereorig.server.formats.calibrations.views import ViewFile, find_views
 from stereorig.server.formats.files import make_folder, sha256_of
 from stereorig.server.formats.images import decode, read_file
 from stereorig.server.formats.version import software_version
-from stereorig.server.formats.views import ViewFile, find_views
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from stereorig.core.target import GridTarget
 from stereorig.server.formats.calibrations.native import covariance_in, write_calibration
 from stereorig.server.formats.calibrations.recognise import load_calibration
 from stereorig.server.formats.calibrations.target_toml import read_rig, read_target
-from stereorig.server.formats.views import find_views
+from stereorig.server.formats.calibrations.views import find_views
 from tests.support.calibration_truth import HELD, NOMINAL, Grid, make_views
 from tests.support.requirements import ROOT
 
