@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereorig.core.arrays import Float
+from stereorig.core.arrays import Bool, Float
 from stereorig.core.common.factor import Causes, joined
 from stereorig.core.errors import InputError
 from stereorig.core.field.points.result import Field
@@ -46,6 +46,14 @@ class Mean(NamedTuple):
     component: str
     polygon_px: _Positions | None = None
     x_line_px: tuple[tuple[float, float], tuple[float, float]] | None = None
+
+
+def corners_of(rectangle_px: tuple[float, float, float, float] | None) -> _Positions | None:
+    """Return the corners of a rectangle x0, y0, x1, y1; None of none, for the whole field."""
+    if rectangle_px is None:
+        return None
+    x0, y0, x1, y1 = rectangle_px
+    return ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
 
 
 class Deflection(NamedTuple):
@@ -89,6 +97,16 @@ class History:
     own: Float
     shared: dict[str, Float]
     known: bool
+
+    def at(self, steps: Bool) -> History:
+        """Return the history at some of its steps, (n,) True."""
+        shared = {cause: columns[steps] for cause, columns in self.shared.items()}
+        return History(self.value[steps], self.own[steps], shared, self.known)
+
+    @property
+    def whole(self) -> Float:
+        """(n,) standard uncertainty of each value."""
+        return np.asarray(np.sqrt(self.own**2 + sum((columns**2).sum(axis=1) for columns in self.shared.values())))
 
 
 def history(files: Sequence[Path], gauge: Ends | Mean | Deflection) -> History:

@@ -6,6 +6,8 @@ import re
 import unicodedata
 from collections.abc import Callable, Iterable
 
+from stereorig.core.errors import InputError
+
 #: ends of a channel's name that state its unit. ``nm`` is N m here: a record's own unit is kept with its channel
 _UNITS = {"nm": "N m", "c": "degC", "k": "K", "v": "V", "mv": "mV", "ma": "mA", "percent": "%", "hz": "Hz"}
 _FORCES = "N kN cN daN lbf klbf kip kgf"
@@ -77,6 +79,33 @@ def stated_unit(written: str) -> str:
     """Return a unit in the program's spelling, as written if it is not known; empty for none."""
     plain = "".join(c if c.isprintable() else " " for c in written).strip()
     return known_unit(plain) or ("" if plain in ("-", "1") else plain[:_LONGEST_UNIT])
+
+
+def newtons_of(name: str, recorded: Iterable[str], stated: str | None) -> float:
+    """Return the newtons of a channel's unit.
+
+    Parameters
+    ----------
+    name
+        The channel.
+    recorded, stated
+        Units that its record has in the steps, ``1`` for none; and the unit to take without one.
+
+    Raises
+    ------
+    InputError
+        ``load_unit`` if that is no force.
+    """
+    units = set(recorded) - {"1"}
+    written = units.pop() if len(units) == 1 else stated
+    unit = None if written is None or units else known_unit(written)
+    if unit not in FORCE_N:
+        raise InputError(
+            f"The channel {name!r} is in {written or 'no stated unit'}, which is no force.",
+            code="load_unit",
+            remedy="Name another channel, or state load_unit, as kN.",
+        )
+    return FORCE_N[unit]
 
 
 def unit_of(name: str) -> str:

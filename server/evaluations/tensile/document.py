@@ -20,8 +20,11 @@ class CurveFound(BaseModel):
     stress_mpa: list[float | None] = Field(description="Engineering stress.")
     strain_u: list[float | None] = Field(description="Standard uncertainty of the strain.")
     stress_u_mpa: list[float | None] = Field(description="Standard uncertainty of the stress.")
-    true_strain: list[float | None] = Field(description="True strain; of a gauge that is stretched alike.")
-    true_stress_mpa: list[float | None] = Field(description="True stress, at constant volume; up to the largest load.")
+    true_strain: list[float | None] = Field(description="True strain of the local gauge; without one of the gauge.")
+    true_strain_u: list[float | None] = Field(description="Its standard uncertainty.")
+    true_stress_mpa: list[float | None] = Field(
+        description="True stress there, at constant volume; past the largest load of a local gauge in the neck alone."
+    )
 
 
 class MaterialCardFound(Reply):

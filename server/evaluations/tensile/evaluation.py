@@ -11,7 +11,7 @@ from stereorig.core.errors import InputError, MeasurementError
 from stereorig.core.progress import Progress
 from stereorig.server.evaluations.cards import CardNumber, MarkFound, number_found, number_missing
 from stereorig.server.evaluations.door import Evaluated, Results
-from stereorig.server.evaluations.histories import Ends, History, Mean
+from stereorig.server.evaluations.histories import Ends, History, Mean, corners_of
 from stereorig.server.evaluations.specimens import over_specimens, table_over
 from stereorig.server.evaluations.tensile.assessment import Assessed, Found, assessed
 from stereorig.server.evaluations.tensile.curve import AXIAL, LATERAL, STRESS, Curve, with_load_errors
@@ -20,7 +20,7 @@ from stereorig.server.evaluations.tensile.flexure import strain_of_deflection, w
 from stereorig.server.evaluations.tensile.planning import Asked
 from stereorig.server.evaluations.tensile.profiles import PROFILES, UNITS, Profile
 from stereorig.server.evaluations.tensile.settings import TensileSettings
-from stereorig.server.formats.channel_units import FORCE_N, known_unit
+from stereorig.server.formats.channel_units import newtons_of
 from stereorig.server.results.channels import Recorded
 
 
@@ -56,7 +56,11 @@ class MaterialCard:
         rules = Asked(asked.min_steps, asked.sampling_share, asked.r_window, asked.n_window)
         expected = None if asked.expected_modulus_mpa is None else np.array(asked.expected_modulus_mpa)
         found = assessed(curve, profile, rules, expected)
-        card = _card(curve, found, profile, asked, missing)
+        local = None
+        if asked.local_px is not None:
+            local = results.history(Mean(asked.components[0], corners_of(asked.local_px), asked.pull_px))
+            local = local.at(np.isin(results.steps, curve.steps))
+        card = _card(curve, found, profile, asked, missing, local)
         files = {".csv": table_of(card), ".html": page_of(self.title, card)}
         return Evaluated(card, results.steps[-1], files=files)
 
@@ -112,12 +116,8 @@ def curve_of(results: Results, asked: TensileSettings, progress: Progress) -> tu
 def _strains(results: Results, asked: TensileSettings) -> tuple[History, History | None]:
     if asked.deflection_px is not None:
         return strain_of_deflection(results, asked), None
-    corners = None
-    if asked.rectangle_px is not None:
-        x0, y0, x1, y1 = asked.rectangle_px
-        corners = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
-    of_line = asked.pull_px is not None or asked.direction == "rows"
-    along, across = ("exx", "eyy") if of_line else ("eyy", "exx")
+    along, across = asked.components
+    corners = corners_of(asked.rectangle_px)
     ends = None if asked.extensometer_px is None else Ends(*asked.extensometer_px)
     axial = results.history(ends or Mean(along, corners, asked.pull_px))
     if not asked.lateral or asked.span_mm is not None:
@@ -151,7 +151,8 @@ def _loads(recorded: list[Recorded], asked: TensileSettings) -> tuple[Float, Flo
             code="load_missing",
             remedy="Name the load channel, or add the load frame's record to the test.",
         )
-    newtons = 1.0 if name is None else _newtons(name, recorded, asked.load_unit)
+    units = [one.units.get(name or "", "1") for one in recorded]
+    newtons = 1.0 if name is None else newtons_of(name, units, asked.load_unit)
     stated = [None if name is None else one.u.get(name) for one in recorded]
     own = asked.load_u_n
     if asked.load_scale_u is None or (own is None and any(u is None for u in stated)):
@@ -165,22 +166,8 @@ def _loads(recorded: list[Recorded], asked: TensileSettings) -> tuple[Float, Flo
     return (load - asked.load_zero_n) * asked.load_scale, np.array(each) * asked.load_scale
 
 
-def _newtons(name: str, recorded: list[Recorded], stated: str | None) -> float:
-    """Return the newtons of a channel's unit."""
-    units = {one.units[name] for one in recorded if one.units.get(name, "1") != "1"}
-    written = units.pop() if len(units) == 1 else stated
-    unit = None if written is None or units else known_unit(written)
-    if unit not in FORCE_N:
-        raise InputError(
-            f"The channel {name!r} is in {written or 'no stated unit'}, which is no force.",
-            code="load_unit",
-            remedy="Name another channel, or state load_unit, as kN.",
-        )
-    return FORCE_N[unit]
-
-
 def _card(
-    curve: Curve, found: Assessed, profile: Profile, asked: TensileSettings, missing: list[str]
+    curve: Curve, found: Assessed, profile: Profile, asked: TensileSettings, missing: list[str], local: History | None
 ) -> MaterialCardFound:
     numbers = {symbol: _number(key, found.numbers[key]) for key, symbol in profile.numbers.items()}
     verdict: str = "good"
@@ -199,7 +186,7 @@ def _card(
             "window_steps": list(found.used),
             "marks": [MarkFound(code=one.code, text=one.text, steps=list(one.steps)) for one in found.marks],
             "not_included": missing,
-            "curve": _curve(curve),
+            "curve": _curve(curve, local),
         }
     )
 
@@ -212,17 +199,19 @@ def _number(key: str, found: Found) -> CardNumber:
     return number_found(key, one.value, units, one.parts, found.doubts)
 
 
-def _curve(curve: Curve) -> CurveFound:
+def _curve(curve: Curve, local: History | None) -> CurveFound:
     axial, lateral, stress = curve.values
     whole = np.sqrt(curve.own**2 + sum((columns**2).sum(axis=0) for columns in curve.shared.values()))
+    near, near_u = (axial, whole[AXIAL]) if local is None else (local.value, local.whole)
     lists: Mapping[str, Float] = {
         "strain": axial,
         "lateral": lateral,
         "stress_mpa": stress,
         "strain_u": whole[AXIAL],
         "stress_u_mpa": whole[STRESS],
-        "true_strain": np.log1p(axial),
-        "true_stress_mpa": stress * (1.0 + axial),
+        "true_strain": np.log1p(near),
+        "true_strain_u": near_u / (1.0 + near),
+        "true_stress_mpa": stress * (1.0 + near),
     }
     plain = {name: [float(v) if np.isfinite(v) else None for v in values] for name, values in lists.items()}
     return CurveFound(steps=[int(step) for step in curve.steps], **plain)

@@ -75,6 +75,9 @@ class TensileSettings(Request):
     rectangle_px: tuple[Pixel, Pixel, Pixel, Pixel] | None = Field(
         None, description="x0, y0, x1, y1 of the area whose mean strain is used; null: the whole field."
     )
+    local_px: tuple[Pixel, Pixel, Pixel, Pixel] | None = Field(
+        None, description="x0, y0, x1, y1 of a local gauge in the neck, for true stress and strain; null: the area."
+    )
     extensometer_px: _Ends | None = Field(
         None, description="Ends of an extensometer along the pull; null: the area's mean strain."
     )
@@ -104,6 +107,11 @@ class TensileSettings(Request):
         if self.span_mm is not None and not (self.span_u and self.depth_u):
             raise ValueError("a span needs span_u and depth_u, its and the depth's relative standard uncertainty")
         return self
+
+    @property
+    def components(self) -> tuple[str, str]:
+        """Components of strain along and across the pull."""
+        return ("exx", "eyy") if self.pull_px is not None or self.direction == "rows" else ("eyy", "exx")
 
     def section(self) -> tuple[float, float]:
         """Return the section in mm2, and its relative standard uncertainty; of a bent bar, load over bending stress.
