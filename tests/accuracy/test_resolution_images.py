@@ -109,6 +109,7 @@ def star_over_theory(patch: Any, order: int, low: float, high: float) -> float:
     return float(minimize_scalar(misfit, bounds=(0.7, 1.4), method="bounded").x)
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize(("patch", "order", "low", "high"), [("affine", 1, 50.0, 170.0), ("quadratic", 2, 18.0, 55.0)])
 def test_l10_of_a_star_rendered_in_stereo_is_the_transfers(patch: Any, order: int, low: float, high: float) -> None:
     theory = bisected(lambda one: least_squares(SUBSET, order, one), 0.5 * low, 1.5 * high)
