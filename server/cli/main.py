@@ -34,7 +34,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "run a simulated load frame that pulls the strip of a simulated rig",
     ),
     "live": ("stereorig.server.cli.operation.live", "measure a test while it runs: begin, show, stop"),
-    "calibrate": ("stereorig.server.cli.measurement.calibrate", "calibrate a pair of cameras from grid images"),
+    "calibrate": (
+        "stereorig.server.cli.measurement.calibrate",
+        "calibrate a pair of cameras from images of a target; --by-hand: on a running service",
+    ),
     "expect": ("stereorig.server.cli.planning.expect", "predict the uncertainties of a planned measurement"),
     "print": ("stereorig.server.cli.planning.prints", "calibration targets and speckle as PDF or SVG, in true mm"),
     "channels": (
@@ -48,7 +51,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "stereorig.server.cli.measurement.report",
         "write a report of results: one HTML file that a lab can file",
     ),
-    "verify": ("stereorig.server.cli.operation.verify", "check a data folder: damage, leftovers, checksums"),
+    "verify": (
+        "stereorig.server.cli.operation.verify",
+        "check a data folder: damage, leftovers, checksums; --repair: put it in order",
+    ),
     "reproduce": ("stereorig.server.cli.evidence.reproduce", "measure a stored analysis again and compare"),
     "certify": ("stereorig.server.cli.evidence.certify", "judge the measuring system by known motions and lengths"),
     "compare-model": (
@@ -70,6 +76,16 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
 }
 
+#: how the help lists them; the others are for tests, or older names of what is listed
+GROUPS: dict[str, tuple[str, ...]] = {
+    "rig": ("serve", "keys", "devices", "doctor", "rigfile", "demo"),
+    "calibrate": ("print", "expect", "calibrate", "calibration", "noise", "certify"),
+    "measure": ("measure", "live", "channels"),
+    "look": ("gauge", "export", "report", "evaluate", "compare-model"),
+    "keep": ("verify", "bundle", "reproduce", "trash"),
+}
+#: option of a command that stands for a command of its own
+_FOLDED = {("calibrate", "--by-hand"): "guide", ("verify", "--repair"): "repair"}
 #: commands that load the kernels
 _MEASURING = ("measure", "reproduce")
 _NEGATIVE_LIST = re.compile(r"-[0-9.]+(e[-+]?[0-9]+)?,")
@@ -103,14 +119,35 @@ def _joined(arguments: Sequence[str]) -> list[str]:
     return result
 
 
+def _unfolded(arguments: Sequence[str]) -> list[str]:
+    """Return ``guide ...`` for ``calibrate --by-hand ...``, and so on."""
+    for (command, option), name in _FOLDED.items():
+        if arguments and arguments[0] == command and option in arguments:
+            return [name, *(one for one in arguments[1:] if one != option)]
+    return list(arguments)
+
+
+def _listed() -> str:
+    """Return the commands by group, as the help shows them."""
+    lines = []
+    for group, names in GROUPS.items():
+        lines += [f"{group}:", *(f"  {name:<15}{COMMANDS[name][1]}" for name in names), ""]
+    return "\n".join([*lines, "stereorig COMMAND --help lists the options of a command."])
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status (0 done, 1 failed, 2 wrong usage, 3 to 5 in part, 130 stopped)."""
-    arguments = _joined(sys.argv[1:] if argv is None else argv)
-    parser = _OneLineParser(prog="stereorig", description="Stereo measurement of shape and displacement.")
+    arguments = _unfolded(_joined(sys.argv[1:] if argv is None else argv))
+    parser = _OneLineParser(
+        prog="stereorig",
+        description="Stereo measurement of shape and displacement.",
+        epilog=_listed(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("--version", action="version", version=f"stereorig {software_version()}")
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, (module, text) in COMMANDS.items():
-        sub = subparsers.add_parser(name, help=text, description=text)
+        sub = subparsers.add_parser(name, description=text)
         if arguments and arguments[0] == name:
             command = _measuring(module) if name in _MEASURING else load_module(module)
             command.add_arguments(sub)

@@ -6,7 +6,7 @@ from stereorig.client import operations
 from stereorig.client.operations import Ask, Operation
 from stereorig.core.errors import StereorigError
 from stereorig.server.api.models import AnalysisReply, TestReply
-from stereorig.server.formats.card import card
+from stereorig.server.formats.figures.card import card
 
 _WIDTH_PX = 420
 

@@ -41,7 +41,7 @@ from stereorig.server.api.models import (
 from stereorig.server.api.models.calibrations import CalibrationEntry
 from stereorig.server.api.models.channels import ChannelsImported, ChannelsPreview
 from stereorig.server.api.models.tests import StepEntry, TestEntry
-from stereorig.server.formats.card import card
+from stereorig.server.formats.figures.card import card
 from stereorig.server.results.gauges.request import GaugeRequest
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from stereorig.server.api.models.jobs import Accepted, JobProblem
 from stereorig.server.base.models import Label, Listing, Number, Reply, Request, StepNumber
 from stereorig.server.documents.made import MadeState, Review
 from stereorig.server.documents.results import ViewResiduals
-from stereorig.server.formats.card import card
+from stereorig.server.formats.figures.card import card
 
 
 class CalibrationRequest(Request):

@@ -18,6 +18,11 @@ from stereorig.server.formats.calibrations.views import ViewFile, views_of_pairs
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument(
+        "--by-hand",
+        action="store_true",
+        help="take views of a target held by hand on a running service: see --by-hand --help",
+    )
+    parser.add_argument(
         "views",
         nargs="?",
         metavar="VIEWS",

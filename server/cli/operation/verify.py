@@ -18,6 +18,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("data", type=Path, metavar="DATA", help="data folder of 'stereorig serve'")
     parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument(
+        "--repair",
+        action="store_true",
+        help="quarantine unfinished steps, rebuild the catalogue; with no service running on the folder",
+    )
 
 
 def run(args: argparse.Namespace) -> int:

@@ -38,7 +38,7 @@ from stereorig.server.formats.calibrations.programs.named_numbers import is_pyva
 from stereorig.server.formats.calibrations.programs.opencv_yaml import is_half, is_opencv, joined, parse_opencv
 from stereorig.server.formats.calibrations.programs.vic3d_xml import is_vic3d, parse_vic3d
 from stereorig.server.formats.calibrations.record import CalibrationRecord
-from stereorig.server.formats.card import card
+from stereorig.server.formats.figures.card import card
 from stereorig.server.formats.manifest import checked_bytes
 
 #: text for the option of a command

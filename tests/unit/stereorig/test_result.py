@@ -17,7 +17,7 @@ from stereorig.core.settings import AnalysisSettings
 from stereorig.core.strain import StrainOptions, surface_strain
 from stereorig.result import Result
 from stereorig.server.formats.calibrations.recognise import parse_calibration
-from stereorig.server.formats.card import card
+from stereorig.server.formats.figures.card import card
 from tests.support.disc_images import cameras_beside
 from tests.support.strain_fields import make_field, plane
 
