@@ -144,35 +144,11 @@ def motion_geometry(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, G: ArrayLi
         (N, 3, 3) or (N, 3, 6), see :class:`stereorig.core.matching.MotionFit`. Second-order terms have no effect in the
         middle of the patch, where all of this is reported.
     """
-    w, G = np.asarray(w, dtype=np.float64)[..., :3], np.asarray(G, dtype=np.float64)[..., :3]
-    R = pair.cam1.cam_from_sys.rotation
+    from stereorig.core.matching.moved import motions  # slow to load, and not every start needs it
+
     ray = pair.cam1.rays_cam(xy_px).xyz_mm
-    uvw = ((G[..., :, 0] - ray) / w[..., :1]) @ R
-    slopes = w[:, 1:].T / w[:, 0]
-    # tangents in the system frame, (N, 3, 2), both in units of 1 / w0
-    before = _tangents(R, ray.T, np.eye(3, 2)[..., None], slopes)
-    now = np.ascontiguousarray(np.moveaxis(G, 0, -1))
-    after = _tangents(R, now[:, 0], now[:, 1:], slopes)
-    frame = tangent_frames(_plane(ray, w) @ R)
-    coordinates = np.swapaxes(frame[..., :2], -1, -2) @ before
-    gradient = after @ _inverse2(coordinates)  # (N, 3, 2): tangent coordinates -> deformed tangents
-    # by a copy: a product with its own transpose goes another way, of three times the cost
-    right = _root2(np.swapaxes(gradient, -1, -2) @ gradient.copy())
-    axes = gradient @ _inverse2(right)
-    turned = np.concatenate([axes, np.cross(axes[..., 0], axes[..., 1])[..., None]], axis=-1)
-    rotation = turned @ np.ascontiguousarray(np.swapaxes(frame, -1, -2))
-    stretch = np.stack([right[..., 0, 0] - 1.0, right[..., 1, 1] - 1.0, right[..., 0, 1]], axis=-1)
-    return MotionGeometry(uvw_mm=uvw, rotation_rad=_rotation_vectors(rotation), stretch=stretch)
-
-
-def _tangents(R: Float, place: Float, columns: Float, slopes: Float) -> Float:
-    """(N, 3, 2) in the system frame, of columns (3, 2, N) less those along the ray to ``place`` (3, N).
-
-    One component of all points after another: loops over two numbers cost more than the numbers.
-    """
-    tangents = columns - place[:, None] * slopes
-    turned = (R.T @ tangents.reshape(3, -1)).reshape(tangents.shape)
-    return np.ascontiguousarray(np.moveaxis(turned, -1, 0))
+    uvw, turned, stretch = motions(ray, np.asarray(w), np.asarray(G), pair.cam1.cam_from_sys.rotation)
+    return MotionGeometry(uvw_mm=uvw, rotation_rad=_rotation_vectors(turned), stretch=stretch)
 
 
 def covariance_xyz(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, covariance: ArrayLike) -> Float:
@@ -186,14 +162,11 @@ def covariance_xyz(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, covariance:
 
 def covariance_xyzuvw(pair: StereoPair, xy_px: ArrayLike, w: ArrayLike, G: ArrayLike, covariance: ArrayLike) -> Float:
     """Return the covariance (N, 6, 6) of X Y Z u v w in mm^2, system frame, from a motion fit's (N, 5, 5)."""
-    w, G = np.asarray(w, dtype=np.float64), np.asarray(G, dtype=np.float64)
-    R = pair.cam1.cam_from_sys.rotation
+    from stereorig.core.matching.moved import covariances  # slow to load, and not every start needs it
+
     ray = pair.cam1.rays_cam(xy_px).xyz_mm
-    J = np.zeros((*w.shape[:-1], 6, 4))
-    J[..., :3, 0] = _xyz_jacobian(pair, xy_px, w)
-    J[..., 3:, 0] = -((G[..., :, 0] - ray) / w[..., :1] ** 2) @ R
-    J[..., 3:, 1:] = R.T / w[..., :1, None]
-    return np.asarray(J @ np.asarray(covariance)[..., :4, :4] @ np.ascontiguousarray(np.swapaxes(J, -1, -2)))
+    R = pair.cam1.cam_from_sys.rotation
+    return covariances(ray, np.asarray(w), np.asarray(G), R, np.asarray(covariance))
 
 
 def _xyz_jacobian(pair: StereoPair, xy_px: ArrayLike, w: Float) -> Float:
@@ -208,7 +181,7 @@ def _plane(ray: Float, w: Float) -> Float:
 
 def tangent_frames(normals: Float) -> Float:
     """Columns: X_sys projected on the patch (Y_sys where the patch is normal to X_sys), its partner, the normal."""
-    n = _unit(np.ascontiguousarray(np.moveaxis(normals, -1, 0)))  # as in _tangents
+    n = _unit(np.ascontiguousarray(np.moveaxis(normals, -1, 0)))  # one component of all points after another
     steep = np.abs(n[0]) > 0.999
     axis = np.stack([~steep, steep, np.zeros_like(steep)]).astype(np.float64)
     a = _unit(axis - n * (axis * n).sum(axis=0))
@@ -227,13 +200,6 @@ def _inverse2(m: Float) -> Float:
     out[..., 0, 0], out[..., 1, 1] = m[..., 1, 1], m[..., 0, 0]
     out[..., 0, 1], out[..., 1, 0] = -m[..., 0, 1], -m[..., 1, 0]
     return np.asarray(out / det[..., None, None])
-
-
-def _root2(m: Float) -> Float:
-    """Square root of symmetric positive 2 x 2 matrices (Cayley-Hamilton)."""
-    s = np.sqrt(m[..., 0, 0] * m[..., 1, 1] - m[..., 0, 1] * m[..., 1, 0])
-    trace = np.sqrt(m[..., 0, 0] + m[..., 1, 1] + 2.0 * s)
-    return np.asarray((m + s[..., None, None] * np.eye(2)) / trace[..., None, None])
 
 
 def _rotation_vectors(rotation: Float) -> Float:

@@ -4,38 +4,26 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from stereorig.core.arrays import Float
 from stereorig.core.matching.kernels.naming import entry, entry_with_arrays, inner
+from stereorig.core.matching.moved import cross, dense, dot, fill_frame
 from stereorig.core.settings import StrainTensor
 from stereorig.core.strain.tensors import hencky_of_green, hencky_slope
-
-
-@inner
-def _dot(a, b):
-    """Scalar product of two vectors (3,)."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@inner
-def _cross(a, b, out):
-    """Vector product of two vectors (3,)."""
-    out[0], out[1], out[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @inner
 def _fill_bias(slope, second, moments, normal, out):
     """Fill ``out`` (3, 2) with the bias of slopes (3, 2) that the surface's bend makes, see :mod:`.strain.arcs`."""
     x, p = slope[:, 0], slope[:, 1]
-    _cross(x, p, normal)
-    aa, ab, bb = _dot(x, x), _dot(x, p), _dot(p, p)
-    per = 1.0 / _dot(normal, normal)  # the metric's determinant, and the normal's square
+    cross(x, p, normal)
+    aa, ab, bb = dot(x, x), dot(x, p), dot(p, p)
+    per = 1.0 / dot(normal, normal)  # the metric's determinant, and the normal's square
     root = math.sqrt(per)
-    ss, st = root * _dot(normal, second[:, 0]), root * _dot(normal, second[:, 1])
-    tt = root * _dot(normal, second[:, 2])
+    ss, st = root * dot(normal, second[:, 0]), root * dot(normal, second[:, 1])
+    tt = root * dot(normal, second[:, 2])
     for k in range(2):
         m = moments[k]
         # the third derivatives along the two slopes
@@ -44,24 +32,6 @@ def _fill_bias(slope, second, moments, normal, out):
         along, across = (ab * two - bb * one) * per, (ab * one - aa * two) * per
         for i in range(3):
             out[i, k] = along * x[i] + across * p[i]
-
-
-@inner
-def _fill_frame(slope, towards, normal, frame):
-    """Fill the unit tangents (3, 2) of the plane of slopes (3, 2), and its normal on the side of ``towards``."""
-    _cross(slope[:, 0], slope[:, 1], normal)
-    size = math.sqrt(_dot(normal, normal))
-    if _dot(normal, towards) < 0.0:
-        size = -size
-    for i in range(3):
-        normal[i] /= size
-    axis = 1 if abs(normal[0]) > 0.999 else 0  # as in stereorig.core.matching.geometry.tangent_frames
-    for i in range(3):
-        frame[i, 0] = (1.0 if i == axis else 0.0) - normal[i] * normal[axis]
-    size = math.sqrt(_dot(frame[:, 0], frame[:, 0]))
-    for i in range(3):
-        frame[i, 0] /= size
-    _cross(normal, frame[:, 0], frame[:, 1])
 
 
 @entry_with_arrays
@@ -79,9 +49,13 @@ def _fill(slopes, seconds, moments, towards, infinitesimal, frames, per_mm, grad
         for i in range(3):
             for k in range(2):
                 at[i, k] = slope[i, k] - before[i, k]
-        _fill_frame(at, towards[n], normal, frame)
-        a, b = _dot(frame[:, 0], at[:, 0]), _dot(frame[:, 0], at[:, 1])
-        c, d = _dot(frame[:, 1], at[:, 0]), _dot(frame[:, 1], at[:, 1])
+        cross(at[:, 0], at[:, 1], normal)
+        if dot(normal, towards[n]) < 0.0:
+            for i in range(3):
+                normal[i] = -normal[i]
+        fill_frame(normal, frame)
+        a, b = dot(frame[:, 0], at[:, 0]), dot(frame[:, 0], at[:, 1])
+        c, d = dot(frame[:, 1], at[:, 0]), dot(frame[:, 1], at[:, 1])
         per = 1.0 / (a * d - b * c)
         grid[0, 0], grid[0, 1], grid[1, 0], grid[1, 1] = d * per, -b * per, -c * per, a * per
         for i in range(3):
@@ -92,19 +66,19 @@ def _fill(slopes, seconds, moments, towards, infinitesimal, frames, per_mm, grad
                 moved[i, k] = frame[i, k] + gradient[i, k]
         one, two = gradient[:, 0], gradient[:, 1]
         strain = strains[n]
-        strain[0], strain[1] = _dot(frame[:, 0], one), _dot(frame[:, 1], two)
-        strain[2] = 0.5 * (_dot(frame[:, 0], two) + _dot(frame[:, 1], one))
+        strain[0], strain[1] = dot(frame[:, 0], one), dot(frame[:, 1], two)
+        strain[2] = 0.5 * (dot(frame[:, 0], two) + dot(frame[:, 1], one))
         left = frame if infinitesimal else moved
         for i in range(2):
             for j in range(2):
-                product[i, j] = _dot(left[:, i], moved[:, j])
+                product[i, j] = dot(left[:, i], moved[:, j])
         if not infinitesimal:
-            strain[0] += 0.5 * _dot(one, one)
-            strain[1] += 0.5 * _dot(two, two)
-            strain[2] += 0.5 * _dot(one, two)
+            strain[0] += 0.5 * dot(one, one)
+            strain[1] += 0.5 * dot(two, two)
+            strain[2] += 0.5 * dot(one, two)
         for k in range(2):
             # an infinitesimal strain's frame tilts with the positions, see stereorig.core.strain.tensors.pulls_of
-            tilt = _dot(normal, moved[:, k]) if infinitesimal else 0.0
+            tilt = dot(normal, moved[:, k]) if infinitesimal else 0.0
             for i in range(3):
                 own = frame[i, 0] * product[k, 0] + frame[i, 1] * product[k, 1]
                 pulls[n, k, i] = left[i, k] - own + tilt * normal[i]
@@ -181,7 +155,7 @@ class OnSurface:
             Which strain.
         """
         n = len(slope)
-        given = (_dense(a) for a in (slope, second, moments, towards))
+        given = (dense(a) for a in (slope, second, moments, towards))
         frame, per_mm, gradient = np.empty((n, 3, 2)), np.empty((n, 2, 2)), np.empty((n, 3, 2))
         strain, pulls = np.empty((n, 3)), np.empty((n, 2, 6))
         _fill(*given, tensor == "infinitesimal", frame, per_mm, gradient, strain, pulls)
@@ -219,14 +193,8 @@ def strain_covariance(
     strain follows as de_ij = 1/2 (A_i . d_j + A_j . d_i), and cov(d_i, d_j) = spread_ij points.
     """
     out = np.empty((len(pulls), 3, 3))
-    _fill_covariance(*(_dense(a) for a in (pulls, spread[0], points, spread[1])), out)
+    _fill_covariance(*(dense(a) for a in (pulls, spread[0], points, spread[1])), out)
     if tensor == "hencky":
         J = hencky_slope(strain)
         out = J @ out @ np.swapaxes(J, -1, -2)
     return out
-
-
-def _dense(values: Float) -> Any:
-    """As the kernels are compiled for: contiguous, and writable."""
-    values = np.ascontiguousarray(values, dtype=np.float64)
-    return values if values.flags.writeable else values.copy()

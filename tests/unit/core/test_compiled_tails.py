@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.linalg import polar
 from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
 
 from stereorig.core.common.derivatives import WEIGHTS, Estimator
 from stereorig.core.field.region.window import window_offsets
+from stereorig.core.matching.geometry import covariance_xyzuvw, motion_geometry, shape_geometry, tangent_frames
 from stereorig.core.matching.image import PAD, prepare
 from stereorig.core.strain.reduced import window_sums
 from stereorig.core.systematic.sampled import residual_shifts
@@ -112,3 +115,61 @@ def test_residual_shifts_are_those_of_sampled_subsets(kind, order):
             shift = -np.linalg.solve(A, [(u * rest).sum(), (v * rest).sum()])
             np.testing.assert_allclose(found[k, first : first + 2], shift, rtol=1e-4, atol=1e-6)
     assert seen > 10
+
+
+def _patches(pair, *, size: float = 0.05, n: int = 60):
+    """Positions, planes and motions of patches that turn and stretch by about ``size``."""
+    rng = np.random.default_rng(9)
+    xy = rng.uniform(40.0, 120.0, (n, 2))
+    ray = pair.cam1.rays_cam(xy).xyz_mm
+    w = np.column_stack([rng.normal(1.0, 0.02, n), rng.normal(0.0, 0.1, (n, 2))]) / 400.0
+    G = np.concatenate([ray[:, :, None], np.tile(np.eye(3, 2), (n, 1, 1))], axis=2)
+    return xy, ray, w, G + size * rng.normal(size=G.shape)
+
+
+@pytest.mark.parametrize("make", [paper_pair, opencv_pair])
+def test_a_patch_turns_and_stretches_as_its_polar_decomposition_states(make):
+    pair = make()
+    xy, ray, w, G = _patches(pair)
+    found, normals = motion_geometry(pair, xy, w, G), shape_geometry(pair, xy, w).normal_sys
+    to_system = pair.cam1.cam_from_sys.rotation.T
+    for k in range(len(xy)):
+        # the point at (x, y) off the middle is ray / w there; by differences, in the system frame
+        step = 1e-6
+        before, after = np.empty((3, 2)), np.empty((3, 2))
+        for j in range(2):
+            at = np.zeros(2)
+            at[j] = step
+            for out, of in ((before, np.column_stack([ray[k], np.eye(3, 2)])), (after, G[k])):
+                ends = [(of[:, 0] + of[:, 1:] @ (s * at)) / (w[k, 0] + w[k, 1:] @ (s * at)) for s in (-1.0, 1.0)]
+                out[:, j] = to_system @ (ends[1] - ends[0]) / (2.0 * step)
+        frame = tangent_frames(normals[k])
+        gradient = after @ np.linalg.inv(frame[:, :2].T @ before)
+        turned, right = polar(gradient)
+        assert found.stretch[k] == pytest.approx([right[0, 0] - 1.0, right[1, 1] - 1.0, right[0, 1]], abs=1e-8)
+        rotation = Rotation.from_rotvec(found.rotation_rad[k]).as_matrix()
+        assert rotation @ frame[:, :2] == pytest.approx(turned, abs=1e-8)
+
+
+def test_the_covariance_of_a_position_and_its_motion_follows_from_their_derivatives():
+    pair = paper_pair()
+    xy, _, w, G = _patches(pair)
+    root = np.random.default_rng(10).normal(size=(len(xy), 5, 5))
+    given = root @ np.swapaxes(root, 1, 2)
+
+    def both(w0, g):
+        moved, there = G.copy(), w.copy()
+        moved[:, :, 0], there[:, 0] = g, w0
+        return np.concatenate(
+            [shape_geometry(pair, xy, there).xyz_mm, motion_geometry(pair, xy, there, moved).uvw_mm], 1
+        )
+
+    J = np.empty((len(xy), 6, 4))
+    for j, step in enumerate((1e-8, 1e-5, 1e-5, 1e-5)):
+        off = np.zeros(4)
+        off[j] = step
+        ends = [both(w[:, 0] + s * off[0], G[:, :, 0] + s * off[1:]) for s in (-1.0, 1.0)]
+        J[:, :, j] = (ends[1] - ends[0]) / (2.0 * step)
+    wanted = J @ given[:, :4, :4] @ np.swapaxes(J, 1, 2)
+    found = covariance_xyzuvw(pair, xy, w, G, given)
+    np.testing.assert_allclose(found, wanted, atol=1e-6 * np.abs(wanted).max())
