@@ -11,7 +11,18 @@ from stereorig.core.settings import Real, Whole
 from stereorig.drivers.acquisition.simultaneity import SKEW_SOURCES, SkewSource
 from stereorig.server.api.models.jobs import Accepted
 from stereorig.server.api.models.warnings import AnalysisWarning
-from stereorig.server.base.models import ON_ONE_LINE, Channels, Label, Listing, Notes, Number, Reply, Request, Timestamp
+from stereorig.server.base.models import (
+    ON_ONE_LINE,
+    Channels,
+    JobState,
+    Label,
+    Listing,
+    Notes,
+    Number,
+    Reply,
+    Request,
+    Timestamp,
+)
 from stereorig.server.documents.made import TrashEntry
 from stereorig.server.documents.steps import BurstIndex, StepQuality
 from stereorig.server.workflows.recording import RecordPlan
@@ -82,6 +93,7 @@ class AnalysisEntry(Reply):
     calibration_id: str | None = Field(None, description="Calibration that it is measured with; null: not known.")
     created_utc: str | None = Field(None, description="Time at which it was begun.")
     job_id: str | None = Field(None, description="Its job.")
+    state: JobState | None = Field(None, description="State of its last job.")
     steps_failed: list[int] = Field(default_factory=list, description="Steps that could not be measured.")
     warnings: list[AnalysisWarning] = Field(
         default_factory=list, description="Warnings about its results, failed checks first."

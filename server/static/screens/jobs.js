@@ -3,6 +3,7 @@ import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
 import { certificates } from "./certificates.js";
 import { stateBadge, warningsBox } from "./results/warnings.js";
+import { continueButton } from "../widgets/analyses_table.js";
 import { duration, times } from "../lib/units.js";
 import { h, replace, action, badge, count, definitions, num, quantity, table, when, problemText, STATE_KIND } from "../lib/dom.js";
 
@@ -50,7 +51,7 @@ export async function open(root) {
           ["State", state],
           ["Progress", progress],
           ["Begun", (job) => when(job.started_utc ?? job.created_utc)],
-          ["Cancel", (job) => (["queued", "running"].includes(job.state) ? cancel(job) : null), { unseen: true }],
+          ["Cancel or continue", (job) => (["queued", "running"].includes(job.state) ? cancel(job) : goOn(job)), { unseen: true }],
         ],
         rows,
         { caption: "Jobs, newest first", onrow: choose, empty: "No job has run yet." },
@@ -77,6 +78,15 @@ export async function open(root) {
       },
       { kind: "danger", "aria-label": `Cancel ${job.kind} ${job.id}` },
     );
+
+  /** An analysis that stopped, unless a later job works on it. @param {Job} job */
+  function goOn(job) {
+    const { test_id: testId, analysis_id: analysisId } = job.subject ?? {};
+    if (job.kind !== "analysis" || !testId || !analysisId) return null;
+    if ([...jobs.values()].some((other) => other.subject?.analysis_id === analysisId && other.id > job.id)) return null;
+    const failed = Object.keys(job.result?.steps_failed ?? {}).length;
+    return continueButton({ testId: String(testId), analysisId: String(analysisId), state: job.state, failed, label: `analysis ${analysisId}` });
+  }
 
   /** @param {Job} job */
   function take(job) {

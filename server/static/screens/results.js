@@ -21,6 +21,7 @@ import { live } from "./results/live.js";
 import { evaluations } from "./results/evaluations.js";
 import { models } from "./results/models.js";
 import { views } from "./results/views.js";
+import { continueButton } from "../widgets/analyses_table.js";
 import { choose, tabs } from "../widgets/tabs.js";
 import { stateBadge, warningsBox } from "./results/warnings.js";
 import { Workspace } from "../lib/workspace.js";
@@ -181,9 +182,18 @@ async function show(root, testId, analysisId, query) {
     await figures.principal();
   }
 
+  const goOn = () =>
+    continueButton({ testId, analysisId, state: result.analysis.state, failed: result.analysis.n_failed }, async () => {
+      await result.refresh();
+      drawStatus();
+    });
   function drawStatus() {
     const { analysis } = result;
-    replace(status, h("span.row", stateBadge(analysis.state, analysis.warnings)), analysis.problem ? problemText(api.problemOf(analysis.problem)) : null);
+    replace(
+      status,
+      h("span.row", stateBadge(analysis.state, analysis.warnings), goOn()),
+      analysis.problem ? problemText(api.problemOf(analysis.problem)) : null,
+    );
     replace(warned, warningsBox(analysis.warnings));
   }
 

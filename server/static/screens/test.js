@@ -7,9 +7,10 @@ import { liveValuesPanel } from "./test/live_values.js";
 import { metadataPanel } from "./test/metadata.js";
 import { measurePanel } from "./test/measure.js";
 import { procedurePanel } from "./test/procedure.js";
-import { warningsCell } from "./results/warnings.js";
+import { analysesTable } from "../widgets/analyses_table.js";
+import { testsList } from "./test/list.js";
 import { allRight, rule } from "../lib/fields.js";
-import { h, replace, field, select, action, table, when, notify, problemText } from "../lib/dom.js";
+import { h, replace, field, select, action, when, notify, problemText } from "../lib/dom.js";
 
 /** @import { Here } from "../main.js" */
 /** @import { Ends } from "#dom" */
@@ -69,37 +70,13 @@ async function all(root) {
     },
     { kind: "primary" },
   );
-  const list = h("div");
-  async function refresh() {
-    const { tests } = await api.get("/tests");
-    replace(
-      list,
-      table(
-        [
-          ["Test", (test) => h("a", { href: `#/test/${test.id}` }, test.name)],
-          ["Specimen", (test) => test.specimen || "–"],
-          ["Calibration", (test) => (test.calibration_id ? h("a", { href: `#/calibrate/${test.calibration_id}` }, test.calibration_id) : "none")],
-          ["Made", (test) => when(test.created_utc)],
-          ["Id", (test) => h("code", test.id)],
-        ],
-        tests.toReversed(),
-        {
-          caption: "Tests, newest first",
-          onrow: (test) => {
-            location.hash = `#/test/${test.id}`;
-          },
-          empty: "No test yet.",
-        },
-      ),
-    );
-  }
-  await refresh();
+  const list = await testsList();
   replace(
     root,
     h("h1", "Tests"),
     h(
       "div.grid.side",
-      h("section.panel", list),
+      list.root,
       h(
         "section.panel",
         { "aria-label": "New test" },
@@ -113,7 +90,7 @@ async function all(root) {
       ),
     ),
   );
-  return events.on("test", () => refresh().catch(notify));
+  return list.close;
 }
 
 /**
@@ -173,17 +150,18 @@ async function one(root, id) {
       metadataPanel(id),
     );
   }
-  const drawAnalyses = () => replace(analyses, h("h2", "Analyses"), analysesTable(test));
+  const again = async () => {
+    test = await readTest(id);
+    drawAnalyses();
+  };
+  const drawAnalyses = () => replace(analyses, h("h2", "Analyses"), analysesTable(test, again));
   const title = h("h1", test.name);
   const steps = await stepsPanel(id, test, ends, async () => {
     test = await readTest(id);
     return test;
   });
   const liveValues = await liveValuesPanel(id, ends);
-  const measure = await measurePanel(id, test, ends, async () => {
-    test = await readTest(id);
-    drawAnalyses();
-  });
+  const measure = await measurePanel(id, test, ends, again);
   steps.onchange((/** @type {typeof test} */ fresh) => {
     test = fresh;
     measure.steps(fresh);
@@ -254,17 +232,3 @@ async function calibrationRow(test, calibrate) {
         row,
       );
 }
-
-/** @param {Test} test */
-const analysesTable = (test) =>
-  table(
-    [
-      ["Analysis", (a) => h("a", { href: `#/results/${test.id}/${a.id}` }, a.label || a.id)],
-      ["Kind", (a) => a.kind],
-      ["Checks", warningsCell],
-      ["Calibration", (a) => (a.calibration_id ? h("a", { href: `#/calibrate/${a.calibration_id}` }, a.calibration_id) : "–")],
-      ["Made", (a) => when(a.created_utc)],
-    ],
-    (test.analyses ?? []).toReversed(),
-    { caption: "Newest first", empty: "None yet." },
-  );

@@ -51,6 +51,7 @@ from stereorig.server.formats.manifest import checked_bytes
 from stereorig.server.jobs.idempotency import RequestMark
 from stereorig.server.store.indexing.entries import step_entry, test_entry
 from stereorig.server.wording import problems_in
+from stereorig.server.workflows.analysis.listed import listed
 from stereorig.server.workflows.burst import start_burst
 from stereorig.server.workflows.capture import capture_step, import_step
 from stereorig.server.workflows.service import Service
@@ -75,7 +76,7 @@ def _reply(service: Service, test_id: str) -> dict[str, object]:
 
 
 def _shown(service: Service, test_id: str, reply: dict[str, object]) -> TestReply:
-    entries = service.checks.with_warnings(test_id, service.catalog.entries("analysis", test_id))
+    entries = listed(service, test_id, service.catalog.entries("analysis", test_id))
     return TestReply.model_validate({**reply, "analyses": entries})
 
 

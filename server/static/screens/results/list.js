@@ -2,8 +2,9 @@
 import * as api from "../../lib/api.js";
 import * as events from "../../lib/events.js";
 import { h, replace, table, when, count, definitions, problemText } from "../../lib/dom.js";
+import { ENDED } from "../../widgets/analysis_job.js";
 import { allTests } from "./analysis.js";
-import { warningsCell } from "./warnings.js";
+import { analysesTable } from "../../widgets/analyses_table.js";
 
 /**
  * @param {HTMLElement} root
@@ -12,12 +13,15 @@ import { warningsCell } from "./warnings.js";
 export async function list(root, testId) {
   const tests = await allTests();
   const detail = h("section.panel", { "aria-live": "polite" });
-  const chosen = tests.find((one) => one.id === testId) ?? tests[0];
+  /** @type {{ id: string } | undefined} */
+  let chosen = tests.find((one) => one.id === testId) ?? tests[0];
   /** @param {{ id: string }} test */
   async function choose(test) {
-    replace(detail, h("p.quiet", "Loading …"));
+    if (test.id !== chosen?.id) replace(detail, h("p.quiet", "Loading …"));
+    chosen = test;
     try {
       const whole = await api.get(`/tests/${test.id}`);
+      if (chosen !== test) return;
       replace(
         detail,
         h("div.spread", h("h2", whole.name), h("a", { href: `#/test/${whole.id}` }, "the test")),
@@ -28,22 +32,7 @@ export async function list(root, testId) {
           ["calibration", whole.calibration_id ?? "–"],
         ]),
         h("h3", "Analyses"),
-        table(
-          [
-            ["Analysis", (one) => h("a", { href: `#/results/${test.id}/${one.id}` }, one.label || one.id)],
-            ["Kind", (one) => one.kind],
-            ["Checks", warningsCell],
-            ["Begun", (one) => when(one.created_utc)],
-          ],
-          (whole.analyses ?? []).toReversed(),
-          {
-            caption: "Analyses of this test, newest first",
-            empty: "This test has not been measured yet.",
-            onrow: (one) => {
-              location.hash = `#/results/${test.id}/${one.id}`;
-            },
-          },
-        ),
+        analysesTable(whole, () => choose(test)),
         whole.analyses?.length ? null : h("a.button", { href: `#/test/${test.id}?at=region` }, "Measure it"),
       );
     } catch (error) {
@@ -72,7 +61,10 @@ export async function list(root, testId) {
   );
   if (chosen) choose(chosen);
   else replace(detail, h("p.quiet", "Results appear here once a test was measured."), h("a.button.primary", { href: "#/test" }, "Make a test"));
-  return events.on("result", (event) => {
-    if (event.test_id === chosen?.id) choose(chosen);
-  });
+  const again = (/** @type {unknown} */ id) => (chosen && id === chosen.id ? choose(chosen) : null);
+  const ends = [
+    events.on("result", (event) => again(event.test_id)),
+    events.on("job", (job) => (ENDED.includes(job.state) ? again(job.subject?.test_id) : null)),
+  ];
+  return () => ends.forEach((end) => end());
 }

@@ -2,6 +2,7 @@
 import * as api from "../../lib/api.js";
 import * as events from "../../lib/events.js";
 import { analysisJob, doing, ENDED } from "../../widgets/analysis_job.js";
+import { continueButton } from "../../widgets/analyses_table.js";
 import { stateBadge, warningsBox } from "../results/warnings.js";
 import { h, replace, notify, problemText } from "../../lib/dom.js";
 
@@ -70,7 +71,9 @@ export function running(testId, ends, done) {
     if (!ENDED.includes(job.state) || ENDED.includes(before)) return;
     const warnings = /** @type {import("../results/warnings.js").Warning[] | undefined} */ (job.result?.warnings);
     const problem = ["succeeded", "cancelled"].includes(job.state) ? null : problemText(api.jobProblem(job));
-    replace(one.row, h("div.row", stateBadge(job.state, warnings), one.link), problem, warningsBox(warnings));
+    const failed = Object.keys(job.result?.steps_failed ?? {}).length;
+    const goOn = continueButton({ testId, analysisId: String(job.subject.analysis_id), state: job.state, failed }, () => one.row.remove());
+    replace(one.row, h("div.row", stateBadge(job.state, warnings), one.link, goOn), problem, warningsBox(warnings));
     await done();
   }
 
