@@ -100,20 +100,41 @@ def geometry_at(
     sizes
         Width and height of both cameras' images.
     """
-    directions_mm = [camera.centre_sys_mm - middle for camera in (pair.cam1, pair.cam2)]
-    directions = [s / np.linalg.norm(s) for s in directions_mm]
     views: dict[str, View] = {}
     for name, camera, size in zip(CAMERAS, (pair.cam1, pair.cam2), sizes, strict=True):
         view = _view(camera, middle, normal, size)
         if view is None:
             return None
         views[name] = view
+    directions_mm = [camera.centre_sys_mm - middle for camera in (pair.cam1, pair.cam2)]
+    directions = [s / np.linalg.norm(s) for s in directions_mm]
     return Geometry(
         stereo_angle_rad=pair.stereo_angle_rad,
         viewing_angle_rad=float(np.arccos(np.clip(directions[0] @ directions[1], -1.0, 1.0))),
         baseline_mm=pair.baseline_mm,
         views=views,
     )
+
+
+def geometry_of_cameras(
+    pair: StereoPair, sizes: tuple[tuple[int, int] | None, tuple[int, int] | None]
+) -> Geometry | None:
+    """Return the geometry before the plane Z = 0 at its origin, or where the optical axes come nearest to each other.
+
+    The origin is the target's of a calibration made here; of another program's it may be a camera's own pinhole. The
+    plane through the axes' place is across the mean of both axes. None where the cameras see neither.
+    """
+    found = geometry_at(pair, np.zeros(3), np.array([0.0, 0.0, 1.0]), sizes)
+    if found is not None:
+        return found
+    one, two = (camera.cam_from_sys.rotation[2] for camera in (pair.cam1, pair.cam2))
+    between = pair.cam2.centre_sys_mm - pair.cam1.centre_sys_mm
+    if float(np.linalg.norm(np.cross(one, two))) < 1e-6:  # parallel axes meet nowhere
+        return None
+    along = np.linalg.lstsq(np.column_stack([one, -two]), between, rcond=None)[0]
+    ends = pair.cam1.centre_sys_mm + along[0] * one, pair.cam2.centre_sys_mm + along[1] * two
+    mean = one + two
+    return geometry_at(pair, 0.5 * (ends[0] + ends[1]), mean / np.linalg.norm(mean), sizes)
 
 
 def _view(camera: Camera, middle: Float, normal: Float, size: tuple[int, int] | None) -> View | None:

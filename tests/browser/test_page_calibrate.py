@@ -76,7 +76,7 @@ def test_foreseen_run_and_seen(page: Watched, client: httpx.Client) -> None:
         expect(verdict).to_contain_text(reason)
     expect(shown.get_by_text(f"{document['checks']['held_out']['rbe_px']:.5f} px").first).to_be_visible()
     # one figure of the parameters, with its uncertainty
-    expect(shown.get_by_role("region", name="Ten parameters")).to_contain_text(f"{document['cam1']['z0_mm']:.2f}")
+    expect(shown.get_by_role("region", name="Parameters of each camera")).to_contain_text(f"{document['cam1']['z0_mm']:.2f}")
     # the estimate is confirmed: the simulated grid is on its corner
     noise = sum(document["noise_px"].values()) / 2
     reply = client.post(
@@ -248,6 +248,7 @@ def test_import_compare_accept_discard(page: Watched, client: httpx.Client, tmp_
     dialog.get_by_role("button", name="Close").click()
 
     shown.get_by_role("button", name="Accept", exact=True).click()
+    shown.get_by_role("dialog").get_by_role("button", name="This rig").click()
     verdict = shown.get_by_role("region", name="Verdict")
     expect(verdict.locator(".badge").first).to_have_text("accepted")
     expect(verdict.get_by_role("link", name="Make a test")).to_have_attribute("href", "#/test?new")

@@ -160,8 +160,11 @@ class GeometryReply(Reply):
     stereo_angle_deg: float = Field(description="Between the optical axes.")
     baseline_mm: float = Field(description="Between the pinholes.")
     cameras: dict[CameraName, CameraGeometry] | None = Field(
-        description="Before the plane Z = 0 at its origin, the target's of a calibration made here; null where a "
-        "camera does not see it."
+        description="Before the plane Z = 0 at its origin, the target's of a calibration made here; where a camera "
+        "does not see that, at the place where the optical axes come nearest to each other; null: neither is seen."
+    )
+    parameters: dict[CameraName, dict[str, float]] = Field(
+        description="Parameters of each camera's lens and place, by name with the unit, another program's included."
     )
 
 

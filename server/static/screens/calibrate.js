@@ -6,10 +6,10 @@ import { correlations } from "./calibrate/correlations.js";
 import { guidePanel } from "./calibrate/guide.js";
 import { newCalibration } from "./calibrate/new.js";
 import { printer } from "./calibrate/print.js";
-import { geometryOf, statusBadge } from "./calibrate/summary.js";
+import { figures, geometryOf, statusBadge } from "./calibrate/summary.js";
 import { comparison, measures, parameters, um, viewTable } from "./calibrate/tables.js";
 import { calibrationViews } from "./calibrate/views.js";
-import { h, replace, field, action, table, definitions, badge, quantity, when, notify, problemText, confirmed } from "../lib/dom.js";
+import { h, replace, field, action, table, definitions, badge, quantity, when, notify, problemText, ask, confirmed } from "../lib/dom.js";
 
 /** @import { Here } from "../main.js" */
 /** @import { Ends, Part } from "#dom" */
@@ -197,16 +197,17 @@ async function one(document_, decide) {
   } catch (error) {
     if (!(error instanceof api.Problem && error.status === 404)) notify(error);
   }
+  const geometry = await geometryOf(document_);
   const made = calibrationViews(document_, /** @type {import("./calibrate/views.js").Found[] | null} */ (residuals));
   return {
     nodes: [
-      h("section.panel", { "aria-label": "Verdict" }, heading, verdict(document_), await geometryOf(document_), decide),
+      h("section.panel", { "aria-label": "Verdict" }, heading, verdict(document_), figures(geometry), decide),
       made ? h("section.panel", { "aria-label": "Views" }, h("h2", "Views"), made.root) : null,
       h(
         "div.grid.tables",
         { style: { marginTop: "var(--gap)" } },
         h("section.panel", h("h2", "Checks"), measures(document_), viewTable(document_), document_.state === "complete" ? distanceCheck(document_) : null),
-        h("section.panel", h("h2", "Parameters"), parameters(document_), correlations(document_)),
+        h("section.panel", h("h2", "Parameters"), parameters(document_, geometry?.parameters), correlations(document_)),
       ),
     ],
     close: () => made?.close(),
@@ -216,7 +217,7 @@ async function one(document_, decide) {
 /** @param {Calibration} document_ */
 function verdict(document_) {
   const { verdict: v, uncertainty: u, checks } = document_;
-  if (!v) return h("p.quiet", `Imported${document_.plan.source_name ? ` from ${document_.plan.source_name}` : ""}: it has no verdict.`);
+  if (!v) return h("p.quiet", "Imported: it has no verdict.");
   return [
     h(
       "ul",
@@ -258,10 +259,23 @@ function decisions(document_, changed, gone) {
     const text = "No new test can be made with it. It stays on disk, and the decision can be withdrawn.";
     if (await confirmed("Discard this calibration?", h("div", h("p", text), field("Reason", note)), "Discard")) await put("discarded", note.value);
   }
+  async function accept() {
+    if (document_.plan.source !== "import") {
+      await put("accepted");
+      return;
+    }
+    const text = "For this rig, the live cameras are checked against it, and new tests measure with it. For imported images only, you choose it for a test.";
+    const answer = await ask("What is this calibration for?", h("p", text), [
+      ["Imported images only", "images"],
+      ["This rig", "rig"],
+    ]);
+    if (answer === "rig") await put("accepted");
+    if (answer === "images") location.hash = `#/test?calibration=${id}`;
+  }
   return [
     state === "complete" && now === "accepted" ? h("a.button.primary", { href: "#/test?new" }, "Make a test") : null,
     state === "complete" && now !== "accepted"
-      ? action("Accept", () => put("accepted"), { kind: "primary", title: "New tests measure with the newest accepted calibration" })
+      ? action("Accept", accept, { kind: "primary", title: "New tests measure with the newest accepted calibration" })
       : null,
     now !== "discarded" ? action("Discard", discard, { kind: "danger" }) : null,
     now ? action("Withdraw the decision", () => put(null)) : null,

@@ -21,8 +21,8 @@ import { h, replace, field, select, action, when, notify, problemText } from "..
  * @param {HTMLElement} root
  * @param {Here} here
  */
-export async function open(root, { path }) {
-  return path[0] ? one(root, path[0]) : all(root);
+export async function open(root, { path, query }) {
+  return path[0] ? one(root, path[0]) : all(root, query.get("calibration"));
 }
 
 /**
@@ -41,12 +41,16 @@ async function calibrationChoice(chosen) {
   return select(chosen ? options : [["", usable.length ? "choose one …" : "there is none yet"], ...options], chosen);
 }
 
-/** @param {HTMLElement} root */
-async function all(root) {
+/**
+ * @param {HTMLElement} root
+ * @param {string | null} asked calibration that was chosen on the way here
+ */
+async function all(root, asked) {
   const name = h("input", { type: "text", maxlength: 300, required: true });
   const specimen = h("input", { type: "text", maxlength: 300 });
   const notes = h("textarea", { rows: 2, maxlength: 20000 });
   const calibration = await calibrationChoice();
+  if (asked && [...calibration.options].some((one) => one.value === asked)) calibration.value = asked;
   const named = rule(name, (text) => (text ? "" : "The test has no name. Give it one; it can be changed later."));
   const uncalibrated = calibration.value
     ? null

@@ -22,7 +22,7 @@ interface Unnamed {
     views?: (Check & { name: string; dz_mm: number; held_out: boolean })[]; sigma?: Numbers; cam1?: Numbers; cam2?: Numbers;
     nominal?: { [cam: string]: { phd_px: number; standoff_mm: number; angle_deg: number; image_size_px: [number, number] } };
     covariance?: { names: string[]; matrix: number[][] }; image_size_px?: { [cam: string]: [number, number] };
-    plan: { label?: string; source_name?: string; created_utc?: string }; taken?: TakenView[] | null;
+    plan: { label?: string; source?: string | null; created_utc?: string }; taken?: TakenView[] | null;
   };
 }
 

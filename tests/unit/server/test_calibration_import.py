@@ -24,6 +24,7 @@ from stereorig.server.formats.calibrations.recognise import (
     load_calibration,
     parse_calibration,
 )
+from stereorig.server.report.geometry import geometry_of_cameras
 
 K1 = np.array([[6638.6, 0.0, 981.5], [0.0, 6639.8, 610.0], [0.0, 0.0, 1.0]])
 K2 = np.array([[6644.7, 0.0, 1005.4], [0.0, 6644.1, 567.3], [0.0, 0.0, 1.0]])
@@ -594,3 +595,33 @@ def test_our_own_file_with_a_bad_number(tmp_path: Path, key: str, value: object,
     assert key in error.cause
     path.write_text(json.dumps({"cam1": OURS, "cam2": OURS}))
     assert "same position" in refused(path).cause
+
+
+def test_another_programs_cameras_have_a_geometry_where_their_axes_meet(tmp_path: Path) -> None:
+    """The system's origin is camera 1's pinhole: two cameras turned by 20 degrees about a point 500 mm away."""
+    focal, distance, angle = 2000.0, 500.0, np.radians(20.0)
+    K = np.array([[focal, 0.0, 959.5], [0.0, focal, 599.5], [0.0, 0.0, 1.0]])
+    turn = cv2.Rodrigues(np.array([0.0, angle, 0.0]))[0]
+    middle = np.array([0.0, 0.0, distance])
+    none = np.zeros(5)
+    file = opencv_file(
+        tmp_path / "pair.yml",
+        cameraMatrix1=K,
+        cameraMatrix2=K,
+        distCoeffs1=none,
+        distCoeffs2=none,
+        R=turn,
+        T=(middle - turn @ middle)[:, None],
+    )
+    loaded = load_calibration(file)
+    with np.errstate(all="raise"):
+        found = geometry_of_cameras(loaded.pair, ((1920, 1200), (1920, 1200)))
+    assert found is not None
+    assert np.degrees(found.stereo_angle_rad) == pytest.approx(20.0)
+    for view in found.views.values():  # the plane is turned by half the angle to each of them
+        assert view.standoff_mm == pytest.approx(distance)
+        assert view.field_of_view_mm is not None
+        assert view.field_of_view_mm[1] == pytest.approx(1200 * distance / focal)
+        edge = np.arctan(960.0 / focal)
+        lengths = [distance * np.sin(edge) / np.cos(angle / 2 + sign * edge) for sign in (-1, 1)]
+        assert view.field_of_view_mm[0] == pytest.approx(sum(lengths))

@@ -24,7 +24,7 @@ from stereorig.server.cell.images import images as read_images
 from stereorig.server.formats.calibrations.recognise import LoadedCalibration, load_calibration
 from stereorig.server.formats.calibrations.target_toml import target_of
 from stereorig.server.formats.images import read_image
-from stereorig.server.report.geometry import geometry_at
+from stereorig.server.report.geometry import geometry_of_cameras
 from stereorig.server.results.calibration_checks import (
     KNOWN_DISTANCE,
     NamedImage,
@@ -50,10 +50,10 @@ def _loaded(service: Service, calibration_id: str) -> LoadedCalibration:
     responses=errors(404, 409, 422),
 )
 def get_geometry(service: ServiceDep, calibration_id: CalibrationId) -> GeometryReply:
-    """Return the geometry of the calibrated cameras, before the plane of the target."""
+    """Return the geometry of the calibrated cameras before the plane of the target, and each camera's parameters."""
     loaded = _loaded(service, calibration_id)
     pair, sizes = loaded.pair, (loaded.image_size1_px, loaded.image_size2_px)
-    found = geometry_at(pair, np.zeros(3), np.array([0.0, 0.0, 1.0]), sizes)
+    found = geometry_of_cameras(pair, sizes)
     pitch_um = {cam: service.config.camera(cam).pixel_um for cam in CAMERAS}
 
     def seen(cam: CameraName) -> dict[str, object]:
@@ -71,6 +71,7 @@ def get_geometry(service: ServiceDep, calibration_id: CalibrationId) -> Geometry
             "stereo_angle_deg": float(np.degrees(pair.stereo_angle_rad)),
             "baseline_mm": pair.baseline_mm,
             "cameras": None if found is None else {cam: seen(cam) for cam in CAMERAS},
+            "parameters": {"cam1": pair.cam1.values(), "cam2": pair.cam2.values()},
         }
     )
 

@@ -27,17 +27,24 @@ export function statusOf({ state, decision, level }) {
 export const statusBadge = (fact) => badge(...statusOf(fact));
 
 /**
- * Stereo angle, baseline, focal length and field of view of a complete calibration.
+ * Geometry of a complete calibration's cameras, and their parameters; null if there are none.
  * @param {Model<"CalibrationReply">} document_
  */
 export async function geometryOf(document_) {
   if (document_.state !== "complete") return null;
-  let found;
   try {
-    found = await api.get(`/calibrations/${/** @type {"{calibration_id}"} */ (document_.id)}/geometry`);
+    return await api.get(`/calibrations/${/** @type {"{calibration_id}"} */ (document_.id)}/geometry`);
   } catch {
     return null; // a broken file shows its error at its use
   }
+}
+
+/**
+ * Stereo angle, baseline, focal length and field of view.
+ * @param {Model<"GeometryReply"> | null} found
+ */
+export function figures(found) {
+  if (!found) return null;
   const { cam1, cam2 } = found.cameras ?? {};
   const both = (/** @type {string | null} */ one, /** @type {string | null} */ two) => (one === two ? one : `${one ?? "–"}; ${two ?? "–"}`);
   const size = (/** @type {readonly number[] | null | undefined} */ mm) => (mm ? `${quantity(mm[0], "", 3)} × ${quantity(mm[1], "mm", 3)}` : null);

@@ -22,7 +22,11 @@ const PARAMETERS = {
 export const NAMES = Object.keys(PARAMETERS);
 export const CAMERAS = /** @type {const} */ (["cam1", "cam2"]);
 /** Symbol of a parameter, and its unit. @param {string} name */
-export const named = (name) => [PARAMETERS[name][0], " ", h("span.quiet", PARAMETERS[name][1])];
+export function named(name) {
+  const [, plain, ending] = /^(.*?)(?:_(px|mm|rad|deg))?$/.exec(name) ?? [];
+  const [symbol, unit] = PARAMETERS[name] ?? [plain, ending ?? ""];
+  return [symbol, " ", h("span.quiet", unit)];
+}
 export const um = (/** @type {number | null | undefined} */ mm, digits = 3) => quantity(mm === null || mm === undefined ? null : 1000 * mm, "µm", digits);
 
 /** @param {Calibration} document_ */
@@ -100,17 +104,27 @@ function withSigma(value, sigma) {
   return Math.abs(value) < 1e-4 ? `${num(value, 4)} ± ${num(sigma, 2)}` : `${value.toFixed(Math.min(decimals, 8)).replace("-", "−")} ± ${num(sigma, 2)}`;
 }
 
-/** @param {Calibration} document_ */
-export function parameters(document_) {
+/**
+ * The parameters of both cameras, whatever their lens model is.
+ * @param {Calibration} document_
+ * @param {{ [cam: string]: { [name: string]: number } } | undefined} values of a complete one
+ */
+export function parameters(document_, values) {
   const sigma = document_.sigma ?? {};
+  const of = (/** @type {"cam1" | "cam2"} */ cam) => values?.[cam] ?? document_[cam] ?? {};
+  const names = [...new Set(CAMERAS.flatMap((cam) => Object.keys(of(cam))))];
   return table(
     [
       ["Parameter", named],
-      ...CAMERAS.map((cam) => numeric(`${cam} ± σ`, (/** @type {string} */ name) => withSigma(document_[cam]?.[name], sigma[`${cam}.${name}`]))),
-      ["nominal", (name) => nominal(document_, name), { numeric: true }],
+      ...CAMERAS.map((cam) => numeric(`${cam} ± σ`, (/** @type {string} */ name) => withSigma(of(cam)[name], sigma[`${cam}.${name}`]))),
+      ...(document_.nominal ? [numeric("nominal", (/** @type {string} */ name) => nominal(document_, name))] : []),
     ],
-    NAMES,
-    { caption: "Ten parameters of each camera, with their standard uncertainties" },
+    names.length ? names : NAMES,
+    {
+      caption: Object.keys(sigma).length
+        ? "Parameters of each camera, with their standard uncertainties"
+        : "Parameters of each camera; their uncertainty is not known",
+    },
   );
 }
 
