@@ -33,7 +33,7 @@ from stereorig.server.api.routes.analyses import (
     report,
     results,
 )
-from stereorig.server.api.routes.calibrations import calibrations, guide, noise, repair, review
+from stereorig.server.api.routes.calibrations import calibrations, guide, noise, repair, review, uploads
 from stereorig.server.api.routes.calibrations import checks as calibration_checks
 from stereorig.server.api.routes.calibrations import exports as calibration_exports
 from stereorig.server.api.routes.certificates import certificates, procedure
@@ -155,6 +155,7 @@ def bare_app(lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
         noise,
         calibrations,
         repair,
+        uploads,
         calibration_exports,
         calibration_checks,
         review,

@@ -76,7 +76,9 @@ def test_foreseen_run_and_seen(page: Watched, client: httpx.Client) -> None:
         expect(verdict).to_contain_text(reason)
     expect(shown.get_by_text(f"{document['checks']['held_out']['rbe_px']:.5f} px").first).to_be_visible()
     # one figure of the parameters, with its uncertainty
-    expect(shown.get_by_role("region", name="Parameters of each camera")).to_contain_text(f"{document['cam1']['z0_mm']:.2f}")
+    expect(shown.get_by_role("region", name="Parameters of each camera")).to_contain_text(
+        f"{document['cam1']['z0_mm']:.2f}"
+    )
     # the estimate is confirmed: the simulated grid is on its corner
     noise = sum(document["noise_px"].values()) / 2
     reply = client.post(

@@ -29,7 +29,7 @@ MAX_NAMES = 12_000
 #: the readings of a live measurement have few names each, and end at the first that is wrong
 MAX_READING_NAMES, MAX_NAMES_OF_ONE = 60_000, 1000
 
-_UPLOADS = re.compile(r".*(?:/steps:import|/models)")
+_UPLOADS = re.compile(r".*(?:/steps:import|/models|/calibrations:upload)")
 _FORMS = re.compile(r".*(?:/calibrations:(?:import|aspect)|/channels:(?:import|preview))")
 _MASKS = re.compile(r".*(?:/analyses|/texture|/recipes(?:/[^/]+)?|/workspace|/calibrations/[^/]+:repair)")
 _READINGS = re.compile(r".*/live/channels")

@@ -3,6 +3,7 @@ import * as api from "../lib/api.js";
 import * as events from "../lib/events.js";
 import { distanceCheck } from "./calibrate/checks.js";
 import { correlations } from "./calibrate/correlations.js";
+import { fromImages } from "./calibrate/from_images.js";
 import { guidePanel } from "./calibrate/guide.js";
 import { newCalibration } from "./calibrate/new.js";
 import { printer } from "./calibrate/print.js";
@@ -104,7 +105,7 @@ export async function open(root, { path }) {
           },
         ),
       );
-      const parts = await one(document_, decide);
+      const parts = await one(document_, decide, chosenNow);
       closeShown = parts.close;
       replace(shown, parts.nodes);
     } catch (error) {
@@ -121,6 +122,11 @@ export async function open(root, { path }) {
     }),
   );
   await refresh();
+  const chosenNow = async (/** @type {string} */ id) => {
+    chosen = id;
+    await refresh();
+    await show(true);
+  };
   const running = newCalibration(
     rig,
     ends,
@@ -131,11 +137,7 @@ export async function open(root, { path }) {
     },
     !chosen && !entries.some((one) => one.state === "complete"),
   );
-  const guided = guidePanel(rig, ends, async (id) => {
-    chosen = id;
-    await refresh();
-    await show(true);
-  });
+  const guided = guidePanel(rig, ends, chosenNow);
   const compare = action("Compare the two chosen", () => comparison(ticked(list)));
   await show();
   replace(
@@ -143,7 +145,7 @@ export async function open(root, { path }) {
     h("h1", "Calibrate"),
     h(
       "div.grid.side",
-      h("div.grid", rig.calibration_plan?.moves === "free" ? null : running, guided, shown),
+      h("div.grid", rig.calibration_plan?.moves === "free" ? null : running, guided, fromImages(ends, chosenNow), shown),
       h(
         "section.panel",
         list,
@@ -166,9 +168,10 @@ export async function open(root, { path }) {
 /**
  * @param {Calibration} document_
  * @param {HTMLElement} decide buttons of its review
+ * @param {(id: string) => Promise<unknown>} other shows another calibration
  * @returns {Promise<Panels>}
  */
-async function one(document_, decide) {
+async function one(document_, decide, other) {
   const { id, plan } = document_;
   const heading = h(
     "div.spread",
@@ -206,7 +209,13 @@ async function one(document_, decide) {
       h(
         "div.grid.tables",
         { style: { marginTop: "var(--gap)" } },
-        h("section.panel", h("h2", "Checks"), measures(document_), viewTable(document_), document_.state === "complete" ? distanceCheck(document_) : null),
+        h(
+          "section.panel",
+          h("h2", "Checks"),
+          measures(document_),
+          viewTable(document_, other),
+          document_.state === "complete" ? distanceCheck(document_) : null,
+        ),
         h("section.panel", h("h2", "Parameters"), parameters(document_, geometry?.parameters), correlations(document_)),
       ),
     ],

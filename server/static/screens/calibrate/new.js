@@ -3,18 +3,16 @@ import * as api from "../../lib/api.js";
 import * as events from "../../lib/events.js";
 import { allRight, numberWithin, numbersWithin, rule } from "../../lib/fields.js";
 import { wayBackNote } from "../../widgets/way_back.js";
-import { h, numeric, replace, field, number, select, action, table, definitions, badge, num, quantity, notify, problemText } from "../../lib/dom.js";
+import { h, numeric, replace, field, number, select, action, table, definitions, num, quantity, notify, problemText } from "../../lib/dom.js";
+import { course } from "./course.js";
 import { CAMERAS, NAMES, named, um } from "./tables.js";
 
 /** @import { Ends } from "#dom" */
 /** @import { Model } from "#routes" */
-/** @import { Calibration } from "./tables.js" */
 /** @typedef {Model<"RigReply">} Rig */
 /** @typedef {Model<"ExpectReply">} Expected */
 /** @typedef {[HTMLInputElement, import("../../lib/fields.js").Rule]} Ruled */
 
-/** @type {Record<string, string>} */
-const PHASES = { target: "looking for the target", views: "taking views", grid: "finding the target", calibration: "adjusting" };
 /** @type {Record<string, string>} */
 const MOVES = {
   cameras: "Each camera moves along its own axis.",
@@ -26,12 +24,6 @@ const LOCALISERS = [
   ["profile", "profile (finest)"],
   ["paper", "paper (1996)"],
 ];
-
-/** @param {Model<"JobReply">} job of a calibration */
-function verdictOf(job) {
-  const verdict = /** @type {Calibration["verdict"]} */ (job.result?.verdict);
-  return verdict ? `Verdict: ${verdict.level}.` : "";
-}
 
 /**
  * The plan, its expected uncertainty, and its run.
@@ -113,43 +105,6 @@ export function newCalibration(rig, ends, done, first) {
     progress,
     note.root,
   );
-}
-
-/**
- * Follow a calibration to its end, with its progress and its verdict.
- * @param {Model<"JobReply">} job
- * @param {HTMLElement} progress
- * @param {AbortSignal} signal
- */
-async function course(job, progress, signal) {
-  const bar = h("progress", { max: 1, "aria-label": "Progress of the calibration" });
-  const text = h("span");
-  replace(
-    progress,
-    h(
-      "div.row",
-      h("span", { style: { flex: 1, minWidth: "10rem" } }, bar),
-      text,
-      action("Cancel", () => api.post(`/jobs/${job.id}:cancel`), { kind: "danger" }),
-    ),
-  );
-  const ended = await api.finished(job.id, {
-    signal,
-    onprogress: (now) => {
-      const { phase: stage, done: ready, total } = now.progress ?? {};
-      if (total) bar.value = ready / total;
-      text.textContent = now.state === "queued" ? "waiting" : `${PHASES[stage ?? ""] ?? stage ?? ""} ${total ? `${ready} of ${total}` : ""}`;
-    },
-  });
-  replace(
-    progress,
-    ended.state === "succeeded"
-      ? h("p", verdictOf(ended), " It is shown below.")
-      : ended.state === "cancelled"
-        ? h("p", badge("cancelled", "warn"), " The axes were stopped; no calibration was computed from the views.")
-        : problemText(api.jobProblem(ended)),
-  );
-  return ended;
 }
 
 /** The fields of the plan with their rules. @param {Rig} rig */

@@ -2,6 +2,7 @@
 import * as api from "../../lib/api.js";
 import { h, numeric, table, num, count, quantity, when, problemText, ask } from "../../lib/dom.js";
 import { comparedInSpace } from "./checks.js";
+import { refit } from "./from_images.js";
 
 /** @import { Model } from "#routes" */
 /** @typedef {Model<"CalibrationReply">} Calibration */
@@ -72,26 +73,43 @@ export function measures(document_) {
   ];
 }
 
-/** @param {Calibration} document_ */
-export function viewTable(document_) {
+/**
+ * Each view's residuals, the largest first, with a tick to leave it out of another fit.
+ * @param {Calibration} document_
+ * @param {(id: string) => Promise<unknown>} done shows the other fit
+ */
+export function viewTable(document_, done) {
   if (!Array.isArray(document_.views)) return null;
-  return h(
-    "details",
-    h("summary", "Each view"),
+  const progress = h("div", { role: "status" });
+  const indexOf = (/** @type {{ name: string }} */ view) => Number(/^\d+(?=_cam)/.exec(view.name)?.[0] ?? NaN);
+  const again = Boolean(document_.taken?.length);
+  const list = h(
+    "div",
     table(
       [
-        ["View", (v) => v.name],
+        ...(again ? [leaveOut(indexOf)] : []),
+        ["View", (v) => v.name.replace(/\.tif$/, "")],
         ["dZ", (v) => quantity(v.dz_mm, "mm", 4), { numeric: true }],
         ["Role", (v) => (v.held_out ? "held out" : "fitted")],
         ["RBE", (v) => quantity(v.rbe_px, "px", 3), { numeric: true }],
         ["RAZ", (v) => um(v.raz_mm), { numeric: true }],
         ["NSCE", (v) => num(v.nsce, 3), { numeric: true }],
       ],
-      document_.views,
-      { caption: "Measures of each view" },
+      document_.views.toSorted((a, b) => (b.rbe_px ?? 0) - (a.rbe_px ?? 0)),
+      { caption: "Measures of each view, the largest error first" },
     ),
   );
+  return h("details", h("summary", "Each view"), list, again ? h("div.row", refit(document_.id, list, progress, done)) : null, progress);
 }
+
+/**
+ * @param {(view: { name: string }) => number} indexOf
+ * @returns {import("#dom").Column<any>}
+ */
+const leaveOut = (indexOf) => [
+  "Leave out",
+  (view) => (Number.isFinite(indexOf(view)) ? h("input", { type: "checkbox", value: indexOf(view), "aria-label": `Leave out ${view.name}` }) : null),
+];
 
 /**
  * @param {number | null | undefined} value
