@@ -98,7 +98,8 @@ class Session:
             value = body
             if files is not None:
                 value = {name: data.decode() if text_files else FILE for name, data in files.items()} | (form or {})
-            value = {name: [given] if name == "images" else given for name, given in value.items()}
+            lists = ("cam1", "cam2") if operation == "upload_views" else ("images",)
+            value = {name: [given] if name in lists else given for name, given in value.items()}
             media_sent = "application/json" if files is None else "multipart/form-data"
             self.requests.append(Sent(operation, media_sent, summary, value, answer.status_code))
         replies = self.replies.setdefault(operation, {}).setdefault(str(answer.status_code), {})
@@ -263,6 +264,15 @@ def _calibration(session: Session) -> str:
         files={"file": json.dumps(true_cameras(SMALL)).encode()},
         text_files=True,
     ).json()
+    uploaded = call(
+        "upload_views",
+        summary="A pair; three are needed at least",
+        form={"plan": '{"target": {"kind": "checkerboard", "pitch_mm": 3.0, "size": [11, 8]}, "phd_px": 7000.0}'},
+        files={cam: _grid_along_its_normal() for cam in ("cam1", "cam2")},
+    )
+    wait_for_job(client, uploaded.json()["job"])  # its problem is the job's
+    again = call("refit_calibration", calibration, summary="Without the view at 2 mm", body={"without": [1]})
+    assert wait_for_job(client, again.json()["job"])["state"] == "succeeded"
     call("compare_calibration", calibration, query={"with": second["id"]})
     call(
         "measure_aspect",

@@ -89,7 +89,7 @@ def begin_uploaded(service: Service, plan: UploadedPlan, pairs: Sequence[Read], 
         )
     sizes = _sizes(service, pairs)
     usual = CalibrationSection.model_validate({"moves": "free"})
-    cameras = {
+    cameras: dict[str, dict[str, Any]] = {
         cam: {
             "image_size_px": sizes[cam],
             "phd_px": plan.phd_px,
@@ -99,7 +99,7 @@ def begin_uploaded(service: Service, plan: UploadedPlan, pairs: Sequence[Read], 
         }
         for k, cam in enumerate(CAMERAS)
     }
-    rig = {
+    rig: dict[str, Any] = {
         "name": "uploaded images",
         "simulated": [],
         "target": plan.target.plain(),
@@ -146,7 +146,7 @@ def begin_refit(service: Service, calibration_id: str, asked: RefitRequest, requ
         ``views_missing`` if it has no such views, or none would be left.
     """
     made = service.calibrations.read(calibration_id)
-    taken = [view.plain() for view in made.taken or []]
+    taken: list[dict[str, Any]] = [view.plain() for view in made.taken or []]
     known = {int(view["index"]) for view in taken}
     strange = sorted(set(asked.without) - known)
     left = [view for view in taken if view["index"] not in asked.without]
@@ -157,11 +157,14 @@ def begin_refit(service: Service, calibration_id: str, asked: RefitRequest, requ
             code="views_missing",
             remedy="Leave out views of GET /calibrations/{id}/views, and keep at least three.",
         )
-    plan = made.plan.plain()
+    plan: dict[str, Any] = made.plan.plain()
     dropped = {*plan.get("without", []), *asked.without}
     label = asked.label or f"{made.plan.label or calibration_id} without {', '.join(str(n) for n in sorted(dropped))}"
     kept = {name: plan[name] for name in plan if name not in ("id", "created_utc", "job_id", "request", "check")}
     document = {**kept, "label": label[:300], "refitted_from": calibration_id, "without": sorted(dropped)}
+    if "held_out_mm" in plan:  # a position of which no view is left would be refused
+        held = {view.get("dz_commanded_mm") for view in left if view["role"] == "held_out"}
+        document["held_out_mm"] = [mm for mm in plan["held_out_mm"] if mm in held]
 
     def views(new_id: str) -> Iterable[dict[str, Any]]:
         for view in left:

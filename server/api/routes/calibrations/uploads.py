@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hashlib import file_digest
+from hashlib import sha256
 from typing import Annotated
 
 from fastapi import APIRouter, File, Form, Request, UploadFile
@@ -75,7 +75,7 @@ def _upload(service: ServiceDep, one: list[UploadFile], two: list[UploadFile], p
             remedy="Send as many images of each camera, in the same order.",
         )
     pairs = [_reader(first, second) for first, second in zip(one, two, strict=True)]
-    digests = [file_digest(upload.file, "sha256").digest() for upload in (*one, *two)]
+    digests = [sha256(data).digest() for read in pairs for data in read().values()]
     sent = mark("calibrations:upload", key, None, plan.encode(), *digests)
     made, _ = service.once(sent.scope, key, sent.body_sha256, lambda: begin_uploaded(service, asked, pairs, sent))
     return made
