@@ -1,4 +1,4 @@
-"""A test's analyses in a list: each with its state and its warnings."""
+"""A test's analyses in a list: each with its state."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from stereorig.server.base.errors import NotFoundError
 from stereorig.server.workflows.service import Service
 
 
-def listed(service: Service, test_id: str, entries: Sequence[Mapping[str, object]]) -> list[dict[str, object]]:
-    """Return entries of a test's analyses with their state and warnings; an unreadable analysis has none."""
-    shown = service.checks.with_warnings(test_id, entries)
-    return [{**entry, "state": _state(service, test_id, entry)} for entry in shown]
+def with_states(service: Service, test_id: str, entries: Sequence[Mapping[str, object]]) -> list[dict[str, object]]:
+    """Return entries of a test's analyses with their states; an unreadable analysis has none."""
+    return [{**entry, "state": _state(service, test_id, entry)} for entry in entries]
 
 
 def _state(service: Service, test_id: str, entry: Mapping[str, object]) -> str | None:

@@ -33,7 +33,7 @@ from stereorig.server.documents.tests import Finished, SummaryRecord
 from stereorig.server.jobs.idempotency import RequestMark
 from stereorig.server.store.tests.steps import MAX_STEPS
 from stereorig.server.workflows.analysis import start as analysis_start
-from stereorig.server.workflows.analysis.listed import listed
+from stereorig.server.workflows.analysis.listed import with_states
 from stereorig.server.workflows.service import Service
 
 router = APIRouter(prefix="/tests/{test_id}/analyses", tags=["analyses"])
@@ -208,7 +208,7 @@ def list_analyses(service: ServiceDep, test_id: TestId, page: PageDep) -> Analys
     service.tests.path(test_id)
     rest = service.catalog.entries("analysis", test_id, after=page.after, limit=page.limit + 1)
     analyses_page = page.cut(rest, lambda a: str(a["id"]))
-    shown = listed(service, test_id, analyses_page)
+    shown = service.checks.with_warnings(test_id, with_states(service, test_id, analyses_page))
     return AnalysisList.model_validate({"analyses": shown, "next_cursor": page.next_cursor})
 
 

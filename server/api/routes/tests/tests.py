@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 import cv2
 from fastapi import APIRouter, File, Form, Query, Request, UploadFile
@@ -51,7 +51,7 @@ from stereorig.server.formats.manifest import checked_bytes
 from stereorig.server.jobs.idempotency import RequestMark
 from stereorig.server.store.indexing.entries import step_entry, test_entry
 from stereorig.server.wording import problems_in
-from stereorig.server.workflows.analysis.listed import listed
+from stereorig.server.workflows.analysis.listed import with_states
 from stereorig.server.workflows.burst import start_burst
 from stereorig.server.workflows.capture import capture_step, import_step
 from stereorig.server.workflows.service import Service
@@ -71,12 +71,14 @@ def _reply(service: Service, test_id: str) -> dict[str, object]:
         "steps_next_cursor": None if n_steps <= WHOLE else cursor_of(f"{steps[-1]['n']:04d}"),
         "newest_step": service.catalog.last_entry("step", test_id),
         "incomplete_steps": service.tests.steps.incomplete(test_id),
-        "analyses": service.catalog.entries("analysis", test_id),
+        # a browser keeps the answer as long as its ETag stays: the states are part of it
+        "analyses": with_states(service, test_id, service.catalog.entries("analysis", test_id)),
     }
 
 
 def _shown(service: Service, test_id: str, reply: dict[str, object]) -> TestReply:
-    entries = listed(service, test_id, service.catalog.entries("analysis", test_id))
+    analyses = cast("list[dict[str, object]]", reply["analyses"])
+    entries = service.checks.with_warnings(test_id, analyses)
     return TestReply.model_validate({**reply, "analyses": entries})
 
 
