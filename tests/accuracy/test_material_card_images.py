@@ -11,7 +11,6 @@ from tests.support.strip_images import TRUTH, cards, within
 pytestmark = pytest.mark.timeout(600)
 
 
-@pytest.mark.deep
 def test_the_modulus_of_a_rendered_strip_is_within_its_uncertainty(tmp_path: Path) -> None:
     for card in cards(tmp_path, 3, seed=1):
         for symbol, true in TRUTH.items():

@@ -30,6 +30,9 @@ from tests.support.matching_scene import Plane, Texture, digitise, render
 SIZE = 420
 PHD_PX, AWAY_MM = 5400.0, 390.0
 MM_PER_PX = AWAY_MM / PHD_PX
+NEAR_PX = 72
+#: patch, its order, and the periods of its star about its l10 of 84 and 27 px
+STARS: list[tuple[Any, int, float, float]] = [("affine", 1, 65.0, 105.0), ("quadratic", 2, 21.0, 34.0)]
 TEXTURE = Texture(blob_mm=1.5 * MM_PER_PX, extent_mm=20.0)
 pytestmark = pytest.mark.timeout(600)
 
@@ -76,7 +79,10 @@ class Star(Plane):
 
 
 def star_over_theory(patch: Any, order: int, low: float, high: float) -> float:
-    """l10 that a star shows over that of the least-squares fit; its periods grow from ``low`` to ``high`` px."""
+    """l10 that a star shows over that of the least-squares fit; its periods grow from ``low`` to ``high`` px.
+
+    Far from its middle line the waves run askew, and a subset loses more of them: only points near the line are taken.
+    """
     pair, rng = stereo(), np.random.default_rng(1)
     size_mm = 0.15 * MM_PER_PX
     star = Star(low_mm=low * MM_PER_PX, high_mm=high * MM_PER_PX, size_mm=size_mm)
@@ -88,7 +94,7 @@ def star_over_theory(patch: Any, order: int, low: float, high: float) -> float:
         for plane in (Plane(), star)
     ]
     grid, options = (
-        PointGrid.rectangle(30, 30, SIZE - 31, SIZE - 31, spacing_px=9),
+        PointGrid.rectangle(30, 0.5 * SIZE - NEAR_PX, SIZE - 31, 0.5 * SIZE + NEAR_PX, spacing_px=9),
         MeasureOptions(subset_px=SUBSET, patch=patch),
     )
     reference = ReferencePair(pair, *images[0])
@@ -109,8 +115,7 @@ def star_over_theory(patch: Any, order: int, low: float, high: float) -> float:
     return float(minimize_scalar(misfit, bounds=(0.7, 1.4), method="bounded").x)
 
 
-@pytest.mark.deep
-@pytest.mark.parametrize(("patch", "order", "low", "high"), [("affine", 1, 50.0, 170.0), ("quadratic", 2, 18.0, 55.0)])
+@pytest.mark.parametrize(("patch", "order", "low", "high"), STARS)
 def test_l10_of_a_star_rendered_in_stereo_is_the_transfers(patch: Any, order: int, low: float, high: float) -> None:
     theory = bisected(lambda one: least_squares(SUBSET, order, one), 0.5 * low, 1.5 * high)
     assert l10_px([patch_filter(SUBSET, order)]) == pytest.approx(theory, rel=1e-6)

@@ -140,7 +140,6 @@ HEADLINES: dict[tuple[str, str], dict[str, str]] = {
     ("cards", "Cards"): {
         "tensile tests, all laws and numbers: within 95 %": "numbers of tensile tests within their 95 % interval",
         "cracks, all numbers: within 95 %": "K, T, tip and J of cracks within their 95 % interval",
-        "star rendered in stereo, affine patch: l10 off its theory": "spatial resolution l10 of a star, off its theory",
     },
     ("long_sequences", "Long sequences and later references"): {
         "drift per update, steps of 0.64 px all alike": "bias that each later reference adds"
