@@ -163,9 +163,10 @@ def _lost_to_noise(inputs: FieldInputs, state: GrowthState, width: int) -> Bool:
     rows, cols = inputs.ref1.shape
     inside = np.abs(inputs.xy_px - 0.5 * np.array([cols - 1, rows - 1])) < 0.5 * np.array([cols, rows]) - width // 2 - 1
     lost &= inside.all(axis=1)
-    sigma = np.maximum(*sigma_px(state.fitter, points, ok, inputs.xy_px))
     place = cv2.connectedComponents(lost.reshape(inputs.grid.shape).astype(np.uint8), connectivity=8)[1]
     about = cv2.dilate(place.astype(np.float32), np.ones((3, 3), np.uint8)).ravel()[ok].astype(int)
+    ok, about = ok[about > 0], about[about > 0]
+    sigma = np.maximum(*sigma_px(state.fitter, points, ok, inputs.xy_px))
     count, total = np.bincount(about, minlength=place.max() + 1), np.bincount(about, sigma, minlength=place.max() + 1)
     unsure = total > _UNSURE * single_sigma_px(options.validity.max_sigma_px) * count
     return np.asarray(lost & unsure[place.ravel()])

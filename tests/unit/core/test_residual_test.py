@@ -371,6 +371,7 @@ def test_scatter_is_told_by_what_no_linear_motion_explains():
         (0.09, 0.05, False, 0.25),
         (0.09, 1.2, False, 0.1),
         (0.11, 0.5, False, 0.1),
+        (0.107, 0.1, False, 0.25),  # of one kind, as camera 1 blurred by 2 px
         (0.115, 0.1, True, 0.25),  # along the depth, of camera 2 blurred by 2 px
         (0.15, 0.6, True, 0.1),
     ],
