@@ -25,7 +25,6 @@ WEIGHTS = np.eye(3) - 0.25
 _AT_ONCE = 1024
 _FIRM = 1e-12  # share of the variance
 Index = slice | Bool | NDArray[np.int64]
-_NOISE = np.kron(np.eye(3) + 1.0, np.eye(2))
 
 
 def measured_derivatives(
@@ -234,10 +233,9 @@ class Estimator:
         first.
         """
         assert self.by_match is not None
-        every = self.by_match @ _NOISE @ np.swapaxes(self.by_match, 1, 2)
-        root: Float = np.asarray(np.linalg.cholesky(every), dtype=np.float64)
-        new = own @ inverse_of_lower(root) @ self.by_match[:, :, 2:]
-        return np.asarray(new @ np.swapaxes(new, 1, 2))
+        from stereorig.core.common.estimates import new_noise  # slow to load, and not every start needs it
+
+        return new_noise(self.by_match, own)
 
 
 def lower_root(covariance: Float) -> Float:

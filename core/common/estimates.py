@@ -135,6 +135,52 @@ def estimates(
     return by_match, whole
 
 
+@entry_with_arrays
+def _new_noise(by_match, own, out):
+    L, shifts, new = np.empty((3, 3)), np.empty((3, 4)), np.empty((3, 4))
+    for n in range(len(by_match)):
+        B = by_match[n]
+        for i in range(3):
+            for j in range(i + 1):
+                # the comparisons' noise has the unit matrix plus one in all elements
+                s = (B[i, 0] + B[i, 2] + B[i, 4]) * (B[j, 0] + B[j, 2] + B[j, 4])
+                s += (B[i, 1] + B[i, 3] + B[i, 5]) * (B[j, 1] + B[j, 3] + B[j, 5])
+                for k in range(6):
+                    s += B[i, k] * B[j, k]
+                for k in range(j):
+                    s -= L[i, k] * L[j, k]
+                L[i, j] = math.sqrt(s) if i == j else s / L[j, j]
+        for i in range(3):
+            for j in range(4):
+                s = B[i, 2 + j]
+                for k in range(i):
+                    s -= L[i, k] * shifts[k, j]
+                shifts[i, j] = s / L[i, i]
+        for i in range(3):
+            for j in range(4):
+                new[i, j] = own[n, i, 0] * shifts[0, j] + own[n, i, 1] * shifts[1, j] + own[n, i, 2] * shifts[2, j]
+        for i in range(3):
+            for j in range(3):
+                out[n, i, j] = 0.0
+                for k in range(4):
+                    out[n, i, j] += new[i, k] * new[j, k]
+
+
+def new_noise(by_match: Float, own: Float) -> Float:
+    """Return the part (n, 3, 3) of displacements' noise that the current images add.
+
+    Parameters
+    ----------
+    by_match
+        (n, 3, 6) as :func:`estimates` returns it.
+    own
+        (n, 3, 3) lower triangle of the displacements' covariance.
+    """
+    out = np.empty((len(own), 3, 3))
+    _new_noise(_dense(by_match), _dense(own), out)
+    return out
+
+
 def _dense(values: Float) -> Float:
     """As the kernel is compiled for: contiguous, and writable."""
     values = np.ascontiguousarray(values, dtype=np.float64)

@@ -9,6 +9,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from stereorig.core.common.derivatives import WEIGHTS, Estimator
+from stereorig.core.common.estimates import new_noise
 from stereorig.core.field.region.window import window_offsets
 from stereorig.core.matching.geometry import covariance_xyzuvw, motion_geometry, shape_geometry, tangent_frames
 from stereorig.core.matching.image import PAD, prepare
@@ -173,3 +174,15 @@ def test_the_covariance_of_a_position_and_its_motion_follows_from_their_derivati
     wanted = J @ given[:, :4, :4] @ np.swapaxes(J, 1, 2)
     found = covariance_xyzuvw(pair, xy, w, G, given)
     np.testing.assert_allclose(found, wanted, atol=1e-6 * np.abs(wanted).max())
+
+
+def test_the_new_part_of_a_displacements_noise_is_that_of_the_current_images_shifts():
+    """The plain twin takes the root of the whole noise off by LAPACK; the reference's two shifts are left out."""
+    rng = np.random.default_rng(11)
+    by_match, root = rng.normal(size=(30, 3, 6)), np.linalg.cholesky(3.0 * np.eye(3) + np.ones((30, 3, 3)))
+    found = new_noise(by_match, root)
+    noise = np.kron(np.eye(3) + 1.0, np.eye(2))
+    for k in range(30):
+        L = np.linalg.cholesky(by_match[k] @ noise @ by_match[k].T)
+        new = root[k] @ np.linalg.inv(L) @ by_match[k][:, 2:]
+        assert found[k] == pytest.approx(new @ new.T, rel=1e-10, abs=1e-12)
