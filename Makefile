@@ -20,7 +20,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # only compile the same kernels again
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n > 3 ? 4 : n + 1)))
 
-.PHONY: fuzzreaders help wheel demo quick test test-deep serve check check-page kernels bench format accuracy coverage fuzz load years soak problems docs torture stops powerloss livebench clusterbench pagespeed pagepictures same newest constraints clean
+.PHONY: fuzzreaders help release wheel demo quick test test-deep serve check check-page kernels bench format accuracy coverage fuzz load years soak problems docs torture stops powerloss livebench clusterbench pagespeed pagepictures same newest constraints clean
 
 help:
 	@echo "make demo    start the service on the simulated paper rig and run the plate experiment over HTTP"
@@ -41,6 +41,7 @@ help:
 	@echo "make fuzz    schema fuzzing of the whole API on a simulated rig (ARGS='--each N --seed S --only OPERATION')"
 	@echo "make fuzzreaders  coverage-guided fuzzing of each reader of foreign files, a process each (ARGS='--executions N --reader NAME')"
 	@echo "make wheel   build the wheel into dist/, with its bill of materials (CycloneDX) inside and beside"
+	@echo "make release  everything that is published, into dist/: wheel, source, bill of materials, changes, citation, container file; tried in a fresh environment"
 	@echo "make newest  the tests of make quick with the newest of every package, beyond the upper bounds"
 	@echo "make constraints  write constraints.txt: the tested versions, with checksums, for a release"
 	@echo "make docs    build the site into build/site, offline, and check every link in it"
@@ -163,6 +164,9 @@ wheel: $(STAMP)
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps -w dist .
 	$(BIN)/python -m tests.bench.documents.bill_of_materials dist/stereorig-*.whl
 
+release: $(STAMP)
+	$(BIN)/python -m tests.bench.documents.release
+
 coverage: $(STAMP)
 	$(BIN)/python -m tests.bench.coverage.coverage $(ARGS)
 
@@ -184,8 +188,14 @@ fuzzreaders: $(STAMP)
 problems: $(STAMP)
 	$(BIN)/python -m tests.bench.documents.problem_list
 
+# the site needs the program, whose lists it shows, and four packages
+SITE := $(VENV)/.site
+$(SITE): $(PROGRAM)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]' || { echo "pip could not install the packages of pyproject.toml; its message is above."; exit 1; }
+	@touch $@
+
 SPHINX = $(BIN)/python -m sphinx -n -W --keep-going -q -d build/doctrees
-docs: $(STAMP)
+docs: $(SITE)
 	$(SPHINX) -b html docs build/site
 	@echo "build/site/index.html"
 
