@@ -143,8 +143,8 @@ class AsyncClient:
         return AsyncTest(self, (await self._run(operations.new_test(body))).id)
 
     def test(self, test_id: str) -> AsyncTest:
-        """Return a test by its id; nothing is asked of the service."""
-        return AsyncTest(self, test_id)
+        """Do as :meth:`Client.test`."""
+        return AsyncTest(self, operations.id_of_test(test_id))
 
     async def tests(self) -> list[TestEntry]:
         """Do as :meth:`Client.tests`."""

@@ -7,6 +7,7 @@ whether a thread or an event loop waits.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -100,6 +101,23 @@ def request_of(model: type[Model], given: Model | None, named: Mapping[str, Any]
     except ValidationError as error:
         text = " ".join(str(one) for one in problems_in(error)[:3])
         raise InputError(text, code="invalid_request", remedy="Correct the values named above.") from error
+
+
+def id_of_test(text: str) -> str:
+    """Return a test's id.
+
+    Raises
+    ------
+    InputError
+        ``invalid_request`` for a text that is none.
+    """
+    if not re.fullmatch(r"t[0-9]+-[0-9a-f]+", text):
+        raise InputError(
+            f"{text[:60]!r} is no test's id.",
+            code="invalid_request",
+            remedy="Give one as t000001-0c9f1e; `tests()` lists ids and names.",
+        )
+    return text
 
 
 def _body(request: BaseModel) -> Any:

@@ -177,8 +177,14 @@ class Client:
         return Test(self, self._run(operations.new_test(body)).id)
 
     def test(self, test_id: str) -> Test:
-        """Return a test by its id; nothing is asked of the service."""
-        return Test(self, test_id)
+        """Return a test by its id; nothing is asked of the service.
+
+        Raises
+        ------
+        InputError
+            ``invalid_request`` for a text that is no test's id, as a name.
+        """
+        return Test(self, operations.id_of_test(test_id))
 
     def tests(self) -> list[TestEntry]:
         """List tests, oldest first."""

@@ -212,6 +212,14 @@ def test_what_cannot_be_is_refused_in_the_users_words_before_anything_is_sent() 
             test.measure(AnalysisRequest.model_validate({"region": REGION}), subset_px=33)
 
 
+@pytest.mark.parametrize("text", ["nope", "plate 3", "a000001-0c9f1e", ""])
+def test_a_name_is_not_taken_for_an_id(tiny: Client, text: str) -> None:
+    for client in (tiny, AsyncClient(tiny.url, progress=False)):
+        with pytest.raises(InputError, match="is no test's id") as caught:
+            client.test(text)
+        assert "`tests()`" in caught.value.remedy
+
+
 def test_a_refusal_is_the_error_that_it_was_in_the_service(tiny: Client) -> None:
     with pytest.raises(InputError) as unknown:
         tiny.test("t000009-abcdef").document()
@@ -272,7 +280,12 @@ def test_a_test_and_its_analysis_show_themselves_in_a_notebook(tiny: Client, ser
     assert "map of step 2" in shown
     # without the service there is the line
     gone = stereorig.Client("http://127.0.0.1:9", progress=False)
-    assert "&lt;Test t1 of http://127.0.0.1:9&gt;: " in gone.test("t1")._repr_html_()
+    line = "&lt;Test t000001-abcdef of http://127.0.0.1:9&gt;: "
+    assert line in gone.test("t000001-abcdef")._repr_html_()
+    # a step that was not measured yet is not simply unknown
+    (service.tests.analyses.path(test.id, made.id) / "step_0002.nc").unlink()
+    with pytest.raises(StereorigError, match=r"has no result for step 2\. It has measured 2 of 3 steps"):
+        test.analysis(made.id).field("w_mm", step=2)
 
 
 @pytest.mark.deep

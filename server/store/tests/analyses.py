@@ -150,8 +150,11 @@ class AnalysisStore:
         if n not in self.finished_steps(test_id, analysis_id):
             summary = self.summary(test_id, analysis_id)
             problem = None if summary is None else summary.steps_failed.get(str(n))
-            failed = "" if problem is None else f" It failed: {problem.code}: {problem.detail}"
-            raise NotFoundError(f"Analysis {analysis_id} has no result for step {n}.{failed}", kind="result")
+            why = "" if problem is None else f" It failed: {problem.code}: {problem.detail}"
+            there, wanted = self.finished_steps(test_id, analysis_id), self.read(test_id, analysis_id).steps
+            if problem is None and n in wanted:
+                why = f" It has measured {len(there)} of {len(wanted)} steps: wait for it, or continue it."
+            raise NotFoundError(f"Analysis {analysis_id} has no result for step {n}.{why}", kind="result")
         require_sound(path)
         return path
 
