@@ -10,7 +10,7 @@ from stereorig.core.arrays import Float
 from stereorig.core.calibration.checks.agreement import share_of_own_poses
 from stereorig.core.calibration.checks.measures import CheckMeasures, Measures, mean_of_cameras, measure_points, pooled
 from stereorig.core.calibration.checks.positions import PositionCheck
-from stereorig.core.calibration.choice.declared import ASPECTS, AXES, POSITIONS, SCALE, SCALE_GROUPS
+from stereorig.core.calibration.choice.declared import ASPECTS, AXES, POSITIONS, SCALE, SCALE_GROUPS, TURNS
 from stereorig.core.calibration.choice.held_out import HeldOutView, held_out_view
 from stereorig.core.calibration.choice.lens import Chosen
 from stereorig.core.calibration.choice.screening import points_mm
@@ -161,7 +161,7 @@ def _errors_found(chosen: Chosen) -> dict[Cause, Float]:
     for found in chosen.structure:
         if found.camera is not None:
             continue
-        cause: Cause = "stage" if found.name in (POSITIONS, AXES, *SCALE_GROUPS) else "target"
+        cause: Cause = "stage" if found.name in (POSITIONS, AXES, TURNS, *SCALE_GROUPS) else "target"
         if found.name in SCALE_GROUPS:
             own = _by_scale(adjustment) * found.terms.get(SCALE, (0.0, 0.0))[0]
         elif found.freed is not None:

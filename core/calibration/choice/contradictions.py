@@ -12,10 +12,12 @@ from stereorig.core.calibration.choice.declared import (
     ASPECTS,
     AXES,
     DECLARED,
+    MOVED,
     POSITIONS,
     SCALE,
     SCALE_GROUPS,
     SCALES,
+    TURNS,
     position_name,
 )
 from stereorig.core.calibration.choice.screening import Screened, fit_screened
@@ -147,8 +149,8 @@ def in_words(screened: Screened, found: Sequence[tuple[Structure, Group]], score
         elif group.name == POSITIONS:
             out.append(replace(structure, sentence=_positions(screened.adjustment, group, score, given)))
         else:
-            sentence = _axes(screened, structure) if group.name == AXES else _moved(screened, structure)
-            out.append(replace(structure, sentence=sentence))
+            worded = {AXES: _axes, TURNS: _turns, MOVED: _moved}[group.name]
+            out.append(replace(structure, sentence=worded(screened, structure)))
     return out
 
 
@@ -245,6 +247,14 @@ def _axes(screened: Screened, structure: Structure) -> str:
         f"{1e3 * screened.problem.options.axis_tilt_sigma_rad:g} (axis_tilt_sigma_rad). A thin prism or a tilted "
         "sensor would leave nearly the same residuals."
     )
+
+
+def _turns(_: Screened, structure: Structure) -> str:
+    """Put stages that turn what they carry in words."""
+    turns = np.array([v for v, _ in structure.terms.values()]).reshape(-1, 3)
+    sizes = " and ".join(f"{1e3 * size:.2g}" for size in np.linalg.norm(turns, axis=1))
+    who = "The stages turn what they carry" if len(turns) > 1 else "The stage turns what it carries"
+    return f"{who} by {sizes} mrad over the travel (pitch, yaw and roll)."
 
 
 def _moved(screened: Screened, structure: Structure) -> str:

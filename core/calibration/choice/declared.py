@@ -20,9 +20,11 @@ from stereorig.core.calibration.fit.observations import ViewRows
 
 SCALE, SCALES, ASPECT, ASPECTS = "stage over pitch", "stages over pitch", "aspect ratio", "aspect ratios"
 POSITIONS, MOVED, AXES = "positions", "moved target", "stage axes"
+#: a stage's pitch, yaw and roll, in proportion to its travel
+TURNS = "stage turns"
 #: the contradiction of two measures of a millimetre; one number explains any of these nearly as well
 SCALE_GROUPS = (SCALE, ASPECT, SCALES, ASPECTS)
-DECLARED = (*SCALE_GROUPS, AXES, POSITIONS, MOVED)
+DECLARED = (*SCALE_GROUPS, AXES, TURNS, POSITIONS, MOVED)
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class DeclaredTerms:
 
 
 def declared_terms(
-    adjustment: Adjustment, views: Sequence[ViewRows], lins: Sequence[Linearised], first: int
+    adjustment: Adjustment, views: Sequence[ViewRows], lins: Sequence[Linearised], nominal_nodes_mm: Float, first: int
 ) -> DeclaredTerms:
     """Return the terms of a stage's views; of free poses alone there are none.
 
@@ -54,8 +56,8 @@ def declared_terms(
     ----------
     adjustment
         The minimum.
-    views, lins
-        Its views and their derivatives there.
+    views, lins, nominal_nodes_mm
+        Its views, their derivatives there, and nominal points (n, 3).
     first
         Place of the first term.
     """
@@ -65,7 +67,10 @@ def declared_terms(
         return DeclaredTerms((), (none,) * len(views), tuple(np.zeros((len(v.found), 2, 0)) for v in views), 0)
     positions = [sorted({v.dz_mm for v in views if v.camera == c and v.dz_mm is not None}) for c in range(2)]
     axes = sorted({axis for axis, _ in layout.steps})
-    rows = [_of_view(layout, view, lin, positions) for view, lin in zip(views, lins, strict=True)]
+    # a turn about each axis of the target displaces its points by these
+    arms = np.stack([np.cross(axis, nominal_nodes_mm) for axis in np.eye(3)], axis=-1)
+    arms /= max(abs(dz) for _, dz in layout.steps) or 1.0
+    rows = [_of_view(layout, view, lin, positions, arms) for view, lin in zip(views, lins, strict=True)]
     groups: list[tuple[str, tuple[str, ...]]] = [(SCALE, ("pitch",))]
     # an aspect ratio that the views are free to find contradicts nothing
     if not layout.frames:
@@ -75,6 +80,7 @@ def declared_terms(
         groups.append((SCALES, tuple(f"stage {axis + 1}" for axis in axes)))
     if layout.moves == "cameras":
         groups.append((AXES, tuple(f"{way} tilt {c + 1}" for c in range(2) for way in "xy")))
+    groups.append((TURNS, tuple(f"turn {way} {axis + 1}" for axis in axes for way in "XYZ")))
     groups.append((POSITIONS, tuple(position_name(*step) for step in layout.steps)))
     if len(positions[0]) == len(positions[1]):
         groups.append((MOVED, tuple(f"{way} {k}" for k in range(1, len(positions[0])) for way in "XY")))
@@ -100,7 +106,9 @@ def position_name(axis: int, dz_mm: float) -> str:
     return f"axis {axis + 1} at {dz_mm:+.3f} mm"
 
 
-def _of_view(layout: Layout, view: ViewRows, lin: Linearised, positions: Sequence[Sequence[float]]) -> dict[str, Float]:
+def _of_view(
+    layout: Layout, view: ViewRows, lin: Linearised, positions: Sequence[Sequence[float]], arms: Float
+) -> dict[str, Float]:
     """Return derivatives (n, 2) of a view's image over the terms that it feels, by their names."""
     at = {int(k): lin.by_unknown[..., j] for j, k in enumerate(lin.columns)}
     aspect = at[layout.lens(view.camera).stop - 1]
@@ -112,6 +120,8 @@ def _of_view(layout: Layout, view: ViewRows, lin: Linearised, positions: Sequenc
     if layout.moves == "cameras":
         first = layout.tilt(view.camera).start
         out.update({f"{way} tilt {view.camera + 1}": at[first + k] for k, way in enumerate("xy")})
+    turned = view.dz_mm * (lin.by_node @ arms)
+    out.update({f"turn {way} {axis + 1}": turned[..., k] for k, way in enumerate("XYZ")})
     step = layout.step(axis, view.dz_mm)
     if step is not None:
         out[position_name(axis, view.dz_mm)] = at[step]

@@ -343,7 +343,7 @@ def _extras(
     half = np.abs(nominal_nodes_mm[:, :2]).max()
     X, Y = (nominal_nodes_mm[:, :2] / half).T
     lins = linearise_all(layout, state, views, nominal_nodes_mm)
-    declared = declared_terms(adjustment, views, lins, at)
+    declared = declared_terms(adjustment, views, lins, nominal_nodes_mm, at)
     groups.extend(Group(label, None, terms, own) for label, terms, own in declared.groups)
     extras = []
     for k, (view, lin) in enumerate(zip(views, lins, strict=True)):

@@ -337,6 +337,7 @@ def _modern_rig(
     shear: float = 0.0,
     stretch: float = 0.0,
     aspects: tuple[float, float] = (1.0, 1.0),
+    turns_rad: Array | None = None,
     bend_mm: Array | None = None,
     tau_rad: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (0.0, 0.0)),
     noise_px: float = 0.02,
@@ -368,10 +369,12 @@ def _modern_rig(
     rng = np.random.default_rng(seed)
     along = np.array([*axis_rad, np.sqrt(1.0 - np.square(axis_rad).sum())])
     views = []
-    for name, camera in zip(CAMERAS, cameras, strict=True):
-        for dz in np.linspace(0.0, 0.1 * standoff_mm, 6):
+    for name, camera, turn in zip(CAMERAS, cameras, np.zeros((2, 3)) if turns_rad is None else turns_rad, strict=True):
+        for share in np.linspace(0.0, 1.0, 6):
+            dz = share * 0.1 * standoff_mm
             moved = camera.moved((long * dz + step_mm * rng.standard_normal()) * along)
-            views.append(CalibrationView(name, float(dz), observed(moved, points, rng, noise_px)))
+            turned = points @ Rotation.from_rotvec(share * turn).as_matrix().T
+            views.append(CalibrationView(name, float(dz), observed(moved, turned, rng, noise_px)))
     nominal = NominalValues(size, focal_px, standoff_mm, -12.5), NominalValues(size, focal_px, standoff_mm, 12.5)
     return views, GridTarget(pitch_mm=pitch_mm, lines=(13, 13), line_width_mm=0.8), nominal, cameras
 
@@ -438,6 +441,24 @@ def test_what_an_unstated_aspect_ratio_or_a_sheared_target_would_do_is_named_wit
         squares += aligned_rms_um(off.pair.triangulate(*seen).xyz_mm, before) ** 2
     assert float(said[1]) == pytest.approx(0.01, rel=0.4)
     assert float(said[2]) == pytest.approx(np.sqrt(squares) * float(said[1]) / 0.01, rel=0.15)
+
+
+@pytest.mark.parametrize("lens", [(-0.05, 0.1, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0)])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_stages_that_turn_over_their_travel_are_named_with_the_angle_and_reported(
+    lens: tuple[float, ...], seed: int
+) -> None:
+    turns_rad = 1.5e-4 * np.random.default_rng(seed).standard_normal((2, 3))
+    views, target, nominal, cameras = _modern_rig(25.0, lens, turns_rad=turns_rad, seed=seed)
+    result = calibrate(views, target, nominal)
+    assert result.verdict.level == "warning"
+    said = [re.search(r"by ([0-9.]+) and ([0-9.]+) mrad over the travel", reason) for reason in result.verdict.reasons]
+    (found,) = (m for m in said if m)
+    true_mrad = 1e3 * np.linalg.norm(turns_rad, axis=1)
+    np.testing.assert_allclose([float(found[1]), float(found[2])], true_mrad, atol=0.05)
+    # up to five times as much as reported where none was looked for
+    true_um = rig_shape_error_um(result.pair, cameras, result.uncertainty.points_mm)
+    assert true_um < 2e3 * result.uncertainty.shape_rms_mm
 
 
 @pytest.mark.parametrize("lens", [(-0.05, 0.1, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0)])
