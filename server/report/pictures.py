@@ -27,6 +27,7 @@ from stereorig.server.report.items import shown_unit
 Lines = dict[str, tuple[Sequence[float | None], Sequence[float | None] | None]]
 _HALF = FigureStyle(width_px=960, dots_per_inch=210)
 _MAX_PX = 900
+_LITTLE = 1  # compression of a PNG that is cropped and compressed again
 _COLOURS = ("#1b4f72", "#b9770e", "#7d3c98", "#1e8449", "#a93226", "#5d6d7e", "#2e86c1", "#6e2c00")
 _VALID, _INVALID = "#00d9a0", "#ff4060"
 
@@ -62,14 +63,14 @@ def field_map(
     scale = scale_of_image(*places)
     axes = directions_of(*places)
     picture = FigureData(shown, field.x_px, field.y_px, name, units, title, cuts=field.cuts, axes=axes, px_per_mm=scale)
-    return _cropped(draw(picture, _HALF, "png"))
+    return _cropped(draw(picture, _HALF, "png", compression=_LITTLE))
 
 
 def status_map(field: Field, title: str) -> bytes:
     """Draw the state of each point; PNG."""
     names = {s.value: s.name.lower().replace("_", " ") for s in PointStatus}
     drawn = FigureData(field.status, field.x_px, field.y_px, "status", "1", title, cuts=field.cuts, flags=names)
-    return _cropped(draw(drawn, _HALF, "png"))
+    return _cropped(draw(drawn, _HALF, "png", compression=_LITTLE))
 
 
 def strain_values(strain: StrainField, k: int) -> Float:

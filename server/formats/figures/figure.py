@@ -140,12 +140,13 @@ def _pitch(along: Float, other: Float) -> float:
     return 1.0
 
 
-def draw(picture: FigureData, style: FigureStyle, form: PictureForm) -> bytes:
-    """Draw a picture; return the file's bytes."""
+def draw(picture: FigureData, style: FigureStyle, form: PictureForm, *, compression: int | None = None) -> bytes:
+    """Draw a picture; return the file's bytes, a PNG's compressed by this level (0 to 9; None: as by default)."""
     with _drawing, mpl.rc_context({"svg.fonttype": "none"}):
         figure = Drawing(picture, style).figure
         out = io.BytesIO()
-        figure.savefig(out, format=form, metadata=_metadata(picture, form))
+        how = {} if compression is None else {"pil_kwargs": {"compress_level": compression}}
+        figure.savefig(out, format=form, metadata=_metadata(picture, form), **how)
     return out.getvalue()
 
 
