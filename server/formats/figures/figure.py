@@ -145,8 +145,11 @@ def draw(picture: FigureData, style: FigureStyle, form: PictureForm, *, compress
     with _drawing, mpl.rc_context({"svg.fonttype": "none"}):
         figure = Drawing(picture, style).figure
         out = io.BytesIO()
-        how = {} if compression is None else {"pil_kwargs": {"compress_level": compression}}
-        figure.savefig(out, format=form, metadata=_metadata(picture, form), **how)
+        about = _metadata(picture, form)
+        if compression is None:
+            figure.savefig(out, format=form, metadata=about)
+        else:
+            figure.savefig(out, format=form, metadata=about, pil_kwargs={"compress_level": compression})
     return out.getvalue()
 
 
