@@ -8,9 +8,8 @@ from scipy.spatial.transform import Rotation
 from stereorig.core.arrays import Bool, Float
 from stereorig.core.field.points.result import Field
 from stereorig.core.matching.geometry import tangent_frames
-from stereorig.core.strain.on_surface import strain_covariance
 from stereorig.core.strain.result import StrainField
-from stereorig.core.strain.tensors import pulls_of
+from stereorig.core.strain.tensors import pulls_of, strain_slopes
 
 
 def reference_share(field: Field, strain: StrainField, points: Bool | None = None) -> Float | None:
@@ -44,16 +43,14 @@ def reference_share(field: Field, strain: StrainField, points: Bool | None = Non
     frame = tangent_frames(field.normal_sys[good])[..., :2]
     gradient = _moved(field, good, frame) - frame
     per_mm = np.linalg.inv(np.swapaxes(frame, -1, -2) @ _grid_tangents(field)[good])
-    # a whole window's slopes are equally sure along columns and rows
-    spread = np.asarray(per_mm), np.tile(np.eye(2), (len(per_mm), 1, 1))
-    pulls, own = pulls_of(frame, gradient, strain.options.tensor), field.covariance[good]
+    tensor = strain.options.tensor
+    by_slope = strain_slopes(pulls_of(frame, gradient, tensor), tensor, per_mm, strain.strain[good]).reshape(-1, 6, 6)
+    own = field.covariance[good]
     reference = own.copy()
     reference[:, 3:, 3:] = field.frozen[good]
+    # a whole window's slopes are equally sure along columns and rows
     variance, of_reference = (
-        np.diagonal(
-            strain_covariance(pulls, strain.options.tensor, noise, spread, strain.strain[good]), axis1=1, axis2=2
-        )
-        for noise in (own, reference)
+        ((by_slope @ noise) * by_slope).sum(axis=2).reshape(-1, 3, 2).sum(axis=2) for noise in (own, reference)
     )
     out = np.full((*field.shape, 3), np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
