@@ -42,7 +42,7 @@ def reference_share(field: Field, strain: StrainField, points: Bool | None = Non
         good &= points
     frame = tangent_frames(field.normal_sys[good])[..., :2]
     gradient = _moved(field, good, frame) - frame
-    per_mm = np.linalg.inv(np.swapaxes(frame, -1, -2) @ _grid_tangents(field)[good])
+    per_mm = np.asarray(np.linalg.inv(np.swapaxes(frame, -1, -2) @ _grid_tangents(field)[good]), dtype=np.float64)
     tensor = strain.options.tensor
     by_slope = strain_slopes(pulls_of(frame, gradient, tensor), tensor, per_mm, strain.strain[good]).reshape(-1, 6, 6)
     own = field.covariance[good]
