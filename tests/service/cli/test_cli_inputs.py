@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -254,6 +256,13 @@ def test_wrong_usage_is_one_line(arguments: list[str], capsys: pytest.CaptureFix
         assert out.err.startswith("stereorig: wrong_usage: ")
         assert "Remedy: " in out.err
         assert out.err.count("\n") == 1
+
+
+def test_the_command_line_runs_as_a_module() -> None:
+    asked = [sys.executable, "-m", "stereorig", "frobnicate"]
+    ended = subprocess.run(asked, capture_output=True, text=True, check=False, timeout=120)
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert ended.stderr.startswith("stereorig: wrong_usage: ")
 
 
 def test_durations_read_as_people_say_them() -> None:
