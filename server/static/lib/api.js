@@ -146,9 +146,11 @@ export const get = async (path, query, signal) => json(await send("GET", path, {
  * @param {P & Address<"post", P>} path
  * @param {Body<"post", P>} [body]
  * @param {Query<"post", P>} [query]
+ * @param {AbortSignal} [signal]
  * @returns {Promise<Reply<"post", P>>}
  */
-export const post = async (path, body, query) => json(await send("POST", path, { body, query: /** @type {Asked | undefined} */ (query), making: true }));
+export const post = async (path, body, query, signal) =>
+  json(await send("POST", path, { body, query: /** @type {Asked | undefined} */ (query), making: true, signal }));
 
 /**
  * @template {string} const P

@@ -1,4 +1,4 @@
-// Round numbers: 1, 2 or 5 times a power of ten, and even marks of such steps.
+// Round numbers: 1, 2 or 5 times a power of ten, even marks of such steps; and even parts of a list.
 
 /**
  * 1, 2 or 5 times a power of ten, not above `value`; 1 if there is none.
@@ -24,3 +24,11 @@ export function marks(low, high, max = 5) {
   for (let v = Math.ceil(low / step - 1e-9) * step; v <= high + 1e-9 * step; v += step) out.push(Math.abs(v) < 1e-9 * step ? 0 : Number(v.toPrecision(12)));
   return out;
 }
+
+/**
+ * So many entries of a list, evenly spread, its first and last among them; all if there are no more.
+ * @param {readonly number[]} all
+ * @param {number} most
+ */
+export const spread = (all, most) =>
+  all.length <= most ? [...all] : Array.from({ length: most }, (_, k) => all[Math.round((k * (all.length - 1)) / (most - 1))]);

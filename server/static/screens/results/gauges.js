@@ -71,9 +71,10 @@ export function gauges(screen) {
     const now = `${screen.step} ${screen.info?.key} ${result.frame}`;
     if (now === last) return;
     last = now;
-    if (state.line) await panels.line.read().catch(notify);
-    else if (more.kept.length) await more.draw().catch(notify);
-    if (state.area && screen.info) await panels.area.read().catch(notify);
+    // the map does not wait for them: a history is read over all steps
+    const line = state.line ? panels.line.read() : more.kept.length ? more.draw() : null;
+    line?.catch(notify);
+    if (state.area && screen.info) panels.area.read().catch(notify);
   });
   screen.landed.add(() => Promise.all([panels.extensometer.read(), panels.area.read()]).catch(notify)); // histories of all steps
   screen.ends.push(() => each.forEach((one) => one.close()));

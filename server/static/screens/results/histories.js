@@ -1,7 +1,11 @@
 // Abscissas of histories: step number, time, load, a channel, the number in the label.
-import { channelsOfSteps } from "../../lib/steps.js";
-import { h, select, replace } from "../../lib/dom.js";
+import * as api from "../../lib/api.js";
+import { spread } from "../../lib/even.js";
+import { channelsOfSteps, readGauges } from "../../lib/steps.js";
+import { h, select, replace, count } from "../../lib/dom.js";
 
+/** @import { Body, GaugeReadings } from "#routes" */
+/** @import { Viewer } from "../results.js" */
 /** @import { Result } from "./analysis.js" */
 
 /** @type {WeakMap<Result, { steps: number, found: Map<number, { [name: string]: number }> }>} step -> its channels */
@@ -74,4 +78,62 @@ export function abscissas(result) {
       return choice.selectedOptions[0]?.text ?? "";
     },
   };
+}
+
+const COARSE = 25; // steps that a history begins with
+const MOST = 300; // steps of a history: a plot has few more pixels for their points
+
+/**
+ * Readings of gauges over the steps. Of a long test the plot comes first with a few steps, then with more in between;
+ * a new question, and leaving the screen, end the work on the one before.
+ * @param {Viewer} screen
+ */
+export function gaugeHistory(screen) {
+  const { result } = screen;
+  const note = h("p.quiet", { role: "status", hidden: true, "data-role": "thinned" });
+  /** @type {AbortController | null} */
+  let going = null;
+  let asked = "";
+  let again = false;
+  screen.ends.push(() => going?.abort());
+
+  /**
+   * @param {Body<"post", "/tests/{test_id}/analyses/{analysis_id}/gauges">} body
+   * @param {(steps: GaugeReadings[]) => unknown} draw called with more and more readings, in the order of the steps
+   */
+  async function read(body, draw) {
+    const { steps, path, frame } = result;
+    const question = JSON.stringify([body, frame]);
+    again = going !== null && question === asked; // more steps are finished: they are read once this has ended
+    if (again) return;
+    going?.abort();
+    const mine = new AbortController();
+    const { signal } = mine;
+    going = mine;
+    asked = question;
+    const long = steps.length > COARSE;
+    const coarse = spread(steps, COARSE);
+    const shown = spread(steps, MOST);
+    const rest = shown.filter((n) => !coarse.includes(n));
+    /** @type {Map<number, GaugeReadings>} */
+    const found = new Map();
+    const put = async (/** @type {GaugeReadings[]} */ part) => {
+      if (signal.aborted) return;
+      for (const one of part) found.set(one.n, one);
+      note.hidden = !long || found.size >= steps.length;
+      note.textContent = `${count(found.size)} of ${count(steps.length)} steps, evenly spread${found.size < shown.length ? "; more are being read" : ""}. The table that Export saves has all.`;
+      await draw([...found.values()].sort((a, b) => a.n - b.n));
+    };
+    try {
+      await put(await readGauges(path, long ? { ...body, steps: coarse } : body, { frame }, signal));
+      // the first step defines the frame, so each part has it
+      if (rest.length) await put(await readGauges(path, { ...body, steps: [steps[0], ...rest] }, { frame }, signal, put));
+    } catch (error) {
+      if (!api.aborted(error)) throw error;
+    } finally {
+      if (going === mine) going = null;
+    }
+    if (again && !signal.aborted) await read(body, draw);
+  }
+  return { read, note };
 }

@@ -1,10 +1,9 @@
 // An area: statistics of the shown field in a rectangle, over the steps.
-import { readGauges } from "../../../lib/steps.js";
 import { h, replace, table, field, notify } from "../../../lib/dom.js";
 import { amount, shown, uncertain } from "../../../lib/units.js";
 import { banded, chartIn } from "../../../widgets/plots.js";
 import { isRelative, pretty, shownUnit } from "../analysis.js";
-import { abscissas } from "../histories.js";
+import { abscissas, gaugeHistory } from "../histories.js";
 import { budgetTable, withBudget } from "../uncertainty.js";
 import { clear, four } from "./shared.js";
 
@@ -28,6 +27,7 @@ export function areaPanel(my) {
     state.area = v;
     return my.changed("area");
   });
+  const history = gaugeHistory(screen);
   /** @type {Answer | null} */
   let answer = null;
 
@@ -36,10 +36,11 @@ export function areaPanel(my) {
     if (screen.info.component !== null) return void replace(box, h("p.quiet", "An area needs a scalar field; choose another field."));
     const { name } = screen.info;
     if (!box.firstChild) replace(box, h("p.quiet", "Reading …"));
-    const steps = await readGauges(result.path, my.body({ areas: [{ rectangle_px: state.area }], variables: [name] }), { frame: result.frame });
-    await against.fill();
-    answer = { name, steps };
-    draw();
+    await history.read(my.body({ areas: [{ rectangle_px: state.area }], variables: [name] }), async (steps) => {
+      await against.fill();
+      answer = { name, steps };
+      draw();
+    });
   }
 
   function draw() {
@@ -89,6 +90,7 @@ export function areaPanel(my) {
     h("summary", "Areas"),
     h("p.quiet", "Choose the tool Area and drag a rectangle, or give its corners."),
     h("div.row", inputs.row, field("Area against", against.choice), clear(my, "area", close, [plot.box, box])),
+    history.note,
     plot.box,
     box,
   );

@@ -1,9 +1,8 @@
 // Extensometers: elongation, length and strain between two points over the steps.
-import { readGauges } from "../../../lib/steps.js";
 import { h, numeric, replace, table, tick, select, field, notify } from "../../../lib/dom.js";
 import { amount, shown, uncertain } from "../../../lib/units.js";
 import { banded, chartIn } from "../../../widgets/plots.js";
-import { abscissas } from "../histories.js";
+import { abscissas, gaugeHistory } from "../histories.js";
 import { budgetTable, withBudget } from "../uncertainty.js";
 import { four, nextName, times } from "./shared.js";
 
@@ -39,6 +38,7 @@ export function extensometersPanel(my) {
     state.extensometers.push({ name: nextName(state), a: [x0, y0], b: [x1, y1] });
     return my.changed("extensometer");
   });
+  const history = gaugeHistory(screen);
   /** @type {GaugeReadings[] | null} */
   let answer = null;
 
@@ -51,32 +51,34 @@ export function extensometersPanel(my) {
     }
     if (!answer) replace(box, h("p.quiet", "Reading …"));
     const asked = my.body({ extensometers: state.extensometers.map((one) => ({ name: one.name, a_px: one.a, b_px: one.b })) });
-    answer = await readGauges(result.path, asked, { frame: result.frame });
-    await against.fill();
-    await draw();
+    await history.read(asked, async (steps) => {
+      answer = steps;
+      await against.fill();
+      await draw();
+    });
   }
 
   async function draw() {
     if (!answer) return;
-    const history = historyOf(screen, answer, quantity.value, against);
+    const found = historyOf(screen, answer, quantity.value, against);
     const names = state.extensometers.map((one) => one.name);
-    const each = (/** @type {"value" | "sigma"} */ part) => history.rows.map((one) => names.map((_, k) => history.of(one, k, part)));
-    const drawn = curves(history, names, interval);
+    const each = (/** @type {"value" | "sigma"} */ part) => found.rows.map((one) => names.map((_, k) => found.of(one, k, part)));
+    const drawn = curves(found, names, interval);
     plot.box.dataset.answer = JSON.stringify({ x: drawn.data[0], value: each("value"), sigma: each("sigma") });
     await plot.draw({
       x: against.text,
-      y: `${quantity.selectedOptions[0].text.replace(" (mm)", "")} (${history.to.unit})`,
+      y: `${quantity.selectedOptions[0].text.replace(" (mm)", "")} (${found.to.unit})`,
       height: 320,
       said: interval.text,
       ...drawn,
       label: `${quantity.value} of the extensometers`,
     });
     const abscissa = against.choice.value === "n" ? [] : [numeric(against.text, (/** @type {Row} */ one) => tick(one.x))];
-    const columns = names.map((name, k) => numeric(name, (/** @type {Row} */ one) => valueText(history, one, k, interval)));
+    const columns = names.map((name, k) => numeric(name, (/** @type {Row} */ one) => valueText(found, one, k, interval)));
     const caption = `± ${interval.text}`;
     replace(
       box,
-      table([["Step", (one) => one.n], ["Label", (one) => one.label], ...abscissa, ...columns], history.rows, { caption }),
+      table([["Step", (one) => one.n], ["Label", (one) => one.label], ...abscissa, ...columns], found.rows, { caption }),
       h("div.row", state.extensometers.map(remove)),
     );
   }
@@ -98,6 +100,7 @@ export function extensometersPanel(my) {
     h("p.quiet", "Choose the tool Extensometer and click its two ends, or give them."),
     inputs.row,
     h("div.row", field("Show", quantity), field("Against", against.choice)),
+    history.note,
     plot.box,
     box,
   );
