@@ -1,4 +1,4 @@
-"""Parameters by their names, as types: those of a measurement in memory.
+"""Parameters by their names, as types: a measurement in memory.
 
 Written by ``python -m tests.bench.documents.parameters`` from the request models, which have bounds and meanings.
 """

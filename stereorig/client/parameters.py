@@ -1,4 +1,4 @@
-"""Parameters by their names, as types: those of the service's requests.
+"""Parameters by their names, as types: the requests of the service.
 
 Written by ``python -m tests.bench.documents.parameters`` from the request models, which have bounds and meanings.
 """

@@ -32,11 +32,11 @@ from typing import Any, Literal, TypedDict
 #: file -> what its first line says, and its models
 FILES: dict[Path, tuple[str, dict[str, type[BaseModel]]]] = {
     ROOT / "stereorig/parameters.py": (
-        "those of a measurement in memory",
+        "a measurement in memory",
         {"MeasurementParameters": AnalysisSettings, "StrainParameters": StrainSettings},
     ),
     ROOT / "stereorig/client/parameters.py": (
-        "those of the service's requests",
+        "the requests of the service",
         {
             "AnalysisParameters": AnalysisRequest,
             "CalibrationParameters": CalibrationRequest,
