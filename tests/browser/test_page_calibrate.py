@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Download, Page, expect
 
+from stereorig.core.boards import BoardTarget
 from stereorig.core.names import CameraName
 from stereorig.server.config.rig_file import parse_config
 from stereorig.server.workflows.service import Service
+from tests.support.board_views import camera_pair, hand_poses, render_views, write_views
 from tests.support.page_bench import Watched, watched
 from tests.support.service_rig import SMALL, wait_for_job, wait_for_rig
 
@@ -313,3 +315,45 @@ def test_targets_are_printed_and_measured_on_the_page(page: Watched, client: htt
     # by hand: the mean of 0.9993 and 1.002, and of 0.05/100 and 0.05/200
     expect(shown.locator('[data-role="print-scale"]')).to_contain_text("scale 1.00065 ± 0.00038")
     assert f"pitch_mm = {rigs * 1.00065:.9g}" in Path(measured.value.path()).read_text(encoding="utf-8")
+
+
+def test_images_at_hand_are_calibrated_from_and_fitted_again_without_a_view(
+    page: Watched, client: httpx.Client, tmp_path: Path
+) -> None:
+    target, size = BoardTarget(kind="checkerboard", size=(11, 8), pitch_mm=4.0), (612, 512)
+    cameras = camera_pair(focal_px=1000.0, size_px=size)
+    views = render_views(target, hand_poses(target, cameras, range(9), size_px=size), cameras, size_px=size)
+    folder = write_views(tmp_path / "views", views, target, cameras, nominal=False)
+    shown = page.open("#/calibrate")
+    panel = shown.get_by_role("region", name="Calibrate from images")
+    panel.locator("summary").click()
+    for n in (1, 2):
+        panel.get_by_label(f"Camera {n}'s images").set_input_files(sorted(folder.glob(f"cam{n}_*.tif")))
+    expect(panel.locator('[data-role="pairs"]')).to_contain_text("9 pairs")
+    start = panel.get_by_role("button", name="Calibrate from these images")
+    start.click()  # what is missing is said, and nothing is sent
+    expect(panel.get_by_role("alert").first).to_be_visible()
+    for label, value in (
+        ("Points or lines across", "11"),
+        ("Points or lines down", "8"),
+        ("Distance of points or lines", "4"),
+        ("Focal length", "10"),
+        ("Width of a pixel", "10"),
+        ("Name it", "own images"),
+    ):
+        panel.get_by_label(label).fill(value)
+    start.click()
+    verdict = shown.get_by_role("region", name="Verdict")
+    expect(verdict).to_contain_text("own images", timeout=SLOW)
+    first = newest(client)
+    assert client.get(f"{API}/calibrations/{first}").json()["plan"]["label"] == "own images"
+    expect(start).to_be_enabled(timeout=SLOW)  # what is shown is drawn a last time
+    # both images of a ticked pair are left out, and the first calibration is kept
+    shown.get_by_text("Each view", exact=True).click()
+    shown.get_by_role("checkbox", name=re.compile("^Leave out 002_cam1")).check()
+    shown.get_by_role("button", name="Fit again without the ticked views").click()
+    expect(verdict).to_contain_text("own images without 2", timeout=SLOW)
+    second = client.get(f"{API}/calibrations/{newest(client)}").json()
+    assert second["id"] != first
+    assert {view["index"] for view in second["taken"]} == set(range(9)) - {2}
+    page.sound()
