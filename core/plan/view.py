@@ -1,13 +1,16 @@
-"""The view of a planned camera: field, size of a pixel, depth of field, blur by motion, size of a good speckle.
+"""The view of a planned camera: field, size of a pixel, depth of field, blur by motion, light, size of a good speckle.
 
 Whatever needs a value that is not stated is None, and the value is named.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 _SPECKLE_PX = (3.0, 5.0)
+# luminous flux of green light (555 nm, the candela's definition), and the energy of one of its photons
+_LM_PER_W, _PHOTON_J = 683.0, 6.62607e-34 * 2.99792e8 / 555e-9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +30,9 @@ class PlannedView:
         is None if it has no end.
     blur_px
         Motion during the exposure, across the optical axis.
+    photons_at_1000_lx
+        Photons of green light that a pixel gets in the exposure from a matt white surface lit with 1,000 lx, on the
+        axis; the lens's own losses are not taken off.
     missing
         Names of the values that are not stated and would give more.
     """
@@ -36,6 +42,7 @@ class PlannedView:
     speckle_mm: tuple[float, float]
     depth_mm: tuple[float, float | None] | None
     blur_px: float | None
+    photons_at_1000_lx: float | None
     missing: tuple[str, ...]
 
 
@@ -71,6 +78,11 @@ def planned_view(
     blur = None
     if exposure_ms is not None and speed_mm_s is not None:
         blur = 1e-3 * exposure_ms * speed_mm_s / mm_per_px
+    photons = None
+    if focal_mm is not None and f_number is not None and exposure_ms is not None:
+        # a matt white surface has the luminance E / pi; a pixel takes that of its square into the pupil's solid angle
+        lumen = 1e3 / math.pi * (1e-3 * mm_per_px) ** 2 * math.pi / 4.0 * (focal_mm / f_number / standoff_mm) ** 2
+        photons = 1e-3 * exposure_ms * lumen / _LM_PER_W / _PHOTON_J
     stated = {"focal_mm": focal_mm, "f_number": f_number, "exposure_ms": exposure_ms, "speed_mm_s": speed_mm_s}
     return PlannedView(
         field_mm=(image_size_px[0] * mm_per_px, image_size_px[1] * mm_per_px),
@@ -78,5 +90,6 @@ def planned_view(
         speckle_mm=(_SPECKLE_PX[0] * mm_per_px, _SPECKLE_PX[1] * mm_per_px),
         depth_mm=depth,
         blur_px=blur,
+        photons_at_1000_lx=photons,
         missing=tuple(name for name, value in stated.items() if value is None),
     )

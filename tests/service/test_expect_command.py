@@ -104,13 +104,16 @@ def test_what_the_cameras_see_follows_from_what_is_stated(capsys: pytest.Capture
     assert plain["field_mm"][0] == pytest.approx(2448 * 0.005 * 500.0 / 35.0)
     assert plain["um_per_px"] == pytest.approx(5.0 * 500.0 / 35.0)
     assert plain["speckle_mm"] == pytest.approx([3e-3 * plain["um_per_px"], 5e-3 * plain["um_per_px"]])
-    assert (plain["depth_mm"], plain["blur_px"]) == (None, None)
+    assert (plain["depth_mm"], plain["blur_px"], plain["photons_at_1000_lx"]) == (None, None, None)
     assert plain["missing"] == ["f_number", "exposure_ms", "speed_mm_s"]
     moved = ("--f-number", "8", "--exposure-ms", "10", "--speed-mm-s", "2")
     full = document(capsys, *NOT_THERE, *moved)["views"]["cam2"]
     assert full["missing"] == []
     # 0.02 mm of motion during the exposure
     assert full["blur_px"] == pytest.approx(0.02 / (1e-3 * full["um_per_px"]))
+    # 1,000 lx on matt white are 1,000 / (4 8^2) lx behind f/8, for 10 ms on 25 um^2; 683 lm/W, 3.579e-19 J a photon
+    photons = 1000.0 / (4.0 * 8.0**2) * 0.01 * 25e-12 / 683.0 / 3.579e-19
+    assert full["photons_at_1000_lx"] == pytest.approx(photons, rel=1e-3)
     # a thin lens with the sensor at 35 mm in focus on 500 mm: the cone of a point elsewhere, cut by the sensor
     pupil, sensor = 35.0 / 8.0, 35.0
     for z in (500.0 - full["depth_mm"][0], 500.0 + full["depth_mm"][1]):

@@ -159,6 +159,10 @@ class ExpectedView(Reply):
         "focal length and f-number are not stated."
     )
     blur_px: float | None = Field(description="Motion during the exposure; null if that or the speed is not stated.")
+    photons_at_1000_lx: float | None = Field(
+        description="Photons of green light that a pixel gets in the exposure from a matt white surface lit with "
+        "1,000 lx; null if focal length, f-number or exposure is not stated."
+    )
     missing: list[str] = Field(description="Values that are not stated.", examples=[["f_number"]])
 
 

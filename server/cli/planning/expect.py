@@ -178,6 +178,8 @@ def _seen(view: Mapping[str, Any]) -> str:
         parts.append(f"blurred by less than 1 px from {near:.3g} mm nearer to {end}")
     if view["blur_px"] is not None:
         parts.append(f"blur by motion {view['blur_px']:.3g} px")
+    if view["photons_at_1000_lx"] is not None:
+        parts.append(f"light: {view['photons_at_1000_lx']:.3g} photons a pixel from matt white lit with 1,000 lx")
     if view["missing"]:
         parts.append(f"not stated: {', '.join(view['missing'])}")
     return "; ".join(parts)
