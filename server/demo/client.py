@@ -188,6 +188,11 @@ class ServiceClient:
                 return _READINGS.validate_python(found)
             cursor = {"cursor": page["next_cursor"]}
 
+    def evaluate(self, analysis: AnalysisHandle, name: str, **settings: Any) -> Any:
+        """Return the document of an evaluation, with the settings that it takes."""
+        path = f"/tests/{analysis.test_id}/analyses/{analysis.analysis_id}/evaluations/{name}"
+        return self.call("POST", path, json={"settings": settings}).json()["document"]
+
     def export(self, analysis: AnalysisHandle, step: int) -> bytes:
         """Fetch the result file of one step."""
         path = f"/tests/{analysis.test_id}/analyses/{analysis.analysis_id}/export"
