@@ -132,7 +132,7 @@ def test_a_strain_gauge_has_its_channels_beside_it(analysis: Analysis) -> None:
 @pytest.mark.deep
 @pytest.mark.delivered
 def test_exports_are_written(analysis: Analysis, tmp_path: Path) -> None:
-    assert analysis.export(tmp_path / "a" / "last.csv", "csv", step=4).read_bytes().startswith(b"#")
+    assert analysis.export(tmp_path / "a" / "last.csv", "csv", step=4).read_bytes().startswith(b"row,col,x_px,")
     with pytest.raises(InputError) as refused:
         analysis.export(tmp_path / "b.csv", "csv", step=77)
     assert refused.value.code == "not_found" or "77" in refused.value.cause
