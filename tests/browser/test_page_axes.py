@@ -101,7 +101,8 @@ def test_two_drawings_at_once_list_the_principal_strains_once(page: Watched, ben
     at.route(re.compile("fields/e1"), lambda route: held.append(route))  # both drawings wait for these strains
     at.get_by_label("Field", exact=True).select_option("exx")
     at.get_by_label("Colours", exact=True).select_option("turbo")
-    assert held
+    while not held:
+        at.wait_for_timeout(20)
     for route in held:
         route.continue_()
     expect(at.locator('[data-role="principal-axis"]')).to_have_count(1)

@@ -115,5 +115,5 @@ export async function testsList() {
       if (tests.slice(0, most).some((test) => test.id === id)) draw();
     }),
   ];
-  return { root: h("section.panel", h("div.spread", h("h2", "Tests"), wanted), list), close: () => ends.forEach((end) => end()) };
+  return { root: h("section.panel", h("div.spread", h("h2", "All tests"), wanted), list), close: () => ends.forEach((end) => end()) };
 }
