@@ -22,9 +22,8 @@ from tests.bench.accuracy import blur_in_time as accuracy_blur
 from tests.bench.accuracy import bumps as accuracy_bumps
 from tests.bench.accuracy import calibration as accuracy_calibration
 from tests.bench.accuracy import calibration_beside as accuracy_beside
-from tests.bench.accuracy import coverage as accuracy_coverage
-from tests.bench.accuracy import cracks as accuracy_cracks
 from tests.bench.accuracy import (
+    cards,
     curved,
     gauges,
     lenses_motions,
@@ -34,6 +33,8 @@ from tests.bench.accuracy import (
     rig_campaign,
     sequence,
 )
+from tests.bench.accuracy import coverage as accuracy_coverage
+from tests.bench.accuracy import cracks as accuracy_cracks
 from tests.bench.accuracy import experiments as accuracy_experiments
 from tests.bench.accuracy import faces_speed as accuracy_faces_speed
 from tests.bench.accuracy import large as accuracy_large
@@ -71,6 +72,7 @@ SECTIONS: dict[str, Callable[[Path], Section]] = {
     **accuracy_rim.SECTIONS,
     **accuracy_specimen.SECTIONS,
     **gauges.SECTIONS,
+    "cards": cards.evaluations,
     **accuracy_models.SECTIONS,
     **accuracy_models_images.SECTIONS,
     "cracks": accuracy_cracks.cracks,

@@ -55,6 +55,7 @@ TOPICS = (
     Topic("cracks", "Cracks", ("cracks",)),
     Topic("strain", "Strain", ("strains", "strain-bending", "strain-rim")),
     Topic("gauges", "Gauges", ("gauges",)),
+    Topic("cards", "Cards", ("cards",)),
     Topic("models", "Comparison with a model", ("models", "models-images")),
     Topic("long_sequences", "Long sequences", ("updates",)),
     Topic("smoothing", "Smoothing", ("smoothing",)),
@@ -135,6 +136,10 @@ HEADLINES: dict[tuple[str, str], dict[str, str]] = {
     },
     ("gauges", "Gauges"): {
         "all of these, root mean square": "empirical over reported standard deviation of gauges, rms"
+    },
+    ("cards", "Cards"): {
+        "tensile tests, all laws and numbers: within 95 %": "numbers of tensile tests within their 95 % interval",
+        "cracks, all numbers: within 95 %": "K, T, tip and J of cracks within their 95 % interval",
     },
     ("long_sequences", "Long sequences and later references"): {
         "drift per update, steps of 0.64 px all alike": "bias that each later reference adds"
