@@ -57,8 +57,12 @@ async def create_calibration(
     key: KeyHeader = None,
 ) -> CalibrationAccepted:
     """Move both cameras through the plan before the grid, then fit; the rig file gives the parts left out."""
-    made = await run_in_threadpool(_start, service, body, key)
-    reply = await job_reply(request, service, str(made["job_id"]), wait_s=wait)
+    return await accepted(request, service, await run_in_threadpool(_start, service, body, key), wait)
+
+
+async def accepted(request: Request, service: Service, made: Ids, wait_s: float) -> CalibrationAccepted:
+    """Answer with a calibration that was begun and its job, at once or after a wait."""
+    reply = await job_reply(request, service, str(made["job_id"]), wait_s=wait_s)
     return CalibrationAccepted.model_validate({**reply, "calibration_id": made["calibration_id"]})
 
 

@@ -6,9 +6,10 @@ from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 
 from stereorig.server.api.models import CalibrationAccepted, RepairRequest
-from stereorig.server.api.protocol.dependencies import CalibrationId, KeyHeader, ServiceDep, Wait, job_reply, mark
+from stereorig.server.api.protocol.dependencies import CalibrationId, KeyHeader, ServiceDep, Wait, mark
 from stereorig.server.api.protocol.problems import errors
 from stereorig.server.api.routes.analyses.analyses import mask_of
+from stereorig.server.api.routes.calibrations.calibrations import accepted
 from stereorig.server.base.models import Ids
 from stereorig.server.workflows.calibration.repair import begin
 from stereorig.server.workflows.service import Service
@@ -36,8 +37,7 @@ async def repair_calibration(
     the baseline is kept, the covariance widened. The job fails with a `repair_...` code if a check refuses the repair.
     """
     made = await run_in_threadpool(_start, service, calibration_id, body, key)
-    reply = await job_reply(request, service, str(made["job_id"]), wait_s=wait)
-    return CalibrationAccepted.model_validate({**reply, "calibration_id": made["calibration_id"]})
+    return await accepted(request, service, made, wait)
 
 
 def _start(service: Service, calibration_id: str, body: RepairRequest, key: str | None) -> Ids:

@@ -11,8 +11,9 @@ from pydantic import ValidationError
 
 from stereorig.core.errors import InputError
 from stereorig.server.api.models import CalibrationAccepted
-from stereorig.server.api.protocol.dependencies import CalibrationId, KeyHeader, ServiceDep, Wait, job_reply, mark
+from stereorig.server.api.protocol.dependencies import CalibrationId, KeyHeader, ServiceDep, Wait, mark
 from stereorig.server.api.protocol.problems import errors
+from stereorig.server.api.routes.calibrations.calibrations import accepted
 from stereorig.server.base.models import Ids
 from stereorig.server.wording import problems_in
 from stereorig.server.workflows.calibration.uploaded import (
@@ -58,7 +59,7 @@ async def upload_views(
 ) -> CalibrationAccepted:
     """Fit both cameras to pairs of images of the target, in free poses or at known travels; no rig is needed."""
     made = await run_in_threadpool(_upload, service, cam1, cam2, plan, key)
-    return await _accepted(request, service, made, wait)
+    return await accepted(request, service, made, wait)
 
 
 def _upload(service: ServiceDep, one: list[UploadFile], two: list[UploadFile], plan: str, key: str | None) -> Ids:
@@ -108,7 +109,7 @@ async def refit_calibration(
 ) -> CalibrationAccepted:
     """Make another calibration from the views of this one, without those named; this one is kept."""
     made = await run_in_threadpool(_refit, service, calibration_id, body, key)
-    return await _accepted(request, service, made, wait)
+    return await accepted(request, service, made, wait)
 
 
 def _refit(service: ServiceDep, calibration_id: str, body: RefitRequest, key: str | None) -> Ids:
@@ -116,8 +117,3 @@ def _refit(service: ServiceDep, calibration_id: str, body: RefitRequest, key: st
     sent = mark(f"calibrations/{calibration_id}:refit", key, body)
     made, _ = service.once(sent.scope, key, sent.body_sha256, lambda: begin_refit(service, calibration_id, body, sent))
     return made
-
-
-async def _accepted(request: Request, service: ServiceDep, made: Ids, wait_s: float) -> CalibrationAccepted:
-    reply = await job_reply(request, service, str(made["job_id"]), wait_s=wait_s)
-    return CalibrationAccepted.model_validate({**reply, "calibration_id": made["calibration_id"]})
