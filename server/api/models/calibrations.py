@@ -74,8 +74,9 @@ class ExpectRequest(Request):
     noise_px: Annotated[Real, Field(ge=1e-6, le=10.0)] | None = Field(
         None, description="Standard deviation with which an intersection's coordinate is found; 0.005 if left out."
     )
-    roll_deg: Annotated[Real, Field(ge=-180.0, le=180.0)] = Field(
-        0.0, description="Turn of the grid in the images; matters where its corners leave them."
+    roll_deg: Annotated[Real, Field(ge=-180.0, le=180.0)] | None = Field(
+        None,
+        description="Turn of the grid in the images; null: as the rig's newest calibration found it; 0 without one.",
     )
     rig: PlannedRig | None = Field(
         None, description="Differences from the rig file, for a planned rig; the stage is not asked then."

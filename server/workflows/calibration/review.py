@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 from stereorig.core.errors import StateError
@@ -21,7 +22,7 @@ def expectation(
     plan: CalibrationPlan,
     *,
     noise_px: float | None,
-    roll_deg: float,
+    roll_deg: float | None,
     rig: PlannedRig,
     measurement: PlannedMeasurement,
 ) -> dict[str, object]:
@@ -41,6 +42,8 @@ def expectation(
     )
 
     check_plan(plan)
+    if roll_deg is None:
+        roll_deg = _newest_roll_deg(service)
     as_it_is = rig == PlannedRig()
     if service.rig.config.stage is not None and as_it_is:
         targets_of(service, plan)
@@ -51,6 +54,18 @@ def expectation(
         ),
         measurement,
     )
+
+
+def _newest_roll_deg(service: Service) -> float:
+    """Return the target's turn before camera 1, degrees, as the rig's newest complete calibration found it; else 0."""
+    complete = (str(e["id"]) for e in service.catalog.entries("calibration") if e.get("state") == "complete")
+    for calibration_id in sorted(complete, reverse=True):
+        made = service.calibrations.read(calibration_id)
+        camera = (made.model_extra or {}).get("cam1")
+        # imported and uploaded ones have no views of this rig
+        if made.taken and isinstance(camera, dict) and isinstance(camera.get("alpha_rad"), float):
+            return round(math.degrees(camera["alpha_rad"]), 3)
+    return 0.0
 
 
 def decide(service: Service, calibration_id: str, decision: Decision | None, note: str, by: str) -> None:

@@ -178,13 +178,22 @@ function predictionOf(plan, ends, open) {
     [roll, rule(roll, numberWithin({ low: -180, high: 180, unit: "°", what: "An angle" }))],
   ]);
   let asked = 0;
+  // until somebody states it, the grid lies as the rig's newest calibration found it
+  let stated = false;
+  roll.addEventListener("input", () => (stated = true));
   async function estimate() {
     asked += 1;
     const mine = asked;
     if (![...plan.rules, ...assumed].map(([, check]) => check()).every(Boolean)) return replace(expected, h("p.quiet", "Correct the fields that are marked."));
     try {
-      const estimated = await api.post("/calibrations:expect", { ...plan.value(), roll_deg: Number(roll.value), noise_px: Number(noise.value) });
-      if (mine === asked) replace(expected, expectedUncertainty(estimated));
+      const estimated = await api.post("/calibrations:expect", {
+        ...plan.value(),
+        roll_deg: stated ? Number(roll.value) : null,
+        noise_px: Number(noise.value),
+      });
+      if (mine !== asked) return undefined;
+      if (!stated) roll.value = estimated.assumed.roll_deg.toFixed(1);
+      replace(expected, expectedUncertainty(estimated));
     } catch (error) {
       if (mine === asked) replace(expected, problemText(error));
     }
