@@ -191,22 +191,13 @@ class Camera:
 
     def parameter_jacobian(self, points_sys_mm: ArrayLike) -> Float:
         """Return d(image px) / d(:attr:`parameter_names`), (..., 2, n), at points (..., 3) of the system frame."""
-        return self._parameter_jacobian(points_sys_mm, len(self.lens.parameter_names))
-
-    def ten_parameter_jacobian(self, points_sys_mm: ArrayLike) -> Float:
-        """Return d(image px) / d(:data:`TEN_PARAMETER_NAMES`), (..., 2, 10), for a camera with the paper's lens."""
-        if not isinstance(self.lens, SeidelLens):
-            raise TypeError(f"a {type(self.lens).__name__} has no ten-parameter form")
-        return self._parameter_jacobian(points_sys_mm, 4)
-
-    def _parameter_jacobian(self, points_sys_mm: ArrayLike, n_lens: int) -> Float:
-        """Differentiate with respect to the lens's first parameters, then the pose's six."""
+        n_lens = len(self.lens.parameter_names)
         points = np.asarray(points_sys_mm, dtype=np.float64)
         p = self.cam_from_sys.apply(points)
         n = p[..., :2] / p[..., 2:]
         to_cam = self.lens.image_jacobian(n) @ normalised_jacobian(p)
         jac = np.empty((*points.shape[:-1], 2, n_lens + len(POSE_NAMES)))
-        jac[..., :n_lens] = self.lens.parameter_jacobian(n)[..., :n_lens]
+        jac[..., :n_lens] = self.lens.parameter_jacobian(n)
         for i, dR in enumerate(rotation_derivatives(*angles_from_rotation(self.cam_from_sys.rotation))):
             jac[..., n_lens + i] = np.einsum("...ij,...j->...i", to_cam, points @ dR.T)
         jac[..., n_lens + 3 :] = to_cam

@@ -6,19 +6,10 @@ from stereorig.core.lazy import names_of
 
 if TYPE_CHECKING:
     from stereorig.core.grid.detect import detect_grid, find_grid, lines_shown
-    from stereorig.core.grid.view import (
-        GridOptions,
-        GridOverlay,
-        GridView,
-        LineModel,
-        LineOffsets,
-        Localiser,
-        Orientation,
-    )
+    from stereorig.core.grid.view import GridOptions, GridView, LineModel, LineOffsets, Localiser, Orientation
 
 __all__ = [
     "GridOptions",
-    "GridOverlay",
     "GridView",
     "LineModel",
     "LineOffsets",
@@ -33,6 +24,6 @@ __getattr__, __dir__ = names_of(
     __name__,
     {
         "detect": ("detect_grid", "find_grid", "lines_shown"),
-        "view": ("GridOptions", "GridOverlay", "GridView", "LineModel", "LineOffsets", "Localiser", "Orientation"),
+        "view": ("GridOptions", "GridView", "LineModel", "LineOffsets", "Localiser", "Orientation"),
     },
 )

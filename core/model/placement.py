@@ -67,10 +67,6 @@ class Placement:
         """(6, 6) with the common part."""
         return self.own if self.common is None else np.asarray(self.own + self.common @ self.common.T)
 
-    def applied(self, points_mm: ArrayLike) -> Float:
-        """Return points of the model (n, 3) in the system frame."""
-        return np.asarray(np.asarray(points_mm, dtype=np.float64) @ self.rotation.T + self.shift_mm)
-
     def moved_by(self, points_mm: Float) -> Float:
         """Return (n, 3, 6): how far the six errors move placed points (n, 3)."""
         return _moves(points_mm, self.centre_mm)

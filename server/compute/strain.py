@@ -19,13 +19,6 @@ from stereorig.server.formats.results.budgets import spread_points, strain_budge
 _NAMES = ("exx", "eyy", "exy")
 
 
-def strain_settings(options: StrainOptions | None) -> dict[str, Any] | None:
-    """Return the options as settings; None: no strain."""
-    if options is None:
-        return None
-    return {"window": options.window, "order": options.order, "tensor": options.tensor}
-
-
 def smoothed_step(field: Field, window: int | None, *, subset_px: float) -> Field:
     """Return a step's field with its displacement smoothed; unchanged without a window, or for a shape."""
     if not window or not field.has_motion:

@@ -126,7 +126,6 @@ class _Scene:
     """Poses about the specimen as the pair sees them."""
 
     def __init__(self, estimate: Estimate, sizes_px: tuple[tuple[int, int], tuple[int, int]]) -> None:
-        self._estimate = estimate
         self._sizes = sizes_px
         self._line: Sightline = sightline(estimate)
         line = self._line

@@ -33,9 +33,6 @@ def sorting_network(n: int) -> NDArray[np.int32]:
     return np.array(steps, dtype=np.int32)
 
 
-_NETWORK = sorting_network(_NEIGHBOURS)
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sort(keys, network):
     for s in range(network.shape[0]):

@@ -149,11 +149,6 @@ class Distortion:
         """Return f_m(u), (..., 2, m)."""
         return distortion_terms(u, len(self.D))
 
-    def correct(self, xy_px: Float) -> Float:
-        """Return v of image positions (..., 2)."""
-        u = (xy_px - self.centre_px) / self.scale_px
-        return u + self.terms(u) @ self.D
-
     def gradient(self, xy_px: Float, normal: Float) -> Float:
         """Return unit vectors (..., 2) in the image across lines whose normals in corrected coordinates are given."""
         u = (xy_px - self.centre_px) / self.scale_px

@@ -31,7 +31,6 @@ from stereorig.server.formats.figures.smooth import between_points
 
 PictureForm = Literal["png", "svg"]
 
-MEDIA_TYPES: dict[PictureForm, str] = {"png": "image/png", "svg": "image/svg+xml"}
 _MAP_SHARE = 0.84  # of the width; the rest is the colour bar
 _TEXT_IN = 1.05  # height of title and notes, inch
 _TALLEST = 1.6  # of the width
@@ -153,11 +152,6 @@ def draw(picture: FigureData, style: FigureStyle, form: PictureForm, *, compress
     return out.getvalue()
 
 
-def draw_pixels(picture: FigureData, style: FigureStyle) -> NDArray[np.uint8]:
-    """Draw a picture; return its pixels (h, w, 3), red green blue, of even height and width."""
-    return Frames(picture, style).first()
-
-
 class Frames:
     """Pictures of one size on one scale: their common parts are laid out and drawn once.
 
@@ -180,7 +174,7 @@ class Frames:
             self._background: Any = None
 
     def first(self) -> NDArray[np.uint8]:
-        """Return the pixels (h, w, 3) of the first picture."""
+        """Return the pixels (h, w, 3), red green blue, of the first picture; height and width are even."""
         return self._pixels()
 
     def next(self, picture: FigureData) -> NDArray[np.uint8]:

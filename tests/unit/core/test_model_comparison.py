@@ -176,7 +176,7 @@ def test_a_best_fit_s_uncertainty_is_that_of_drawn_shapes() -> None:
         field = one.replicate(rng)
         place = place_by_fit(field, nodes, start, shared=SHARED)
         turn = Rotation.from_matrix(place.rotation).as_rotvec()
-        at_centre = place.applied(place.centre_mm[None])[0] - place.centre_mm
+        at_centre = place.rotation @ place.centre_mm + place.shift_mm - place.centre_mm
         found.append([turn[0], turn[1], at_centre[2]])
         said = place.covariance[np.ix_([0, 1, 5], [0, 1, 5])]
         assert place.held == ("turn about Z", "shift along X", "shift along Y")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stereorig.server.formats.figures.axes import directions_of
-from stereorig.server.formats.figures.figure import FigureData, draw_pixels
+from stereorig.server.formats.figures.figure import FigureData, Frames
 from stereorig.server.formats.figures.options import FigureStyle
 
 X_PX, Y_PX = np.meshgrid(np.arange(50.0, 200.0, 10.0), np.arange(40.0, 160.0, 10.0))
@@ -41,7 +41,7 @@ def test_the_triad_is_drawn_in_the_lower_left_corner_of_the_map_alone() -> None:
         np.zeros_like(X_PX), X_PX, Y_PX, "w", "mm", "a test", axes=directions_of(X_PX, Y_PX, x_mm, y_mm)
     )
     style = FigureStyle(limits=(-1.0, 1.0))
-    before, after = draw_pixels(plain, style), draw_pixels(with_axes, style)
+    before, after = Frames(plain, style).first(), Frames(with_axes, style).first()
     rows, cols = np.nonzero((before != after).any(axis=2))
     assert len(rows) > 200
     assert cols.max() < before.shape[1] / 4
