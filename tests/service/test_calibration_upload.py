@@ -81,6 +81,9 @@ def test_uploaded_boards_give_the_cameras_that_rendered_them(client: httpx.Clien
     assert second["plan"]["refitted_from"] == calibration
     assert {view["index"] for view in second["taken"]} == {0, 1, 3, 4, 5, 6, 7, 8}
     assert second["plan"]["label"] == "own images without 2"
+    # no view of the rig's own target: what is expected of the rig assumes nothing from it
+    expected = client.post(f"{API}/calibrations:expect", json={})
+    assert expected.json()["assumed"]["roll_deg"] == 0.0, expected.text
 
 
 def test_an_upload_that_cannot_be_fitted_is_refused_before_anything_is_kept(client: httpx.Client, files: Files) -> None:

@@ -62,8 +62,9 @@ def _newest_roll_deg(service: Service) -> float:
     for calibration_id in sorted(complete, reverse=True):
         made = service.calibrations.read(calibration_id)
         camera = (made.model_extra or {}).get("cam1")
-        # imported and uploaded ones have no views of this rig
-        if made.taken and isinstance(camera, dict) and isinstance(camera.get("alpha_rad"), float):
+        # imported and uploaded ones show no view of this rig; a guided one's poses are free
+        staged = bool(made.taken) and made.plan.source is None and made.plan.plain().get("kind") != "guided"
+        if staged and isinstance(camera, dict) and isinstance(camera.get("alpha_rad"), float):
             return round(math.degrees(camera["alpha_rad"]), 3)
     return 0.0
 
