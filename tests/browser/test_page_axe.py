@@ -99,14 +99,20 @@ def test_tests(page: Watched, bench: Bench, audit: Audit) -> None:
     expect(at.get_by_role("button", name="Save the metadata")).to_be_visible()
     at.locator('[data-step="1"] button').click()
     expect(at.locator('[data-role="quality"]')).to_contain_text("Step 1")
-    at.get_by_role("button", name="Rectangle in the middle").click()
-    expect(at.locator('[data-role="texture"]')).to_contain_text("texture")
-    at.get_by_label("texture map").check()
-    unfold(at)
-    audit("a test, a region drawn")
+    audit("a test and a step of it")
     at.get_by_role("button", name="Delete …").click()
     expect(at.get_by_role("dialog")).to_be_visible()
     audit("the question whether to delete a step")
+    at.get_by_role("button", name="Cancel").click()
+    screens = at.get_by_role("navigation", name="Screens")
+    for name in ("Capture", "Measure", "Live", "Verify", "Region"):
+        screens.get_by_role("link", name=name, exact=True).click()
+        if name == "Region":
+            at.get_by_role("button", name="Rectangle in the middle").click()
+            expect(at.locator('[data-role="texture"]')).to_contain_text("texture")
+            at.get_by_label("texture map").check()
+        unfold(at)
+        audit(f"a test, screen {name}")
     page.sound()
 
 

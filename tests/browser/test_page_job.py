@@ -116,15 +116,15 @@ def capture(shown: Page, label: str, load_n: float) -> Locator:
     return quality
 
 
-def open_test(shown: Page) -> None:
-    """Go back to the test: the path leads to the one last open, in a fresh browser to the list."""
+def open_test(shown: Page, part: str = "Capture") -> None:
+    """Go back to the test's part: the path leads to the one last open, in a fresh browser to the list."""
     shown.get_by_role("navigation", name="Screens").get_by_role("link", name="Test", exact=True).click()
     listed = shown.get_by_role("link", name="Pressure test").first
     heading = shown.get_by_role("heading", level=1, name="Pressure test")
     expect(listed.or_(heading).first).to_be_visible()
     if listed.is_visible():
         listed.click()
-    expect(heading).to_be_visible()
+    go(shown, part, "Pressure test")
 
 
 def deflection_mm(x: Any, y: Any, pressure_kpa: float) -> Any:
@@ -177,7 +177,8 @@ def test_from_the_rig_to_the_report(page: Watched, client: httpx.Client, made: M
     shown.keyboard.press("Tab")
     shown.keyboard.press("Enter")
     expect(shown.get_by_role("heading", level=1, name="Pressure test")).to_be_visible()
-    made.test_id = shown.url.split("/")[-1]
+    made.test_id = shown.url.split("/")[-1].removesuffix("?at=capture")
+    go(shown, "Test", "Pressure test")
     shown.get_by_text("Metadata for the report").click()
     shown.get_by_label("Operator").fill("A. Smith")
     shown.get_by_role("button", name="Save the metadata").click()
@@ -195,6 +196,7 @@ def test_from_the_rig_to_the_report(page: Watched, client: httpx.Client, made: M
     assert [(one["label"], one["load_n"]) for one in steps] == [(f"{p:g} kPa", load) for p, load in STEPS]
 
     # a region, and three points in both views
+    go(shown, "Region", "Pressure test")
     first, second = Editor(shown), Editor(shown, 2)
     true = true_cameras(SMALL)
     one, two = (Camera.from_paper(**true[cam]) for cam in ("cam1", "cam2"))
@@ -459,7 +461,7 @@ def test_a_camera_lost_in_mid_run(page: Watched, client: httpx.Client, service: 
 
 def test_a_job_that_is_cancelled(page: Watched, client: httpx.Client, finished: Made) -> None:
     shown = page.open("#/test")
-    open_test(shown)
+    open_test(shown, "Region")
     Editor(shown).drag((40, 40), (210, 200))
     shown.get_by_label("Subset", exact=True).fill("31")
     shown.get_by_label("Spacing", exact=True).fill("1")

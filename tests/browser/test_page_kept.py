@@ -72,7 +72,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 
 def opened(page: Watched, test_id: str = TEST) -> Page:
-    shown = page.open(f"#/test/{test_id}")
+    shown = page.open(f"#/test/{test_id}?at=region")
     Editor(shown, size=SIZE)
     return shown
 

@@ -39,14 +39,16 @@ def focused(at: Page) -> str:
     return "" if focus is None else str(focus["name"])
 
 
-@pytest.mark.parametrize("screen", ["rig", "calibrate", "test", "jobs"])
+@pytest.mark.parametrize("screen", ["rig", "calibrate", "test", "region", "jobs"])
 def test_tab_reaches_everything_and_the_focus_is_seen(page: Watched, plate: str, screen: str) -> None:
-    at = page.open(f"#/test/{plate}" if screen == "test" else f"#/{screen}")
-    if screen == "test":
+    at = page.open({"test": f"#/test/{plate}", "region": f"#/test/{plate}?at=region"}.get(screen, f"#/{screen}"))
+    if screen in ("test", "region"):
         at.evaluate("document.querySelectorAll('details').forEach(one => { one.open = true })")
-        expect(at.get_by_role("button", name="Save the metadata")).to_be_visible()
-        at.get_by_role("button", name="Rectangle in the middle").click()
-        expect(at.locator('[data-role="texture"]')).to_contain_text("texture")
+        if screen == "test":
+            expect(at.get_by_role("button", name="Save the metadata")).to_be_visible()
+        else:
+            at.get_by_role("button", name="Rectangle in the middle").click()
+            expect(at.locator('[data-role="texture"]')).to_contain_text("texture")
         at.evaluate("document.activeElement.blur(); scrollTo(0, 0)")
         at.locator("#bar").click(position={"x": 2, "y": 2})
     elif screen == "rig":
@@ -55,16 +57,17 @@ def test_tab_reaches_everything_and_the_focus_is_seen(page: Watched, plate: str,
         at.wait_for_timeout(1000)
     order = tabbed(at)
     names = [one["name"] for one in order]
-    if screen != "test":
+    if screen not in ("test", "region"):
         assert names[0] == "Skip to the content"
     way = ["Rig", "Calibrate", "Test", "Capture", "Region", "Measure", "Results"]
-    bar = ["stereorig", *way, "Jobs & system", "API", "Keys", "Light or dark colours", "STOP"]
+    beside = ["Live", "Verify"] if screen in ("test", "region") else []
+    bar = ["stereorig", *way, *beside, "Jobs & system", "API", "Keys", "Light or dark colours", "STOP"]
     first = names.index("stereorig")
     # a step of the way has its number before it, or a tick
     assert [re.sub(r"^[\d\u2713]", "", name) for name in names[first : first + len(bar)]] == bar
     assert [one for one in order if not one["drawn"]] == []
     assert [one for one in order if not one["seen"]] == []
-    assert [one for one in at.evaluate(UNREACHED) if screen != "test" or "skip" not in one] == []
+    assert [one for one in at.evaluate(UNREACHED) if screen not in ("test", "region") or "skip" not in one] == []
     page.sound()
 
 
@@ -95,7 +98,7 @@ def test_stop_from_anywhere(page: Watched, plate: str) -> None:
     at.get_by_label("Exposure").first.focus()
     stopped(at, lambda: twice(at))
     # in a drawing that uses Escape itself
-    page.open(f"#/test/{plate}")
+    page.open(f"#/test/{plate}?at=region")
     at.get_by_role("button", name="Polygon", exact=True).press("Enter")
     at.keyboard.press("ArrowLeft")
     at.keyboard.press("Enter")
@@ -157,7 +160,7 @@ def test_the_focus_stays_where_something_is_drawn_anew(page: Watched, client: ht
     assert focused(at) == name
     # where a link led to another screen, Tab goes on from the screen's beginning
     row.press("Enter")
-    page.open(f"#/test/{plate}")
+    page.open(f"#/test/{plate}?at=region")
     at.get_by_role("link", name="All tests").press("Enter")
     expect(at.get_by_role("heading", name="Tests", exact=True)).to_be_visible()
     expect(at.locator("#main")).to_be_focused()
@@ -181,7 +184,7 @@ def aim(at: Page, camera: int = 1) -> tuple[float, float]:
 
 
 def test_a_region_is_drawn_by_keyboard(page: Watched, plate: str) -> None:
-    at = page.open(f"#/test/{plate}")
+    at = page.open(f"#/test/{plate}?at=region")
     image = at.get_by_alt_text("Reference image of cam1")
     at.wait_for_function("image => image.naturalWidth === 256", arg=image.element_handle())
     frame = at.locator(".view .frame").first
@@ -232,7 +235,7 @@ def test_a_region_is_drawn_by_keyboard(page: Watched, plate: str) -> None:
 
 
 def test_seeds_in_both_views_by_keyboard(page: Watched, client: httpx.Client, plate: str) -> None:
-    at = page.open(f"#/test/{plate}")
+    at = page.open(f"#/test/{plate}?at=region")
     image = at.get_by_alt_text("Reference image of cam2")
     at.wait_for_function("image => image.naturalWidth === 256", arg=image.element_handle())
     at.get_by_role("button", name="Rectangle in the middle").press("Enter")

@@ -46,7 +46,7 @@ def mask_of(region: dict[str, str]) -> np.ndarray:
 
 
 def test_circles_are_added_and_cut_out_and_can_be_set_by_numbers(page: Watched, plate: str) -> None:
-    shown = page.open(f"#/test/{plate}")
+    shown = page.open(f"#/test/{plate}?at=region")
     editor = Editor(shown)
     editor.tool("Circle")
     sent = posted(shown, "/texture", lambda: editor.drag((110, 100), (140, 100)))
@@ -87,7 +87,7 @@ def test_circles_are_added_and_cut_out_and_can_be_set_by_numbers(page: Watched, 
 
 
 def test_a_region_is_painted_inverted_saved_and_read_again(page: Watched, plate: str, tmp_path: Path) -> None:
-    shown = page.open(f"#/test/{plate}")
+    shown = page.open(f"#/test/{plate}?at=region")
     editor = Editor(shown)
     editor.tool("Brush")
     size = shown.get_by_label("Brush", exact=True)
@@ -139,7 +139,7 @@ def test_the_gauge_is_told_in_mm_and_warned_of_where_the_region_is_small(
     page: Watched, client: httpx.Client, plate: str
 ) -> None:
     scale = client.get(f"{API}/tests/{plate}/scale").json()["mm_per_px"]
-    shown = page.open(f"#/test/{plate}")
+    shown = page.open(f"#/test/{plate}?at=region")
     editor = Editor(shown)
     editor.drag((60, 60), (200, 180))
     shown.get_by_label("Subset", exact=True).fill("15")

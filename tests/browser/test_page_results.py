@@ -823,7 +823,7 @@ def test_a_running_analysis_is_followed_until_it_is_finished(page: Watched, benc
     at.reload()  # nothing is said of a job that waits: who comes later asks
     expect(at.locator("#bar-job")).to_contain_text("analysis")
     # the test's screen says so, too, and either of them finishes it
-    page.open(f"#/test/{test_id}")
+    page.open(f"#/test/{test_id}?at=measure")
     expect(at.locator('[data-role="measuring"]')).to_have_text("measuring: waiting for the next step")
     at.locator('[data-role="progress"]').get_by_role("button", name="Finish").click()
     expect(at.locator('[data-role="progress"] .badge')).to_have_text("succeeded")

@@ -79,8 +79,10 @@ def test_make_tell_capture(page: Watched, client: httpx.Client, calibration: str
     shown.get_by_label("Calibration", exact=True).select_option(calibration)
     shown.get_by_role("button", name="Make the test").click()
     expect(shown.get_by_role("heading", name="Plate <b> & more")).to_be_visible()
-    test_id = page.page.url.split("/")[-1]
+    test_id = page.page.url.split("/")[-1].removesuffix("?at=capture")
+    screens = shown.get_by_role("navigation", name="Screens")
     # metadata for the report
+    screens.get_by_role("link", name="Test", exact=True).click()
     shown.get_by_text("Metadata for the report").click()
     shown.get_by_label("Operator").fill("A. Smith")
     camera = shown.get_by_role("group", name="Camera 2 and its lens")
@@ -91,6 +93,7 @@ def test_make_tell_capture(page: Watched, client: httpx.Client, calibration: str
         "operator": "A. Smith",
         "cam2": {"lens": {"focal_length_mm": 50.0}},
     }
+    screens.get_by_role("link", name="Capture", exact=True).click()
     # a step with the load frame's values, and the quality of the pair
     group = shown.get_by_role("group", name="Capture")
     group.get_by_label("Label").fill("1.25 kN")
@@ -127,10 +130,12 @@ def test_the_path_leads_back_to_the_test_and_its_parts_and_ticks_what_is_done(pa
         expect(link).to_have_attribute("title", re.compile("^Done" if done else "^Not yet"))
     expect(screens.get_by_role("link", name="Test", exact=True)).to_have_attribute("aria-current", "page")
     # live where one captures
+    screens.get_by_role("link", name="Capture", exact=True).click()
     for cam in ("cam1", "cam2"):
         live = shown.get_by_alt_text(f"Live view of {cam}", exact=True)
         shown.wait_for_function("image => image.naturalWidth > 0", arg=live.element_handle())
     # each part is a screen of its own, and what was drawn on it stays
+    screens.get_by_role("link", name="Region", exact=True).click()
     Editor(shown).drag((90, 80), (170, 160))
     drawn = shown.get_by_text("Draw a region to rate its speckle quality")
     expect(drawn).to_have_count(0)
@@ -140,15 +145,40 @@ def test_the_path_leads_back_to_the_test_and_its_parts_and_ticks_what_is_done(pa
     screens.get_by_role("link", name="Measure", exact=True).click()
     expect(shown.get_by_role("button", name="Measure", exact=True)).to_be_in_viewport()
     expect(drawn).to_have_count(0)
-    own = {"Capture": "Live view", "Region": "Seed", "Measure": "Advanced"}
+    own = {
+        "Test": "Metadata for the report",
+        "Capture": "Live view",
+        "Region": "Seed",
+        "Measure": "Recipes: kept for the next specimen",
+        "Live": "Measure live",
+        "Verify": "Plan the procedure",
+    }
     for name in own:
         screens.get_by_role("link", name=name, exact=True).click()
         for other, text in own.items():
             part = shown.get_by_text(text, exact=True).first
             expect(part).to_be_visible() if other == name else expect(part).to_be_hidden()
-        for width in (1440, 1024, 390):
-            shown.set_viewport_size({"width": width, "height": 844})
+        for width, height in ((1024, 768), (390, 844), (1440, 900)):
+            shown.set_viewport_size({"width": width, "height": height})
             assert shown.evaluate("document.documentElement.scrollWidth") <= width
+        # on a screen of usual size all of it is seen at once
+        assert shown.evaluate("document.documentElement.scrollHeight") <= height, name
+    # the picture has most of the region's screen, and what is set stands beside it without a scroll bar
+    screens.get_by_role("link", name="Region", exact=True).click()
+    frame = shown.locator(".work .view .frame").first.bounding_box()
+    assert frame is not None
+    assert frame["width"] * frame["height"] > 0.45 * 1440 * 900
+    assert shown.locator(".work .set").evaluate("one => one.scrollHeight - one.clientHeight") <= 0
+    expect(shown.get_by_role("button", name="Measure", exact=True)).to_be_in_viewport()
+    # camera 2 is an inset until a seed is to be set
+    two = shown.locator(".work .view .frame").nth(1)
+    small = two.bounding_box()
+    shown.get_by_role("button", name="Seed", exact=True).click()
+    large = two.bounding_box()
+    assert small is not None
+    assert large is not None
+    assert small["width"] < 0.2 * frame["width"]
+    assert large["width"] > 2 * small["width"]
     # from elsewhere it is the test that was open, not the list
     screens.get_by_role("link", name="Rig", exact=True).click()
     expect(shown.get_by_role("heading", level=1, name="tiny rig")).to_be_visible()
@@ -165,7 +195,7 @@ def test_cameras_off_their_place_are_told_where_one_captures_with_the_way_back(
     assert moved["job"]["state"] == "succeeded"
     for _ in range(3):
         assert client.post(f"{API}/tests/{test_id}/steps", json={}).status_code == 201
-    shown = page.open(f"#/test/{test_id}")
+    shown = page.open(f"#/test/{test_id}?at=capture")
     # the long badges of neighbouring thumbnails stay apart
     badges = shown.locator('[data-role="thumbnails"] .badge')
     expect(badges).to_have_count(3)
@@ -186,9 +216,8 @@ def test_cameras_off_their_place_are_told_where_one_captures_with_the_way_back(
 
 def test_a_verification_procedure_is_followed_with_ticks(page: Watched, client: httpx.Client) -> None:
     test_id = new_test(client, name="bench")
-    shown = page.open(f"#/test/{test_id}")
+    shown = page.open(f"#/test/{test_id}?at=verify")
     panel = shown.locator("[data-role=procedure]")
-    panel.locator("summary").click()
     said = panel.locator("[data-role=procedure-next]")
     plan = {"static_steps": [1], "translations": [{"n": 2, "translation_mm": [0.0, 0.0, 0.4]}], "rotations": [{"n": 3}]}
     panel.locator("textarea").fill("{")
@@ -238,6 +267,7 @@ def test_pairs_are_imported_in_the_order_of_their_names(page: Watched, client: h
             got = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
             assert np.array_equal(got, cv2.imread(str(tmp_path / f"{side}_{number}.png"), cv2.IMREAD_UNCHANGED))
     # without a calibration the measurement is refused with the cause
+    shown.get_by_role("link", name="Region", exact=True).click()
     shown.get_by_role("button", name="Rectangle in the middle").click()
     shown.get_by_role("button", name="Measure", exact=True).click()
     expect(shown.get_by_role("alert").filter(has_text="calibration")).to_be_visible()
@@ -305,7 +335,7 @@ def test_a_load_frames_record_gives_the_steps_their_channels_by_time(
 
 @pytest.mark.parametrize("presses", [0, 4])
 def test_the_region_that_is_posted_is_the_one_drawn(page: Watched, plate: str, presses: int) -> None:
-    shown = page.open(f"#/test/{plate}")
+    shown = page.open(f"#/test/{plate}?at=region")
     editor = Editor(shown)
     editor.key("+", presses)
     middle = (127.5, 119.5)
@@ -363,7 +393,7 @@ def test_the_grey_level_under_the_mouse_is_the_recorded_one(
 ) -> None:
     data = client.get(f"{API}/tests/{plate}/steps/0/cam{camera}", params={"format": "png"}).content
     stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    shown = page.open(f"#/test/{plate}")
+    shown = page.open(f"#/test/{plate}?at=region")
     editor = Editor(shown, camera)
     readout = editor.view.locator(".readout")
     frame = editor.view.locator(".frame").bounding_box()
@@ -388,7 +418,7 @@ def test_the_grey_level_under_the_mouse_is_the_recorded_one(
 
 
 def test_subsets_are_drawn_to_scale_and_texture_is_judged(page: Watched, client: httpx.Client, plate: str) -> None:
-    shown = page.open(f"#/test/{plate}")
+    shown = page.open(f"#/test/{plate}?at=region")
     editor = Editor(shown)
     editor.drag((90, 80), (170, 160))
     texture = shown.locator('[data-role="texture"]')
@@ -411,7 +441,7 @@ def test_subsets_are_drawn_to_scale_and_texture_is_judged(page: Watched, client:
 def test_each_field_of_a_measurement_says_its_error_beside_itself_and_nothing_is_sent(
     page: Watched, plate: str
 ) -> None:
-    shown = page.open(f"#/test/{plate}")
+    shown = page.open(f"#/test/{plate}?at=region")
     sent: list[str] = []
     shown.on("request", lambda one: one.method == "POST" and sent.append(one.url))
     measure = shown.get_by_role("region", name="Region and analysis")
@@ -497,7 +527,7 @@ def test_seeds_in_both_views_and_a_measurement(
     one, two = (camera.project(positions).xy for camera in (pair.cam1, pair.cam2))
     for job in client.get(f"{API}/jobs").json()["jobs"]:
         wait_for_job(client, job)  # an analysis of another test that still ran would be shown beside this one
-    shown = page.open(f"#/test/{plate}")
+    shown = page.open(f"#/test/{plate}?at=region")
     first, second = Editor(shown), Editor(shown, 2)
     x, y = one.mean(axis=0)
     first.drag((x - 45, y - 40), (x + 45, y + 40))
@@ -523,6 +553,7 @@ def test_seeds_in_both_views_and_a_measurement(
     assert progress.get_by_role("link", name="Show results").get_attribute("href") == (
         f"#/results/{plate}/{analysis['id']}"
     )
+    shown.get_by_role("link", name="Measure", exact=True).click()
     expect(shown.get_by_role("link", name="seeded")).to_be_visible()
     summary = client.get(f"{API}/tests/{plate}/analyses/{analysis['id']}").json()["summary"]
     assert summary["state"] == "complete" or summary["steps"]
@@ -551,7 +582,7 @@ def test_a_test_without_calibration_is_given_one_at_its_head(
 
 def test_a_test_is_measured_live_and_its_curves_are_drawn(page: Watched, client: httpx.Client, plate: str) -> None:
     client.put(f"{API}/sim/scene", json={"scene": "plate", "load": 0.0}).raise_for_status()
-    shown = page.open(f"#/test/{plate}")
+    shown = page.open(f"#/test/{plate}?at=live")
     panel = shown.get_by_role("region", name="Live values")
     panel.get_by_label("with a coarse field").check()
     panel.get_by_role("button", name="Measure live").click()
@@ -576,7 +607,7 @@ def test_a_test_is_measured_live_and_its_curves_are_drawn(page: Watched, client:
     expect(against.locator("option", has_text="force_n")).to_have_count(1, timeout=SLOW)
     # the switch, and the screen opened again while it goes on
     shown = page.open("#/test")
-    shown = page.open(f"#/test/{plate}")
+    shown = page.open(f"#/test/{plate}?at=live")
     panel = shown.get_by_role("region", name="Live values")
     expect(panel.get_by_role("button", name="Measure live")).to_be_hidden()
     panel.get_by_role("button", name="Stop").click()

@@ -64,7 +64,7 @@ def held_in(at: Page) -> None:
 
 
 def test_a_region_is_dragged_by_a_finger_and_two_fingers_zoom_instead_of_drawing(page: Watched, bench: Bench) -> None:
-    at = page.open(f"#/test/{bench.test_id}")
+    at = page.open(f"#/test/{bench.test_id}?at=region")
     panel = at.get_by_role("region", name="Region and analysis")
     panel.locator(".view").first.scroll_into_view_if_needed()
     before_it = panel.evaluate("panel => [...document.querySelectorAll('.view')].findIndex(one => panel.contains(one))")

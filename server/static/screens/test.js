@@ -70,7 +70,7 @@ async function all(root, asked) {
         notes: notes.value,
         calibration_id: calibration.value || null,
       });
-      location.hash = `#/test/${made.id}`;
+      location.hash = `#/test/${made.id}?at=capture`;
     },
     { kind: "primary" },
   );
@@ -105,7 +105,7 @@ async function one(root, id) {
   /** @type {Ends} */
   const ends = [];
   let test = await readTest(id);
-  const head = h("section.panel");
+  const head = h("section.panel", { "aria-label": "About the test" });
   const analyses = h("section.panel", { "aria-label": "Analyses" });
 
   /** @param {import("#routes").Body<"patch", "/tests/{test_id}">} changes */
@@ -197,7 +197,7 @@ async function one(root, id) {
   replace(
     root,
     h("div.spread", title, measure.head, h("a", { href: "#/test" }, "All tests")),
-    h("div.grid", head, steps.root, procedurePanel(id, ends), measure.root, liveValues, analyses),
+    h("div.grid.parts", head, steps.root, procedurePanel(id, ends), measure.root, liveValues, analyses),
   );
   return () => ends.forEach((end) => end());
 }

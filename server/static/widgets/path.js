@@ -55,11 +55,25 @@ async function look() {
   };
 }
 
-/** Show one part of a test as a screen of its own, capture, region or measure; all of it without one. */
+/** Parts of a test that are screens beside the path. @type {readonly [string, string][]} */
+const BESIDE = [
+  ["live", "Live"],
+  ["verify", "Verify"],
+];
+
+/** Show one part of a test as a screen of its own, such as capture or region; its own facts, steps and analyses without one. */
 export function goTo(at = "") {
   const screen = /** @type {HTMLElement | null} */ (document.querySelector('main > [data-screen="test"]'));
   if (screen) screen.dataset.at = at;
+  const plan = /** @type {HTMLDetailsElement | null | undefined} */ (screen?.querySelector('[data-role="procedure"]'));
+  if (plan) plan.open = at === "verify";
   window.scrollTo({ top: 0 });
+}
+
+/** @param {HTMLElement} link @param {boolean} current */
+function mark(link, current) {
+  if (current) link.setAttribute("aria-current", "page");
+  else link.removeAttribute("aria-current");
 }
 
 /** @param {HTMLElement} others links that follow the steps */
@@ -71,6 +85,7 @@ export function path(others) {
       h("a", { href: `#/${name}`, "data-screen": name }, h("span.tick", { "aria-hidden": "true" }, String(index + 1)), h("span.word", text)),
     ]),
   );
+  const beside = BESIDE.map(([name, text]) => h("a", { "data-screen": name }, text));
   /** @type {Here | null} */
   let here = null;
   /** @type {Done | null} */
@@ -101,8 +116,12 @@ export function path(others) {
       link.classList.toggle("done", Boolean(ticks[name]));
       link.title = `${ticks[name] ? "Done" : "Not yet"}: ${why}`;
       /** @type {HTMLElement} */ (link.firstElementChild).textContent = ticks[name] ? "✓" : String(index + 1);
-      if (name === current) link.setAttribute("aria-current", "page");
-      else link.removeAttribute("aria-current");
+      mark(link, name === current);
+    });
+    BESIDE.forEach(([name], index) => {
+      beside[index].hidden = !test;
+      beside[index].href = `${within}?at=${name}`;
+      mark(beside[index], name === current);
     });
   }
 
@@ -130,6 +149,7 @@ export function path(others) {
       "ol.path",
       [...links.values()].map((link) => h("li", link)),
     ),
+    beside,
     others,
   );
   // a part of the test that is open is only shown: nothing drawn on it is lost

@@ -59,7 +59,7 @@ export class RegionEditor {
     two.onleave = () => this.use("move");
     two.aimFrom = () => this.#onLine();
     one.image.addEventListener("load", () => this.#changed(false));
-    this.hint = h("p.quiet", { role: "status", style: { minHeight: "3em", margin: "0.25rem 0 0" } });
+    this.hint = h("p.quiet", { role: "status", "data-role": "hint" });
     this.buttons = TOOLS.map(([name, text, title]) =>
       h("button", { type: "button", title, "aria-pressed": String(name === this.tool), onclick: (event) => this.use(name, event.detail === 0) }, text),
     );
@@ -69,7 +69,8 @@ export class RegionEditor {
     this.undoButton = h("button", { type: "button", title: "Undo (Ctrl+Z)", onclick: () => this.undo() }, "Undo");
     this.redoButton = h("button", { type: "button", title: "Redo (Ctrl+Y)", onclick: () => this.redo() }, "Redo");
     this.bar = h("div.row", { role: "toolbar", "aria-label": "Drawing" }, this.buttons, this.undoButton, this.redoButton);
-    this.more = h("div.row.region-more", h("div.row", { role: "group", "aria-label": "Action of the next shape" }, this.modes), this.painting.controls);
+    this.more = h("div.row", { role: "group", "aria-label": "Action of the next shape" }, this.modes);
+    this.masks = h("details", h("summary", "Brush and mask"), h("div.row.region-more", this.painting.controls));
     this.list = h("div", { "data-role": "shapes" });
     listen(this);
     this.draw();
@@ -86,6 +87,7 @@ export class RegionEditor {
     this.one.drawing = tool !== "move";
     this.two.drawing = tool === "seed";
     for (const view of [this.one, this.two]) if (!view.drawing && view.aim) view.setAim(null);
+    if (tool === "brush" || tool === "eraser") this.masks.open = true;
     if (byKey && this.one.drawing) this.one.frame.focus();
     TOOLS.forEach(([name], index) => this.buttons[index].setAttribute("aria-pressed", String(name === tool)));
     this.hint.textContent = hintOf(tool);
@@ -281,6 +283,7 @@ export class RegionEditor {
     const [parts, second] = drawn(this);
     replace(this.layer, parts);
     replace(this.layer2, second);
+    this.two.root.parentElement?.classList.toggle("inset", !this.drawn.seeds.length && this.tool !== "seed");
     this.undoButton.setAttribute("aria-disabled", String(!this.past.length && !this.draft));
     this.redoButton.setAttribute("aria-disabled", String(!this.future.length));
   }

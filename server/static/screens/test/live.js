@@ -22,7 +22,8 @@ export async function livePanel(ends) {
   const note = wayBackNote();
   const views = CAMERAS.map((cam) => {
     const [width, height] = rig.cameras[cam].nominal.image_size_px;
-    const image = h("img", { alt: `Live view of ${cam}`, width, height, draggable: "false" });
+    const image = h("img", { alt: `Live view of ${cam}`, width, height, draggable: "false", style: { aspectRatio: `${width} / ${height}` } });
+    image.style.setProperty("--aspect", String(width / height));
     const trouble = h("p.quiet", { hidden: true }, "No picture: the cameras do not answer, or are in use.");
     const state = h("span.quiet", { "data-role": `live-${cam}` });
     const start = () => {

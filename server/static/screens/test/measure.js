@@ -141,8 +141,8 @@ async function build(id, test, ends, { body, jobs, done }) {
     workspace.change({ ...(recipe.gauges ? { gauges: recipe.gauges } : {}), ...(recipe.display ? { display: recipe.display } : {}) });
   }
   const start = action("Measure", () => measure(my, jobs, done), { kind: "primary" });
-  replace(body, layout(my, { sample, texture, gauge: gauge.parts, end: [h("div.row", { style: { marginTop: "0.5rem" } }, start), jobs.root] }));
-  body.before(await recipesBar(id, workspace.state, { take, now: () => recipeOf(my) }));
+  replace(body, layout(my, { sample, texture, gauge: gauge.parts, end: [h("div.row", start, workspace.state), jobs.root] }));
+  body.before(await recipesBar(id, { take, now: () => recipeOf(my) }));
   editor.use("rectangle");
   editor.drawList();
   gauge.draw();
@@ -159,7 +159,7 @@ async function build(id, test, ends, { body, jobs, done }) {
         reference,
         (test().steps ?? [])
           .filter((one, k) => k < MOST_REFERENCES || String(one.n) === kept)
-          .map((one) => h("option", { value: one.n, selected: String(one.n) === kept }, `${one.n} ${one.label ?? ""}`)),
+          .map((one) => h("option", { value: one.n, selected: String(one.n) === kept }, `step ${one.n}${one.label ? `: ${one.label}` : ""}`)),
       );
       if (reference.selectedIndex < 0) reference.selectedIndex = 0;
       showReference();
@@ -343,54 +343,44 @@ async function measure(my, jobs, done) {
 }
 
 /**
+ * The pictures, and beside them all that is set: the region, three settings, the others folded, and the button.
  * @param {Panel} my
  * @param {{ sample: ReturnType<typeof sampleOf>, texture: ReturnType<typeof textureRating>, gauge: HTMLElement[], end: HTMLElement[] }} parts
  */
 function layout({ views, editor, form, reference, asked, finder }, { sample, texture, gauge, end }) {
-  const seedsHint =
-    "Seeds are searched for automatically if none are given. On a periodic texture, click three points that are not on one line, each in both views.";
   const region = h(
     "fieldset",
     { "data-on": "region" },
-    h("legend", "Region and seeds"),
+    h("legend", "Region"),
+    h("div.row", h("label", { for: "reference-step" }, "Reference step"), reference),
     h("div.row", finder.find, finder.found),
     finder.missing,
     editor.list,
-    h("p.hint", seedsHint),
+    editor.masks,
   );
   const zoom = h("button", { type: "button", onclick: () => views[0].centreOn(...editor.middle(), 6) }, "Zoom to the subsets");
-  const subsets = h(
+  const basic = h(
     "fieldset",
-    h("legend", "Subsets and texture"),
-    h("div.fields", field("Subset", form.subset_px, "px", "odd"), field("Spacing", form.spacing_px, "px", "distance of neighbouring points")),
+    h("legend", "Subsets and strain"),
+    h("div.fields.three", field("Subset", form.subset_px, "px"), field("Spacing", form.spacing_px, "px"), field("Window", form.window, "points")),
+    gauge,
     h(
       "div.row",
       { "data-on": "region" },
       h("label.check", sample.shown, "draw them to scale"),
-      zoom,
       h("label.check", texture.showMap, "texture map"),
+      zoom,
       texture.legend,
     ),
     texture.rating,
   );
   const pictured = (/** @type {View} */ view, /** @type {number} */ k) => h("div", h("h3", `cam${k + 1}`), view.root);
   const steps = h("div.fields", field("Steps", asked.which, "", "such as 1-5, 8; empty: all"), field("Label", asked.label));
-  return [
-    h(
-      "div",
-      { "data-on": "region" },
-      h("div.row", h("label", { for: "reference-step" }, "Reference step"), reference, editor.bar),
-      editor.more,
-      editor.hint,
-      h("div.grid.two.views", { style: { marginTop: "0.5rem" } }, views.map(pictured)),
-    ),
-    h(
-      "div.grid.two",
-      { style: { marginTop: "var(--gap)" } },
-      h("div", region, subsets),
-      h("div", { "data-on": "measure" }, settingsFields(form, gauge), steps, h("label.check", asked.follow, "continue with each new step"), end),
-    ),
-  ];
+  return h(
+    "div.work",
+    h("div.pictured", { "data-on": "region" }, editor.bar, h("div.row", editor.more, editor.hint), h("div.grid.two.views", views.map(pictured))),
+    h("div.set", region, basic, settingsFields(form), steps, h("label.check", asked.follow, "continue with each new step"), end),
+  );
 }
 
 /**

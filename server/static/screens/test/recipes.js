@@ -10,10 +10,9 @@ const problem = (/** @type {string} */ detail, /** @type {string} */ remedy) => 
 
 /**
  * @param {string} id of the test
- * @param {HTMLElement} saved shows if the drawing is saved
  * @param {{ take: (recipe: Recipe) => unknown, now: () => Recipe }} panel
  */
-export async function recipesBar(id, saved, { take, now }) {
+export async function recipesBar(id, { take, now }) {
   const origin = h("select", { "aria-label": "Take region and settings from" });
   const which = h("select", { "aria-label": "Choice of its region", hidden: true });
   const said = h("p.quiet", { role: "status", "data-role": "taken" });
@@ -105,7 +104,7 @@ export async function recipesBar(id, saved, { take, now }) {
   return h(
     "div",
     { "data-role": "recipes" },
-    h("div.row", h("span", "Take region and settings from"), origin, which, taking, saved),
+    h("div.row", h("span", "Take region and settings from"), origin, which, taking),
     said,
     h(
       "details",

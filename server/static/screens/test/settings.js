@@ -134,15 +134,14 @@ export function showSettings(form, set) {
 }
 
 /**
- * The fields of strain and correlation: the strain's window, and what is seldom changed folded.
+ * What is seldom changed, folded.
  * @param {Form} form
- * @param {HTMLElement[]} gauge
  */
-export const settingsFields = (form, gauge) => [
-  h("fieldset", h("legend", "Strain"), h("label.check", form.strain, "compute strain"), h("div.fields", field("Window", form.window, "points", "odd")), gauge),
+export const settingsFields = (form) =>
   h(
     "details.advanced",
     h("summary", "Advanced"),
+    h("label.check", form.strain, "compute strain"),
     h(
       "div.fields",
       field("Strain fit", form.order),
@@ -157,8 +156,7 @@ export const settingsFields = (form, gauge) => [
       field("Smoothing window", form.smoothing_window, "points", "odd; empty: none"),
       field("Dense field, a vector every", form.dense_step_px, "px", "in addition to the ordinary field; empty: none"),
     ),
-  ),
-];
+  );
 
 /**
  * Length of the virtual strain gauge, and a warning if it is long for the region.

@@ -35,7 +35,6 @@ const WORDS = {
 export async function stepsPanel(id, test, ends, reread) {
   const thumbs = h("div.thumbs", {
     "data-role": "thumbnails",
-    style: { maxHeight: "22rem", overflow: "auto" },
     tabindex: 0,
     role: "region",
     "aria-label": "Thumbnails",
@@ -58,6 +57,7 @@ export async function stepsPanel(id, test, ends, reread) {
     const steps = test.steps ?? [];
     part.lay(steps);
     if (!steps.length) replace(thumbs, h("p.quiet", "No steps yet. The first one is the reference: capture it with the specimen unloaded, or import pairs."));
+    thumbs.scrollLeft = thumbs.scrollWidth; // where they stand in a row, the newest is seen
     replace(incomplete, test.incomplete_steps?.length ? h("p.quiet", `Incomplete: ${test.incomplete_steps.join(", ")}.`) : null);
   }
 
@@ -110,31 +110,30 @@ export async function stepsPanel(id, test, ends, reread) {
   }
 
   const live = await livePanel(ends); // before anything is shown: it would push the region away from under a drawing hand
+  const taking = capture(
+    id,
+    async (step) => {
+      chosen = step.n;
+      drawDetail(step);
+      await refresh();
+    },
+    ends,
+    refresh,
+  );
+  live.root.dataset.on = taking.dataset.on = "capture";
   const root = h(
     "section.panel",
     { "aria-label": "Steps" },
     h("h2", "Steps"),
     h(
       "div.grid.side",
+      h("div", live.root, part.bar, thumbs, incomplete),
       h(
         "div",
-        live.root,
-        part.bar,
-        thumbs,
-        incomplete,
+        taking,
         detail,
         importPairs(id, refresh, ends),
         importRecord(id, () => test, refreshed),
-      ),
-      capture(
-        id,
-        async (step) => {
-          chosen = step.n;
-          drawDetail(step);
-          await refresh();
-        },
-        ends,
-        refresh,
       ),
     ),
   );

@@ -13,7 +13,11 @@ export const TOOLS = [
   ["brush", "Brush", "Paint where points are allowed; the region becomes a mask, over whose border no subset reaches. [ and ] change the size"],
   ["eraser", "Eraser", "Paint where no points are allowed; the region becomes a mask, over whose border no subset reaches. [ and ] change the size"],
   ["crack", "Crack line", "Click the points that the crack goes through; Enter ends it"],
-  ["seed", "Seed", "Click a point in camera 1, then the same point in camera 2 on the line that appears there"],
+  [
+    "seed",
+    "Seed",
+    "Click a point in camera 1, then the same point in camera 2 on the line that appears there; three that are not on one line on a periodic texture. Without any they are searched for",
+  ],
 ];
 /** @type {[mode: Mode, text: string, title: string][]} */
 export const MODES = [
