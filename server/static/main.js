@@ -60,7 +60,7 @@ async function open() {
     leave = ended;
     replace(main, root);
     root.dispatchEvent(new Event("shown"));
-    if (here.screen === "test") goTo(here.query.get("at") ?? "");
+    if (here.screen === "test") goTo(route().query.get("at") ?? ""); // another part may have been chosen while it loaded
   } catch (error) {
     if (mine === visit) replace(main, h("div.panel", h("h1", SCREENS[here.screen][0]), problemText(error)));
   }

@@ -124,6 +124,7 @@ def open_test(shown: Page, part: str = "Capture") -> None:
     expect(listed.or_(heading).first).to_be_visible()
     if listed.is_visible():
         listed.click()
+    expect(heading).to_be_visible()
     go(shown, part, "Pressure test")
 
 

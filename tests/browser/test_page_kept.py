@@ -153,6 +153,7 @@ def test_region_and_settings_outlive_screen_reload_browser_and_service(chromium:
         expect(shown.get_by_role("cell", name="strip <b>")).to_be_visible()
         shown = opened(page, OTHER)
         expect(shown.get_by_text("No region yet.")).to_be_visible()
+        shown.get_by_text("Recipes: kept for the next specimen").click()
         shown.get_by_label("Take region and settings from").select_option(label="strip <b>")
         shown.get_by_role("button", name="Take", exact=True).first.click()
         expect(shown.get_by_label("Rectangle: x, y of each point, px")).to_have_value(outline)

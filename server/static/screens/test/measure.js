@@ -141,8 +141,16 @@ async function build(id, test, ends, { body, jobs, done }) {
     workspace.change({ ...(recipe.gauges ? { gauges: recipe.gauges } : {}), ...(recipe.display ? { display: recipe.display } : {}) });
   }
   const start = action("Measure", () => measure(my, jobs, done), { kind: "primary" });
-  replace(body, layout(my, { sample, texture, gauge: gauge.parts, end: [h("div.row", start, workspace.state), jobs.root] }));
-  body.before(await recipesBar(id, { take, now: () => recipeOf(my) }));
+  replace(
+    body,
+    layout(my, {
+      sample,
+      texture,
+      gauge: gauge.parts,
+      recipes: await recipesBar(id, { take, now: () => recipeOf(my) }),
+      end: [h("div.row.start", start, workspace.state), jobs.root],
+    }),
+  );
   editor.use("rectangle");
   editor.drawList();
   gauge.draw();
@@ -345,9 +353,9 @@ async function measure(my, jobs, done) {
 /**
  * The pictures, and beside them all that is set: the region, three settings, the others folded, and the button.
  * @param {Panel} my
- * @param {{ sample: ReturnType<typeof sampleOf>, texture: ReturnType<typeof textureRating>, gauge: HTMLElement[], end: HTMLElement[] }} parts
+ * @param {{ sample: ReturnType<typeof sampleOf>, texture: ReturnType<typeof textureRating>, gauge: HTMLElement[], recipes: HTMLElement, end: HTMLElement[] }} parts
  */
-function layout({ views, editor, form, reference, asked, finder }, { sample, texture, gauge, end }) {
+function layout({ views, editor, form, reference, asked, finder }, { sample, texture, gauge, recipes, end }) {
   const region = h(
     "fieldset",
     { "data-on": "region" },
@@ -379,7 +387,7 @@ function layout({ views, editor, form, reference, asked, finder }, { sample, tex
   return h(
     "div.work",
     h("div.pictured", { "data-on": "region" }, editor.bar, h("div.row", editor.more, editor.hint), h("div.grid.two.views", views.map(pictured))),
-    h("div.set", region, basic, settingsFields(form), steps, h("label.check", asked.follow, "continue with each new step"), end),
+    h("div.set", region, recipes, basic, settingsFields(form), steps, h("label.check", asked.follow, "continue with each new step"), end),
   );
 }
 

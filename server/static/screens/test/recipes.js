@@ -102,17 +102,14 @@ export async function recipesBar(id, { take, now }) {
   name.addEventListener("input", () => name.setCustomValidity(""));
   await list();
   return h(
-    "div",
+    "details",
     { "data-role": "recipes" },
+    h("summary", "Recipes: kept for the next specimen"),
     h("div.row", h("span", "Take region and settings from"), origin, which, taking),
     said,
-    h(
-      "details",
-      h("summary", "Recipes: kept for the next specimen"),
-      h("div.row", field("Name", name), keep),
-      kept,
-      field("Add a recipe's file", fileInput(list)),
-    ),
+    h("div.row", field("Name", name), keep),
+    kept,
+    field("Add a recipe's file", fileInput(list)),
   );
 }
 

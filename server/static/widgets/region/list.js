@@ -43,9 +43,8 @@ function row(editor, label, form, points, put, remove) {
   });
   return h(
     "div.row",
-    h("span", { style: { minWidth: "6.5rem" } }, label),
-    h("span", { style: { flex: 1, minWidth: "9rem", display: "grid", gridTemplateColumns: "minmax(0, 1fr)" } }, input, wrong),
-    h("span.unit", "px"),
+    h("span", { style: { minWidth: "5rem" } }, label),
+    h("span", { style: { flex: 1, minWidth: "6rem", display: "grid", gridTemplateColumns: "minmax(0, 1fr)" } }, input, wrong),
     h("button", { type: "button", "aria-label": `Delete ${label}`, onclick: () => editor.change(remove) }, "Delete"),
   );
 }
