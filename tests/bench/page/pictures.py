@@ -93,14 +93,14 @@ def calibrate(page: Page, out: Path) -> None:
     kept(page, out / "page_calibrate.png")
 
 
-def test(page: Page, out: Path) -> None:
-    page.wait_for_selector('[aria-label="Region and analysis"] .view img')
+def capture(page: Page, out: Path) -> None:
     page.locator('[data-role="thumbnails"] button').last.click()
     page.wait_for_timeout(1500)
     kept(page, out / "page_test_steps.png")
-    view = page.locator('[aria-label="Region and analysis"] .view').first
-    view.locator("img").first.scroll_into_view_if_needed()
-    box = view.locator(".content > img").first.bounding_box()
+
+
+def region(page: Page, out: Path) -> None:
+    box = page.locator(".work .view .content > img").first.bounding_box()
     assert box is not None
     corners = [
         (box["x"] + (x + 0.5) / 512 * box["width"], box["y"] + (y + 0.5) / 480 * box["height"]) for x, y in REGION
@@ -111,7 +111,6 @@ def test(page: Page, out: Path) -> None:
     page.mouse.up()
     page.get_by_label("Subset", exact=True).fill("21")
     page.locator('[data-role="texture"] .badge').wait_for()
-    top(page, '[aria-label="Region and analysis"]')
     page.mouse.move(2, 2)
     page.wait_for_timeout(1000)
     kept(page, out / "page_test.png")
@@ -156,7 +155,8 @@ def take(made: Browser, url: str, out: Path) -> None:
     for address, draw in (
         ("rig", rig),
         (f"calibrate/{calibration_id}", calibrate),
-        (f"test/{test_id}", test),
+        (f"test/{test_id}?at=capture", capture),
+        (f"test/{test_id}?at=region", region),
         (field, lambda page, out: results(page, out, "page_results")),
         (field, surface),
         ("jobs", jobs),
