@@ -387,7 +387,7 @@ function layout({ views, editor, form, reference, asked, finder }, { sample, tex
   return h(
     "div.work",
     h("div.pictured", { "data-on": "region" }, editor.bar, h("div.row", editor.more, editor.hint), h("div.grid.two.views", views.map(pictured))),
-    h("div.set", region, recipes, basic, settingsFields(form), steps, h("label.check", asked.follow, "continue with each new step"), end),
+    h("div.set", h("div", region, recipes, basic, settingsFields(form), steps, h("label.check", asked.follow, "continue with each new step")), end),
   );
 }
 
