@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numba import njit
 
-from stereorig.core.arrays import Float
+from stereorig.core.arrays import Bool, Float
 
 _SPHERE_REACH_RAD: Final = 1.4  # beyond it a sphere is seen too obliquely for a texture
 
@@ -242,3 +242,56 @@ def sphere(par: Float, s: Float, t: Float, out: Float) -> None:
         out[2, i] = radius * (1.0 - np.cos(theta)) if seen else np.nan
         out[3, i], out[4, i], out[5, i] = f + df * x * x, df * x * y, f * x / radius
         out[6, i], out[7, i], out[8, i] = df * x * y, f + df * y * y, f * y / radius
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _outside_unit_circle(radius: float, m: float, s: float, t: float) -> complex:
+    """Return zeta of z = R (zeta + m / zeta), the root that is not less than sqrt(m)."""
+    z = complex(s, t) / radius
+    edge = 2.0 * np.sqrt(m)
+    zeta: complex = 0.5 * (z + np.sqrt(z - edge) * np.sqrt(z + edge))
+    return zeta
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def inside_notch(par: Float, s: Float, t: Float) -> Bool:
+    """True where a material point lies in the notch, ``par`` as for :func:`notched_sheet`."""
+    out = np.empty(s.size, np.bool_)
+    for i in range(s.size):
+        out[i] = abs(_outside_unit_circle(par[0], par[1], s[i], t[i])) < 1.0
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def notched_sheet(par: Float, s: Float, t: Float, out: Float) -> None:
+    """The sheet with an elliptical notch in tension along t, ``par`` = [R, m, S / (2 G), kappa]; `stereorig.sim.notch`.
+
+    Within the notch, next to its edge, the potentials are continued, so that a ray's search may cross it.
+    """
+    radius, m, load, kappa = par[0], par[1], par[2], par[3]
+    q = 1.0 + m + m * m
+    for i in range(s.size):
+        zeta = _outside_unit_circle(radius, m, s[i], t[i])
+        if not abs(zeta) > 0.9:
+            for k in range(9):
+                out[k, i] = np.nan
+            continue
+        z = complex(s[i], t[i])
+        one = 1.0 / zeta
+        by_zeta = radius * (1.0 - m * one * one)  # dz / d zeta
+        phi = 0.25 * radius * load * (zeta - (2.0 + m) * one)
+        slope = 0.25 * radius * load * (1.0 + (2.0 + m) * one * one)
+        phi1 = slope / by_zeta
+        bent = -0.5 * radius * load * (2.0 + m) * one * one * one
+        phi2 = (bent * by_zeta - slope * 2.0 * radius * m * one * one * one) / (by_zeta * by_zeta * by_zeta)
+        above, below = q * zeta * zeta + 1.0, zeta * (zeta * zeta - m)
+        psi = 0.5 * radius * load * (zeta - above / below)
+        turned = (2.0 * q * zeta * below - above * (3.0 * zeta * zeta - m)) / (below * below)
+        psi1 = 0.5 * radius * load * (1.0 - turned) / by_zeta
+        moved = kappa * phi - z * np.conj(phi1) - np.conj(psi)
+        far = z * np.conj(phi2) + np.conj(psi1)
+        by_s = kappa * phi1 - np.conj(phi1) - far
+        by_t = 1j * (kappa * phi1 - np.conj(phi1) + far)
+        out[0, i], out[1, i], out[2, i] = s[i] + moved.real, t[i] + moved.imag, 0.0
+        out[3, i], out[4, i], out[5, i] = 1.0 + by_s.real, by_s.imag, 0.0
+        out[6, i], out[7, i], out[8, i] = by_t.real, 1.0 + by_t.imag, 0.0

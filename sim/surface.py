@@ -5,8 +5,8 @@ system frame. (s, t) are material coordinates in mm: they identify a material po
 defined in them.
 
 All formulas are closed. The kernels take flat numbers and whole arrays; they come from `stereorig.sim.plate`,
-`stereorig.sim.panel` and `stereorig.sim.steel`. For a ray (nx, ny, 1) in the camera's frame the material point that it
-meets solves
+`stereorig.sim.panel`, `stereorig.sim.notch` and `stereorig.sim.steel`. For a ray (nx, ny, 1) in the camera's frame the
+material point that it meets solves
 
     X_cam(s, t) - nx Z_cam(s, t) = 0,  Y_cam(s, t) - ny Z_cam(s, t) = 0
 
@@ -31,6 +31,7 @@ PLATE: Final = 2
 PANEL: Final = 3
 SPHERE: Final = 4
 BOWL: Final = 5
+NOTCH: Final = 6
 _NO_TABLE: Final = np.zeros((4, 4))
 _STEPS: Final = 30
 # a Newton step shorter than this leaves an error of half the curvature times its square: 1e-10 mm at 0.02 per mm
@@ -45,7 +46,7 @@ class Surface:
     Attributes
     ----------
     kind
-        ``FLAT``, ``HEIGHT``, ``PLATE``, ``PANEL``, ``SPHERE`` or ``BOWL``.
+        ``FLAT``, ``HEIGHT``, ``PLATE``, ``PANEL``, ``SPHERE``, ``BOWL`` or ``NOTCH``.
     parameters
         Numbers of that kind, see `stereorig.sim.formulas`.
     coarse, fine
@@ -93,6 +94,9 @@ class Surface:
         kernels.meet_plane(np.array([1.0, 0.0, 0.0, 1.0]), pose, nx, ny, s, t)
         if self.kind != PANEL:
             self._newton(pose, nx, ny, s, t, lip)
+            if self.kind == NOTCH:
+                cut = kernels.inside_notch(self.parameters, s, t)
+                s[cut] = t[cut] = np.nan
             return
         # a crack: first the lip on whose side the ray seems to be, then the other; between the lips there is nothing
         half_crack = self.parameters[0]
@@ -144,6 +148,7 @@ _SMOOTH: Final[dict[int, Callable[[Float, Float, Float, Float], None]]] = {
     PLATE: kernels.circular_plate,
     SPHERE: kernels.sphere,
     BOWL: kernels.bowl,
+    NOTCH: kernels.notched_sheet,
 }
 
 

@@ -8,6 +8,7 @@ from scipy.optimize import fsolve
 
 from stereorig.core.cameras.camera import Camera
 from stereorig.sim.catalog import SCENE_NAMES, make_scene
+from stereorig.sim.notch import NotchedSheet
 from stereorig.sim.panel import PAPER_LOADS_KN, CrackedPanel
 from stereorig.sim.plate import PAPER_PRESSURES_KPA, CircularPlate
 from stereorig.sim.render import material_points, render
@@ -303,3 +304,43 @@ def test_a_scene_can_fill_nothing_and_still_render() -> None:
         background=0.25,
     )
     np.testing.assert_allclose(render(scene, PAPER.cam1.camera, (40, 30)), 0.25, atol=1e-12)
+
+
+def test_a_notched_sheet_is_in_equilibrium_free_at_its_edge_and_strained_as_asked_far_away() -> None:
+    sheet, applied_mpa, h = NotchedSheet(), 100.0, 1e-4
+    surface = sheet.surface(applied_mpa)
+    modulus, nu = sheet.youngs_modulus_mpa, sheet.poisson
+
+    def stress(st: np.ndarray) -> np.ndarray:
+        """Hooke's law in plane stress, from differences of positions."""
+        by = [(surface.positions(st + step) - surface.positions(st - step)) / (2 * h) for step in ([h, 0], [0, h])]
+        exx, eyy, exy = by[0][:, 0] - 1, by[1][:, 1] - 1, 0.5 * (by[0][:, 1] + by[1][:, 0])
+        share = modulus / (1 - nu**2)
+        return np.stack([share * (exx + nu * eyy), share * (eyy + nu * exx), modulus / (1 + nu) * exy])
+
+    st = np.random.default_rng(1).uniform(-9, 9, (300, 2))
+    st = st[(st[:, 0] / sheet.half_length_mm) ** 2 + (st[:, 1] / sheet.half_width_mm) ** 2 > 1.2]
+    k = 0.01
+    by_s, by_t = ((stress(st + step) - stress(st - step)) / (2 * k) for step in (np.array([k, 0]), np.array([0, k])))
+    assert np.abs(by_s[0] + by_t[2]).max() < 0.02  # MPa/mm, of some 30
+    assert np.abs(by_s[2] + by_t[1]).max() < 0.02
+    around = np.linspace(0, 2 * np.pi, 41)
+    axes = np.array([sheet.half_length_mm, sheet.half_width_mm])
+    edge = 1.0001 * axes * np.stack([np.cos(around), np.sin(around)], axis=1)
+    normal = edge / axes**2
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    sxx, syy, sxy = stress(edge)
+    assert np.abs(sxx * normal[:, 0] + sxy * normal[:, 1]).max() < 0.2
+    assert np.abs(sxy * normal[:, 0] + syy * normal[:, 1]).max() < 0.2
+    # Inglis: S (1 + 2 a / b) at the ends
+    assert syy[0] == pytest.approx(applied_mpa * (1 + 2 * axes[0] / axes[1]), rel=1e-3)
+    np.testing.assert_allclose(stress(np.array([[900.0, 700.0]]))[:, 0], [0, applied_mpa, 0], atol=0.01)
+    by_s_mm = (surface.positions(st + np.array([h, 0])) - surface.positions(st - np.array([h, 0]))) / (2 * h)
+    np.testing.assert_allclose(surface.tangents(st)[..., 0], by_s_mm, atol=1e-9)
+    # a ray meets the material point it comes from, and in the notch nothing
+    camera = PAPER.cam1.camera
+    scene = Scene(name="notch", surface=surface, texture=speckle(diameter_mm=0.1, seed=1))
+    met, _ = material_points(scene, camera, camera.project(surface.positions(st[:20])).xy)
+    np.testing.assert_allclose(met, st[:20], atol=1e-8)
+    inside, _ = material_points(scene, camera, camera.project(np.zeros((1, 3))).xy)
+    assert np.isnan(inside).all()

@@ -3,6 +3,7 @@ import * as api from "../../lib/api.js";
 import * as events from "../../lib/events.js";
 import { continueButton } from "../../widgets/analyses_table.js";
 import { allTests } from "../results/analysis.js";
+import { tryIt } from "./sample.js";
 import { stateBadge } from "../results/warnings.js";
 import { h, replace, action, confirmed, count, numeric, table, when, notify } from "../../lib/dom.js";
 
@@ -67,7 +68,12 @@ export async function testsList() {
     await refresh();
   }
 
+  const offer = tryIt();
   function draw() {
+    if (!tests.length || offer.dataset.going) {
+      replace(list, offer); // it stays until its results are shown
+      return;
+    }
     const word = wanted.value.trim().toLowerCase();
     const found = tests.filter((test) => `${test.name} ${test.specimen ?? ""} ${test.id}`.toLowerCase().includes(word));
     replace(
@@ -91,7 +97,7 @@ export async function testsList() {
           onrow: (test) => {
             location.hash = `#/test/${test.id}`;
           },
-          empty: word ? "No test has this in its name, specimen or id." : "No test yet.",
+          empty: "No test has this in its name, specimen or id.",
         },
       ),
       found.length > most ? h("button", { type: "button", onclick: more }, `Show more of ${found.length}`) : null,
